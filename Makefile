@@ -1,0 +1,43 @@
+# make demo, make test: all that a fresh clone needs is Python 3.10 or newer, make and the package
+# index. Both make their own environment in .venv/ the first time; PYTHON=... picks the interpreter.
+
+VENV := .venv
+BIN := $(VENV)/bin
+
+# The environment brings its own ROS packages. What a sourced ROS (or another environment's
+# interpreter) put into these variables would mix two installations.
+unexport PYTHONHOME PYTHONPATH AMENT_PREFIX_PATH RMW_IMPLEMENTATION VIRTUAL_ENV
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
+unexport LD_LIBRARY_PATH
+endif
+
+.PHONY: help env demo test lint clean distclean
+.NOTPARALLEL:
+
+help:
+	@echo 'make demo       run the Autoware workload under the executor, record and replay it'
+	@echo 'make test       run all tests (PYTEST_ARGS=... for some of them)'
+	@echo 'make lint       run the linters and mypy only'
+	@echo 'make env        make or refresh the environment in $(VENV)/ (the others do it, too)'
+	@echo 'make clean      remove what builds and tests left behind'
+	@echo 'make distclean  the same, and the environment'
+
+env:
+	@PYTHON='$(PYTHON)' sh .ci/environment $(VENV)
+
+demo: env
+	@$(BIN)/mddag demo $(DEMO_ARGS)
+
+test: env
+	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: env
+	@$(BIN)/python -m pytest -q -m linter test/test_linters.py test/test_layers.py
+
+clean:
+	rm -rf build install log dist *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -name $(VENV) -prune -o -name __pycache__ -type d -exec rm -rf {} +
+
+distclean: clean
+	rm -rf $(VENV) $(VENV).lock

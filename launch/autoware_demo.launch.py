@@ -1,0 +1,56 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Run the paper's Autoware workload under the executor, as `mddag run` does, and record it.
+
+    ros2 launch mddag_executor autoware_demo.launch.py utilisation:=0.8 trace:=/tmp/run.mcap
+
+The program is started as a node, so remappings, namespaces and parameters of an including launch
+file reach it. Every argument below has the meaning of the option of `mddag run` of that name.
+"""
+
+ARGUMENTS = (
+    ('synthetic', 'sleep', 'how a callback takes its time: sleep or spin'),
+    ('utilisation', '0.6', 'normalised utilisation that the execution times are scaled to'),
+    ('seed', '0', 'what the execution times are drawn with'),
+    ('duration', '20s', 'how long to run'),
+    ('workers', '7', 'how many worker threads run callbacks'),
+    ('policy', 'rad', 'the scheduling policy'),
+    ('trace', 'autoware_demo.mcap', 'where to record'),
+)
+
+
+def generate_launch_description():
+    """Return the launch description, with one launch argument for each option."""
+    # Here, so that this file can be read on a machine without ROS's launch.
+    from launch.actions import DeclareLaunchArgument
+    from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+    from launch_ros.actions import Node
+    from launch_ros.substitutions import FindPackageShare
+
+    from launch import LaunchDescription
+
+    workload = PathJoinSubstitution(
+        [FindPackageShare('mddag_executor'), 'config', 'autoware.yaml'])
+    command = ['run', LaunchConfiguration('graph')]
+    for name, _, _ in ARGUMENTS:
+        command += [f'--{name}', LaunchConfiguration(name)]
+    return LaunchDescription([
+        DeclareLaunchArgument('graph', default_value=workload,
+                              description='the declaration to run'),
+        *(DeclareLaunchArgument(name, default_value=value, description=meaning)
+          for name, value, meaning in ARGUMENTS),
+        Node(package='mddag_executor', executable='mddag', arguments=command, output='screen'),
+    ])

@@ -1,0 +1,260 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What the verbs share: reading files and standard input, writing results, kinds of arguments.
+
+Theory of operation for outputs: a result goes to a temporary file beside its target and takes the
+target's name in one step when it is whole, so an interrupted or failed run never leaves half a
+file, and never harms the file that was there before. `check_output` is called before long work
+starts, so a mistyped path costs nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+import json
+import math
+import os
+from pathlib import Path
+import shutil
+import stat
+import sys
+import tempfile
+from typing import Any, BinaryIO, cast, TYPE_CHECKING
+
+from mddag_executor.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from msg_graph import TaskSet
+
+STDIN = '<stdin>'
+_read_already: object = None  # the stream that was standard input when it was read
+
+
+def read_bytes(path: str) -> tuple[str, bytes]:
+    """
+    Return the name for messages and the content of a file, or of standard input for `-`.
+
+    :raises OSError: when the file cannot be read
+    :raises mddag_executor.errors.UsageError: when standard input was read already
+    """
+    if path != '-':
+        return path, Path(path).read_bytes()
+    return STDIN, _claim_stdin().read()
+
+
+def read_text(path: str) -> tuple[str, str]:
+    """
+    Return the name for messages and the text of a file, or of standard input for `-`.
+
+    :raises OSError: when the file cannot be read
+    :raises mddag_executor.errors.InputError: when it is not UTF-8
+    :raises mddag_executor.errors.UsageError: when standard input was read already
+    """
+    name, data = read_bytes(path)
+    try:
+        return name, data.decode('utf-8-sig')
+    except UnicodeDecodeError as error:
+        line = data.count(b'\n', 0, error.start) + 1
+        raise InputError(name, 'this is not UTF-8 text', 'save the file as UTF-8',
+                         line=line) from None
+
+
+def read_json(path: str) -> Any:
+    """
+    Return the content of a JSON file, or of standard input for `-`.
+
+    :raises mddag_executor.errors.InputError: when it is no JSON
+    """
+    name, text = read_text(path)
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(name, f'this is not JSON: {error.msg}', 'correct the file',
+                         line=error.lineno) from None
+    except RecursionError:
+        raise InputError(name, 'the JSON is nested too deeply', 'correct the file') from None
+
+
+def load_graph(path: str) -> TaskSet:
+    """
+    Return the task set that a declaration gives, from a file or from standard input for `-`.
+
+    :raises msg_graph.GraphError: when the declaration is wrong
+    """
+    import msg_graph
+    if path != '-':
+        return msg_graph.load(path)
+    name, text = read_text(path)
+    return msg_graph.loads(text, name=name)
+
+
+@contextmanager
+def input_file(path: str) -> Iterator[Path]:
+    """
+    Give a seekable file for a path; what comes from standard input (`-`) is kept in a copy.
+
+    :raises OSError: when it cannot be read
+    """
+    if path != '-':
+        yield Path(path)
+        return
+    source = _claim_stdin()
+    with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
+        copy = Path(folder, STDIN)
+        with copy.open('wb') as target:
+            shutil.copyfileobj(source, target, 1 << 20)
+        yield copy
+
+
+def _claim_stdin() -> BinaryIO:
+    global _read_already
+    if sys.stdin is None:
+        raise UsageError("-: there is no standard input: name a file instead of '-'")
+    if _read_already is sys.stdin:
+        raise UsageError("-: standard input can be read only once: use '-' for one file only")
+    _read_already = sys.stdin
+    return cast(BinaryIO, getattr(sys.stdin, 'buffer', sys.stdin))
+
+
+def check_output(path: str | None) -> None:
+    """
+    Find out whether a result can be written, before the work starts.
+
+    :param path: as given on the command line; None and `-` are always fine
+    :raises mddag_executor.errors.InputError: when it cannot be written
+    """
+    if path is None or path == '-':
+        return
+    target = Path(path)
+    folder = target.parent
+    if target.is_dir():
+        raise InputError(path, 'this is a directory', 'name a file')
+    if not folder.is_dir():
+        raise InputError(path, f'there is no directory {folder}', 'make it first')
+    if _is_special(target):
+        return
+    if not os.access(folder.resolve(), os.W_OK | os.X_OK):
+        raise InputError(path, 'the directory cannot be written to', 'name another file')
+
+
+def _is_special(path: Path) -> bool:
+    """Tell a pipe or device (`/dev/stdout`), which is written to and never replaced."""
+    try:
+        return not stat.S_ISREG(path.stat().st_mode)
+    except OSError:
+        return False
+
+
+@contextmanager
+def output_file(path: str) -> Iterator[BinaryIO]:
+    """
+    Give a binary file that becomes `path` when the block ends well, and vanishes otherwise.
+
+    :param path: the target; `-` is standard output
+    :raises OSError: when it cannot be written
+    """
+    if path == '-':
+        sys.stdout.flush()
+        yield cast(BinaryIO, sys.stdout.buffer)
+        sys.stdout.buffer.flush()
+        return
+    target = Path(path)
+    if _is_special(target):
+        with target.open('wb') as special:
+            yield special
+        return
+    target = target.resolve()  # a symbolic link stays one
+    part = target.with_name(f'.{target.name}.{os.getpid()}.part')
+    try:
+        with part.open('xb') as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        if target.exists():
+            shutil.copymode(target, part)
+        part.replace(target)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def write_text(path: str, text: str) -> None:
+    """Write a text file as a whole, or to standard output for `-`."""
+    with output_file(path) as file:
+        file.write(text.encode('utf-8', 'surrogateescape'))
+
+
+def write_json(path: str, value: Any) -> None:
+    """
+    Write a result for machines as a whole, or to standard output for `-`.
+
+    :raises ValueError: when it holds a number that JSON lacks (infinity, not a number)
+    """
+    text = json.dumps(value, indent=2, ensure_ascii=True, allow_nan=False, default=_plain)
+    write_text(path, text + '\n')
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, 'tolist'):  # numpy's scalars and arrays
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f'{type(value).__name__} has no JSON form')
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Declare `--json`."""
+    parser.add_argument('--json', metavar='FILE',
+                        help="write the whole result as JSON ('-': to standard output, "
+                             'instead of the tables)')
+
+
+def wants_tables(args: argparse.Namespace) -> bool:
+    """Tell whether standard output is for people, and not taken by `--json -`."""
+    return getattr(args, 'json', None) != '-'
+
+
+def duration(text: str) -> int:
+    """Return the nanoseconds of an argument such as `20s` or `100ms`."""
+    import msg_graph
+    try:
+        return msg_graph.parse_duration(text)
+    except (ValueError, msg_graph.GraphError) as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def positive_int(text: str) -> int:
+    """Return a whole number from 1 up."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f'{text!r} is no whole number from 1 up')
+    return value
+
+
+def positive_float(text: str) -> float:
+    """Return a finite number above zero."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (value > 0 and math.isfinite(value)):
+        raise argparse.ArgumentTypeError(f'{text!r} is no number above zero')
+    return value

@@ -1,0 +1,203 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Entry point of `mddag`: find the verb, run it, turn errors into one line and an exit status.
+
+Theory of operation: the table of verbs below holds the one-line helps, so that `mddag --help`
+imports nothing but argparse; the module of a verb is imported when that verb is named first on the
+command line, and only then. Whatever the user can cause comes up as an exception of a known tree
+and leaves as one line `error: PLACE: what is wrong: what to do`. The exit status is
+
+| status | meaning |
+| --- | --- |
+| 0 | done |
+| 1 | done, and with `--fail-on-miss` a deadline was missed |
+| 2 | bad input or usage |
+| 70 | a defect of this program or of a node's callback, with its traceback (EX_SOFTWARE) |
+| 130 | interrupted with Ctrl-C |
+| 141 | the reader of the output went away |
+
+`MDDAG_DEBUG=1` in the environment shows the traceback of every error.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.util import find_spec
+import io
+import os
+import sys
+from types import ModuleType
+from typing import NamedTuple, NoReturn
+
+from mddag_executor import __version__
+from mddag_executor.cli.text import one_line
+from mddag_executor.errors import MddagError, UsageError
+
+EXIT_DONE = 0
+EXIT_BAD_INPUT = 2
+EXIT_DEFECT = 70
+EXIT_INTERRUPTED = 130
+EXIT_BROKEN_PIPE = 141
+
+
+class Verb(NamedTuple):
+    """A row of the table of verbs: its module in `mddag_executor.cli` and its one-line help."""
+
+    module: str
+    summary: str
+
+
+VERBS = {
+    'demo': Verb('demo', 'run the whole Autoware workload, record it and replay the recording'),
+    'run': Verb('run', 'run rclpy nodes, or nodes made from the declaration, and record them'),
+    'replay': Verb('replay', 'check a recorded run against its deadlines, or reschedule it'),
+    'simulate': Verb('simulate', 'run a declaration in virtual time'),
+    'evaluate': Verb('evaluate', 'measure acceptance ratios over many simulated runs'),
+    'graph': Verb('graph', 'check, draw, derive and analyse declarations'),
+    'import': Verb('import_', 'turn a CARET or ros2_tracing recording into a trace'),
+    'export': Verb('export', 'turn a trace into a file for Perfetto, spreadsheets or data frames'),
+    'bench': Verb('bench', 'measure the executor, the core, the replayer and the simulator'),
+}
+# Where the error classes of the neighbours are, of which not all derive from MddagError (msg_graph
+# stands below this package). They are looked up in sys.modules: a module that was not imported
+# cannot have raised.
+_ERRORS = (('msg_graph', 'GraphError'), ('mddag_executor.trace', 'TraceError'))
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that reports a wrong command line as a `UsageError`."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise instead of printing the usage over several lines and exiting."""
+        raise UsageError(f"{self.prog}: {message}: see '{self.prog} --help'")
+
+
+def available() -> dict[str, Verb]:
+    """Return the verbs that this installation has."""
+    return {name: verb for name, verb in VERBS.items()
+            if find_spec(f'mddag_executor.cli.{verb.module}') is not None}
+
+
+def load(verb: Verb) -> ModuleType:
+    """Import the module of a verb."""
+    return import_module(f'mddag_executor.cli.{verb.module}')
+
+
+def build_parser(chosen: str | None) -> Parser:
+    """Return the program's parser, with the arguments of the chosen verb only."""
+    parser = Parser(
+        prog='mddag', allow_abbrev=False,
+        description='Run ROS 2 callbacks by their deadlines, and check recorded runs offline.',
+        epilog="'mddag VERB --help' explains a verb and shows an example.")
+    parser.add_argument('--version', action='version', version=f'mddag {__version__}')
+    verbs = parser.add_subparsers(dest='verb', metavar='VERB', required=True, title='verbs')
+    for name, verb in available().items():
+        if name != chosen:
+            verbs.add_parser(name, help=verb.summary, add_help=False)
+            continue
+        module = load(verb)
+        examples = ''.join(f'\n  {line}' for line in module.EXAMPLE.strip().splitlines())
+        own = verbs.add_parser(
+            name, help=verb.summary, allow_abbrev=False,
+            description=module.HELP[:1].upper() + module.HELP[1:].rstrip('.') + '.',
+            epilog=f'example:{examples}', formatter_class=argparse.RawDescriptionHelpFormatter)
+        module.add_arguments(own)
+        own.set_defaults(main=module.main)
+    return parser
+
+
+def run(argv: Sequence[str]) -> int:
+    """
+    Parse and do what a command line says.
+
+    :returns: the verb's exit status
+    :raises mddag_executor.errors.UsageError: when the command line is wrong
+    """
+    parser = build_parser(argv[0] if argv else None)
+    args = parser.parse_args(argv)
+    status = int(args.main(args))
+    # Here, not at the interpreter's exit: a full disk or a closed pipe must still be reported.
+    sys.stdout.flush()
+    return status
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run the program.
+
+    :param argv: the arguments after the program's name; those of the process when None
+    :returns: the exit status
+    """
+    try:
+        # A name that the terminal's encoding lacks is escaped; it must not end the program.
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors='backslashreplace')
+        return run(sys.argv[1:] if argv is None else argv)
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        _silence_stdout()
+        return EXIT_BROKEN_PIPE
+    except Exception as error:
+        line = user_line(error)
+        if line is None or os.environ.get('MDDAG_DEBUG') == '1':
+            import traceback
+            traceback.print_exception(type(error), error, error.__traceback__)
+        if line is None:
+            return EXIT_DEFECT
+        print(f'error: {line}', file=sys.stderr)
+        return EXIT_BAD_INPUT
+
+
+def user_line(error: BaseException) -> str | None:
+    """Return the line that tells the user about an error, or None when it is a defect."""
+    if isinstance(error, known_errors()):
+        return one_line(str(error))
+    if isinstance(error, OSError) and error.filename is not None:
+        reason = error.strerror or type(error).__name__
+        remedy = _REMEDIES.get(type(error), 'check the path and what it lies on')
+        name = error.filename if error.filename2 is None else error.filename2
+        place = name if isinstance(name, int) else os.fsdecode(name)
+        return one_line(f'{place}: {reason[:1].lower()}{reason[1:]}: {remedy}')
+    return None
+
+
+_REMEDIES: dict[type[BaseException], str] = {
+    FileNotFoundError: 'check the path',
+    IsADirectoryError: 'name a file',
+    NotADirectoryError: 'check the path',
+    PermissionError: 'change its permissions or name another file',
+}
+
+
+def known_errors() -> tuple[type[BaseException], ...]:
+    """Return the base classes of the errors that are the user's to mend."""
+    found: list[type[BaseException]] = [MddagError]
+    for module, name in _ERRORS:
+        error = getattr(sys.modules.get(module), name, None)
+        if isinstance(error, type) and issubclass(error, BaseException):
+            found.append(error)
+    return tuple(found)
+
+
+def _silence_stdout() -> None:
+    # The interpreter flushes stdout once more at its exit, and would complain again.
+    try:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (OSError, ValueError):
+        pass  # stdout is no file descriptor (captured by a test), or is closed already

@@ -1,0 +1,102 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Tables of what came of each sink; live runs and the demo show them.
+
+The numbers are those of the result format: ``completed`` counts all completions, ``late`` those
+after the deadline and what was overdue and open when the run ended.  For people *due* is every
+sink job that got a verdict, and *in time* what completed by its deadline.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+from mddag_executor.cli.text import Cell, format_ns, table
+
+HEADER = ('DAG', 'sink', 'due', 'in time', 'late', 'expired', 'median', 'p99', 'max', 'deadline')
+
+
+class Counts(NamedTuple):
+    """Verdicts about the jobs of a sink, or of several."""
+
+    due: int
+    in_time: int
+    late: int
+    expired: int
+    aborted: int
+
+
+def counts(sink: Mapping[str, Any]) -> Counts:
+    """Return the verdicts that a sink's result holds."""
+    overdue = sink.get('overdue', 0)
+    aborted = sink.get('aborted', 0)
+    in_time = sink['completed'] - (sink['late'] - overdue)
+    due = sink['completed'] + overdue + sink['expired'] + aborted
+    return Counts(due, in_time, sink['late'], sink['expired'], aborted)
+
+
+def total(dags: Mapping[str, Any]) -> Counts:
+    """Return the verdicts about all sinks."""
+    every = [counts(sink) for dag in dags.values() for sink in dag['sinks'].values()]
+    return Counts(*(sum(column) for column in zip(*every))) if every else Counts(0, 0, 0, 0, 0)
+
+
+def short_names(names: Iterable[str]) -> dict[str, str]:
+    """
+    Return for each vertex its name with only the last part of the node's.
+
+    Where that is not enough to tell it from the others it keeps the whole name.
+    """
+    shortened = {name: name[name.rfind('/') + 1:] for name in names}
+    used = Counter(shortened.values())
+    return {name: short if used[short] == 1 else name for name, short in shortened.items()}
+
+
+def sink_table(dags: Mapping[str, Any]) -> str:
+    """Return a table with a row for each sink: counts, and response times by its deadline."""
+    short = short_names(name for dag in dags.values() for name in dag['sinks'])
+    some_aborted = total(dags).aborted > 0
+    header = [*HEADER[:6], *(['aborted'] if some_aborted else []), *HEADER[6:]]
+    rows: list[list[Cell]] = []
+    for dag_name, dag in dags.items():
+        shown = dag_name
+        for name, sink in dag['sinks'].items():
+            verdicts = counts(sink)
+            rows.append([
+                shown, short[name], verdicts.due, verdicts.in_time, verdicts.late,
+                verdicts.expired, *([verdicts.aborted] if some_aborted else []),
+                *response_cells(sink['response_ns']), format_ns(sink['relative_deadline_ns'])])
+            shown = ''
+    return table(header, rows)
+
+
+def response_cells(response: Mapping[str, int] | None) -> list[Cell]:
+    """Return the cells for median, p99 and max of response times."""
+    if response is None:
+        return [None, None, None]
+    return [format_ns(response[key]) for key in ('median', 'p99', 'max')]
+
+
+def percent(part: int, whole: int) -> str:
+    """Return a share for people; never rounded up to 100 % or down to 0 %."""
+    if not whole:
+        return '-'
+    share = 100 * part / whole
+    if part not in (0, whole):
+        share = min(99.99, max(0.01, share))
+    return f'{share:.2f} %'

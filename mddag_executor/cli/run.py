@@ -1,0 +1,312 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The verb `run`: real nodes, or nodes made from the declaration, under the executor.
+
+Everything that can be wrong with the command line is found before a node starts: the declaration,
+the names of policy and nodes, whether trace and result can be written.  A run ends after
+`--duration`, with Ctrl-C (or SIGTERM), when a node calls `rclpy.shutdown`, or when all programs have
+ended; however it ends, its summary is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+import signal
+import sys
+import threading
+from typing import Any, TYPE_CHECKING
+
+from mddag_executor.cli import common
+from mddag_executor.cli.results import percent, sink_table, total
+from mddag_executor.cli.text import printable, Progress
+from mddag_executor.core import POLICIES
+from mddag_executor.core import policy as find_policy
+from mddag_executor.errors import MddagError, UsageError
+
+if TYPE_CHECKING:
+    from mddag_executor.live.execution import ExecutionPlan
+    from mddag_executor.live.executor import MultiDeadlineExecutor
+    from mddag_executor.live.loading import Program
+    from mddag_executor.live.session import Session
+    from msg_graph import TaskSet
+
+NAME = 'run'
+HELP = 'run rclpy nodes, or nodes made from the declaration, and record them'
+EXAMPLE = """\
+mddag run graph.yaml --node my_package/driver --node my_package.filter:main --trace run.mcap
+mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20s"""
+
+_LONGEST_LIST = 10
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add('graph', metavar='GRAPH', help="the declaration, a YAML file ('-': standard input)")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        '--node', metavar='SPEC', action='append', default=[],
+        help='run this node: package/executable (unmodified, as ros2 run does), module:function '
+        'or module:NodeClass; repeat it for more nodes')
+    what.add_argument(
+        '--synthetic', choices=('sleep', 'spin'),
+        help='make the nodes from the declaration; their callbacks sleep, or take CPU, for the '
+        'declared execution times')
+    add('--utilisation', type=common.positive_float, metavar='U',
+        help='with --synthetic: scale the execution times to this normalised utilisation, '
+        'sum(C/T)/workers')
+    add('--seed', type=int, default=0, metavar='N',
+        help='with --synthetic: draw the execution times with this (default: 0)')
+    add('--duration', type=common.duration, metavar='TIME',
+        help='end after this time, as 20s (default: with Ctrl-C); with --synthetic after a '
+        'warm-up of 1 s')
+    add('--workers', type=common.positive_int, metavar='M',
+        help='threads that run callbacks (default: what the declaration says, else 7)')
+    add('--policy', default='rad', metavar='P',
+        help=f'one of {", ".join(POLICIES)} (default: rad)')
+    add('--intake', choices=('auto', 'events', 'waitset'), default='auto',
+        help='how the executor learns what is ready (default: auto)')
+    add('--trace', metavar='OUT.mcap', help='record the run to this file')
+    common.add_json(parser)
+    add('--ros-args', nargs=argparse.REMAINDER, metavar='…',
+        help='the rest of the command line goes to rclpy.init, as -r from:=to')
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Run nodes until the run ends, and print what came of the deadlines.
+
+    :raises msg_graph.GraphError: when the declaration is wrong
+    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    """
+    common.check_output(args.json)
+    _check_arguments(args)
+    task_set = common.load_graph(args.graph)
+    workers = args.workers or task_set.workers or 7
+    plan = None
+    programs: list[Program] = []
+    if args.synthetic is not None:
+        from mddag_executor.live.execution import ExecutionPlan
+        plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
+        _warn(plan)
+    else:
+        from mddag_executor.live.loading import resolve
+        programs = [resolve(spec) for spec in args.node]
+    with _rclpy(args.ros_args or []):
+        from mddag_executor.live.executor import MultiDeadlineExecutor
+        executor = MultiDeadlineExecutor(
+            task_set, num_workers=workers, policy=args.policy, trace=args.trace,
+            intake=args.intake)
+        try:
+            result, error = _run(args, task_set, executor, programs, plan)
+        except MddagError:
+            if args.trace is not None:  # nothing ran: leave no empty trace behind
+                Path(args.trace).unlink(missing_ok=True)
+            raise
+    _report(args, result)
+    if error is not None:
+        raise error
+    return 0
+
+
+def _check_arguments(args: argparse.Namespace) -> None:
+    find_policy(args.policy)
+    if args.trace == '-':
+        raise UsageError('--trace -: a trace is not written to standard output: name a file')
+    common.check_output(args.trace)
+    if args.synthetic is None and args.utilisation is not None:
+        raise UsageError(
+            '--utilisation: it scales synthetic nodes only: add --synthetic or leave it out')
+
+
+def _warn(plan: ExecutionPlan) -> None:
+    """Tell what the draw makes impossible, whatever the executor does."""
+    for sink in plan.infeasible():
+        print(
+            f'warning: {printable(sink.vertex)}: with seed {plan.seed} its critical path takes '
+            f'{sink.critical_path_ns / 1e6:.1f} ms, and its deadline is '
+            f'{sink.deadline_ns / 1e6:.1f} ms: no scheduler can keep it', file=sys.stderr)
+    if plan.mode == 'spin' and plan.utilisation * plan.workers > 0.9:
+        print(
+            f'warning: spinning callbacks share the interpreter lock, so one core; these need '
+            f'{plan.utilisation * plan.workers:.2f}: lower --utilisation, or sleep',
+            file=sys.stderr)
+
+
+@contextmanager
+def _rclpy(ros_args: Sequence[str]) -> Iterator[None]:
+    """Initialise rclpy, whose own signal handlers would take Ctrl-C away from the summary."""
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import try_shutdown
+    arguments = [sys.argv[0], '--ros-args', *ros_args] if ros_args else []
+    try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:
+        lines = str(error).split('\n')
+        raise UsageError(
+            f'--ros-args {" ".join(ros_args)}: {lines[0]}: correct it, or leave it out') from error
+    try:
+        yield
+    finally:
+        try_shutdown()
+
+
+def _run(
+    args: argparse.Namespace, task_set: TaskSet, executor: MultiDeadlineExecutor,
+    programs: list[Program], plan: ExecutionPlan | None,
+) -> tuple[dict[str, Any], BaseException | None]:
+    """Run until the end; return the result, and what a node raised."""
+    from mddag_executor.live.session import Session
+    session = Session(executor)
+    seconds = None if args.duration is None else args.duration / 1e9
+    measured: dict[str, Any] | None = None
+    with _signals(session), Progress('running', seconds) as progress:
+        if plan is not None:
+            measured = _run_synthetic(session, task_set, plan, seconds, progress)
+        else:
+            _run_programs(session, programs, args.ros_args or [], seconds, progress)
+    result = {
+        'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
+        **executor.statistics(), 'measured': measured}
+    if not session.clean:
+        print('warning: a callback did not end in time; it is left behind', file=sys.stderr)
+    return result, session.error
+
+
+def _run_synthetic(
+    session: Session, task_set: TaskSet, plan: ExecutionPlan, seconds: float | None,
+    progress: Progress,
+) -> dict[str, Any] | None:
+    from mddag_executor.live import current_job
+    from mddag_executor.live.session import run_synthetic
+    from mddag_executor.live.synthetic import build_nodes
+    workload = build_nodes(task_set, plan, current_job=current_job)
+    for node in workload.nodes:
+        session.executor.add_node(node)
+    try:
+        with session:
+            return run_synthetic(session, workload, seconds, progress.update)
+    finally:
+        workload.destroy()
+
+
+def _run_programs(
+    session: Session, programs: list[Program], ros_args: list[str], seconds: float | None,
+    progress: Progress,
+) -> None:
+    from mddag_executor.live.hosting import Host
+    arguments = ['--ros-args', *ros_args] if ros_args else []
+    with Host(session.executor, session.stop) as host:
+        try:
+            with session:
+                host.start(programs, arguments)
+                session.wait(seconds, progress.update)
+        except MddagError:
+            # What a callback raised tells more than that its program failed to start.
+            if session.error is None:
+                raise
+        left = host.end()
+        for guest in host.guests:
+            if guest.error is not None and session.error is None:
+                session.error = guest.error
+        for guest in left:
+            print(f'warning: --node {printable(guest.program.spec)}: its main() has not '
+                  'ended in time; it is left behind', file=sys.stderr)
+
+
+@contextmanager
+def _signals(session: Session) -> Iterator[None]:
+    """Let SIGINT and SIGTERM end the run; the second SIGINT interrupts the program itself."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handler(number: int, frame: object) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        session.stop()
+
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def _report(args: argparse.Namespace, result: dict[str, Any]) -> None:
+    if args.json is not None:
+        common.write_json(args.json, result)
+    if common.wants_tables(args):
+        print(sink_table(result['dags']))
+        for line in summary(result):
+            print(line)
+
+
+def summary(result: dict[str, Any]) -> Iterator[str]:
+    """Yield the lines that stand below the table of a run."""
+    every = total(result['dags'])
+    yield (f'{every.due} sink jobs due, {every.in_time} in time '
+           f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
+           + (f', {every.aborted} aborted' if every.aborted else ''))
+    measured = result['measured']
+    if measured is not None:
+        yield from measured_lines(measured)
+    dropped = result['dropped']
+    yield f'{sum(dropped.values())} dropped' + _details(dropped)
+    skipped = {name: counts['skipped'] for name, counts in result['callbacks'].items()
+               if counts['skipped']}
+    if skipped:
+        yield f'{sum(skipped.values())} timer releases skipped' + _details(skipped)
+    yield f'{result["undeclared"]} runs of undeclared callbacks'
+    never = result['never_ran']
+    if never:
+        yield f'{len(never)} declared callbacks never ran: ' + _listed(never)
+    if result['trace'] is not None:
+        lost = result['trace']['lost']
+        yield (f'trace: {printable(str(Path(result["trace"]["path"]).absolute()))}'
+               + (f' ({lost} events lost: the disk was too slow)' if lost else ''))
+
+
+def measured_lines(measured: dict[str, Any]) -> Iterator[str]:
+    """Yield the lines about what the synthetic nodes themselves measured."""
+    yield (
+        f'measured by the nodes, {measured["window_ns"] / 1e9:.1f} s after a warm-up of '
+        f'{measured["warm_up_ns"] / 1e9:g} s: {measured["sink_jobs_due"]} due, '
+        f'{measured["on_time"]} on time ({percent(measured["on_time"], measured["sink_jobs_due"])}'
+        f'), {measured["late"]} late, {measured["missing"]} missing')
+    cpu = measured['cpu_us_per_callback']
+    yield (
+        f'utilisation {measured["utilisation"]:.3f} planned (seed {measured["seed"]}), '
+        f'{measured["utilisation_taken"]:.3f} taken; {measured["callbacks_per_s"]:.0f} callbacks '
+        f'a second, {"-" if cpu is None else f"{cpu:.0f}"} us of CPU each')
+    attribution = measured['attribution']
+    if attribution['wrong'] or attribution['none']:
+        yield (f'{attribution["wrong"]} callbacks ran as the wrong job, {attribution["none"]} as '
+               'none')
+
+
+def _details(numbers: dict[str, int]) -> str:
+    return ': ' + _listed([f'{name} {n}' for name, n in numbers.items()]) if numbers else ''
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = ', '.join(printable(name) for name in names[:_LONGEST_LIST])
+    return shown + (f', … ({len(names) - _LONGEST_LIST} more)'
+                    if len(names) > _LONGEST_LIST else '')

@@ -1,0 +1,161 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Jobs as a whole: rules 1 and 6 to 8 of the scheduling rules, whose text stands in ``rules``.
+
+Here jobs are opened, judged and ended, and their slots recycled.  Like ``rules`` this is nothing
+but integer arithmetic and list indexing.
+"""
+
+from __future__ import annotations
+
+from mddag_executor.core.state import (
+    ABORTED,
+    DONE,
+)
+from mddag_executor.core.tables import Tables
+
+
+def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int) -> int:
+    """
+    Open a job (rule 1) and return its slot, or -1 when the DAG needs one more slot first.
+
+    :param job: index of the job in its DAG, from 0.
+    :param release: time its source became due, ns; not later than ``now``.
+    """
+    expire_idle(t, s, dag, now)
+    if s.n_open[dag] >= t.max_active_jobs[dag]:
+        expire_job(t, s, s.oldest[dag], now)
+    slot = s.free_slot[dag]
+    if slot < 0:
+        return -1
+    s.free_slot[dag] = s.job_next[slot]
+    s.job_index[slot] = job
+    s.job_release[slot] = release
+    s.job_state[slot] = OPEN
+    s.job_sinks_left[slot] = t.first_sink[dag + 1] - t.first_sink[dag] if dag < t.n_dags else 0
+    s.job_late[slot] = 0
+    s.job_active[slot] = 0
+    _link_newest(s, dag, slot)
+    base = s.job_base[slot]
+    for x in range(base, base + t.n_region[dag]):
+        s.x_state[x] = IDLE
+        s.x_pending[x] = t.n_predecessors[s.x_vertex[x]]
+        s.x_worker[x] = -1
+    return slot
+
+
+def _link_newest(s: State, dag: int, slot: int) -> None:
+    newest = s.newest[dag]
+    s.job_previous[slot] = newest
+    s.job_next[slot] = -1
+    if newest < 0:
+        s.oldest[dag] = slot
+    else:
+        s.job_next[newest] = slot
+    s.newest[dag] = slot
+    s.n_open[dag] += 1
+
+
+def _close(s: State, slot: int, end: int, now: int) -> None:
+    """End an open job (rule 8): it leaves the open jobs and, when nothing is active, its slot."""
+    dag = s.job_dag[slot]
+    before, after = s.job_previous[slot], s.job_next[slot]
+    if before < 0:
+        s.oldest[dag] = after
+    else:
+        s.job_next[before] = after
+    if after < 0:
+        s.newest[dag] = before
+    else:
+        s.job_previous[after] = before
+    s.n_open[dag] -= 1
+    s.job_state[slot] = end
+    if dag < len(s.oldest) - 1:  # jobs of the undeclared DAG are nobody's to judge
+        s.decisions.append((JOB_END, dag, -1, s.job_index[slot], end, now))
+    if s.job_active[slot] == 0:
+        _free(s, slot)
+
+
+def _free(s: State, slot: int) -> None:
+    dag = s.job_dag[slot]
+    s.job_state[slot] = FREE
+    s.job_next[slot] = s.free_slot[dag]
+    s.free_slot[dag] = slot
+
+
+def expire_idle(t: Tables, s: State, dag: int, now: int) -> None:
+    """Expire the oldest jobs of a DAG that can no longer complete (rule 1)."""
+    while s.oldest[dag] >= 0:
+        slot = s.oldest[dag]
+        patience = t.dag_deadline[dag] + t.expire_after[dag]
+        if s.job_active[slot] > 0 or now - s.job_release[slot] <= patience:
+            return
+        expire_job(t, s, slot, now)
+
+
+def expire_job(t: Tables, s: State, slot: int, now: int) -> None:
+    """Expire an open job: each sink that has not completed is missed and expired."""
+    _give_up_sinks(t, s, slot, SINK_EXPIRED)
+    _close(s, slot, EXPIRED, now)
+
+
+def abort_job(t: Tables, s: State, slot: int, now: int) -> None:
+    """Abort an open job (rule 7): each sink that has not completed is missed and aborted."""
+    _give_up_sinks(t, s, slot, SINK_ABORTED)
+    _close(s, slot, ABORTED, now)
+
+
+def _give_up_sinks(t: Tables, s: State, slot: int, kind: int) -> None:
+    dag = s.job_dag[slot]
+    for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
+        vertex = t.sinks[i]
+        if s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0:
+            deadline = s.job_release[slot] + t.sink_deadline[vertex]
+            s.decisions.append((kind, dag, vertex, s.job_index[slot], deadline, -1))
+
+
+def _overdue(t: Tables, s: State, slot: int, now: int) -> bool:
+    """Tell whether a sink that has not completed is past its absolute deadline."""
+    dag = s.job_dag[slot]
+    for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
+        vertex = t.sinks[i]
+        if (now > s.job_release[slot] + t.sink_deadline[vertex]
+                and s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0):
+            return True
+    return False
+
+
+def finish(t: Tables, s: State, now: int) -> None:
+    """Judge the jobs that are open when the run ends (rule 6); they stay open."""
+    for dag in range(t.n_dags):
+        slot = s.oldest[dag]
+        while slot >= 0:
+            for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
+                vertex = t.sinks[i]
+                deadline = s.job_release[slot] + t.sink_deadline[vertex]
+                if deadline <= now and s.x_pending[
+                        s.job_base[slot] + t.region_offset[vertex]] >= 0:
+                    s.job_late[slot] += 1
+                    s.decisions.append(
+                        (SINK_MISSED, dag, vertex, s.job_index[slot], deadline, -1))
+            slot = s.job_next[slot]
+
+
+def _deactivate(s: State, slot: int) -> None:
+    """Count one waiting or running execution of a job less; free the slot of an ended job."""
+    s.job_active[slot] -= 1
+    if s.job_active[slot] == 0 and s.job_state[slot] != OPEN:
+        _free(s, slot)

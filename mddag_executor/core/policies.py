@@ -1,0 +1,103 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Scheduling policies: in which order ready callbacks run.
+
+A policy is a key function and one row of ``POLICIES``.  The key is a tuple of four integers;
+smaller runs first.  The first integer is the *priority* (only it decides about preemption, and a
+preemption needs a strictly smaller one), the others break ties, so that two runs and two machines
+agree.  The ties are those of the paper's own program.
+
+A key function gets the tables, the global vertex index, the job's release and index, the
+*readiness*, which grows with the time at which the callback became ready, and the *order*, which
+counts how callbacks became ready.  It must stay free of anything but integer arithmetic on its
+arguments, because it is compiled for the simulator and called as it is by the live executor.
+"""
+
+from __future__ import annotations
+
+from typing import Callable, NamedTuple
+
+from mddag_executor.core.tables import Tables
+from mddag_executor.errors import MddagError
+
+Key = tuple[int, int, int, int]
+KeyFunction = Callable[[Tables, int, int, int, int, int], Key]
+
+
+def key_rad(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+    """Return the key of extended GEDF: reference absolute deadline, vertex, DAG."""
+    return (release + t.rad_offset[v], t.index_in_dag[v], t.dag_of[v], order)
+
+
+def key_rm(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+    """Return the key of rate monotonic: period, job index, order of becoming ready."""
+    return (t.period[t.dag_of[v]], job, readiness, order)
+
+
+def key_wc(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+    """Return the key of the paper's work-conserving baseline: job index, then readiness."""
+    return (job, readiness, order, 0)
+
+
+def key_fifo(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+    """Return the key of plain order of becoming ready."""
+    return (readiness, order, 0, 0)
+
+
+def key_gedf(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+    """Return the key of GEDF with one deadline for each DAG, its latest."""
+    return (release + t.dag_deadline[t.dag_of[v]], t.index_in_dag[v], t.dag_of[v], order)
+
+
+class Policy(NamedTuple):
+    """
+    A row of the policy table.
+
+    ``preemptive`` tells how the paper's experiment runs the policy; an executor of callbacks can
+    not preempt and ignores it.
+    """
+
+    name: str
+    key: KeyFunction
+    preemptive: bool
+    meaning: str
+
+
+POLICIES: dict[str, Policy] = {p.name: p for p in (
+    Policy('rad', key_rad, True, 'reference absolute deadline (extended GEDF of the paper)'),
+    Policy('rm', key_rm, True, 'rate monotonic: the shortest period first'),
+    Policy('wc', key_wc, False, 'work-conserving baseline of the paper: job index, readiness'),
+    Policy('fifo', key_fifo, False, 'order of becoming ready'),
+    Policy('gedf', key_gedf, True, 'one deadline for each DAG: its latest'),
+)}
+
+
+class PolicyError(MddagError):
+    """A policy name that the table does not have."""
+
+
+def policy(name: str) -> Policy:
+    """
+    Look a policy up by name.
+
+    :raises PolicyError: when there is none of that name.
+    """
+    try:
+        return POLICIES[name]
+    except KeyError:
+        raise PolicyError(
+            f"policy '{name}': there is no such policy: choose one of {', '.join(POLICIES)}"
+        ) from None

@@ -1,0 +1,282 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The scheduling rules, all of them and only here.
+
+Theory of operation
+-------------------
+A driver (live executor, replayer, simulator) tells what happened and when; the rules change the
+state and answer with decisions.  There is no clock, thread, ROS or file in here.  Every function
+takes the tables ``t`` and the state ``s``, and uses nothing but integer arithmetic, list indexing
+and ``heapq``, so that the same source runs on plain lists and can be compiled on arrays.
+
+1.  **Release.**  ``release_job`` opens job J_x^k of a DAG.  At most ``max_active_jobs`` jobs of a
+    DAG are open; the oldest expires to make room.  A job that is idle (nothing of it waits or
+    runs) and ``expire_after`` past its latest deadline can no longer complete: it expires too.
+2.  **Readiness.**  A vertex becomes ready when its join countdown reaches zero: when all its
+    predecessors have completed (AND).  Vertices that several publishers trigger are several
+    vertices (OR), so the countdown is all there is.  Where sync callbacks run leg by leg (live),
+    each leg is ready when its message is there, and the countdown is taken at its completion:
+    the vertex completes with the leg that made it whole.
+3.  **Order.**  Ready executions wait in a heap by the key of the policy; the smallest goes first.
+    The readiness part of keys grows with time; at one instant what was preempted and put back
+    comes before what became ready then (design section 9).
+4.  **Callback groups.**  Each group has at most one owner, from its first dispatch to its
+    completion (also while preempted or suspended).  What would run next but whose group is busy
+    is set aside in the group's own heap; when the owner completes, the group's smallest returns.
+5.  **Workers.**  A fresh execution takes the idle worker with the lowest number (``schedule``),
+    or that of the worker that asks (``take``: live, it is warm).  With no worker idle and
+    preemption on, the running execution with the largest priority (on a tie the one with the
+    highest worker number) is put back, if its priority is strictly larger than the smallest
+    waiting one.  Migration is free; overheads are added to what is left to execute.
+6.  **Verdicts.**  A sink that completes after its absolute deadline (release plus its relative
+    deadline) is late; at the deadline is in time.  ``finish`` judges what is open when the run
+    ends: an absolute deadline at or before the end has been missed.
+7.  **Misses.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops what is left of it, as soon
+    as the miss is known: at a late completion, or when something of it would be dispatched after
+    the deadline of a sink that is not done.  What has started runs on.
+8.  **Ends.**  A job ends in exactly one of completed, late, aborted, expired.  After an abort
+    executions of the job that have not started are dropped; after an expiry they run (live: each
+    stands for a message, which is never lost silently) but make no further edge true and are not
+    judged.  The slot is free for the next job when none of its executions waits, runs or is
+    suspended.
+"""
+
+from __future__ import annotations
+
+from heapq import heappop, heappush
+
+from mddag_executor.core.policies import KeyFunction
+from mddag_executor.core.state import (
+    ABORTED, COMPLETED, DISPATCH_OVERHEAD, DONE, DROP, DROPPED, EXPIRED, FREE, IDLE, JOB_END, LATE,
+    N_IDLE, OPEN, ORDER, PREEMPTIVE, PROPAGATE, RUNNING, SINK_ABORTED, SINK_DONE, SINK_EXPIRED,
+    SINK_MISSED, State, SUSPENDED, SWITCH_OVERHEAD, WAITING)
+from mddag_executor.core.tables import ABORT, Tables
+
+PUT_BACK = 0
+FRESH = 1
+
+
+# --- readiness -----------------------------------------------------------------------------------
+
+def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
+    """Put an execution into the ready queue (rule 3)."""
+    slot = s.x_slot[x]
+    s.job_active[slot] += 1
+    s.x_ready[x] = now
+    s.x_started[x] = -1
+    s.x_left[x] = s.x_cost[x]
+    _enqueue(t, s, key, x, now, FRESH)
+
+
+def _enqueue(t: Tables, s: State, key: KeyFunction, x: int, now: int, fresh: int) -> None:
+    slot = s.x_slot[x]
+    s.scalars[ORDER] += 1
+    k = key(t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], 2 * now + fresh,
+            s.scalars[ORDER])
+    entry = (k[0], k[1], k[2], k[3], x)
+    s.x_key[x] = entry
+    s.x_state[x] = WAITING
+    heappush(s.ready, entry)
+
+
+def edge(t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int) -> None:
+    """Make one trigger edge into ``vertex`` true for a job: its join countdown (rule 2)."""
+    x = s.job_base[slot] + t.region_offset[vertex]
+    s.x_pending[x] -= 1
+    if s.x_pending[x] == 0:
+        make_ready(t, s, key, x, now)
+
+
+def drop(s: State, x: int, now: int) -> None:
+    """Drop a waiting execution, for example because its queue is full; it never runs."""
+    s.x_state[x] = DROPPED
+    slot = s.x_slot[x]
+    s.decisions.append((DROP, s.job_dag[slot], s.x_vertex[x], s.job_index[slot], x, now))
+
+
+# --- dispatch ------------------------------------------------------------------------------------
+
+def peek(t: Tables, s: State, now: int) -> int:
+    """
+    Return the execution that goes next, or -1 when none may run.
+
+    On the way, what can not go next leaves the queue: dropped and aborted executions for good,
+    those whose group is busy into their group's heap (rule 4).
+    """
+    while s.ready:
+        x = s.ready[0][4]
+        slot = s.x_slot[x]
+        if s.x_state[x] == WAITING:
+            dag = s.job_dag[slot]
+            if (t.on_miss[dag] == ABORT and s.job_state[slot] == OPEN
+                    and _overdue(t, s, slot, now)):
+                abort_job(t, s, slot, now)
+            if s.job_state[slot] == ABORTED and s.x_started[x] < 0:
+                drop(s, x, now)
+        if s.x_state[x] == WAITING:
+            group = s.x_group[x]
+            if group < 0 or s.group_owner[group] == -1 or s.group_owner[group] == x:
+                return x
+            heappush(s.group_heap[group], heappop(s.ready))
+        else:
+            heappop(s.ready)
+            group = s.x_group[x]
+            if group >= 0 and s.group_owner[group] == -1:
+                _release_group(s, group)  # it was here as the smallest of its group
+            _deactivate(s, slot)
+    return -1
+
+
+def _start(s: State, x: int, worker: int, now: int) -> None:
+    heappop(s.ready)
+    s.x_state[x] = RUNNING
+    s.x_worker[x] = worker
+    s.x_started[x] = now
+    s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]
+    s.worker_x[worker] = x
+    s.scalars[N_IDLE] -= 1
+    if s.x_group[x] >= 0:
+        s.group_owner[s.x_group[x]] = x
+
+
+def admit(s: State, x: int, now: int) -> None:
+    """Start an execution as it was recorded: past the ready queue, its group and the workers."""
+    s.job_active[s.x_slot[x]] += 1
+    s.x_state[x] = RUNNING
+    s.x_worker[x] = -1
+    s.x_started[x] = now
+
+
+def take(t: Tables, s: State, worker: int, now: int) -> int:
+    """Dispatch the next execution on this idle worker and return it, or -1 (rule 5)."""
+    x = peek(t, s, now)
+    if x >= 0:
+        _start(s, x, worker, now)
+    return x
+
+
+def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
+    """
+    Dispatch one execution (rule 5) and return it, or -1 when the pool is as it should be.
+
+    A driver calls this until it answers -1.
+    """
+    x = peek(t, s, now)
+    if x < 0:
+        return -1
+    if s.scalars[N_IDLE] > 0:
+        worker = 0
+        while s.worker_x[worker] >= 0:
+            worker += 1
+        _start(s, x, worker, now)
+        return x
+    if s.scalars[PREEMPTIVE] == 0:
+        return -1
+    worker = 0
+    largest = s.x_key[s.worker_x[0]][0]
+    for w in range(1, len(s.worker_x)):
+        priority = s.x_key[s.worker_x[w]][0]
+        if priority >= largest:
+            worker, largest = w, priority
+    if largest <= s.x_key[x][0]:
+        return -1
+    victim = s.worker_x[worker]
+    _leave_worker(s, victim)
+    s.x_left[victim] += s.scalars[SWITCH_OVERHEAD] - (now - s.x_started[victim])
+    _start(s, x, worker, now)
+    _enqueue(t, s, key, victim, now, PUT_BACK)
+    return x
+
+
+def _leave_worker(s: State, x: int) -> None:
+    worker = s.x_worker[x]
+    if worker >= 0:
+        s.worker_x[worker] = -1
+        s.x_worker[x] = -1
+        s.scalars[N_IDLE] += 1
+
+
+def lend(s: State, x: int) -> None:
+    """Give a running execution's worker free while it waits for something; it keeps its group."""
+    _leave_worker(s, x)
+
+
+def suspend(s: State, x: int) -> None:
+    """Take a running execution off its worker until ``resume``; it keeps its group."""
+    _leave_worker(s, x)
+    s.x_state[x] = SUSPENDED
+
+
+def resume(s: State, x: int) -> None:
+    """Put a suspended execution back into the ready queue, under the key it had."""
+    s.x_state[x] = WAITING
+    heappush(s.ready, s.x_key[x])
+
+
+# --- completion ----------------------------------------------------------------------------------
+
+def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
+    """
+    End a running execution (rules 2, 4, 6 and 7).
+
+    :return: whether its vertex has completed: False only for a leg that did not make it whole.
+    """
+    _leave_worker(s, x)
+    s.x_state[x] = DONE
+    group = s.x_group[x]
+    if group >= 0:
+        _release_group(s, group)
+    slot = s.x_slot[x]
+    vertex = s.x_vertex[x]
+    head = s.job_base[slot] + t.region_offset[vertex]
+    whole = True
+    if s.scalars[PROPAGATE] == 0 and t.n_predecessors[vertex] > 0:
+        s.x_pending[head] -= 1
+        whole = s.x_pending[head] == 0
+    if whole:
+        s.x_pending[head] = -1
+        if s.job_state[slot] == OPEN:
+            _complete_vertex(t, s, key, slot, vertex, now)
+    _deactivate(s, slot)
+    return whole
+
+
+def _release_group(s: State, group: int) -> None:
+    s.group_owner[group] = -1
+    if s.group_heap[group]:
+        heappush(s.ready, heappop(s.group_heap[group]))
+
+
+def _complete_vertex(
+    t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int
+) -> None:
+    dag = s.job_dag[slot]
+    if dag == t.n_dags:
+        _close(s, slot, COMPLETED, now)
+        return
+    if t.sink_deadline[vertex] >= 0:
+        deadline = s.job_release[slot] + t.sink_deadline[vertex]
+        s.decisions.append((SINK_DONE, dag, vertex, s.job_index[slot], deadline, now))
+        s.job_sinks_left[slot] -= 1
+        if now > deadline:
+            s.job_late[slot] += 1
+        if s.job_sinks_left[slot] == 0:
+            _close(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
+        elif now > deadline and t.on_miss[dag] == ABORT:
+            abort_job(t, s, slot, now)
+    if s.scalars[PROPAGATE] != 0 and s.job_state[slot] == OPEN:
+        for i in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
+            edge(t, s, key, slot, t.successors[i], now)

@@ -1,0 +1,152 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The core for drivers in plain Python: tables, state and policy in one object."""
+
+from __future__ import annotations
+
+from mddag_executor.core import rules
+from mddag_executor.core.policies import policy
+from mddag_executor.core.state import add_group, add_slot, Decision, N_IDLE, new_state
+from mddag_executor.core.tables import Tables
+
+
+class Scheduler:
+    """
+    The scheduling rules bound to one run.
+
+    A driver tells what happens in order of time; it is not thread-safe.  Executions ``x``,
+    slots, DAGs and vertices are the integers of ``core.state`` and ``core.tables``.
+
+    :param tables: the task set's tables.
+    :param n_workers: size of the bounded pool.
+    :param policy_name: a row of ``core.policies``; PolicyError when there is none.
+    :param preemptive: see ``core.state.new_state``, as the remaining ones.
+    """
+
+    def __init__(
+        self,
+        tables: Tables,
+        n_workers: int,
+        policy_name: str = 'rad',
+        *,
+        preemptive: bool = False,
+        propagate: bool = True,
+        dispatch_overhead: int = 0,
+        switch_overhead: int = 0,
+    ) -> None:
+        self.tables = tables
+        self.policy = policy(policy_name)
+        self.state = new_state(
+            tables, n_workers, preemptive=preemptive, propagate=propagate,
+            dispatch_overhead=dispatch_overhead, switch_overhead=switch_overhead)
+        self._key = self.policy.key
+
+    def release(self, dag: int, job: int, release: int, now: int) -> int:
+        """Open a job of a DAG and return its slot."""
+        slot = rules.release_job(self.tables, self.state, dag, job, release, now)
+        if slot < 0:
+            add_slot(self.tables, self.state, dag)
+            slot = rules.release_job(self.tables, self.state, dag, job, release, now)
+        return slot
+
+    def execution(self, slot: int, vertex: int, leg: int = 0) -> int:
+        """Return the execution of a (global) vertex, or of one leg of it, in a job's slot."""
+        return self.state.job_base[slot] + self.tables.region_offset[vertex] + leg
+
+    def source(self, slot: int) -> int:
+        """Return the execution of the source of the job in a slot."""
+        return self.execution(slot, self.tables.source[self.state.job_dag[slot]])
+
+    def ready(self, x: int, now: int) -> None:
+        """Make an execution ready."""
+        rules.make_ready(self.tables, self.state, self._key, x, now)
+
+    def undeclared(self, job: int, group: int, now: int) -> int:
+        """Make a callback that no DAG declares ready; return its execution."""
+        slot = self.release(self.tables.n_dags, job, now, now)
+        x = self.state.job_base[slot]
+        self.state.x_group[x] = group
+        rules.make_ready(self.tables, self.state, self._key, x, now)
+        return x
+
+    def take(self, worker: int, now: int) -> int:
+        """Dispatch the next execution on an idle worker; -1 when there is none to run."""
+        return rules.take(self.tables, self.state, worker, now)
+
+    def schedule(self, now: int) -> int:
+        """Dispatch one execution where the rules want it; -1 when there is nothing to do."""
+        return rules.schedule(self.tables, self.state, self._key, now)
+
+    def admit(self, x: int, now: int) -> None:
+        """Start an execution as it was recorded; it takes no worker and no callback group."""
+        rules.admit(self.state, x, now)
+
+    def complete(self, x: int, now: int) -> bool:
+        """End a running execution; False for a leg that did not make its vertex whole."""
+        return rules.complete(self.tables, self.state, self._key, x, now)
+
+    def drop(self, x: int, now: int) -> None:
+        """Drop a waiting execution: it never runs."""
+        rules.drop(self.state, x, now)
+
+    def lend(self, x: int) -> None:
+        """Free the worker of an execution that goes on without one."""
+        rules.lend(self.state, x)
+
+    def suspend(self, x: int) -> None:
+        """Take a running execution off its worker until ``resume``."""
+        rules.suspend(self.state, x)
+
+    def resume(self, x: int) -> None:
+        """Make a suspended execution ready to go on."""
+        rules.resume(self.state, x)
+
+    def expire(self, slot: int, now: int) -> None:
+        """Expire the open job in a slot."""
+        rules.expire_job(self.tables, self.state, slot, now)
+
+    def abort(self, slot: int, now: int) -> None:
+        """Abort the open job in a slot."""
+        rules.abort_job(self.tables, self.state, slot, now)
+
+    def expire_idle(self, now: int) -> None:
+        """Expire every job that can no longer complete."""
+        for dag in range(self.tables.n_dags):
+            rules.expire_idle(self.tables, self.state, dag, now)
+
+    def finish(self, now: int) -> None:
+        """Judge what is open at the run's end."""
+        rules.finish(self.tables, self.state, now)
+
+    def new_group(self) -> int:
+        """Add a mutually exclusive callback group and return its number."""
+        return add_group(self.state)
+
+    def decisions(self) -> list[Decision]:
+        """Take away what has been decided since the last call."""
+        taken = self.state.decisions[:]
+        self.state.decisions.clear()
+        return taken
+
+    @property
+    def idle_workers(self) -> int:
+        """Number of workers that run nothing."""
+        return self.state.scalars[N_IDLE]
+
+    @property
+    def queue_length(self) -> int:
+        """Number of executions that wait, for a worker or for their group."""
+        waiting = sum(len(heap) for heap in self.state.group_heap)
+        return len(self.state.ready) + waiting

@@ -1,0 +1,157 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The state that the scheduling rules change, as columns.
+
+A *slot* holds one open job of one DAG and owns a region of *executions* ``x``: one for each vertex
+(or leg) of that DAG.  Slots of a DAG are recycled through a free list; open jobs of a DAG form a
+list in order of release.  Columns are plain lists for live use; a compiled driver makes them
+arrays.  ``scalars`` holds what would be plain integers, because a named tuple's can not change.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from mddag_executor.core.tables import Tables
+
+# States of an execution.
+IDLE, WAITING, RUNNING, SUSPENDED, DONE, DROPPED = range(6)
+
+# States of a job.  Of the last four every ended job is in exactly one.
+FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED = range(6)
+
+# Columns of ``scalars``.
+ORDER, N_IDLE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, N_SCALARS = range(7)
+
+# Decisions: (kind, DAG, global vertex, job index, deadline, time).  The deadline is that of the
+# sink; the time that of the decision, for a sink that completed the completion, else -1.
+SINK_DONE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, JOB_END, DROP = range(6)
+
+Entry = tuple[int, int, int, int, int]
+"""What the ready queue holds: the four integers of a key, then the execution."""
+
+Decision = tuple[int, int, int, int, int, int]
+
+
+class State(NamedTuple):
+    """All that changes during a run; made by ``new_state``."""
+
+    scalars: list[int]
+    # ready queue (a heap), and one heap for each callback group with those that wait for it
+    ready: list[Entry]
+    group_heap: list[list[Entry]]
+    group_owner: list[int]
+    # workers
+    worker_x: list[int]
+    # by DAG
+    free_slot: list[int]
+    oldest: list[int]
+    newest: list[int]
+    n_open: list[int]
+    # by slot
+    job_dag: list[int]
+    job_base: list[int]
+    job_index: list[int]
+    job_release: list[int]
+    job_state: list[int]
+    job_sinks_left: list[int]
+    job_late: list[int]
+    job_active: list[int]
+    job_next: list[int]
+    job_previous: list[int]
+    # by execution
+    x_slot: list[int]
+    x_vertex: list[int]
+    x_state: list[int]
+    x_pending: list[int]
+    x_group: list[int]
+    x_worker: list[int]
+    x_key: list[Entry]
+    x_ready: list[int]
+    x_started: list[int]
+    x_left: list[int]
+    x_cost: list[int]
+    # what was decided, for the driver to take away
+    decisions: list[Decision]
+
+
+_BY_DAG = {'free_slot': -1, 'oldest': -1, 'newest': -1, 'n_open': 0}
+
+
+def new_state(
+    tables: Tables,
+    n_workers: int,
+    *,
+    preemptive: bool = False,
+    propagate: bool = True,
+    dispatch_overhead: int = 0,
+    switch_overhead: int = 0,
+) -> State:
+    """
+    Make an empty state.
+
+    :param n_workers: size of the bounded pool.
+    :param preemptive: a smaller key takes the worker of a larger one.
+    :param propagate: completions make the graph's edges true (simulation, replay); live passes
+        False because there messages do.
+    :param dispatch_overhead: added to an execution each time it is dispatched, ns.
+    :param switch_overhead: added to an execution each time it is preempted, ns.
+    """
+    columns: dict[str, list[int]] = {name: [] for name in State._fields}
+    for name, value in _BY_DAG.items():
+        columns[name] = [value] * (tables.n_dags + 1)
+    columns['worker_x'] = [-1] * n_workers
+    columns['scalars'] = [0] * N_SCALARS
+    columns['group_owner'] = [-1] * tables.n_groups
+    state = State(**columns)  # type: ignore[arg-type]
+    state.group_heap.extend([] for _ in range(tables.n_groups))
+    state.scalars[N_IDLE] = n_workers
+    state.scalars[PREEMPTIVE] = int(preemptive)
+    state.scalars[PROPAGATE] = int(propagate)
+    state.scalars[DISPATCH_OVERHEAD] = dispatch_overhead
+    state.scalars[SWITCH_OVERHEAD] = switch_overhead
+    return state
+
+
+def add_slot(t: Tables, s: State, dag: int) -> None:
+    """Give a DAG one more slot, with the region of executions that a job of it needs."""
+    slot = len(s.job_dag)
+    for column, value in (
+        (s.job_dag, dag), (s.job_base, len(s.x_slot)), (s.job_index, -1), (s.job_release, 0),
+        (s.job_state, FREE), (s.job_sinks_left, 0), (s.job_late, 0), (s.job_active, 0),
+        (s.job_next, s.free_slot[dag]), (s.job_previous, -1),
+    ):
+        column.append(value)
+    s.free_slot[dag] = slot
+    last = t.n_vertices + 1 if dag == t.n_dags else t.first_vertex[dag + 1]
+    for vertex in range(t.first_vertex[dag], last):
+        for _ in range(t.n_legs[vertex]):
+            s.x_slot.append(slot)
+            s.x_vertex.append(vertex)
+            s.x_group.append(t.group[vertex])
+            s.x_key.append((0, 0, 0, 0, 0))
+            for column, value in (
+                (s.x_state, IDLE), (s.x_pending, 0), (s.x_worker, -1), (s.x_ready, 0),
+                (s.x_started, -1), (s.x_left, 0), (s.x_cost, 0),
+            ):
+                column.append(value)
+
+
+def add_group(s: State) -> int:
+    """Add a mutually exclusive callback group and return its number."""
+    s.group_owner.append(-1)
+    s.group_heap.append([])
+    return len(s.group_owner) - 1

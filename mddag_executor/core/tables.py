@@ -1,0 +1,200 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Static tables of a task set: what the scheduling rules look up.
+
+Theory of operation
+-------------------
+A task set is flattened into columns.  A *global vertex index* numbers the vertices of all DAGs one
+after the other, in DAG order; a *local* one is the place of a vertex in its DAG.  Behind the
+declared DAGs stands one more, the *undeclared DAG*, with one vertex and no judged sink: every
+callback that no DAG declares runs as a job of it, released when the callback became ready and with
+``default_deadline`` as its deadline, so that it neither starves nor pushes in front.
+
+What a job needs while it is open lives in a *region* of consecutive execution ids (see
+``state``): one id for each vertex, or, where sync callbacks run leg by leg as the live executor
+does it, one id for each leg (topic) of a sync vertex.
+
+The offsets are relative to a job's release:
+
+* ``rad_offset``: reference absolute deadline (RAD) minus release: of a sink its own relative
+  deadline, of any other vertex the least among the sinks that it leads to (Yano and Azumi, RTSS
+  2024 WiP, extended GEDF).
+* ``dag_deadline``: the latest deadline of the DAG (GEDF with one deadline for each DAG).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from msg_graph import Dag, TaskSet
+
+NEVER = 2 ** 62
+"""A time that is never reached (ns): larger than any clock, small enough to add to."""
+
+CONTINUE = 0
+ABORT = 1
+
+
+class Tables(NamedTuple):
+    """
+    Columns of a task set, immutable while a run lasts.
+
+    All times are in nanoseconds.  Lists are indexed by DAG (``period``, ``dag_deadline``, …) or by
+    global vertex index (``rad_offset``, ``dag_of``, …); the last DAG and the last vertex are the
+    undeclared ones.
+    """
+
+    n_dags: int
+    n_vertices: int
+    period: list[int]
+    dag_deadline: list[int]
+    on_miss: list[int]
+    max_active_jobs: list[int]
+    expire_after: list[int]
+    first_vertex: list[int]
+    n_region: list[int]
+    source: list[int]
+    first_sink: list[int]
+    sinks: list[int]
+    dag_of: list[int]
+    index_in_dag: list[int]
+    rad_offset: list[int]
+    sink_deadline: list[int]
+    region_offset: list[int]
+    n_legs: list[int]
+    n_predecessors: list[int]
+    first_successor: list[int]
+    successors: list[int]
+    group: list[int]
+    n_groups: int
+
+    @staticmethod
+    def build(
+        task_set: TaskSet | None,
+        *,
+        legs: bool = False,
+        groups: bool = True,
+        default_deadline: int = 100_000_000,
+        max_active_jobs: int = NEVER,
+        expire_after: int = NEVER,
+    ) -> Tables:
+        """
+        Flatten a task set.
+
+        :param task_set: the DAG tasks; ``None`` stands for no declared DAG at all.
+        :param legs: sync vertices run once for each leg (live), not once when all are there.
+        :param groups: use the declared callback groups (live passes False: it has the real ones).
+        :param default_deadline: relative deadline of undeclared callbacks, ns.
+        :param max_active_jobs: bound on the open jobs of a DAG that declares none itself.
+        :param expire_after: how long past its latest deadline an idle job stays open, ns.
+        """
+        columns = _Columns(legs, groups, max_active_jobs, expire_after)
+        for dag in task_set.dags if task_set is not None else ():
+            columns.add_dag(dag)
+        return columns.finish(default_deadline)
+
+
+class _Columns:
+    """Collects the columns of ``Tables`` DAG by DAG."""
+
+    def __init__(
+        self, legs: bool, groups: bool, max_active_jobs: int, expire_after: int
+    ) -> None:
+        self._legs = legs
+        self._use_groups = groups
+        self._max_active_jobs = max_active_jobs
+        self._expire_after = expire_after
+        self._groups: dict[tuple[str, str], int] = {}
+        names = [n for n in Tables._fields if n not in ('n_dags', 'n_vertices', 'n_groups')]
+        self.lists: dict[str, list[int]] = {name: [] for name in names}
+        self.lists['first_sink'].append(0)
+        self.lists['first_successor'].append(0)
+
+    def add_dag(self, dag: Dag) -> None:
+        lists = self.lists
+        first = len(lists['dag_of'])
+        offsets = rad_offsets(dag)
+        region = 0
+        for vertex, offset in zip(dag.vertices, offsets):
+            countdown, legs = len(vertex.predecessors), 1
+            if self._legs and countdown > 0:
+                countdown = legs = max(1, len(vertex.callback.topics))
+            lists['dag_of'].append(dag.index)
+            lists['index_in_dag'].append(vertex.index)
+            lists['rad_offset'].append(offset)
+            lists['sink_deadline'].append(-1 if vertex.deadline_ns is None else vertex.deadline_ns)
+            lists['region_offset'].append(region)
+            lists['n_legs'].append(legs)
+            lists['n_predecessors'].append(countdown)
+            lists['successors'].extend(first + s for s in vertex.successors)
+            lists['first_successor'].append(len(lists['successors']))
+            lists['group'].append(self._group(vertex.callback.node, vertex.callback.group))
+            region += legs
+        lists['period'].append(dag.period_ns)
+        lists['dag_deadline'].append(max(dag.vertices[s].deadline_ns or 0 for s in dag.sinks))
+        lists['on_miss'].append(ABORT if dag.on_miss == 'abort' else CONTINUE)
+        lists['max_active_jobs'].append(dag.max_active_jobs or self._max_active_jobs)
+        lists['expire_after'].append(self._expire_after)
+        lists['first_vertex'].append(first)
+        lists['n_region'].append(region)
+        lists['source'].append(first + dag.source)
+        lists['sinks'].extend(first + s for s in dag.sinks)
+        lists['first_sink'].append(len(lists['sinks']))
+
+    def _group(self, node: str, group: str | None) -> int:
+        if group is None or not self._use_groups:
+            return -1
+        return self._groups.setdefault((node, group), len(self._groups))
+
+    def finish(self, default_deadline: int) -> Tables:
+        """Add the undeclared DAG and freeze."""
+        lists = self.lists
+        n_dags = len(lists['period'])
+        n_vertices = len(lists['dag_of'])
+        undeclared = {
+            'dag_of': n_dags, 'index_in_dag': 0, 'rad_offset': default_deadline,
+            'sink_deadline': -1, 'region_offset': 0, 'n_legs': 1, 'n_predecessors': 0,
+            'first_successor': len(lists['successors']), 'group': -1,
+            'period': default_deadline, 'dag_deadline': default_deadline, 'on_miss': CONTINUE,
+            'max_active_jobs': NEVER, 'expire_after': NEVER, 'first_vertex': n_vertices,
+            'n_region': 1, 'source': n_vertices, 'first_sink': len(lists['sinks']),
+        }
+        for name, value in undeclared.items():
+            lists[name].append(value)
+        return Tables(
+            n_dags=n_dags, n_vertices=n_vertices, n_groups=len(self._groups), **lists)
+
+
+def rad_offsets(dag: Dag) -> list[int]:
+    """
+    RAD minus release for each vertex of a DAG, ns, by local index.
+
+    The rule of the paper's extended GEDF: a sink has its own deadline, every other vertex the
+    least of its successors', hence the least among the sinks that it leads to.
+    """
+    offsets = [NEVER] * len(dag.vertices)
+    open_successors = [len(v.successors) for v in dag.vertices]
+    done = [v.index for v in dag.vertices if not v.successors]
+    for index in done:
+        vertex = dag.vertices[index]
+        if vertex.deadline_ns is not None:
+            offsets[index] = vertex.deadline_ns
+        for before in vertex.predecessors:
+            offsets[before] = min(offsets[before], offsets[index])
+            open_successors[before] -= 1
+            if open_successors[before] == 0:
+                done.append(before)
+    return offsets

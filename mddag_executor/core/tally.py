@@ -1,0 +1,150 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Counts of what the core decided: per DAG and sink, in the result format of the commands.
+
+Live executor, replayer and simulator all feed the core's decisions in here, so their figures
+mean the same.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, Iterable, Sequence
+
+from mddag_executor.core.state import (
+    ABORTED, COMPLETED, Decision, DROP, EXPIRED, JOB_END, LATE, SINK_ABORTED, SINK_DONE,
+    SINK_EXPIRED, SINK_MISSED)
+from mddag_executor.core.tables import Tables
+from msg_graph import TaskSet
+
+_OUTCOMES = {COMPLETED: 'completed', LATE: 'late', ABORTED: 'aborted', EXPIRED: 'expired'}
+
+
+def quantile(ordered: Sequence[int], q: float) -> int:
+    """Return the nearest-rank quantile ``q`` (0 to 1) of values in ascending order."""
+    return ordered[min(len(ordered) - 1, max(0, -int(-q * len(ordered) // 1) - 1))]
+
+
+class SinkTally:
+    """What came of one sink: counts, and response times (completion minus release, ns)."""
+
+    def __init__(self, relative_deadline_ns: int, keep: int | None) -> None:
+        self.relative_deadline_ns = relative_deadline_ns
+        self.completed = 0
+        self.late = 0
+        self.expired = 0
+        self.aborted = 0
+        self.overdue = 0
+        self.shortest: int | None = None
+        self.longest: int | None = None
+        self.responses: deque[int] = deque(maxlen=keep)
+
+    def done(self, response: int, late: bool) -> None:
+        """Count a completion."""
+        self.completed += 1
+        self.late += late
+        self.responses.append(response)
+        if self.shortest is None or response < self.shortest:
+            self.shortest = response
+        if self.longest is None or response > self.longest:
+            self.longest = response
+
+    def result(self) -> dict[str, Any]:
+        """Return the sink's part of the result; ``late`` includes the overdue at the end."""
+        response = None
+        if self.responses:
+            ordered = sorted(self.responses)
+            response = {
+                'min': self.shortest, 'median': quantile(ordered, 0.5),
+                'p99': quantile(ordered, 0.99), 'max': self.longest}
+        return {
+            'relative_deadline_ns': self.relative_deadline_ns, 'completed': self.completed,
+            'late': self.late, 'overdue': self.overdue, 'expired': self.expired,
+            'aborted': self.aborted, 'response_ns': response}
+
+
+class Tally:
+    """
+    Counts of a run.
+
+    :param keep: how many of the last response times to keep for each sink (None: all).
+    """
+
+    def __init__(self, task_set: TaskSet | None, tables: Tables, keep: int | None = None) -> None:
+        self._tables = tables
+        self._dags = task_set.dags if task_set is not None else ()
+        self.jobs = [0] * tables.n_dags
+        self.ends = [dict.fromkeys(_OUTCOMES, 0) for _ in range(tables.n_dags)]
+        self.sinks = {v: SinkTally(tables.sink_deadline[v], keep) for v in tables.sinks}
+        self.dropped = 0
+        self.first_miss: dict[str, Any] | None = None
+
+    def released(self, dag: int) -> None:
+        """Count the release of a job."""
+        if dag < self._tables.n_dags:
+            self.jobs[dag] += 1
+
+    def add(self, decisions: Iterable[Decision]) -> None:
+        """Count decisions of the core."""
+        for kind, dag, vertex, job, deadline, time in decisions:
+            if kind == JOB_END:
+                self.ends[dag][deadline] += 1
+            elif kind == DROP:
+                self.dropped += 1
+            else:
+                self._add_sink(kind, dag, vertex, job, deadline, time)
+
+    def _add_sink(
+        self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
+    ) -> None:
+        sink = self.sinks[vertex]
+        missed = True
+        if kind == SINK_DONE:
+            missed = time > deadline
+            sink.done(time - deadline + sink.relative_deadline_ns, missed)
+        elif kind == SINK_MISSED:
+            sink.late += 1
+            sink.overdue += 1
+        elif kind == SINK_EXPIRED:
+            sink.expired += 1
+        elif kind == SINK_ABORTED:
+            sink.aborted += 1
+        if missed and self.first_miss is None:
+            self.first_miss = {
+                'dag': self._dags[dag].name, 'vertex': self.vertex_name(vertex), 'job': job,
+                'deadline_ns': deadline, 'completed_ns': time if kind == SINK_DONE else None}
+
+    def vertex_name(self, vertex: int) -> str:
+        """Return the name of a global vertex."""
+        dag = self._dags[self._tables.dag_of[vertex]]
+        return dag.vertices[self._tables.index_in_dag[vertex]].name
+
+    @property
+    def missed(self) -> bool:
+        """Tell whether any deadline was missed."""
+        return self.first_miss is not None
+
+    def result(self) -> dict[str, Any]:
+        """Return ``deadline_missed``, ``first_miss`` and ``dags`` of the result format."""
+        tables = self._tables
+        dags: dict[str, Any] = {}
+        for dag in self._dags:
+            vertices = tables.sinks[tables.first_sink[dag.index]:tables.first_sink[dag.index + 1]]
+            dags[dag.name] = {
+                'jobs': self.jobs[dag.index],
+                'ends': {_OUTCOMES[e]: n for e, n in self.ends[dag.index].items()},
+                'sinks': {self.vertex_name(v): self.sinks[v].result() for v in vertices}}
+        return {'deadline_missed': self.missed, 'first_miss': self.first_miss, 'dags': dags}

@@ -1,0 +1,61 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The errors that a user of this package can cause.
+
+Theory of operation: whatever is wrong with a file, an argument or a recording becomes an exception
+of this tree whose text is the one line that the user sees, `FILE[:LINE]: what is wrong: what to
+do`. The command line prints it after `error: ` and exits with status 2; a Python user catches
+`MddagError`. An exception outside this tree is a defect of the program and keeps its traceback.
+(`msg_graph` stands below this package and has `msg_graph.GraphError`, with the same form.)
+"""
+
+from __future__ import annotations
+
+
+class MddagError(Exception):
+    """
+    Base of this package's errors; its text is the one line that the user sees.
+
+    The line names the place, says what is wrong and what to do about it.
+    """
+
+
+class InputError(MddagError):
+    """A file or stream that cannot be used as asked."""
+
+    def __init__(self, file: str, problem: str, remedy: str, line: int | None = None) -> None:
+        """
+        Keep the parts of the message.
+
+        :param file: the path as the user gave it, or `<stdin>`
+        :param problem: what is wrong
+        :param remedy: what to do about it
+        :param line: the line in the file, counted from 1, where that is known
+        """
+        place = file if line is None else f'{file}:{line}'
+        super().__init__(f'{place}: {problem}: {remedy}')
+        self.file = file
+        self.line = line
+        self.problem = problem
+        self.remedy = remedy
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str, int | None]]:
+        """Pickle by parts, so that the error passes from a worker process unchanged."""
+        return type(self), (self.file, self.problem, self.remedy, self.line)
+
+
+class UsageError(MddagError):
+    """A command line that asks for something impossible."""

@@ -1,0 +1,63 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The live executor: rclpy nodes under the scheduler core."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+__all__ = ['DeadlineMiss', 'Job', 'MultiDeadlineExecutor', 'current_job']
+
+
+@dataclass(frozen=True)
+class Job:
+    """
+    The job that a running callback belongs to.
+
+    :ivar dag: name of its DAG.
+    :ivar job: its index, from 0.
+    :ivar release_ns: when its source became due, ns since the epoch.
+    """
+
+    dag: str
+    job: int
+    release_ns: int
+
+
+def current_job() -> Job | None:
+    """
+    Return the job whose callback runs in the calling thread.
+
+    None outside of callbacks of this executor, and in callbacks that no DAG declares.
+    """
+    from mddag_executor.live.hooks import current
+    running: Any = current.running
+    if running is None or running.work.origin is None:
+        return None
+    origin = running.work.origin
+    return Job(
+        running.pool.dispatcher.dag_names[origin.dag], origin.job, running.work.release_ns)
+
+
+def __getattr__(name: str) -> Any:
+    """Import the executor on first use: it loads rclpy."""
+    if name == 'MultiDeadlineExecutor':
+        from mddag_executor.live.executor import MultiDeadlineExecutor
+        return MultiDeadlineExecutor
+    if name == 'DeadlineMiss':
+        from mddag_executor.live.verdicts import DeadlineMiss
+        return DeadlineMiss
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

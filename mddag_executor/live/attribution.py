@@ -1,0 +1,152 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Which job does a message belong to?  Publications are noted, messages are looked up.
+
+Theory of operation
+-------------------
+A message says when it was published: its source timestamp, which the middleware reads from the
+system clock inside ``publish``.  Every ``publish`` of a trigger topic by a callback of this
+executor is noted as a *publication*: the window of system time that it took, the publisher's
+running number, and the execution that published it (the one whose callback runs in that thread).
+A message belongs to the publication of its topic whose window holds its source timestamp.
+
+Where several windows hold it (two threads published on one topic at the same microsecond), the
+publication sequence number decides.  Publications of one publisher never overlap: they are
+serialised, as the middleware does anyway.  So a doubt can only remain between two publishers with
+the same number; then, and when no window fits (a publisher in another process or thread), the
+answer is None and the message runs as an undeclared callback: never dropped, never guessed.
+
+A publisher may have published before anybody counted; the difference to the middleware's number
+is learnt from messages that only one window holds.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+import threading
+import time
+from typing import Any, Callable, NamedTuple
+
+KEEP = 1024
+"""How many publications of a topic are remembered."""
+
+ROUNDING_NS = 2
+"""DDS stamps are multiples of 2**-32 s: they may lie this far outside of the window."""
+
+_LONG_AGO_NS = 20_000_000
+_STILL_PUBLISHING = 2 ** 63 - 1
+
+
+class Origin(NamedTuple):
+    """The execution that published: its job's slot, DAG and index, and its global vertex."""
+
+    slot: int
+    dag: int
+    job: int
+    vertex: int
+
+
+class PublisherState:
+    """What is kept for each publisher: its topic, and how many messages it has published."""
+
+    __slots__ = ('lock', 'topic', 'count', 'offset')
+
+    def __init__(self, topic: str) -> None:
+        self.lock = threading.Lock()
+        self.topic = topic
+        self.count = 0
+        self.offset = 0
+
+
+class Publication:
+    """One call of ``publish``: window of system time in ns, sequence number, origin."""
+
+    __slots__ = ('begin', 'end', 'publisher', 'sequence', 'origin')
+
+    def __init__(self, begin: int, publisher: PublisherState, origin: Origin) -> None:
+        self.begin = begin
+        self.end = _STILL_PUBLISHING
+        self.publisher = publisher
+        self.sequence = publisher.count
+        self.origin = origin
+
+
+class Attribution:
+    """
+    Notes publications and finds the one that a message comes from.
+
+    :param topics: the trigger topics, fully qualified.
+    """
+
+    def __init__(self, topics: set[str]) -> None:
+        self._by_topic: dict[str, deque[Publication]] = {t: deque(maxlen=KEEP) for t in topics}
+        self.unknown = 0
+        self.doubtful = 0
+
+    def publish(
+        self, send: Callable[[Any, Any], None], publisher: Any, msg: Any,
+        state: PublisherState, origin: Origin,
+    ) -> None:
+        """Send a message and note the publication; the caller holds the publisher's lock."""
+        publications = self._by_topic.get(state.topic)
+        if publications is None:
+            send(publisher, msg)
+            return
+        publication = Publication(time.time_ns(), state, origin)
+        publications.append(publication)
+        try:
+            send(publisher, msg)
+        finally:
+            publication.end = time.time_ns()
+
+    def find(self, topic: str, stamp: int, sequence: int | None) -> Origin | None:
+        """
+        Return the origin of a message, or None when nothing or more than one thing fits.
+
+        :param stamp: its source timestamp, system time in ns.
+        :param sequence: its publication sequence number, where the middleware gives one.
+        """
+        publications = self._by_topic.get(topic)
+        if not publications:
+            self.unknown += 1
+            return None
+        fits = _windows_with(publications, stamp)
+        if len(fits) == 1:
+            if sequence is not None:
+                fits[0].publisher.offset = sequence - fits[0].sequence
+            return fits[0].origin
+        if not fits:
+            self.unknown += 1
+            return None
+        matches = [p for p in fits if p.sequence + p.publisher.offset == sequence]
+        if len(matches) == 1:
+            return matches[0].origin
+        self.doubtful += 1
+        return None
+
+
+def _windows_with(publications: deque[Publication], stamp: int) -> list[Publication]:
+    """Return the publications whose window holds a stamp, the newest first."""
+    fits: list[Publication] = []
+    for i in range(len(publications) - 1, -1, -1):
+        # By index: other threads append meanwhile, which may only show an entry twice.
+        publication = publications[i]
+        if publication.begin - ROUNDING_NS <= stamp <= publication.end + ROUNDING_NS:
+            if publication not in fits:
+                fits.append(publication)
+        elif fits and publication.end < stamp - _LONG_AGO_NS:
+            break
+    return fits

@@ -1,0 +1,299 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The core under one lock: what became ready goes in, what is to run comes out.
+
+Theory of operation
+-------------------
+The intake threads say what became ready, the workers (``pool``) what they have completed; both
+tell the core under ``lock`` and carry out what it decides.
+
+Times given to the core never decrease: where two threads read the clock in one order and get the
+lock in the other, the later gets the earlier one's time.  So the order of a trace's mddag events
+is the order in which the core saw them.
+"""
+
+from __future__ import annotations
+
+import threading
+from time import monotonic_ns
+from typing import Any, Callable
+
+from mddag_executor.core import Scheduler, Tables
+from mddag_executor.core.state import IDLE, OPEN, SUSPENDED
+from mddag_executor.live.attribution import Attribution, Origin, PublisherState
+from mddag_executor.live.entries import Entry, Work
+from mddag_executor.live.verdicts import DeadlineMiss, NO_ORIGIN, Record, Verdicts
+from msg_graph import TaskSet
+
+
+class Dispatcher:
+    """
+    Turns what became ready into executions of the core, and its decisions into actions.
+
+    :param fail: told every exception that a callback lets out.
+    :param record: where trace events go; None records nothing.
+    :param on_miss: told every miss, from the thread that found it.
+    """
+
+    def __init__(
+        self,
+        task_set: TaskSet | None,
+        n_workers: int,
+        policy: str,
+        *,
+        default_deadline: int,
+        max_active_jobs: int,
+        expire_after: int,
+        clock_offset: int,
+        fail: Callable[[BaseException], None],
+        record: Record | None = None,
+        on_miss: Callable[[DeadlineMiss], None] | None = None,
+    ) -> None:
+        self.tables = Tables.build(
+            task_set, legs=True, groups=False, default_deadline=default_deadline,
+            max_active_jobs=max_active_jobs, expire_after=expire_after)
+        self.scheduler = Scheduler(self.tables, n_workers, policy, propagate=False)
+        self.verdicts = Verdicts(task_set, self.tables, record, on_miss, fail)
+        topics = {t for c in task_set.callbacks for t in c.publishes} if task_set else set()
+        self.attribution = Attribution(topics)
+        self.dag_names = [d.name for d in task_set.dags] if task_set else []
+        self.lock = threading.Lock()
+        self.clock_offset = clock_offset
+        self.n_workers = n_workers
+        self.undeclared = 0
+        self.record = record
+        self.fail = fail
+        # told, under the lock, that something may be ready to be dispatched
+        self.dispatch: Callable[[int], None] = lambda now: None
+        self._work: dict[int, Work] = {}
+        self._next_job = [0] * (self.tables.n_dags + 1)
+        self._last = 0
+
+    # --- time ------------------------------------------------------------------------------------
+
+    def now(self) -> int:
+        """Return the time on the trace's clock: ns since the epoch, steady during the run."""
+        return monotonic_ns() + self.clock_offset
+
+    def core_time(self, now: int) -> int:
+        """Return ``now``, or the time of the core's last event where that is later."""
+        if now < self._last:
+            return self._last
+        self._last = now
+        return now
+
+    # --- what became ready -----------------------------------------------------------------------
+
+    def timer_due(self, entry: Entry, work: Work, due: int) -> None:
+        """Take in a timer that became due at ``due`` (trace's clock)."""
+        with self.lock:
+            if entry.removed:
+                return
+            now = self.core_time(self.now())
+            if entry.depth and len(entry.waiting) >= entry.depth:
+                entry.skipped += 1
+                if entry.source >= 0:
+                    self._skip_job(entry, due, now)
+                return
+            if entry.source >= 0:
+                self._start_job(entry, work, min(due, now), now)
+            else:
+                self._start_undeclared(entry, work, now)
+            self.dispatch(now)
+
+    def message(
+        self, entry: Entry, work: Work, origin: Origin | None, release: int | None
+    ) -> None:
+        """
+        Take in a message.
+
+        :param origin: the publication that it comes from, where one was found.
+        :param release: for a source, the release of its job on the trace's clock.
+        """
+        with self.lock:
+            if entry.removed:
+                return
+            now = self.core_time(self.now())
+            if entry.depth and len(entry.waiting) >= entry.depth:
+                self._drop_oldest(entry, now)
+            if entry.source >= 0 and release is not None:
+                self._start_job(entry, work, min(release, now), now)
+            elif origin is None or not self._start_successor(entry, work, origin, now):
+                if entry.callback is not None:
+                    entry.unattributed += 1
+                self._start_undeclared(entry, work, now)
+            self.dispatch(now)
+
+    def undeclared_ready(self, entry: Entry, work: Work) -> None:
+        """Take in anything that no DAG declares: requests, guard conditions, waitables, tasks."""
+        with self.lock:
+            if entry.removed:
+                return
+            now = self.core_time(self.now())
+            self._start_undeclared(entry, work, now)
+            self.dispatch(now)
+
+    def _start_job(self, entry: Entry, work: Work, release: int, now: int) -> None:
+        dag = self.tables.dag_of[entry.source]
+        slot = self._release(dag, release, now)
+        self._enqueue(entry, work, self.scheduler.source(slot), Origin(
+            slot, dag, self.scheduler.state.job_index[slot], entry.source), now)
+
+    def _skip_job(self, entry: Entry, release: int, now: int) -> None:
+        """Account for a release whose source does not run: the job expires at once."""
+        slot = self._release(self.tables.dag_of[entry.source], release, now)
+        self.scheduler.expire(slot, now)
+        self.decided(now)
+
+    def _release(self, dag: int, release: int, now: int) -> int:
+        job = self._next_job[dag]
+        self._next_job[dag] = job + 1
+        slot = self.scheduler.release(dag, job, release, now)
+        self.decided(now)
+        self.verdicts.released(dag, job, release, now)
+        return slot
+
+    def _start_successor(self, entry: Entry, work: Work, origin: Origin, now: int) -> bool:
+        """Make the vertex ready that a message of a known publication starts."""
+        target = entry.targets.get(origin.vertex)
+        if target is None:
+            return False
+        state = self.scheduler.state
+        slot, dag, job, _ = origin
+        if (state.job_dag[slot] != dag or state.job_index[slot] != job
+                or state.job_state[slot] != OPEN):
+            if not self.verdicts.was_aborted(dag, job):
+                return False
+            self.verdicts.note_drop(entry, Origin(slot, dag, job, target[0]), 'aborted', now)
+            return True
+        x = self.scheduler.execution(slot, *target)
+        if state.x_state[x] != IDLE:
+            return False  # a second message for the same vertex of the same job
+        self._enqueue(entry, work, x, Origin(slot, dag, job, target[0]), now)
+        return True
+
+    def _start_undeclared(self, entry: Entry, work: Work, now: int) -> None:
+        self.undeclared += 1
+        self._note_ready(
+            entry, work, self.scheduler.undeclared(entry.ready, entry.group, now), now)
+
+    def _enqueue(self, entry: Entry, work: Work, x: int, origin: Origin, now: int) -> None:
+        state = self.scheduler.state
+        state.x_group[x] = entry.group
+        work.origin = origin
+        work.release_ns = state.job_release[origin.slot]
+        work.reference_deadline = work.release_ns + self.tables.rad_offset[origin.vertex]
+        self.scheduler.ready(x, now)
+        self._note_ready(entry, work, x, now)
+
+    def _note_ready(self, entry: Entry, work: Work, x: int, now: int) -> None:
+        work.x = x
+        work.ready_ns = now
+        entry.ready += 1
+        entry.waiting[x] = None
+        self._work[x] = work
+
+    def resume(self, work: Work) -> None:
+        """Make a suspended execution ready to go on; nothing happens when it is not suspended."""
+        with self.lock:
+            if work.x >= 0 and self.scheduler.state.x_state[work.x] == SUSPENDED:
+                self.scheduler.resume(work.x)
+                self.dispatch(self.core_time(self.now()))
+
+    # --- what does not run -----------------------------------------------------------------------
+
+    def _drop_oldest(self, entry: Entry, now: int) -> None:
+        """Keep QoS: the oldest waiting message of a full queue goes."""
+        self._drop(entry, next(iter(entry.waiting)), 'qos_depth', now)
+        self.decided(now)
+
+    def _drop(self, entry: Entry, x: int, reason: str, now: int) -> None:
+        del entry.waiting[x]
+        work = self._work.pop(x)
+        work.x = -1
+        self.scheduler.drop(x, now)
+        self.verdicts.note_drop(entry, work.origin or NO_ORIGIN, reason, now)
+
+    def remove(self, entry: Entry) -> None:
+        """Forget a destroyed entity: what waits of it never runs."""
+        with self.lock:
+            entry.removed = True
+            now = self.core_time(self.now())
+            for x in list(entry.waiting):
+                self._drop(entry, x, 'destroyed', now)
+            self.decided(now)
+
+    # --- for the pool: all under the lock --------------------------------------------------------
+
+    def take_work(self, x: int) -> Work:
+        """Take the work of an execution that has been dispatched."""
+        work = self._work.pop(x)
+        work.entry.waiting.pop(x, None)
+        return work
+
+    def suspend(self, work: Work) -> None:
+        """Take a running execution off its worker until ``resume``."""
+        self.scheduler.suspend(work.x)
+        self._work[work.x] = work
+
+    def complete(self, work: Work, end: int, now: int, vtid: int) -> None:
+        """End a running execution that ended at ``end``; ``now`` is the core's time."""
+        x = work.x
+        work.x = -1
+        work.entry.ran += 1
+        whole = self.scheduler.complete(x, end)
+        origin = work.origin
+        if origin is not None and self.record is not None:
+            leg = x - self.scheduler.execution(origin.slot, origin.vertex)
+            self.record(
+                'complete', now, vtid, work.entry.address, origin.dag,
+                self.tables.index_in_dag[origin.vertex], origin.job, whole, end, leg)
+        self.decided(now)
+
+    def decided(self, now: int) -> None:
+        """Carry out what the core has decided since the last call."""
+        if not self.scheduler.state.decisions:
+            return
+        for x in self.verdicts.add(self.scheduler.decisions(), now):
+            work = self._work.pop(x, None)
+            if work is not None:  # the core dropped it: what is left of an aborted job
+                work.entry.waiting.pop(x, None)
+                work.x = -1
+                self.verdicts.note_drop(work.entry, work.origin or NO_ORIGIN, 'aborted', now)
+
+    # --- publishing and the end ------------------------------------------------------------------
+
+    def publish(
+        self, send: Any, publisher: Any, msg: Any, state: PublisherState, work: Work, vtid: int
+    ) -> None:
+        """Publish for a running callback: note it for attribution, and in the trace."""
+        if self.record is not None:
+            now = self.now()
+            address, message = id(publisher), id(msg)
+            self.record('rclcpp_publish', now, vtid, address, message, 0)
+            self.record('rcl_publish', now, vtid, address, message)
+        self.attribution.publish(send, publisher, msg, state, work.origin or NO_ORIGIN)
+
+    def finish(self) -> int:
+        """Judge what is open, once, when the run ends; return the time on the trace's clock."""
+        with self.lock:
+            now = self.core_time(self.now())
+            self.scheduler.expire_idle(now)
+            self.decided(now)
+            self.scheduler.finish(now)
+            self.decided(now)
+        self.verdicts.tell()
+        return now

@@ -1,0 +1,181 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the executor keeps for each rclpy entity, and the unit of work that a worker runs."""
+
+from __future__ import annotations
+
+import types
+from typing import Any, Callable
+
+from mddag_executor.core import Tables
+from mddag_executor.live.attribution import Origin
+from msg_graph import Callback, TaskSet
+
+TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
+    'timer', 'subscription', 'service', 'client', 'guard', 'waitable', 'task')
+
+
+class Entry:
+    """
+    An rclpy entity as the executor sees it.
+
+    :param callback: the declared callback that it is, or None.
+    :param group: the number of its mutually exclusive callback group in the core, or -1.
+    :param depth: how many of its executions may wait; 0 stands for any number.
+    """
+
+    __slots__ = (
+        'kind', 'entity', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
+        'topic', 'waiting', 'ready', 'ran', 'dropped', 'skipped', 'last_due', 'busy_ns',
+        'unattributed', 'removed', 'address')
+
+    def __init__(
+        self, kind: str, entity: Any, node: str, callback: Callback | None, group: int,
+        depth: int, label: str,
+    ) -> None:
+        self.kind = kind
+        self.entity = entity
+        self.node = node
+        self.callback = callback
+        self.group = group
+        self.depth = depth
+        self.label = label
+        self.topic = ''
+        # global vertex of the source that this starts, or -1
+        self.source = -1
+        # publishing vertex -> (vertex that its message starts, leg)
+        self.targets: dict[int, tuple[int, int]] = {}
+        self.waiting: dict[int, None] = {}
+        self.ready = 0
+        self.ran = 0
+        self.dropped = 0
+        self.skipped = 0
+        self.last_due = 0
+        self.busy_ns = 0
+        self.unattributed = 0
+        self.removed = False
+        self.address = id(self)
+
+
+def link(entry: Entry, task_set: TaskSet, tables: Tables, topic: str) -> None:
+    """Find the vertices that an entity bound to a declared callback starts."""
+    callback = entry.callback
+    assert callback is not None
+    entry.topic = topic
+    for dag in task_set.dags:
+        first = tables.first_vertex[dag.index]
+        for vertex in dag.vertices:
+            if vertex.callback is not callback and vertex.callback.key != callback.key:
+                continue
+            if vertex.index == dag.source:
+                entry.source = first + vertex.index
+            leg = callback.topics.index(topic) if len(callback.topics) > 1 else 0
+            for before in vertex.predecessors:
+                if topic in dag.vertices[before].callback.publishes:
+                    entry.targets[first + before] = (first + vertex.index, leg)
+
+
+class Work:
+    """
+    One execution of a callback: what to call, for which job, and where it stands.
+
+    ``origin`` is the vertex and job that it executes (UNDECLARED for others).
+    """
+
+    __slots__ = ('entry', 'x', 'function', 'args', 'then', 'coroutine', 'origin', 'ready_ns',
+                 'reference_deadline', 'release_ns')
+
+    def __init__(
+        self, entry: Entry, function: Callable[..., Any], args: tuple[Any, ...],
+        then: Callable[[Any], None] | None = None,
+    ) -> None:
+        self.entry = entry
+        self.x = -1
+        self.function = function
+        self.args = args
+        self.then = then
+        self.coroutine: Any = None
+        self.origin: Origin | None = None
+        self.ready_ns = 0
+        self.reference_deadline = 0
+        self.release_ns = 0
+
+    def step(self) -> Any:
+        """
+        Run, or go on running; return None when it has finished, else what it waits for.
+
+        :raises BaseException: whatever the callback raises.
+        """
+        if self.coroutine is None:
+            result = self.function(*self.args)
+            if type(result) is not types.CoroutineType:
+                if self.then is not None:
+                    self.then(result)
+                return None
+            self.coroutine = result
+        try:
+            yielded = self.coroutine.send(None)
+        except StopIteration as stop:
+            if self.then is not None:
+                self.then(stop.value)
+            return None
+        return yielded if yielded is not None else awaited(self.coroutine)
+
+    def close(self) -> None:
+        """Close what will never run on."""
+        if self.coroutine is not None:
+            self.coroutine.close()
+
+
+class TaskWork(Work):
+    """An execution of an rclpy ``Task``; exceptions are the task's."""
+
+    __slots__ = ()
+
+    def step(self) -> Any:
+        """Run the task once; return None when it is done."""
+        task: Any = self.function
+        task()
+        if task.done() or task.cancelled():
+            if self.then is not None:
+                self.then(task)
+            return None
+        return awaited(self.coroutine)
+
+
+UNKNOWN = object()
+"""Stands for something awaited that can not be found out: it is asked again now and then."""
+
+
+def awaited(coroutine: Any) -> Any:
+    """
+    Return the rclpy future that a suspended coroutine waits for, or UNKNOWN.
+
+    In rclpy of Jazzy ``Future.__await__`` is a generator that yields nothing, so the future is
+    looked up where the chain of awaits ends.
+    """
+    inner = coroutine
+    while True:
+        if type(inner) is types.CoroutineType:
+            inner = inner.cr_await
+        elif type(inner) is types.GeneratorType:
+            if inner.gi_yieldfrom is None:
+                break
+            inner = inner.gi_yieldfrom
+        else:
+            break
+    if type(inner) is types.GeneratorType and inner.gi_frame is not None:
+        inner = inner.gi_frame.f_locals.get('self')
+    return inner if hasattr(inner, 'add_done_callback') else UNKNOWN

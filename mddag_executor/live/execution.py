@@ -1,0 +1,204 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How long synthetic callbacks execute, and how an execution is emulated.
+
+Theory of operation
+-------------------
+As in the paper's experiment, each vertex gets **one** execution time for the whole run, drawn from
+its declared quantiles.  Then all of them are scaled by one factor so that the normalised
+utilisation, sum(C / T) / workers, is what was asked for.  One such draw is one point of the
+experiment: whether its deadlines can be met at all depends on the draw
+(``ExecutionPlan.infeasible``), so a figure measured with one seed speaks for that seed.
+
+``sleep`` stands for work outside of Python (a GPU, a C++ library that releases the interpreter
+lock): it takes a worker but no CPU, so the CPU that the process does take is overhead.
+``spin`` takes CPU and the interpreter lock: all bodies together have at most one core.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+import random
+import statistics
+import time
+from typing import Literal
+
+from mddag_executor.errors import MddagError
+from msg_graph import Dag, TaskSet
+from msg_graph.analysis import path_lengths
+
+Mode = Literal['sleep', 'spin']
+MODES: tuple[Mode, ...] = ('sleep', 'spin')
+
+Emulate = Callable[[int], None]
+"""Executes for that many nanoseconds in the calling thread."""
+
+
+class PlanError(MddagError):
+    """An execution plan that can not be made from this declaration."""
+
+
+@dataclass(frozen=True)
+class Infeasible:
+    """
+    A sink that no scheduler can serve in time: its critical path is longer than its deadline.
+
+    ``critical_path_ns`` is the longest path from the source up to and including the sink.
+    """
+
+    dag: str
+    vertex: str
+    critical_path_ns: int
+    deadline_ns: int
+
+
+class ExecutionPlan:
+    """
+    The execution time of each vertex for one run.
+
+    :param task_set: the declared DAG tasks.
+    :param seed: the same seed gives the same draw, on every machine and Python version.
+    :param utilisation: normalised utilisation to scale to; None takes the draw as it is.
+    :param workers: the number of workers that the utilisation is normalised to.
+    :param mode: ``sleep`` or ``spin``.
+    :raises PlanError: when a utilisation is asked for and no execution time is declared.
+    """
+
+    def __init__(
+        self,
+        task_set: TaskSet,
+        seed: int = 0,
+        utilisation: float | None = None,
+        workers: int = 7,
+        mode: Mode = 'sleep',
+    ) -> None:
+        self.seed = seed
+        self.workers = workers
+        self.mode: Mode = mode
+        self.asked = utilisation
+        self._task_set = task_set
+        drawn = _draw(task_set, seed)
+        self.drawn_utilisation = _utilisation(task_set, drawn, workers)
+        self.factor = 1.0
+        if utilisation is not None:
+            if not (utilisation > 0 and math.isfinite(utilisation)):
+                raise PlanError(
+                    f'utilisation {utilisation}: this is no number above zero: give one as 0.6')
+            if self.drawn_utilisation == 0:
+                raise PlanError(
+                    f'{task_set.file}: no callback has an execution time, so there is nothing to '
+                    'scale: declare execution_time, or leave the utilisation out')
+            self.factor = utilisation / self.drawn_utilisation
+        self._times = [[round(c * self.factor) for c in dag] for dag in drawn]
+
+    @property
+    def utilisation(self) -> float:
+        """Normalised utilisation that results: sum(C / T) / workers."""
+        return _utilisation(self._task_set, self._times, self.workers)
+
+    def execution_ns(self, dag: int, vertex: int) -> int:
+        """Return the execution time of a vertex, by DAG index and local index, ns."""
+        return self._times[dag][vertex]
+
+    def critical_path_ns(self, dag: Dag) -> list[int]:
+        """Return the longest path from the source to the end of each vertex, by index, ns."""
+        return path_lengths(dag, self._times[dag.index])
+
+    def infeasible(self) -> list[Infeasible]:
+        """Return the sinks whose critical path is longer than their deadline."""
+        found = []
+        for dag in self._task_set.dags:
+            ends = self.critical_path_ns(dag)
+            for sink in dag.sinks:
+                vertex = dag.vertices[sink]
+                deadline = vertex.deadline_ns
+                if deadline is not None and ends[sink] > deadline:
+                    found.append(Infeasible(dag.name, vertex.name, ends[sink], deadline))
+        return found
+
+
+def _draw(task_set: TaskSet, seed: int) -> list[list[int]]:
+    """Draw one execution time for each vertex, in the order of the file."""
+    generator = random.Random(seed)
+    times = []
+    for dag in task_set.dags:
+        row = []
+        for vertex in dag.vertices:
+            # Draws even where nothing is declared: declaring one more time changes no other.
+            share = generator.random()
+            declared = vertex.callback.execution_time
+            row.append(0 if declared is None else declared.draw(share))
+        times.append(row)
+    return times
+
+
+def _utilisation(task_set: TaskSet, times: list[list[int]], workers: int) -> float:
+    total = sum(sum(times[dag.index]) / dag.period_ns for dag in task_set.dags)
+    return total / workers
+
+
+def typical_oversleep_ns(samples: int = 100, asked_ns: int = 300_000) -> int:
+    """Measure by how much time.sleep() is late on this machine when it is idle: the median, ns."""
+    late = []
+    for _ in range(samples):
+        start = time.monotonic_ns()
+        time.sleep(asked_ns / 1e9)
+        late.append(time.monotonic_ns() - start - asked_ns)
+    return max(0, int(statistics.median(late)))
+
+
+def sleeper(oversleep_ns: int | None = None) -> Emulate:
+    """
+    Make a function that takes a worker for some time without taking CPU.
+
+    It asks time.sleep() for less by what this machine typically adds, so that the mean is right
+    when the machine isn't overloaded.  What is shorter than that (about 70 us under Linux, whose
+    timer slack is 50 us) is waited out busily.  When the machine is overloaded, executions get
+    longer: that is so for real callbacks too, and it is not hidden.
+
+    :param oversleep_ns: the typical oversleep; None measures it (30 ms).
+    """
+    typical = typical_oversleep_ns() if oversleep_ns is None else oversleep_ns
+    monotonic_ns, sleep = time.monotonic_ns, time.sleep
+
+    def emulate(execution_ns: int) -> None:
+        if execution_ns > typical:
+            sleep((execution_ns - typical) * 1e-9)
+            return
+        end = monotonic_ns() + execution_ns
+        while monotonic_ns() < end:
+            pass
+
+    return emulate
+
+
+def spinner() -> Emulate:
+    """Make a function that takes that much CPU time of the calling thread."""
+    thread_time_ns = time.thread_time_ns
+
+    def emulate(execution_ns: int) -> None:
+        end = thread_time_ns() + execution_ns
+        while thread_time_ns() < end:
+            pass
+
+    return emulate
+
+
+def emulator(mode: Mode) -> Emulate:
+    """Return what executes a body in this mode."""
+    return sleeper() if mode == 'sleep' else spinner()

@@ -1,0 +1,440 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The executor: rclpy's contract on top of intake, core and workers.
+
+Theory of operation
+-------------------
+``spin`` starts the intake threads and lets the workers run; the calling thread then only looks
+after the executor: it takes note of entities that come and go, resumes what can not say when it
+is ready, and ends the spin on an exception, a shutdown, a done future or a time-out.
+
+``spin_once`` uses no thread at all: one wait set over everything hands over what is ready, and the
+calling thread runs the one callback that the core puts first.
+
+Whatever has been taken and not run yet stays with the core and runs with the next spin.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import contextmanager
+import inspect
+import sys
+import threading
+import time
+from typing import Any, Callable, Iterator, TYPE_CHECKING
+
+import rclpy
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import Executor, ExternalShutdownException, TimeoutObject
+from rclpy.task import Future, Task
+
+from mddag_executor.errors import UsageError
+from mddag_executor.live import hooks
+from mddag_executor.live.dispatcher import Dispatcher
+from mddag_executor.live.entries import Entry, TASK, TaskWork
+from mddag_executor.live.events import EventsIntake
+from mddag_executor.live.pool import Pool
+from mddag_executor.live.receiver import Receiver
+from mddag_executor.live.recorder import Recorder
+from mddag_executor.live.registry import Registry
+from mddag_executor.live.statistics import snapshot
+from mddag_executor.live.threads import thread_setting
+from mddag_executor.live.verdicts import DeadlineMiss
+from mddag_executor.live.waitset import ALL_KINDS, WaitSetIntake
+from msg_graph import load, parse_duration, TaskSet
+
+if TYPE_CHECKING:
+    from rclpy.context import Context
+    from rclpy.node import Node
+
+LOOK_AFTER_S = 0.1
+"""How often ``spin`` looks whether the context is still there (signals only end the context)."""
+
+EXPIRE_AFTER_NS = 1_000_000_000
+MAX_ACTIVE_JOBS = 64
+
+
+class ObservedTask(Task):
+    """A task that knows whether somebody waits for it, and so takes care of its exception."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.observed = False
+        super().__init__(*args, **kwargs)
+
+    def add_done_callback(self, callback: Callable[[Future], None]) -> None:
+        """Add a callback for when the task is done."""
+        self.observed = True
+        super().add_done_callback(callback)
+
+
+class MultiDeadlineExecutor(Executor):
+    """
+    Run callbacks in the order that their deadlines need, on a bounded pool of workers.
+
+    What works with ``rclpy.executors.MultiThreadedExecutor`` works with it.  Callbacks of declared
+    DAG tasks get the priority RAD, the reference absolute deadline of the multi-deadline DAG
+    model (Yano and Azumi, RTSS 2024 WiP); others that of ``default_deadline`` after they became
+    ready.
+
+    :param graph: a declaration (path of a YAML file), a ``msg_graph.TaskSet``, or None.
+    :param num_workers: threads of the pool; by default what the declaration says, else seven.
+    :param policy: ``rad`` or another of ``mddag_executor.core.POLICIES``.
+    :param context: the context that the executor belongs to, or None for the default one.
+    :param trace: path of an MCAP file to record to, or None.
+    :param on_deadline_miss: called with a ``DeadlineMiss``, in a worker thread.
+    :param default_deadline: relative deadline of undeclared callbacks: ns, or text as ``100ms``.
+    :param intake: ``events``, ``waitset`` or ``auto`` (events where this rclpy has them).
+    :param worker_policy: real-time policy of the workers, ``SCHED_FIFO`` or ``SCHED_RR``.
+    :param worker_priority: their priority under it.
+    :param worker_cpus: the CPUs that they may use.
+    :raises msg_graph.GraphError: when the declaration is not right.
+    :raises mddag_executor.errors.MddagError: on an unknown policy, intake or thread setting, and
+        when the trace can not be written.
+    """
+
+    def __init__(
+        self,
+        graph: str | TaskSet | None = None,
+        num_workers: int | None = None,
+        *,
+        policy: str = 'rad',
+        context: Context | None = None,
+        trace: str | None = None,
+        on_deadline_miss: Callable[[DeadlineMiss], None] | None = None,
+        default_deadline: int | str = 100_000_000,
+        intake: str = 'auto',
+        max_active_jobs: int = MAX_ACTIVE_JOBS,
+        worker_policy: str | None = None,
+        worker_priority: int | None = None,
+        worker_cpus: set[int] | None = None,
+    ) -> None:
+        task_set = load(graph) if isinstance(graph, str) or hasattr(graph, '__fspath__') else graph
+        if num_workers is None:
+            num_workers = (task_set.workers if task_set is not None else None) or 7
+        if num_workers < 1:
+            raise UsageError(f'num_workers: {num_workers} is too few: give at least 1')
+        if isinstance(default_deadline, str):
+            default_deadline = parse_duration(default_deadline)
+        if intake not in ('auto', 'events', 'waitset'):
+            raise UsageError(f"intake: '{intake}' is unknown: give auto, events or waitset")
+        prepare = thread_setting(worker_policy, worker_priority, worker_cpus)
+        hooks.install()
+        self._recorder: Recorder | None = None
+        clock_offset = time.time_ns() - time.monotonic_ns()
+        if trace is not None:
+            self._recorder = Recorder(
+                trace, task_set, policy, num_workers, default_deadline, max_active_jobs,
+                clock_offset)
+        self._errors: deque[BaseException] = deque()
+        self._attention = threading.Event()
+        self._changed = True
+        self._spinning = threading.Lock()
+        self._refreshing = threading.Lock()
+        self._finished = False
+        self._dispatcher = Dispatcher(
+            task_set, num_workers, policy, default_deadline=default_deadline,
+            max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
+            clock_offset=clock_offset, fail=self._fail,
+            record=self._recorder.record if self._recorder else None, on_miss=on_deadline_miss)
+        self._pool = Pool(self._dispatcher, prepare)
+        self._pool.pump = self._pump
+        self._registry = Registry(
+            task_set, self._dispatcher.tables, self._dispatcher.scheduler)
+        self._receiver = Receiver(
+            self._dispatcher, self._registry, task_set, self, self._fail, self._recorder)
+        self._task_entry = Entry(TASK, None, '', None, -1, 0, 'task')
+        super().__init__(context=context)
+        self._inline: WaitSetIntake | None = None
+        self._intake: Any = None
+        self._intake_kind = intake
+
+    # --- nodes and entities ----------------------------------------------------------------------
+
+    def add_node(self, node: Node) -> bool:
+        """Add a node whose callbacks this executor runs; False when it has it already."""
+        added: bool = super().add_node(node)
+        if added:
+            self.wake()
+        return added
+
+    def remove_node(self, node: Node) -> None:
+        """Stop running a node's callbacks."""
+        super().remove_node(node)
+        self.wake()
+
+    def wake(self) -> None:
+        """Take note of entities that were created or destroyed, or of a change of state."""
+        self._changed = True
+        self._attention.set()
+        guard = self._guard
+        if guard is not None:
+            try:
+                guard.trigger()
+            except InvalidHandle:
+                pass
+
+    def _refresh(self) -> None:
+        """Bring registry, intake and trace up to date with the nodes' entities."""
+        with self._refreshing:
+            if not self._changed:
+                return
+            self._changed = False
+            nodes = self.get_nodes()
+            added, gone = self._registry.refresh(nodes)
+            for entry in gone:
+                self._dispatcher.remove(entry)
+            if self._recorder is not None:
+                self._recorder.entities(nodes, added)
+            for intake in (self._intake, self._inline):
+                if intake is not None:
+                    intake.update(nodes)
+
+    # --- tasks -----------------------------------------------------------------------------------
+
+    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
+        """Run a function or coroutine in this executor; return its task, which is a future."""
+        coroutine = None
+        if inspect.iscoroutinefunction(callback):
+            callback, args, kwargs = callback(*args, **kwargs), (), {}
+        if inspect.iscoroutine(callback):
+            coroutine = callback
+        task = ObservedTask(callback, args, kwargs, executor=self)
+        work = TaskWork(self._task_entry, task, ())
+        work.coroutine = coroutine
+        work.then = self._task_done
+        if coroutine is not None:
+            Future.add_done_callback(task, lambda _: self._dispatcher.resume(work))
+        self._dispatcher.undeclared_ready(self._task_entry, work)
+        self._attention.set()
+        guard = self._guard
+        if guard is not None and not self._pool.running:
+            try:
+                guard.trigger()
+            except InvalidHandle:
+                pass
+        return task
+
+    def _task_done(self, task: ObservedTask) -> None:
+        if not task.observed:
+            error = task.exception()
+            if error is not None:
+                raise error
+
+    # --- spinning --------------------------------------------------------------------------------
+
+    def spin(self) -> None:
+        """
+        Run callbacks on the pool until shutdown.
+
+        :raises ExternalShutdownException: when the context ends.
+        :raises RuntimeError: when the executor spins already.
+        :raises Exception: what a callback raised.
+        """
+        self._spin(lambda: False, None)
+
+    def spin_until_future_complete(
+        self, future: Future, timeout_sec: float | None = None
+    ) -> None:
+        """Run callbacks on the pool until a future is done or the time is over."""
+        future.add_done_callback(lambda _: self._attention.set())
+        try:
+            self._spin(lambda: future.done() or future.cancelled(), timeout_sec)
+        except ExternalShutdownException:
+            pass
+
+    def _spin(self, done: Callable[[], bool], timeout_sec: float | None) -> None:
+        if not self._spinning.acquire(blocking=False):
+            raise RuntimeError('Executor is already spinning')
+        deadline = None
+        if timeout_sec is not None and timeout_sec >= 0:
+            deadline = time.monotonic() + timeout_sec
+        try:
+            if self._is_shutdown:
+                return
+            self._check_context()
+            self._start_intake()
+            self._pool.start()
+            while not self._is_shutdown:
+                self._raise_error()
+                if done():
+                    return
+                self._check_context()
+                self._refresh()
+                left = LOOK_AFTER_S
+                if self._pool.resume_polled():
+                    left = 0.002
+                if deadline is not None:
+                    left = min(left, deadline - time.monotonic())
+                    if left <= 0:
+                        return
+                self._attention.wait(left)
+                self._attention.clear()
+            self._raise_error()
+        finally:
+            self._pool.pause()
+            self._stop_intake()
+            if not self._context.ok():
+                self._pool.close(0.5)
+                self._end_run()
+            self._spinning.release()
+
+    def _check_context(self) -> None:
+        if not self._context.ok():
+            raise ExternalShutdownException()
+
+    def _start_intake(self) -> None:
+        kind = self._intake_kind
+        if kind == 'auto':
+            kind = 'events' if EventsIntake.available() else 'waitset'
+        guards = (self._guard, self._sigint_gc)
+        intake_type = EventsIntake if kind == 'events' else WaitSetIntake
+        self._intake = intake_type(self._context, self._receiver, guards)
+        self._changed = True
+        self._refresh()
+        self._intake.start()
+
+    def _stop_intake(self) -> None:
+        intake, self._intake = self._intake, None
+        if intake is not None:
+            intake.stop()
+
+    def _fail(self, error: BaseException) -> None:
+        """Take an exception from a worker or the intake; it comes out of the spin."""
+        self._errors.append(error)
+        self._attention.set()
+        guard = self._guard
+        if guard is not None:
+            try:
+                guard.trigger()
+            except InvalidHandle:
+                pass
+
+    def _raise_error(self) -> None:
+        if self._errors:
+            raise self._errors.popleft()
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """
+        Wait for one callback and run it in the calling thread.
+
+        Called by ``rclpy.spin``, which would otherwise run one callback at a time, it does what
+        ``spin`` does.
+
+        :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
+        """
+        if timeout_sec is None and sys._getframe(1).f_code is rclpy.spin.__code__:
+            self.spin()
+            return
+        self._spin_once(timeout_sec, lambda: False)
+
+    def spin_once_until_future_complete(
+        self, future: Future, timeout_sec: float | TimeoutObject | None = None
+    ) -> None:
+        """Wait for one callback, or until a future is done, and run it."""
+        if isinstance(timeout_sec, TimeoutObject):
+            timeout_sec = timeout_sec.timeout
+        future.add_done_callback(lambda _: self.wake())
+        self._spin_once(timeout_sec, lambda: future.done() or future.cancelled())
+
+    def _spin_once(self, timeout_sec: float | None, done: Callable[[], bool]) -> None:
+        if not self._spinning.acquire(blocking=False):
+            raise RuntimeError('Executor is already spinning')
+        deadline = None
+        if timeout_sec is not None and timeout_sec >= 0:
+            deadline = time.monotonic() + timeout_sec
+        try:
+            while not self._is_shutdown:
+                self._check_context()
+                if self._one_step(deadline) or done():
+                    return
+                if deadline is not None and time.monotonic() >= deadline:
+                    return
+        finally:
+            self._spinning.release()
+
+    def _one_step(self, deadline: float | None) -> bool:
+        """Take in what is ready, waiting where nothing is; run one callback if there is one."""
+        self._raise_error()
+        if self._inline is None:
+            self._inline = WaitSetIntake(
+                self._context, self._receiver, (self._guard, self._sigint_gc), ALL_KINDS)
+            self._changed = True
+        self._refresh()
+        self._pool.resume_polled()
+        self._inline.poll(0.0)
+        if not self._pool.run_one():
+            left = None if deadline is None else max(0.0, deadline - time.monotonic())
+            self._inline.poll(left)
+            self._refresh()
+            if not self._pool.run_one():
+                self._raise_error()
+                return False
+        self._raise_error()
+        return True
+
+    @contextmanager
+    def _pump(self) -> Iterator[None]:
+        """Let intake and workers run while the callback of a ``spin_once`` waits."""
+        self._start_intake()
+        self._pool.start()
+        try:
+            yield
+        finally:
+            self._pool.pause()
+            self._stop_intake()
+
+    # --- the end ---------------------------------------------------------------------------------
+
+    def shutdown(self, timeout_sec: float | None = None) -> bool:
+        """
+        Stop running callbacks and wait for those that run.
+
+        :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
+        :return: whether everything has finished.
+        """
+        if timeout_sec is not None and timeout_sec < 0:
+            timeout_sec = None
+        self._is_shutdown = True
+        self.wake()
+        self._pool.pause()
+        if self._inline is not None and self._spinning.acquire(blocking=False):
+            self._inline.stop()
+            self._inline = None
+            self._spinning.release()
+        if not self._pool.close(timeout_sec):
+            return False
+        self._end_run()
+        finished: bool = super().shutdown(timeout_sec)
+        return finished
+
+    def _end_run(self) -> None:
+        """Judge what is open and close the trace, once."""
+        if self._finished:
+            return
+        self._finished = True
+        end = self._dispatcher.finish()
+        if self._recorder is not None:
+            self._recorder.close(end)
+
+    def statistics(self) -> dict[str, Any]:
+        """
+        Return a snapshot of what has happened since the executor was made.
+
+        ``dags`` is in the result format of ``mddag replay``; ``callbacks`` counts for each
+        entity what became ready, ran, was dropped for QoS or skipped; times in ns.
+        """
+        return snapshot(self._dispatcher, self._pool, self._registry, self._recorder)

@@ -1,0 +1,94 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Two places in rclpy where the executor must know what a callback does.
+
+``Publisher.publish``: a message's job is found by when its predecessor published it, and a trace
+holds publications.  ``Client.call``: a callback that waits for a service lends its worker's place
+to a spare thread.  Both are wrapped once for the process, when the first executor is made; outside
+of this executor's callbacks they do what they always did.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, Protocol
+
+from mddag_executor.live.attribution import PublisherState
+from rclpy.client import Client
+from rclpy.publisher import Publisher
+
+
+class Running(Protocol):
+    """What runs in a thread, as far as the hooks need it."""
+
+    def publish(self, send: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
+        """Send a message on behalf of the running callback."""
+
+    def waits(self) -> Any:
+        """Return a context manager that lends the worker's place while it is entered."""
+
+
+class _Thread(threading.local):
+    running: Running | None = None
+
+
+current = _Thread()
+"""``current.running``: the execution whose callback runs in the calling thread, or None."""
+
+_STATE = '_mddag_publisher_state'
+_installed = threading.Lock()
+_done = False
+
+
+def publisher_state(publisher: Any) -> PublisherState:
+    """Return what is kept for a publisher."""
+    state: PublisherState | None = publisher.__dict__.get(_STATE)
+    if state is None:
+        state = publisher.__dict__.setdefault(_STATE, PublisherState(publisher.topic_name))
+    return state
+
+
+def install() -> None:
+    """Wrap rclpy's two methods; further calls change nothing."""
+    global _done
+    with _installed:
+        if _done:
+            return
+        _done = True
+    send = Publisher.publish
+    call = Client.call
+
+    def publish(self: Any, msg: Any) -> None:
+        state = publisher_state(self)
+        with state.lock:
+            state.count += 1
+            running = current.running
+            if running is None:
+                send(self, msg)
+            else:
+                running.publish(send, self, msg, state)
+
+    def call_and_wait(self: Any, request: Any, *args: Any, **kwargs: Any) -> Any:
+        running = current.running
+        if running is None:
+            return call(self, request, *args, **kwargs)
+        with running.waits():
+            return call(self, request, *args, **kwargs)
+
+    publish.__doc__ = send.__doc__
+    call_and_wait.__doc__ = call.__doc__
+    Publisher.publish = publish
+    Client.call = call_and_wait

@@ -1,0 +1,285 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Find and run what ``mddag run --node SPEC`` names.
+
+Theory of operation
+-------------------
+A SPEC is
+
+* ``package/executable``: what ``ros2 run`` would start.  It is looked for in
+  ``PREFIX/lib/PACKAGE/`` of the ament index (``AMENT_PREFIX_PATH``), then among the console
+  scripts of the Python distribution of that name, which is what a package installed with pip has.
+  A Python script is executed as ``__main__``, as Python would do it.
+* ``module:NodeClass``: a subclass of ``rclpy.node.Node``; it is constructed without arguments.
+* ``module:function``: it may return a node or several, or be a ``main()`` that spins.  One
+  required argument gets the list of command line arguments.
+
+``resolve`` finds the file or imports the module, so whatever is wrong with a SPEC is said before
+any node starts; ``hosting`` then runs the ``Program`` that it returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+import difflib
+from importlib import import_module, metadata
+import inspect
+import os
+from pathlib import Path
+import sys
+import traceback
+from types import ModuleType
+from typing import Any
+
+from ament_index_python.packages import (
+    get_package_prefix,
+    get_packages_with_prefixes,
+    PackageNotFoundError,
+)
+from mddag_executor.errors import MddagError
+from rclpy.node import Node
+
+_FORMS = 'write package/executable, module:function or module:NodeClass'
+
+
+class LoadingError(MddagError):
+    """A ``--node`` that can not be run; one line that says why and what to do."""
+
+    def __init__(self, spec: str, problem: str, remedy: str) -> None:
+        super().__init__(f'--node {spec}: {problem}: {remedy}')
+        self.spec = spec
+
+
+@dataclass(frozen=True)
+class Program:
+    """
+    Something that brings nodes.
+
+    :ivar spec: as the user wrote it.
+    :ivar argv0: what ``sys.argv[0]`` is while it starts.
+    :ivar run: runs it; what it returns may be nodes.
+    """
+
+    spec: str
+    argv0: str
+    run: Callable[[], Any]
+
+
+def resolve(spec: str) -> Program:
+    """
+    Find what a SPEC names.
+
+    :raises LoadingError: when it can't be found or imported, or is nothing that brings nodes.
+    """
+    if ':' in spec:
+        return _resolve_attribute(spec)
+    if spec.count('/') == 1 and all(spec.split('/')):
+        return _resolve_executable(spec)
+    raise LoadingError(spec, 'this names no node', _FORMS)
+
+
+def _resolve_attribute(spec: str) -> Program:
+    module_name, _, attribute = spec.partition(':')
+    if not all(part.isidentifier() for part in (*module_name.split('.'), *attribute.split('.'))):
+        raise LoadingError(spec, 'this names no node', _FORMS)
+    if '' not in sys.path and os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())  # as `python -m` does
+    module = _import(spec, module_name)
+    target: Any = module
+    for name in attribute.split('.'):
+        try:
+            target = getattr(target, name)
+        except AttributeError:
+            raise LoadingError(
+                spec, f"module '{module_name}' has no '{attribute}'",
+                _did_you_mean(attribute, _callables(module))) from None
+    if isinstance(target, type):
+        if not issubclass(target, Node):
+            raise LoadingError(
+                spec, f"'{attribute}' is a class, but no rclpy node",
+                'name a subclass of rclpy.node.Node, or a function')
+        return Program(spec, module_name, target)
+    if not callable(target):
+        raise LoadingError(
+            spec, f"'{attribute}' is no function and no class, but {_kind(target)}",
+            'name a function or a subclass of rclpy.node.Node')
+    return Program(spec, module_name, lambda: _call(spec, target))
+
+
+def _import(spec: str, module_name: str) -> ModuleType:
+    try:
+        return import_module(module_name)
+    except ModuleNotFoundError as error:
+        missing = error.name or module_name
+        if module_name == missing or module_name.startswith(missing + '.'):
+            raise LoadingError(
+                spec, f"there is no module '{missing}'",
+                'check its name, or add its folder to PYTHONPATH') from None
+        raise LoadingError(
+            spec, f"'{module_name}' needs the module '{missing}', which is not installed",
+            'install it') from error
+    except Exception as error:
+        raise LoadingError(
+            spec, f"'{module_name}' can't be imported ({describe(error)})",
+            'correct it') from error
+
+
+def _call(spec: str, function: Callable[..., Any]) -> Any:
+    """Call with the command line arguments if the function requires one argument."""
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):  # a builtin that doesn't tell
+        parameters = []
+    required = [
+        p for p in parameters
+        if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    if not required:
+        return function()
+    if len(required) == 1 and required[0].kind is not inspect.Parameter.KEYWORD_ONLY:
+        return function(sys.argv)
+    names = ', '.join(p.name for p in required)
+    raise LoadingError(
+        spec, f'the function requires the arguments {names}',
+        'name one that needs none, or only the list of command line arguments')
+
+
+def _resolve_executable(spec: str) -> Program:
+    package, executable = spec.split('/')
+    folder = _library_folder(package)
+    if folder is not None and (folder / executable).is_file():
+        return _script(spec, folder / executable)
+    scripts = _console_scripts(package)
+    if scripts is None and folder is None:
+        known = {*_ament_packages(), *_distributions()}
+        raise LoadingError(
+            spec, f"there is no package '{package}'",
+            _did_you_mean(package, known, "source its workspace's setup file, or install it"))
+    entry = (scripts or {}).get(executable)
+    if entry is not None:
+        return _entry_point(spec, entry)
+    have = [*(scripts or ()), *_executables(folder)]
+    raise LoadingError(
+        spec, f"package '{package}' has no executable '{executable}'",
+        _did_you_mean(executable, have))
+
+
+def _library_folder(package: str) -> Path | None:
+    """Return ``PREFIX/lib/PACKAGE`` for a package of the ament index."""
+    try:
+        return Path(get_package_prefix(package), 'lib', package)
+    except (PackageNotFoundError, ValueError, OSError):
+        # No such package, no name for one, or no AMENT_PREFIX_PATH at all.
+        return None
+
+
+def _ament_packages() -> list[str]:
+    try:
+        return list(get_packages_with_prefixes())
+    except OSError:
+        return []
+
+
+def _distributions() -> list[str]:
+    return [name for d in metadata.distributions() if (name := d.metadata['Name'])]
+
+
+def _console_scripts(package: str) -> dict[str, metadata.EntryPoint] | None:
+    """Return the console scripts of a distribution, or None when it isn't installed."""
+    try:
+        distribution = metadata.distribution(package)
+    except (metadata.PackageNotFoundError, ValueError):
+        return None
+    return {e.name: e for e in distribution.entry_points if e.group == 'console_scripts'}
+
+
+def _executables(folder: Path | None) -> list[str]:
+    if folder is None or not folder.is_dir():
+        return []
+    return sorted(p.name for p in folder.iterdir() if p.is_file() and os.access(p, os.X_OK))
+
+
+def _entry_point(spec: str, entry: metadata.EntryPoint) -> Program:
+    try:
+        function = entry.load()
+    except Exception as error:
+        raise LoadingError(
+            spec, f"its entry point '{entry.value}' can't be imported ({describe(error)})",
+            'install what it needs, or the package again') from error
+    return Program(spec, entry.name, lambda: _call(spec, function))
+
+
+def _script(spec: str, path: Path) -> Program:
+    try:
+        source = path.read_bytes()
+    except OSError as error:
+        raise LoadingError(
+            spec, f'{path} cannot be read ({error.strerror})', 'change its permissions') from None
+    first_line = source.split(b'\n', 1)[0]
+    if not (path.suffix == '.py' or first_line.startswith(b'#!') and b'python' in first_line):
+        raise LoadingError(
+            spec, f'{path} is no Python program, and only Python nodes can run in this process',
+            "start it by itself with 'ros2 run'")
+    try:
+        code = compile(source, str(path), 'exec')
+    except (SyntaxError, ValueError) as error:
+        raise LoadingError(
+            spec, f'{path} is not valid Python ({describe(error)})', 'correct it') from None
+
+    def run() -> None:
+        # Not runpy.run_path: it swaps sys.modules['__main__'] until the script ends, and several
+        # scripts run here at once, in threads.
+        folder = str(path.parent)
+        if folder not in sys.path:
+            sys.path.insert(0, folder)
+        module = ModuleType('__main__')
+        module.__file__ = str(path)
+        exec(code, module.__dict__)
+
+    return Program(spec, str(path), run)
+
+
+def describe(error: BaseException) -> str:
+    """Return an exception on one line, with the place where it was raised."""
+    text = ' '.join(str(error).split())
+    name = type(error).__name__
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [f for f in frames if not f.filename.startswith('<') and f.filename != __file__]
+    place = f', {own[-1].filename}:{own[-1].lineno}' if own else ''
+    return f'{name}: {text}{place}' if text else f'{name}{place}'
+
+
+def _kind(value: object) -> str:
+    return f'a {type(value).__name__}'
+
+
+def _callables(module: ModuleType) -> list[str]:
+    return [
+        name for name, value in vars(module).items()
+        if not name.startswith('_') and callable(value)]
+
+
+def _did_you_mean(word: str, known: Iterable[str], otherwise: str = '') -> str:
+    names = sorted(set(known))
+    near = difflib.get_close_matches(word, names, n=3, cutoff=0.6)
+    if near:
+        return f"did you mean {' or '.join(repr(n) for n in near)}?"
+    if otherwise:
+        return otherwise
+    if not names:
+        return 'it has none'
+    more = ', …' if len(names) > 10 else ''
+    return f"it has {', '.join(names[:10])}{more}"

@@ -1,0 +1,211 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Measure any executor by what its callbacks did.
+
+Theory of operation
+-------------------
+The nodes themselves write the ledger, so any executor can be measured with the same yardstick,
+and an executor can not embellish its figures: each body appends how long it took, each sink
+appends (release, completion).  Appending to a list is one indivisible step in CPython, so no lock
+is taken in a callback.
+
+*Due* are the nominal releases (first release plus k periods) whose deadline lies inside the
+measured window, whether or not the executor ever noticed them.  Of these a sink is *on time* when
+it completed by its deadline, *late* when it completed after it, and *missing* when it has not
+completed when the books are closed.  A release that an executor skipped, a message that got lost
+and a job that still waits are all missing.  What was not yet due at the window's end is not
+counted either way.
+
+CPU for each callback is all CPU that the process took during the window (executor, middleware,
+interpreter, publishing, emulation of short bodies), divided by the vertices that executed in it.
+In ``spin`` mode the CPU that the bodies were told to take is subtracted.  Legs of a sync callback
+that do not complete the join are not counted as callbacks: their cost is overhead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import time
+from typing import Any
+
+from mddag_executor.core.tally import quantile
+from mddag_executor.live.execution import ExecutionPlan
+from msg_graph import Dag, TaskSet, Vertex
+
+_EARLY_NS = 1_000_000
+"""How much before its nominal time a release may be noted: clocks are read twice (ns)."""
+
+
+def epoch_offset_ns() -> int:
+    """
+    Return what turns ``time.monotonic_ns()`` into ns since the epoch, for a whole run.
+
+    The best of several readings, so that an interruption between the two clocks does no harm.
+    """
+    readings = []
+    for _ in range(20):
+        before = time.monotonic_ns()
+        now = time.time_ns()
+        after = time.monotonic_ns()
+        readings.append((after - before, now - (before + after) // 2))
+    return min(readings)[1]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What is counted at one instant: ns since the epoch, CPU of the process (ns), bodies run."""
+
+    at_ns: int
+    cpu_ns: int
+    bodies: tuple[int, ...]
+
+
+class Ledger:
+    """
+    Books about one run of synthetic nodes.
+
+    ``durations[dag][vertex]`` takes how long each body took (ns), ``completions[dag][vertex]`` of
+    a sink (release, completion) in ns since the epoch, ``delays[dag]`` by how much the source's
+    body started after its release.  ``misattributed`` takes (vertex name, release by the message,
+    release by the executor) where these differ, ``unattributed`` the names of vertices that ran as
+    no job.
+    """
+
+    def __init__(self, task_set: TaskSet) -> None:
+        self.task_set = task_set
+        self.durations: list[list[list[int]]] = [[[] for _ in d.vertices] for d in task_set.dags]
+        self.completions: list[list[list[tuple[int, int]]]] = [
+            [[] for _ in d.vertices] for d in task_set.dags]
+        self.delays: list[list[int]] = [[] for _ in task_set.dags]
+        self.misattributed: list[tuple[str, int, int]] = []
+        self.unattributed: list[str] = []
+        self.first_release: list[int | None] = [None for _ in task_set.dags]
+        self.clock_offset_ns = epoch_offset_ns()
+
+    def reading(self) -> Reading:
+        """Read the counters now."""
+        return Reading(
+            at_ns=time.monotonic_ns() + self.clock_offset_ns,
+            cpu_ns=time.process_time_ns(),
+            bodies=tuple(len(vertex) for dag in self.durations for vertex in dag))
+
+
+def measure(
+    ledger: Ledger, plan: ExecutionPlan, start: Reading, end: Reading
+) -> dict[str, Any]:
+    """
+    Judge what came due between two readings.
+
+    :return: the figures of ``bench live --json`` (``sink_jobs_due``, ``on_time``, …,
+        ``cpu_us_per_callback``), the window, and for each DAG and sink due, on_time, late,
+        missing and the response times (completion minus nominal release, ns) of the completed.
+    """
+    dags: dict[str, Any] = {}
+    totals = dict.fromkeys(('due', 'on_time', 'late', 'missing'), 0)
+    for dag in ledger.task_set.dags:
+        sinks = {}
+        for index in dag.sinks:
+            sink = _judge(ledger, dag, dag.vertices[index], start.at_ns, end.at_ns)
+            sinks[dag.vertices[index].name] = sink
+            for name in totals:
+                totals[name] += sink[name]
+        dags[dag.name] = {'sinks': sinks}
+    due = totals['due']
+    return {
+        'mode': plan.mode, 'seed': plan.seed, 'workers': plan.workers,
+        'utilisation': plan.utilisation, 'utilisation_taken': _taken(ledger, plan),
+        'window_start_ns': start.at_ns, 'window_ns': end.at_ns - start.at_ns,
+        'sink_jobs_due': due, 'on_time': totals['on_time'], 'late': totals['late'],
+        'missing': totals['missing'],
+        'on_time_ratio': totals['on_time'] / due if due else None,
+        **_throughput(ledger, plan, start, end),
+        'source_delay_us': _quantiles_us([d for delays in ledger.delays for d in delays]),
+        'attribution': {
+            'wrong': len(ledger.misattributed), 'none': len(ledger.unattributed)},
+        'dags': dags}
+
+
+def _judge(ledger: Ledger, dag: Dag, vertex: Vertex, start: int, end: int) -> dict[str, Any]:
+    """Return one sink's verdicts about the deadlines within ]start, end]."""
+    deadline = vertex.deadline_ns or 0
+    result: dict[str, Any] = {
+        'relative_deadline_ns': deadline, 'due': 0, 'on_time': 0, 'late': 0, 'missing': 0,
+        'response_ns': None}
+    first = ledger.first_release[dag.index]
+    if first is None:
+        return result
+    completed: dict[int, int] = {}
+    for release, completion in list(ledger.completions[dag.index][vertex.index]):
+        job = (release - first + min(_EARLY_NS, dag.period_ns // 4)) // dag.period_ns
+        completed.setdefault(job, completion)
+    first_job = max(0, (start - deadline - first) // dag.period_ns + 1)
+    last_job = (end - deadline - first) // dag.period_ns
+    responses = []
+    for job in range(first_job, last_job + 1):
+        completion_or_none = completed.get(job)
+        result['due'] += 1
+        if completion_or_none is None:
+            result['missing'] += 1
+            continue
+        response = completion_or_none - (first + job * dag.period_ns)
+        responses.append(response)
+        result['on_time' if response <= deadline else 'late'] += 1
+    if responses:
+        responses.sort()
+        result['response_ns'] = {
+            'min': responses[0], 'median': quantile(responses, 0.5),
+            'p99': quantile(responses, 0.99), 'max': responses[-1]}
+    return result
+
+
+def _throughput(
+    ledger: Ledger, plan: ExecutionPlan, start: Reading, end: Reading
+) -> dict[str, Any]:
+    counts = [after - before for before, after in zip(start.bodies, end.bodies)]
+    callbacks = sum(counts)
+    cpu = end.cpu_ns - start.cpu_ns
+    if plan.mode == 'spin':
+        times = [plan.execution_ns(v.dag, v.index) for v in ledger.task_set.vertices]
+        cpu -= sum(n * t for n, t in zip(counts, times))
+    seconds = (end.at_ns - start.at_ns) / 1e9
+    return {
+        'callbacks': callbacks,
+        'callbacks_per_s': callbacks / seconds if seconds > 0 else 0.0,
+        'cpu_us_per_callback': max(0, cpu) / 1000 / callbacks if callbacks else None}
+
+
+def _taken(ledger: Ledger, plan: ExecutionPlan) -> float:
+    """
+    Return the normalised utilisation from the mean times that the bodies really took.
+
+    What never ran counts with its planned time, so a starving executor looks no better.
+    """
+    total = 0.0
+    for vertex in ledger.task_set.vertices:
+        durations = ledger.durations[vertex.dag][vertex.index]
+        mean = sum(durations) / len(durations) if durations else plan.execution_ns(
+            vertex.dag, vertex.index)
+        total += mean / ledger.task_set.dags[vertex.dag].period_ns
+    return total / plan.workers
+
+
+def _quantiles_us(values: list[int]) -> dict[str, float] | None:
+    if not values:
+        return None
+    ordered = sorted(values)
+    return {
+        'p50': quantile(ordered, 0.5) / 1000, 'p99': quantile(ordered, 0.99) / 1000,
+        'max': ordered[-1] / 1000}

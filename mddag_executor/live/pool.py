@@ -1,0 +1,307 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The workers: a fixed pool of threads that run what the core dispatches.
+
+Theory of operation
+-------------------
+A worker that completes takes its next execution itself; an idle worker is woken directly, through
+a lock of its own (a *seat*), with the execution that it is to run.  Nobody polls and nobody wakes
+more threads than there is work for.
+
+A callback that waits inside ``Client.call`` lends its place: its seat leaves the worker, a spare
+seat takes it over, and when the callback completes its thread becomes the next spare.
+
+A coroutine that waits for a future is *suspended*: it keeps its callback group but no worker, and
+becomes ready again, under the key it had, when the future is done.
+"""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+import threading
+from time import monotonic_ns
+from typing import Any, Callable, Iterator
+
+from mddag_executor.core.state import N_IDLE
+from mddag_executor.live.attribution import PublisherState
+from mddag_executor.live.dispatcher import Dispatcher
+from mddag_executor.live.entries import UNKNOWN, Work
+from mddag_executor.live.hooks import current
+from mddag_executor.live.verdicts import NO_ORIGIN
+
+STOP = -2
+LOOK_AGAIN_S = 0.02
+
+
+class Seat:
+    """A worker thread's place: the worker it is (-1: spare), and what it is to run."""
+
+    __slots__ = ('worker', 'wake', 'x', 'work', 'thread', 'vtid', 'waits')
+
+    def __init__(self, worker: int) -> None:
+        self.worker = worker
+        self.wake = threading.Lock()
+        self.wake.acquire()
+        self.x = -1
+        self.work: Work | None = None
+        self.thread: threading.Thread | None = None
+        self.vtid = 0
+        self.waits = False
+
+
+class Running:
+    """What runs in a thread: the hooks find the executor and the job through it."""
+
+    __slots__ = ('pool', 'work', 'seat')
+
+    def __init__(self, pool: Pool, work: Work, seat: Seat) -> None:
+        self.pool = pool
+        self.work = work
+        self.seat = seat
+
+    def publish(self, send: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
+        """Publish on behalf of the running callback."""
+        self.pool.dispatcher.publish(send, publisher, msg, state, self.work, self.seat.vtid)
+
+    def waits(self) -> Any:
+        """Lend the worker's place while entered."""
+        return self.pool.lend(self)
+
+
+class Pool:
+    """
+    The worker threads of a dispatcher.
+
+    :param prepare_thread: called first in each worker thread (priority, CPU set).
+    """
+
+    def __init__(
+        self, dispatcher: Dispatcher, prepare_thread: Callable[[], None] | None = None
+    ) -> None:
+        self.dispatcher = dispatcher
+        self.running = False
+        self.lent = 0
+        self._lock = dispatcher.lock
+        self._scheduler = dispatcher.scheduler
+        self._prepare_thread = prepare_thread
+        self._closed = False
+        self._seats: list[Seat] = []
+        self._spares: list[Seat] = []
+        self._lenders: list[Seat] = []
+        self._polled: list[Work] = []
+        # entered while a callback that runs in the calling thread of spin_once waits
+        self.pump: Callable[[], AbstractContextManager[None]] = nullcontext
+        dispatcher.dispatch = self._dispatch
+
+    def start(self) -> None:
+        """Let workers run what is ready; starts their threads the first time."""
+        with self._lock:
+            for worker in range(len(self._seats), self.dispatcher.n_workers):
+                self._seats.append(self._new_seat(worker))
+            self.running = True
+            self._dispatch(self.dispatcher.core_time(self.dispatcher.now()))
+
+    def pause(self) -> None:
+        """Start nothing more; what runs goes on."""
+        with self._lock:
+            self.running = False
+
+    def close(self, timeout: float | None) -> bool:
+        """
+        End the threads; return False when a callback still ran after ``timeout`` seconds.
+
+        A callback that waits for a service is not waited for: nobody would answer it any more.
+        """
+        with self._lock:
+            self.running = False
+            seats = self._seats + self._spares + self._lenders
+            for seat in seats:
+                if not self._closed and seat.work is None:
+                    seat.x = STOP
+                    seat.wake.release()
+            self._closed = True
+        deadline = None if timeout is None else monotonic_ns() + int(timeout * 1e9)
+        done = True
+        for seat in seats:
+            if seat.thread is not threading.current_thread():
+                done = self._join(seat, deadline) and done
+        return done
+
+    @staticmethod
+    def _join(seat: Seat, deadline: int | None) -> bool:
+        assert seat.thread is not None
+        while seat.thread.is_alive() and not seat.waits:
+            left = LOOK_AGAIN_S
+            if deadline is not None:
+                left = min(left, (deadline - monotonic_ns()) / 1e9)
+                if left <= 0:
+                    return False
+            seat.thread.join(left)
+        return True
+
+    def _new_seat(self, worker: int) -> Seat:
+        seat = Seat(worker)
+        seat.thread = threading.Thread(
+            target=self._work_in, args=(seat,), daemon=True, name=f'mddag-worker-{worker}')
+        seat.thread.start()
+        return seat
+
+    def _work_in(self, seat: Seat) -> None:
+        seat.vtid = threading.get_native_id()
+        if self._prepare_thread is not None:
+            try:
+                self._prepare_thread()
+            except Exception as error:
+                self.dispatcher.fail(error)
+        while True:
+            seat.wake.acquire()
+            while seat.x >= 0:
+                self._execute(seat, True)
+            if seat.x == STOP:
+                return
+
+    def _dispatch(self, now: int) -> None:
+        """Wake idle workers for what is ready; the caller holds the lock."""
+        state = self._scheduler.state
+        while self.running and state.ready and state.scalars[N_IDLE] > 0:
+            x = self._scheduler.schedule(now)
+            self.dispatcher.decided(now)
+            if x < 0:
+                return
+            seat = self._seats[state.x_worker[x]]
+            self._assign(seat, x)
+            seat.wake.release()
+
+    def _assign(self, seat: Seat, x: int) -> None:
+        seat.work = self.dispatcher.take_work(x)
+        seat.x = x
+
+    def run_one(self) -> bool:
+        """Run one ready callback in the calling thread; False when none may run."""
+        state = self._scheduler.state
+        with self._lock:
+            if state.scalars[N_IDLE] == 0:
+                return False
+            now = self.dispatcher.core_time(self.dispatcher.now())
+            x = self._scheduler.take(state.worker_x.index(-1), now)
+            self.dispatcher.decided(now)
+            if x < 0:
+                return False
+            seat = Seat(state.x_worker[x])
+            self._assign(seat, x)
+        seat.vtid = threading.get_native_id()
+        self._execute(seat, False)
+        return True
+
+    def _execute(self, seat: Seat, more: bool) -> None:
+        """Run the seat's execution until it ends or waits; leave the next one in the seat."""
+        dispatcher = self.dispatcher
+        work = seat.work
+        assert work is not None
+        previous = current.running
+        current.running = Running(self, work, seat)
+        waits_for: Any = None
+        start = monotonic_ns() + dispatcher.clock_offset
+        try:
+            waits_for = work.step()
+        except BaseException as error:
+            dispatcher.fail(error)
+        end = monotonic_ns() + dispatcher.clock_offset
+        current.running = previous
+        if dispatcher.record is not None:
+            self._record(work, seat, start, end)
+        with self._lock:
+            now = dispatcher.core_time(end)
+            work.entry.busy_ns += end - start
+            if waits_for is None:
+                dispatcher.complete(work, end, now, seat.vtid)
+            else:
+                dispatcher.suspend(work)
+            self._next(seat, more, now)
+        if waits_for is not None:
+            self._resume_when_done(work, waits_for)
+        dispatcher.verdicts.tell()
+
+    def _next(self, seat: Seat, more: bool, now: int) -> None:
+        """Leave the next execution in the seat; wake others for the rest."""
+        seat.x = -1
+        seat.work = None
+        if self._closed:
+            seat.x = STOP
+        elif more and seat.worker < 0:
+            self._lenders.remove(seat)
+            self._spares.append(seat)
+        elif more and self.running:
+            x = self._scheduler.take(seat.worker, now)
+            self.dispatcher.decided(now)
+            if x >= 0:
+                self._assign(seat, x)
+        self._dispatch(now)
+
+    def _record(self, work: Work, seat: Seat, start: int, end: int) -> None:
+        record = self.dispatcher.record
+        assert record is not None
+        _, dag, job, vertex = work.origin or NO_ORIGIN
+        address = work.entry.address
+        record(
+            'dispatch', start, seat.vtid, address, dag,
+            self.dispatcher.tables.index_in_dag[vertex] if dag >= 0 else -1, job, seat.worker,
+            work.ready_ns, work.reference_deadline)
+        record('callback_start', start, seat.vtid, address, False)
+        record('callback_end', end, seat.vtid, address)
+
+    # --- waiting ---------------------------------------------------------------------------------
+
+    def _resume_when_done(self, work: Work, waits_for: Any) -> None:
+        if waits_for is UNKNOWN or not hasattr(waits_for, 'add_done_callback'):
+            with self._lock:
+                self._polled.append(work)
+        else:
+            waits_for.add_done_callback(lambda _: self.dispatcher.resume(work))
+
+    def resume_polled(self) -> bool:
+        """Let coroutines look again that wait for something unknown; False: there are none."""
+        if not self._polled:
+            return False
+        with self._lock:
+            polled, self._polled = self._polled, []
+        for work in polled:
+            self.dispatcher.resume(work)
+        return True
+
+    @contextmanager
+    def lend(self, running: Running) -> Iterator[None]:
+        """Lend the place of a running callback's worker to a spare thread."""
+        seat = running.seat
+        if seat.worker < 0:  # it has lent its place already
+            yield
+            return
+        with self._lock:
+            worker, seat.worker = seat.worker, -1
+            self._scheduler.lend(running.work.x)
+            self.lent += 1
+            if seat.thread is not None:
+                self._lenders.append(seat)
+                spare = self._spares.pop() if self._spares else self._new_seat(worker)
+                spare.worker = worker
+                self._seats[worker] = spare
+            self._dispatch(self.dispatcher.core_time(self.dispatcher.now()))
+        seat.waits = True
+        try:
+            with nullcontext() if seat.thread is not None else self.pump():
+                yield
+        finally:
+            seat.waits = False

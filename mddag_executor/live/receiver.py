@@ -1,0 +1,132 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the intake hands over becomes work for the dispatcher."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Callable
+
+from mddag_executor.live.attribution import Origin
+from mddag_executor.live.dispatcher import Dispatcher
+from mddag_executor.live.entries import Entry, Work
+from mddag_executor.live.recorder import Recorder
+from mddag_executor.live.registry import Registry
+from msg_graph import TaskSet
+from rclpy.subscription import Subscription
+
+WITH_INFO = Subscription.CallbackType.WithMessageInfo
+
+
+class Receiver:
+    """
+    The intake's receiver: runs in its threads, and never blocks for long.
+
+    A client's response is passed on at once, here: it only completes a future, and a callback
+    that waits for it may hold the last worker.
+    """
+
+    def __init__(
+        self, dispatcher: Dispatcher, registry: Registry, task_set: TaskSet | None,
+        executor: Any, fail: Callable[[BaseException], None], recorder: Recorder | None,
+    ) -> None:
+        self._dispatcher = dispatcher
+        self._registry = registry
+        self._release_from = [d.release_from for d in task_set.dags] if task_set else []
+        self._executor = executor
+        self._fail = fail
+        self._recorder = recorder
+
+    def on_timer(self, timer: Any, due_ns: int) -> None:
+        """Take in a timer; ``due_ns`` is its nominal due time on the monotonic clock."""
+        entry = self._registry[timer]
+        if entry is not None:
+            self._dispatcher.timer_due(
+                entry, Work(entry, timer.callback, ()), due_ns + self._dispatcher.clock_offset)
+
+    def on_message(self, subscription: Any, message: Any, info: dict[str, Any]) -> None:
+        """Take in a message with its info."""
+        entry = self._registry[subscription]
+        if entry is None:
+            return
+        args = (message, info) if subscription._callback_type is WITH_INFO else (message,)
+        work = Work(entry, subscription.callback, args)
+        origin: Origin | None = None
+        release: int | None = None
+        if entry.source >= 0:
+            release = self._release(entry, message, info)
+        elif entry.targets:
+            origin = self._dispatcher.attribution.find(
+                entry.topic, info['source_timestamp'], info.get('publication_sequence_number'))
+        if self._recorder is not None:
+            self._recorder.taken(entry, message, info['source_timestamp'])
+        self._dispatcher.message(entry, work, origin, release)
+
+    def _release(self, entry: Entry, message: Any, info: dict[str, Any]) -> int:
+        """Return the release of the job that a source's message starts, on the trace's clock."""
+        now = self._dispatcher.now()
+        kind = self._release_from[self._dispatcher.tables.dag_of[entry.source]]
+        if kind == 'arrival':
+            return now
+        if kind == 'source_timestamp':
+            stamp = info['source_timestamp']
+        else:
+            header = getattr(message, 'header', message)
+            stamp = getattr(header, 'stamp', None)
+            if stamp is None:
+                return now  # a raw or headerless message: all that is known is its arrival
+            stamp = stamp.sec * 1_000_000_000 + stamp.nanosec
+        return int(stamp) + now - time.time_ns()  # from system time to the steady clock
+
+    def on_request(self, service: Any, request: Any, header: Any) -> None:
+        """Take in a service request."""
+        entry = self._registry[service]
+        if entry is None:
+            return
+        work = Work(
+            entry, service.callback, (request, service.srv_type.Response()),
+            lambda response: service.send_response(response, header))
+        if entry.source >= 0:
+            self._dispatcher.message(entry, work, None, self._dispatcher.now())
+        else:
+            self._dispatcher.undeclared_ready(entry, work)
+
+    def on_response(self, client: Any, sequence: int, header: Any, response: Any) -> None:
+        """Pass a service's response on to the future that waits for it."""
+        try:
+            future = client.get_pending_request(sequence)
+        except KeyError:
+            return  # the request was cancelled
+        future._set_executor(self._executor)
+        future.set_result(response)
+
+    def on_guard(self, guard: Any) -> None:
+        """Take in a guard condition that was triggered."""
+        entry = self._registry[guard]
+        if entry is not None and guard.callback is not None:
+            self._dispatcher.undeclared_ready(entry, Work(entry, guard.callback, ()))
+
+    def on_waitable(self, waitable: Any, data: Any) -> None:
+        """Take in what a waitable has taken."""
+        entry = self._registry[waitable]
+        if entry is None:
+            return
+        for future in waitable._futures:
+            future._set_executor(self._executor)
+        self._dispatcher.undeclared_ready(entry, Work(entry, waitable.execute, (data,)))
+
+    def on_intake_error(self, error: BaseException) -> None:
+        """Take an error of the intake: it comes out of spin."""
+        self._fail(error)

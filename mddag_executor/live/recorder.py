@@ -1,0 +1,115 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the executor writes into a trace besides its hot path: who is who, and what was taken."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any, Iterable
+
+from mddag_executor.live.entries import Entry, SERVICE, SUBSCRIPTION, TIMER
+from mddag_executor.trace import TraceWriter
+from msg_graph import TaskSet
+from rclpy.utilities import get_rmw_implementation_identifier
+
+
+def _symbol(callback: Any) -> str:
+    """Return a name for a callback, as CARET's ``rclcpp_callback_register`` has it."""
+    module = getattr(callback, '__module__', None) or '?'
+    name = getattr(callback, '__qualname__', None) or type(callback).__qualname__
+    return f'{module}.{name}'
+
+
+class Recorder:
+    """
+    The trace of one executor.
+
+    Addresses are those of Python objects: the node, the entity, and, for callbacks, the entry.
+
+    :raises mddag_executor.trace.TraceError: when the file can not be written.
+    """
+
+    def __init__(
+        self, path: str, task_set: TaskSet | None, policy: str, workers: int,
+        default_deadline: int, max_active_jobs: int, clock_offset: int,
+    ) -> None:
+        self.writer = TraceWriter(path, clock_offset=clock_offset)
+        self.record = self.writer.record
+        self.path = path
+        self._clock_offset = clock_offset
+        self._known: set[int] = set()
+        self._say('caret_init', clock_offset, 'jazzy')
+        self._say('rmw_implementation', get_rmw_implementation_identifier())
+        self._say('construct_executor', id(self), 'multi_deadline_executor')
+        self._say(
+            'task_set', task_set.text if task_set else '', task_set.file if task_set else '',
+            policy, workers, default_deadline, max_active_jobs, False)
+
+    def _say(self, event: str, *fields: Any) -> None:
+        now = time.monotonic_ns() + self._clock_offset
+        self.record(event, now, threading.get_native_id(), *fields)
+
+    def entities(self, nodes: Iterable[Any], added: list[Entry]) -> None:
+        """Record new nodes, publishers and entities (CARET's initialization tracepoints)."""
+        by_name: dict[str, int] = {}
+        for node in nodes:
+            address = id(node)
+            by_name[node.get_fully_qualified_name()] = address
+            if address not in self._known:
+                self._known.add(address)
+                self._say(
+                    'rcl_node_init', address, address, node.get_name(), node.get_namespace())
+            for publisher in node.publishers:
+                if id(publisher) not in self._known:
+                    self._known.add(id(publisher))
+                    self._say(
+                        'rcl_publisher_init', id(publisher), address, id(publisher),
+                        publisher.topic_name, publisher.qos_profile.depth)
+        for entry in added:
+            self._entity(entry, by_name.get(entry.node, 0))
+
+    def _entity(self, entry: Entry, node: int) -> None:
+        entity = id(entry.entity)
+        if entry.kind == TIMER:
+            self._say('rcl_timer_init', entity, entry.entity.timer_period_ns)
+            self._say('rclcpp_timer_callback_added', entity, entry.address)
+            self._say('rclcpp_timer_link_node', entity, node)
+        elif entry.kind == SUBSCRIPTION:
+            self._say('rcl_subscription_init', entity, node, entity, entry.label, entry.depth)
+            self._say('rclcpp_subscription_init', entity, entity)
+            self._say('rclcpp_subscription_callback_added', entity, entry.address)
+        elif entry.kind == SERVICE:
+            self._say('rcl_service_init', entity, node, entity, entry.label)
+            self._say('rclcpp_service_callback_added', entity, entry.address)
+        else:
+            return
+        self._say('rclcpp_callback_register', entry.address, _symbol(entry.entity.callback))
+        group = getattr(entry.entity, 'callback_group', None)
+        if group is not None and id(group) not in self._known:
+            self._known.add(id(group))
+            kind = 'reentrant' if entry.group < 0 else 'mutually_exclusive'
+            self._say('add_callback_group', id(self), id(group), kind)
+        if group is not None:
+            self._say(f'callback_group_add_{entry.kind}', id(group), entity)
+
+    def taken(self, entry: Entry, message: Any, source_timestamp: int) -> None:
+        """Record that a message was taken."""
+        self._say('rmw_take', id(entry.entity), id(message), source_timestamp, True)
+
+    def close(self, end: int) -> None:
+        """Record the run's end (trace's clock) and complete the file."""
+        self.record('shutdown', end, threading.get_native_id(), end)
+        self.writer.close()

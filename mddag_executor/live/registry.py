@@ -1,0 +1,133 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which entities there are: an entry for each, its declared callback, its place in a trace."""
+
+from __future__ import annotations
+
+from typing import Any, Iterable
+import weakref
+
+from mddag_executor.core import Scheduler, Tables
+from mddag_executor.live.entries import (
+    CLIENT, Entry, GUARD, link, SERVICE, SUBSCRIPTION, TIMER, WAITABLE)
+from msg_graph import Callback, TaskSet
+from msg_graph.binding import Binder
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.qos import HistoryPolicy
+
+KINDS = (
+    ('timers', TIMER), ('subscriptions', SUBSCRIPTION), ('services', SERVICE),
+    ('clients', CLIENT), ('guards', GUARD), ('waitables', WAITABLE))
+
+
+def source_depth(period_ns: int, deadline_ns: int) -> int:
+    """Return how many releases of a timer source may wait: as many as can still be in time."""
+    return max(1, -(-deadline_ns // period_ns))
+
+
+class Registry:
+    """
+    The entries of all entities of the executor's nodes.
+
+    Not thread-safe: the executor refreshes it under a lock of its own, and other threads only
+    look entities up.
+    """
+
+    def __init__(self, task_set: TaskSet | None, tables: Tables, scheduler: Scheduler) -> None:
+        self._task_set = task_set
+        self._tables = tables
+        self._scheduler = scheduler
+        self._binder = Binder(task_set) if task_set is not None else None
+        self._groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
+        self._entries: dict[int, Entry] = {}
+        # every entry there has been, those of destroyed entities included: for the counts
+        self.known: list[Entry] = []
+
+    def __getitem__(self, entity: Any) -> Entry | None:
+        """Return the entry of an entity, None for one that is not (or no longer) known."""
+        return self._entries.get(id(entity))
+
+    def unbound(self) -> list[Callback]:
+        """Return the declared callbacks that no entity has been found for."""
+        return list(self._binder.unbound()) if self._binder is not None else []
+
+    def refresh(self, nodes: Iterable[Any]) -> tuple[list[Entry], list[Entry]]:
+        """
+        Look which entities the nodes have now.
+
+        :return: entries that are new, and those whose entity is gone.
+        """
+        present: dict[int, Entry] = {}
+        added: list[Entry] = []
+        for node in nodes:
+            name = node.get_fully_qualified_name()
+            for attribute, kind in KINDS:
+                for entity in getattr(node, attribute):
+                    entry = self._entries.get(id(entity))
+                    if entry is None or entry.entity is not entity:
+                        entry = self._new_entry(kind, entity, name)
+                        if entry is None:
+                            continue
+                        added.append(entry)
+                        self.known.append(entry)
+                    present[id(entity)] = entry
+        gone = [e for key, e in self._entries.items() if present.get(key) is not e]
+        for entry in gone:
+            self._unbind(entry)
+        self._entries = present
+        return added, gone
+
+    def _new_entry(self, kind: str, entity: Any, node: str) -> Entry | None:
+        callback, topic, depth, label = None, '', 0, kind
+        try:
+            if kind == TIMER:
+                period = entity.timer_period_ns
+                depth, label = 1, f'timer {period} ns'
+                callback = self._binder.bind_timer(node, period) if self._binder else None
+            elif kind == SUBSCRIPTION:
+                topic = label = entity.topic_name
+                qos = entity.qos_profile
+                depth = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else 0
+                callback = self._binder.bind_subscription(node, topic) if self._binder else None
+            elif kind == SERVICE:
+                label = entity.service_name if hasattr(entity, 'service_name') else entity.srv_name
+                callback = self._binder.bind_service(node, label) if self._binder else None
+        except Exception as error:
+            if type(error).__name__ == 'InvalidHandle':
+                return None  # destroyed between being listed and looked at
+            raise
+        entry = Entry(kind, entity, node, callback, self._group(entity), depth, label)
+        if callback is not None:
+            assert self._task_set is not None
+            link(entry, self._task_set, self._tables, topic)
+            if kind == TIMER and entry.source >= 0:
+                dag = self._tables.dag_of[entry.source]
+                entry.depth = source_depth(
+                    self._tables.period[dag], self._tables.dag_deadline[dag])
+        return entry
+
+    def _group(self, entity: Any) -> int:
+        """Return the core's number of an entity's callback group, -1 for a reentrant one."""
+        group = getattr(entity, 'callback_group', None)
+        if group is None or isinstance(group, ReentrantCallbackGroup):
+            return -1
+        number = self._groups.get(group)
+        if number is None:
+            number = self._groups[group] = self._scheduler.new_group()
+        return number
+
+    def _unbind(self, entry: Entry) -> None:
+        if self._binder is not None and entry.callback is not None:
+            self._binder.release(entry.callback, entry.topic or None)

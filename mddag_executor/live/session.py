@@ -1,0 +1,166 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+One run of an executor, from the start of its nodes to a clean end.
+
+Theory of operation
+-------------------
+The executor spins in a thread of its own; the thread that made the ``Session`` only waits, so
+that Python delivers signals to it at once whatever the executor does.  Everything that can end a
+run (time, a signal, an exception of a callback, the end of the programs) sets one event.
+
+A synthetic run has these steps: wait until publishers and subscriptions have met, start all timers
+and sensors together, let ``WARM_UP_S`` pass, read the counters, wait for the measured window, read
+them again, release nothing more, and shut the executor down.  Only then the figures are made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import threading
+import time
+from typing import Any
+
+from mddag_executor.errors import MddagError
+from mddag_executor.live.measure import measure, Reading
+from mddag_executor.live.synthetic import SyntheticWorkload
+from rclpy.executors import Executor, ExternalShutdownException
+
+WARM_UP_S = 1.0
+END_TIMEOUT_S = 0.5
+MATCH_TIMEOUT_S = 30.0
+
+Tick = Callable[[float], None]
+"""Told now and then for how many seconds the run has been going on."""
+
+
+class SessionError(MddagError):
+    """A run that can not begin."""
+
+
+class Session:
+    """
+    Spins an executor in a thread; a context manager.
+
+    :param executor: any rclpy executor, its nodes added or not.
+    :param spin: what spins it, if that isn't ``executor.spin``.
+    """
+
+    def __init__(self, executor: Executor, spin: Callable[[], None] | None = None) -> None:
+        self.executor = executor
+        self.error: BaseException | None = None
+        self.clean = True
+        self._stop = threading.Event()
+        self._spin = executor.spin if spin is None else spin
+        self._thread = threading.Thread(target=self._run, name='mddag-spin', daemon=True)
+
+    def __enter__(self) -> Session:
+        """Begin to spin."""
+        self._thread.start()
+        return self
+
+    def __exit__(self, *args: object) -> None:
+        """Shut the executor down."""
+        self.end()
+
+    def _run(self) -> None:
+        try:
+            self._spin()
+        except ExternalShutdownException:
+            pass  # somebody shut the context down: that ends a run, too
+        except BaseException as error:
+            self.error = error
+        finally:
+            self._stop.set()
+
+    def stop(self) -> None:
+        """Let the run end; from any thread, also from a signal's handler."""
+        self._stop.set()
+
+    @property
+    def stopped(self) -> bool:
+        """Tell whether the run is to end."""
+        return self._stop.is_set()
+
+    def wait(self, seconds: float | None, tick: Tick | None = None) -> bool:
+        """Wait, for ever with None; return whether the run is to end."""
+        begin = time.monotonic()
+        while True:
+            passed = time.monotonic() - begin
+            left = 0.5 if seconds is None else min(0.5, seconds - passed)
+            if left <= 0 or self._stop.wait(left):
+                return self._stop.is_set()
+            if tick is not None:
+                tick(time.monotonic() - begin)
+
+    def end(self) -> None:
+        """
+        Shut the executor down; later calls change nothing.
+
+        ``clean`` tells whether all callbacks ended within ``END_TIMEOUT_S``.
+        """
+        if self._thread.is_alive() or not self._stop.is_set():
+            self._stop.set()
+            self.clean = self.executor.shutdown(END_TIMEOUT_S) is not False
+            self._thread.join(END_TIMEOUT_S)
+            self.clean = self.clean and not self._thread.is_alive()
+        else:
+            self.clean = self.executor.shutdown(END_TIMEOUT_S) is not False and self.clean
+
+
+def run_synthetic(
+    session: Session,
+    workload: SyntheticWorkload,
+    duration_s: float | None,
+    tick: Tick | None = None,
+    warm_up_s: float = WARM_UP_S,
+) -> dict[str, Any] | None:
+    """
+    Run a synthetic workload in a session that spins already, and end the session.
+
+    :param duration_s: length of the measured window, which begins ``warm_up_s`` after the timers;
+        None: until the session is stopped.
+    :return: the figures of ``measure``; None when the run was stopped before the window began.
+    :raises SessionError: when publishers and subscriptions don't find each other.
+    """
+    window: tuple[Reading, Reading] | None = None
+    try:
+        _wait_until_matched(session, workload)
+        if not session.stopped:
+            workload.start(session.executor.wake)
+            if not session.wait(warm_up_s):
+                start = workload.ledger.reading()
+                session.wait(duration_s, tick)
+                window = start, workload.ledger.reading()
+    finally:
+        workload.stop()
+        session.end()
+    if window is None:
+        return None
+    result = measure(workload.ledger, workload.plan, *window)
+    result['warm_up_ns'] = round(warm_up_s * 1e9)
+    result['incomplete_joins_dropped'] = workload.evicted_joins
+    return result
+
+
+def _wait_until_matched(session: Session, workload: SyntheticWorkload) -> None:
+    end = time.monotonic() + MATCH_TIMEOUT_S
+    while unmatched := workload.unmatched():
+        if session.wait(0.02):
+            return
+        if time.monotonic() > end:
+            raise SessionError(
+                f'{unmatched[0]}: publishers and subscriptions of {len(unmatched)} topics have '
+                f'not met within {MATCH_TIMEOUT_S:.0f} s: check ROS_DOMAIN_ID and the network')

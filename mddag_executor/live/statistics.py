@@ -1,0 +1,65 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A snapshot of what an executor has done: plain dictionaries, as ``--json`` has them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mddag_executor.live.dispatcher import Dispatcher
+from mddag_executor.live.pool import Pool
+from mddag_executor.live.recorder import Recorder
+from mddag_executor.live.registry import Registry
+
+
+def snapshot(
+    dispatcher: Dispatcher, pool: Pool, registry: Registry, recorder: Recorder | None
+) -> dict[str, Any]:
+    """
+    Return the counts of a run.
+
+    ``dags``, ``deadline_missed`` and ``first_miss`` are as in ``replay --json``.  ``callbacks``
+    has for each entity what became ready, ran, waits, was dropped (QoS depth, destroyed, aborted)
+    or skipped (timers), and its busy time in ns.  ``unattributed`` counts messages of declared
+    callbacks whose publication was not found; they ran as undeclared ones.
+    """
+    with dispatcher.lock:
+        result = dispatcher.verdicts.tally.result()
+        waiting = dispatcher.scheduler.queue_length
+        idle = dispatcher.scheduler.idle_workers
+        undeclared = dispatcher.undeclared
+    callbacks: dict[str, dict[str, Any]] = {}
+    for entry in registry.known:
+        if entry.callback is None and not entry.ready + entry.skipped + entry.dropped:
+            continue  # the many services and events of every node that nobody uses
+        name = entry.callback.key if entry.callback is not None else f'{entry.node}:{entry.label}'
+        counts = callbacks.setdefault(name, {
+            'kind': entry.kind, 'declared': entry.callback is not None, 'ready': 0, 'ran': 0,
+            'waiting': 0, 'dropped': 0, 'skipped': 0, 'unattributed': 0, 'busy_ns': 0})
+        for key in ('ready', 'ran', 'dropped', 'skipped', 'unattributed', 'busy_ns'):
+            counts[key] += getattr(entry, key)
+        counts['waiting'] += len(entry.waiting)
+    return {
+        'policy': dispatcher.scheduler.policy.name, 'workers': dispatcher.n_workers,
+        **result, 'callbacks': callbacks, 'undeclared': undeclared,
+        'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
+        'queue': waiting, 'idle_workers': idle, 'lent': pool.lent,
+        'unattributed': {
+            'unknown': dispatcher.attribution.unknown,
+            'doubtful': dispatcher.attribution.doubtful},
+        'never_ran': [c.key for c in registry.unbound()],
+        'trace': None if recorder is None else {
+            'path': recorder.path, 'lost': recorder.writer.dropped},
+    }

@@ -1,0 +1,356 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Real rclpy nodes made from a declaration.
+
+Theory of operation
+-------------------
+One rclpy node for each declared node, with exactly the declared callbacks and publishers.  A
+callback executes for its planned time and then publishes on all of its topics, over the middleware
+like any node.
+
+Every message is a ``std_msgs/Header``.  Its stamp is the *release* of the job, passed on
+unchanged from the source to the sinks, and its ``frame_id`` is ``DAG#INDEX``: the DAG and the
+local index of the vertex that published it.  So a callback that several publishers start (OR)
+knows which of its vertices it runs as.  A sync callback (AND) has one subscription for each topic;
+it executes in the leg that brings the last of the messages with equal stamps.  Incomplete joins
+are kept for the last ``JOIN_LIMIT`` jobs, then dropped and counted.
+
+A source takes its release from the executor (``current_job``) when ours runs it.  Under another
+executor it is the nominal due time of the timer: rcl keeps timers on an exact grid, start plus n
+periods, and leaves out what it missed, so the release that a call stands for is the next due time
+that the timer named at the call before.  A late call does not make a release later.
+
+Sources that are no timers get a stand-in sensor: one thread (node ``/mddag_sensors``, with
+publishers and clients only, given to no executor, so it takes no worker) publishes on their topics
+or calls their services at the nominal releases.  A service's request is a
+``rcl_interfaces/ListParameters``, whose ``depth`` carries the release (ns) as a stamp would.
+
+Queue edges (``reads:``) start nothing and are not subscribed to.  QoS is reliable, keep last 10:
+deep enough that nothing is lost unless a callback falls ten periods behind.  Callbacks without a
+declared group may overlap themselves (one ``ReentrantCallbackGroup`` for each node), as jobs do in
+the paper; each declared group is a ``MutuallyExclusiveCallbackGroup`` of its node.  The nodes have
+no parameter services and no rosout publisher, so that a hundred of them start within a second.
+
+All timers are started together, only when every publisher has met its subscribers, so that no
+release is lost to discovery; the DAGs' first releases are one period after that instant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import threading
+import time
+
+from mddag_executor.live.bodies import (
+    CurrentJob,
+    Grid,
+    Join,
+    no_job,
+    plain_callback,
+    Role,
+    SENSOR,
+    stamped,
+    sync_callback,
+)
+from mddag_executor.live.execution import emulator, ExecutionPlan
+from mddag_executor.live.measure import Ledger
+from msg_graph import Callback, TaskSet, Vertex
+from rcl_interfaces.srv import ListParameters
+from rclpy.callback_groups import (
+    CallbackGroup,
+    MutuallyExclusiveCallbackGroup,
+    ReentrantCallbackGroup,
+)
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.timer import Timer
+from std_msgs.msg import Header
+
+QOS = QoSProfile(
+    reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=10)
+SENSORS_NODE = '/mddag_sensors'
+_LEAD_NS = 20_000_000
+
+
+@dataclass
+class Sensor:
+    """Stand-in for what starts DAGs whose source is no timer, and what sends a release."""
+
+    dags: list[int]
+    period_ns: int
+    send: Callable[[int], None]
+
+
+class SyntheticWorkload:
+    """
+    The nodes of a declaration, their timers and stand-in sensors, and the books about them.
+
+    Use: add ``nodes`` to an executor, let it spin, ``wait_until_matched``, ``start``, measure with
+    ``ledger``, ``stop``, shut the executor down, ``destroy``.
+
+    :param task_set: the declaration.
+    :param plan: how long each vertex executes.
+    :param current_job: ``mddag_executor.live.current_job`` under our executor; leave it out under
+        others.
+    :param context: where the nodes belong to; None is rclpy's default context.
+    """
+
+    def __init__(
+        self, task_set: TaskSet, plan: ExecutionPlan, *, current_job: CurrentJob = no_job,
+        context: Context | None = None,
+    ) -> None:
+        self.task_set = task_set
+        self.plan = plan
+        self.ledger = Ledger(task_set)
+        self.joins: list[Join] = []
+        self._current_job = current_job
+        self._context = context
+        self._emulate = emulator(plan.mode)
+        # Timers on the steady clock: steps of the system's clock move no release.
+        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._nodes: dict[str, Node] = {}
+        self._sensor_node: Node | None = None
+        self._publishers: dict[tuple[str, str], Publisher] = {}
+        self._n_subscribers: dict[str, int] = {}
+        self._groups: dict[tuple[str, str], CallbackGroup] = {}
+        self._timers: list[tuple[int, Timer]] = []
+        self._grids: dict[int, Grid] = {}
+        self._sensors: dict[tuple[str, ...], Sensor] = {}
+        self._sensor_thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        self._build()
+
+    @property
+    def nodes(self) -> list[Node]:
+        """The nodes that an executor is to run."""
+        return list(self._nodes.values())
+
+    @property
+    def evicted_joins(self) -> int:
+        """How many joins were dropped incomplete."""
+        return sum(join.evicted for join in self.joins)
+
+    def unmatched(self) -> list[str]:
+        """Return the topics whose publishers and subscriptions have not all met yet."""
+        n_publishers: dict[str, int] = {}
+        found = set()
+        for (_, topic), publisher in self._publishers.items():
+            n_publishers[topic] = n_publishers.get(topic, 0) + 1
+            if publisher.get_subscription_count() < self._n_subscribers.get(topic, 0):
+                found.add(topic)
+        for node in self._nodes.values():
+            for subscription in node.subscriptions:
+                wanted = n_publishers.get(subscription.topic_name, 0)
+                if subscription.get_publisher_count() < wanted:
+                    found.add(subscription.topic_name)
+        return sorted(found)
+
+    def wait_until_matched(self, timeout_s: float = 30.0) -> list[str]:
+        """Wait until no topic is unmatched; return those that still are after the time-out."""
+        end = time.monotonic() + timeout_s
+        while True:
+            unmatched = self.unmatched()
+            if not unmatched or time.monotonic() > end or self._stop.wait(0.02):
+                return unmatched
+
+    def start(self, wake: Callable[[], None]) -> None:
+        """
+        Start all timers and sensors together.
+
+        :param wake: wakes the executor: a wait set that waits already doesn't see a timer start.
+        """
+        first = self.ledger.first_release
+        for dag, timer in self._timers:
+            timer.reset()
+            self._grids[dag] = Grid(timer, self.ledger.clock_offset_ns)
+            first[dag] = self._grids[dag].first_release
+        wake()
+        if self._sensors:
+            now = time.monotonic_ns() + self.ledger.clock_offset_ns
+            for sensor in self._sensors.values():
+                for dag in sensor.dags:
+                    first[dag] = now + _LEAD_NS + sensor.period_ns
+            self._sensor_thread = threading.Thread(
+                target=self._run_sensors, name='mddag_sensors', daemon=True)
+            self._sensor_thread.start()
+
+    def stop(self) -> None:
+        """Release no more jobs."""
+        self._stop.set()
+        for _, timer in self._timers:
+            timer.cancel()
+        if self._sensor_thread is not None:
+            self._sensor_thread.join()
+
+    def destroy(self) -> None:
+        """Destroy the nodes."""
+        for node in (*self._nodes.values(), self._sensor_node):
+            if node is not None:
+                node.destroy_node()
+
+    def _run_sensors(self) -> None:
+        sensors = list(self._sensors.values())
+        first = self.ledger.first_release
+        due = [(first[sensor.dags[0]] or 0, i) for i, sensor in enumerate(sensors)]
+        while True:
+            release, index = min(due)
+            left = release - self.ledger.clock_offset_ns - time.monotonic_ns()
+            if self._stop.wait(max(0, left) / 1e9):
+                return
+            sensors[index].send(release)
+            due[index] = (release + sensors[index].period_ns, index)
+
+    def _build(self) -> None:
+        vertices: dict[str, list[Vertex]] = {}
+        for vertex in self.task_set.vertices:
+            vertices.setdefault(vertex.callback.key, []).append(vertex)
+        for callback in self.task_set.callbacks:
+            node = self._nodes.get(callback.node)
+            if node is None:
+                node = self._nodes[callback.node] = self._make_node(callback.node)
+            publishers = [self._publisher(node, topic) for topic in callback.publishes]
+            roles = [self._role(v, publishers) for v in vertices.get(callback.key, ())]
+            if callback.kind == 'timer':
+                self._add_timer(node, callback, roles[0])
+            elif callback.kind == 'service':
+                self._add_service(node, callback, roles[0])
+            else:
+                self._add_subscriptions(node, callback, roles)
+
+    def _make_node(self, full_name: str) -> Node:
+        namespace, _, name = full_name.rpartition('/')
+        return Node(
+            name, namespace=namespace or '/', context=self._context, enable_rosout=False,
+            start_parameter_services=False)
+
+    def _publisher(self, node: Node, topic: str) -> Publisher:
+        # Callbacks of a node that publish the same topic share the publisher, as members do.
+        key = (node.get_fully_qualified_name(), topic)
+        if key not in self._publishers:
+            self._publishers[key] = node.create_publisher(Header, topic, QOS)
+        return self._publishers[key]
+
+    def _group(self, callback: Callback) -> CallbackGroup:
+        key = (callback.node, callback.group or '')
+        if key not in self._groups:
+            kind = MutuallyExclusiveCallbackGroup if callback.group else ReentrantCallbackGroup
+            self._groups[key] = kind()
+        return self._groups[key]
+
+    def _role(self, vertex: Vertex, publishers: list[Publisher]) -> Role:
+        name = self.task_set.dags[vertex.dag].name
+        senders = [f'{name}#{index}' for index in vertex.predecessors]
+        completions = self.ledger.completions[vertex.dag][vertex.index]
+        return Role(
+            vertex=vertex, sender=f'{name}#{vertex.index}',
+            senders=senders or [SENSOR + topic for topic in vertex.callback.topics],
+            execution_ns=self.plan.execution_ns(vertex.dag, vertex.index),
+            publishers=publishers, emulate=self._emulate,
+            durations=self.ledger.durations[vertex.dag][vertex.index],
+            completions=completions if vertex.deadline_ns is not None else None,
+            clock_offset_ns=self.ledger.clock_offset_ns)
+
+    def _add_timer(self, node: Node, callback: Callback, role: Role) -> None:
+        dag = role.vertex.dag
+        grids, current_job, offset = self._grids, self._current_job, role.clock_offset_ns
+        delays = self.ledger.delays[dag]
+
+        def on_timer() -> None:
+            start = time.monotonic_ns() + offset
+            job = current_job()
+            release = grids[dag].release() if job is None else job.release_ns
+            delays.append(start - release)
+            role.execute(stamped(release), release)
+
+        timer = node.create_timer(
+            (callback.timer_period_ns or 0) / 1e9, on_timer, callback_group=self._group(callback),
+            clock=self._clock, autostart=False)
+        # Once more, exactly: seconds as a float may lose a nanosecond.
+        timer.timer_period_ns = callback.timer_period_ns or 0
+        self._timers.append((dag, timer))
+
+    def _add_service(self, node: Node, callback: Callback, role: Role) -> None:
+        current_job = self._current_job
+
+        def on_request(
+            request: ListParameters.Request, response: ListParameters.Response
+        ) -> ListParameters.Response:
+            job = current_job()
+            release = request.depth if job is None else job.release_ns
+            role.execute(stamped(release), release)
+            return response
+
+        name = callback.service or ''
+        node.create_service(
+            ListParameters, name, on_request, callback_group=self._group(callback))
+        client = self._sensors_node().create_client(ListParameters, name)
+
+        def send(release: int) -> None:
+            future = client.call_async(ListParameters.Request(depth=release))
+            client.remove_pending_request(future)  # nobody waits for the answer
+
+        self._add_sensor(callback, role, send)
+
+    def _add_subscriptions(self, node: Node, callback: Callback, roles: list[Role]) -> None:
+        if callback.kind == 'sync':
+            joins = [Join(role) for role in roles]
+            self.joins.extend(joins)
+            on_message = sync_callback(joins, self.ledger, self._current_job)
+        else:
+            on_message = plain_callback(roles, self.ledger, self._current_job)
+        for topic in callback.topics:
+            self._n_subscribers[topic] = self._n_subscribers.get(topic, 0) + 1
+            node.create_subscription(
+                Header, topic, on_message, QOS, callback_group=self._group(callback))
+        for role in roles:
+            if not role.vertex.predecessors:
+                self._add_topic_sensor(callback, role)
+
+    def _add_topic_sensor(self, callback: Callback, role: Role) -> None:
+        publishers = [(t, self._publisher(self._sensors_node(), t)) for t in callback.topics]
+
+        def send(release: int) -> None:
+            for topic, publisher in publishers:
+                publisher.publish(stamped(release, SENSOR + topic))
+
+        self._add_sensor(callback, role, send)
+
+    def _add_sensor(self, callback: Callback, role: Role, send: Callable[[int], None]) -> None:
+        # One message on a topic releases all DAGs that wait for it.  (Of two periods the shorter
+        # one sets the pace.)
+        key = callback.topics or (callback.service or '',)
+        period = callback.period_ns or 0
+        sensor = self._sensors.setdefault(key, Sensor([], period, send))
+        sensor.period_ns = min(sensor.period_ns, period)
+        sensor.dags.append(role.vertex.dag)
+
+    def _sensors_node(self) -> Node:
+        if self._sensor_node is None:
+            self._sensor_node = self._make_node(SENSORS_NODE)
+        return self._sensor_node
+
+
+def build_nodes(
+    task_set: TaskSet, plan: ExecutionPlan, *, current_job: CurrentJob = no_job,
+    context: Context | None = None,
+) -> SyntheticWorkload:
+    """Make one rclpy node for each declared node; see ``SyntheticWorkload``."""
+    return SyntheticWorkload(task_set, plan, current_job=current_job, context=context)

@@ -1,0 +1,409 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+When timers are due: a queue by due time instead of an rcl wait set.
+
+Theory of operation
+-------------------
+rcl keeps a timer's state (next call time, period, cancelled), and stays the authority: whether a
+timer is due is asked of rcl, and ``call_timer`` moves it on (missed periods are skipped there, the
+phase is kept). What is kept here is only when to ask: the next due time of each timer in a heap.
+So a wake-up costs the same beside ten timers and beside a thousand, where a wait set has to be
+filled with all of them again.
+
+Nominal due time
+    rcl tells how long it is *until* the next call, not when that is. Reading the clock before and
+    after asking gives an interval that holds the next call time. Once for each timer the interval
+    is made narrow and its middle becomes the anchor of the timer's phase grid, anchor + k*period;
+    from then on due times are points of that grid as long as they lie in the interval (widened by
+    ``TOLERANCE_NS``). When none does, the phase has changed (``reset()``, a stepped system clock,
+    a steady clock that is not slewed like the monotonic one) and a new anchor is taken.
+
+Changes that nobody announces
+    rclpy has no notification for ``cancel()``, ``reset()`` and a new period. A due time that goes
+    back shows when the timer is asked at its old due time. One that comes closer (a cancelled
+    timer reset, a period shortened before a reset) shows in a scan over all timers: at wake-ups
+    that happen anyway, and at the latest after the shortest period of a cancelled timer, since a
+    reset timer is due no sooner than a period later.
+
+Simulated time
+    Timers of a clock whose time is overridden have no due time on the monotonic clock. They are
+    asked after each jump of their clock (its jump callbacks wake the queue's thread).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+import ctypes
+from heapq import heapify, heappop, heappush
+import time
+from typing import Any
+
+from mddag_executor.live.entities import Receiver
+from rclpy.clock import Clock, JumpHandle, JumpThreshold
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.exceptions import InvalidHandle
+from rclpy.timer import Timer
+
+TOLERANCE_NS = 20_000
+"""How far a due time may be off the phase grid before the grid is anchored anew."""
+
+SCAN_GAP_NS = 10_000_000
+SCAN_LATEST_NS = 100_000_000
+SCAN_CANCELLED_NS = 5_000_000
+"""Scans happen at most and at least that often; and at most while a timer is cancelled."""
+
+SCAN_SHARE = 100
+"""A scan may be repeated after this many times what the last one took: at most 1 % of a CPU."""
+
+ZERO_PERIOD_NS = 1_000_000
+"""A timer without a period is always due; so often it is handed over."""
+
+WIDE_NS = 50_000
+"""An interval wider than this comes from a preempted thread and is measured again."""
+
+_now = time.monotonic_ns
+_PR_SET_TIMERSLACK = 29
+
+
+def sharpen_wake_ups() -> None:
+    """
+    Ask Linux not to delay the calling thread's timed wake-ups for joining them with others.
+
+    The default (timer slack, prctl(2)) delays each by up to 50 us. Elsewhere nothing happens.
+    """
+    try:
+        ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
+    except (AttributeError, OSError, TypeError):
+        pass
+
+
+class _Slot:
+    """A timer with its phase grid; ``entry`` is the number of its one valid heap entry, or 0."""
+
+    __slots__ = (
+        'timer', 'handle', 'until', 'call', 'get_period', 'overridden',
+        'period', 'anchor', 'due', 'entry', 'cancelled', 'simulated')
+
+    def __init__(self, timer: Timer) -> None:
+        handle = timer.handle
+        self.timer = timer
+        self.handle: Any = handle
+        self.until: Callable[[], int | None] = handle.time_until_next_call
+        self.call: Callable[[], None] = handle.call_timer
+        self.get_period: Callable[[], int] = handle.get_timer_period
+        clock = timer.clock
+        self.overridden: Callable[[], bool] | None = None
+        if clock.clock_type == ClockType.ROS_TIME:
+            self.overridden = clock.handle.get_ros_time_override_is_enabled
+        self.period = self.get_period()
+        self.anchor = 0
+        self.due = 0
+        self.entry = 0
+        self.cancelled = False
+        self.simulated = False
+
+    def measure(self) -> tuple[int, int] | None:
+        """Return an interval that holds the next call time, or None when cancelled."""
+        best: tuple[int, int] | None = None
+        for _ in range(4):
+            before = _now()
+            until = self.until()
+            after = _now()
+            if until is None:
+                return None
+            if best is None or after - before < best[1] - best[0]:
+                best = before + until, after + until
+            if after - before < WIDE_NS:
+                break
+        return best
+
+    def take_anchor(self) -> bool:
+        """Anchor the phase grid at the next call time; False when cancelled."""
+        self.period = self.get_period()
+        best: tuple[int, int] | None = None
+        for _ in range(5):
+            interval = self.measure()
+            if interval is None:
+                return False
+            if best is None or interval[1] - interval[0] < best[1] - best[0]:
+                best = interval
+        assert best is not None
+        self.anchor = self.due = (best[0] + best[1]) // 2
+        return True
+
+    def grid_point(self, low: int, high: int) -> int | None:
+        """Return the point of the phase grid in an interval, or None if there is none."""
+        period = self.period
+        if period <= 0:
+            return None
+        middle = (low + high) // 2
+        point: int = self.anchor + (middle - self.anchor + period // 2) // period * period
+        if low - TOLERANCE_NS <= point <= high + TOLERANCE_NS:
+            return point
+        return None
+
+
+class TimerQueue:
+    """
+    The timers of an intake, by due time. All methods belong to one thread at a time.
+
+    :param receiver: gets ``on_timer`` and ``on_intake_error``.
+    :param wake: called, from any thread, when a clock jumped: ``fire`` is to be called soon.
+    """
+
+    def __init__(self, receiver: Receiver, wake: Callable[[], None]) -> None:
+        self._on_timer = receiver.on_timer
+        self._on_error = receiver.on_intake_error
+        self._wake = wake
+        self._slots: dict[int, _Slot] = {}
+        self._heap: list[tuple[int, int, _Slot]] = []
+        self._entries = 0
+        self._jumps: dict[int, tuple[Clock, JumpHandle]] | None = None
+        self._jumped = False
+        self._scan_early = 0
+        self._scan_latest = 0
+
+    def __len__(self) -> int:
+        """Return the number of timers."""
+        return len(self._slots)
+
+    def update(self, timers: Iterable[Timer]) -> None:
+        """Set which timers there are; those that stay keep their phase grid."""
+        slots: dict[int, _Slot] = {}
+        for timer in timers:
+            slot = self._slots.get(id(timer))
+            if slot is None:
+                try:
+                    slot = _Slot(timer)
+                except Exception as error:
+                    if not isinstance(error, InvalidHandle) and _alive(timer):
+                        self._on_error(error)
+                    continue
+            slots[id(timer)] = slot
+        self._slots = slots
+        self._heap = [entry for entry in self._heap if id(entry[2].timer) in slots]
+        heapify(self._heap)
+        if self._jumps is not None:
+            self.watch_clocks(True)
+        self.scan()
+
+    def watch_clocks(self, watch: bool) -> None:
+        """
+        Wake on jumps of the timers' ROS clocks, or no longer.
+
+        A clock only borrows its jump callbacks, so whoever has started watching must end it.
+        """
+        wanted = {}
+        if watch:
+            wanted = {
+                id(s.timer.clock): s.timer.clock
+                for s in self._slots.values() if s.overridden is not None}
+        jumps = self._jumps or {}
+        for key in [key for key in jumps if key not in wanted]:
+            try:
+                jumps.pop(key)[1].unregister()
+            except InvalidHandle:
+                pass
+        for key, clock in wanted.items():
+            if key not in jumps:
+                try:
+                    jumps[key] = clock, clock.create_jump_callback(
+                        JumpThreshold(
+                            min_forward=Duration(nanoseconds=1),
+                            min_backward=Duration(nanoseconds=-1), on_clock_change=True),
+                        post_callback=self._on_jump)
+                except InvalidHandle:
+                    pass
+        self._jumps = jumps if watch else None
+
+    def _on_jump(self, _: Any) -> None:
+        if not self._jumped:
+            self._jumped = True
+            self._wake()
+
+    def next_look(self) -> int | None:
+        """Return when to call ``fire`` next (monotonic ns), None for never."""
+        if self._jumped:
+            return 0
+        if not self._slots:
+            return None
+        heap = self._heap
+        while heap and heap[0][2].entry != heap[0][1]:
+            heappop(heap)
+        if heap and heap[0][0] < self._scan_latest:
+            return heap[0][0]
+        return self._scan_latest
+
+    def fire(self, now: int) -> int:
+        """Hand over the timers that are due; return how many."""
+        if self._jumped or (now >= self._scan_early and self._slots):
+            self.scan()
+        count = 0
+        heap = self._heap
+        # An entry made meanwhile is of the next call, so this ends.
+        while heap and heap[0][0] <= now:
+            _, entry, slot = heappop(heap)
+            if slot.entry == entry:
+                slot.entry = 0
+                count += self._fire(slot)
+        return count
+
+    def scan(self) -> None:
+        """Ask every timer when it is due, and find out about changes."""
+        self._jumped = False
+        start = _now()
+        shortest = SCAN_LATEST_NS
+        for slot in list(self._slots.values()):
+            try:
+                self._look_at(slot)
+            except Exception as error:
+                self._failed(slot, error)
+            if slot.cancelled and slot.period < shortest:
+                shortest = max(slot.period, SCAN_CANCELLED_NS)
+        end = _now()
+        rest = (end - start) * SCAN_SHARE
+        self._scan_early = end + max(min(SCAN_GAP_NS, shortest), rest)
+        self._scan_latest = end + max(shortest, rest)
+
+    def _look_at(self, slot: _Slot) -> None:
+        simulated = slot.overridden is not None and slot.overridden()
+        if simulated != slot.simulated:
+            slot.simulated = simulated
+            slot.entry = 0
+        if simulated:
+            until = slot.until()
+            slot.cancelled = until is None
+            if until is None or until > 0:
+                slot.entry = 0
+            elif not slot.entry:
+                self._push(slot, 0)
+            return
+        interval = slot.measure()
+        slot.cancelled = interval is None
+        if interval is None:
+            slot.period = slot.get_period()
+            slot.entry = 0
+            return
+        low, high = interval
+        if slot.entry and low - TOLERANCE_NS <= slot.due <= high + TOLERANCE_NS:
+            return
+        self._aim(slot, low, high)
+
+    def _aim(self, slot: _Slot, low: int, high: int) -> None:
+        """Put a timer into the heap whose next call time lies in this interval."""
+        period = slot.get_period()
+        point = slot.grid_point(low, high) if period == slot.period and slot.anchor else None
+        if point is not None:
+            slot.due = point
+        elif not slot.take_anchor():
+            self._park(slot)
+            return
+        self._push(slot, slot.due)
+
+    def _park(self, slot: _Slot) -> None:
+        """Note that a timer is cancelled: only a scan finds out that it was reset."""
+        slot.cancelled = True
+        self._scan_latest = min(
+            self._scan_latest, _now() + max(slot.period, SCAN_CANCELLED_NS))
+
+    def _push(self, slot: _Slot, due: int) -> None:
+        self._entries += 1
+        slot.entry = self._entries
+        heappush(self._heap, (due, self._entries, slot))
+
+    def _fire(self, slot: _Slot) -> int:
+        """Call a timer if rcl agrees that it is due; return how many were handed over."""
+        try:
+            with slot.handle:
+                due = self._call(slot)
+        except Exception as error:
+            self._failed(slot, error)
+            return 0
+        if due is None:
+            return 0
+        try:
+            self._on_timer(slot.timer, due)
+        except Exception as error:
+            self._on_error(error)
+        return 1
+
+    def _call(self, slot: _Slot) -> int | None:
+        """Call a timer and aim at its next due time; return the one that it had, if it had."""
+        before = _now()
+        until = slot.until()
+        after = _now()
+        if slot.simulated:
+            if until is None or until > 0:
+                return None
+            slot.call()
+            return before
+        if after - before > WIDE_NS:
+            interval = slot.measure()
+        else:
+            interval = None if until is None else (before + until, after + until)
+        if interval is None:
+            self._park(slot)
+            return None
+        low, high = interval
+        if low > _now():
+            # It was reset, or its period has changed: not due yet.
+            self._aim(slot, low, high)
+            return None
+        period = slot.get_period()
+        if period <= 0:
+            slot.call()
+            slot.period = period
+            slot.due = before + ZERO_PERIOD_NS
+            self._push(slot, slot.due)
+            return before
+        due = slot.grid_point(low, high)
+        if due is None:
+            if not slot.take_anchor():
+                self._park(slot)
+                return None
+            due = slot.anchor
+        if period != slot.period:
+            # The call that is due now was still aimed at by the old period.
+            slot.period, slot.anchor = period, due
+        slot.call()
+        slot.due = due + period
+        if slot.due < before:
+            # rcl skips missed periods too; it read its clock later, so it can be ahead of this,
+            # which then shows as "not due yet".
+            slot.due += -(-(before - slot.due) // period) * period
+        self._push(slot, slot.due)
+        return due
+
+    def _failed(self, slot: _Slot, error: Exception) -> None:
+        """Sort out an exception of rcl: the timer was destroyed, cancelled, or it is an error."""
+        slot.entry = 0
+        if isinstance(error, InvalidHandle) or not _alive(slot.timer):
+            self._slots.pop(id(slot.timer), None)
+            return
+        if slot.until() is None:
+            self._park(slot)
+        else:
+            self._on_error(error)
+
+
+def _alive(timer: Timer) -> bool:
+    """Return whether a timer has not been destroyed."""
+    try:
+        with timer.handle:
+            return True
+    except InvalidHandle:
+        return False

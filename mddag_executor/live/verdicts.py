@@ -1,0 +1,151 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is done with the core's decisions: counted, told to the user, written to the trace."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+import threading
+from typing import Any, Callable, Protocol
+
+from mddag_executor.core import Tables, Tally
+from mddag_executor.core.state import (
+    ABORTED, Decision, DROP, EXPIRED, JOB_END, SINK_ABORTED, SINK_DONE, SINK_EXPIRED, SINK_MISSED)
+from mddag_executor.live.attribution import Origin
+from mddag_executor.live.entries import Entry
+from msg_graph import TaskSet
+
+KEEP_RESPONSES = 10_000
+KEEP_ABORTED = 4096
+NO_ORIGIN = Origin(-1, -1, -1, -1)
+
+_WHY = {SINK_DONE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
+        SINK_ABORTED: 'aborted'}
+
+
+@dataclass(frozen=True)
+class DeadlineMiss:
+    """
+    A sink that missed its deadline; times in ns since the epoch.
+
+    ``completed_ns`` is None where it never completed: ``kind`` tells why (``late``, ``overdue``
+    at the run's end, ``expired``, ``aborted``).
+    """
+
+    dag: str
+    vertex: str
+    job: int
+    release_ns: int
+    deadline_ns: int
+    completed_ns: int | None
+    kind: str
+
+
+class Record(Protocol):
+    """Where trace events go (see ``mddag_executor.trace.TraceWriter.record``)."""
+
+    def __call__(self, event: str, timestamp: int, vtid: int, /, *fields: Any) -> None:
+        """Record one event."""
+
+
+class Verdicts:
+    """
+    The run's counts, misses and mddag trace events.
+
+    ``add`` and the ``note_`` methods are called under the dispatcher's lock; ``tell`` without,
+    because it calls the user.
+
+    :param record: where trace events go; None records nothing.
+    :param on_miss: told every miss, from the thread that found it.
+    :param fail: told what ``on_miss`` raises.
+    """
+
+    def __init__(
+        self, task_set: TaskSet | None, tables: Tables, record: Record | None,
+        on_miss: Callable[[DeadlineMiss], None] | None, fail: Callable[[BaseException], None],
+    ) -> None:
+        self.tally = Tally(task_set, tables, KEEP_RESPONSES)
+        self.record = record
+        self._dags = task_set.dags if task_set is not None else ()
+        self._tables = tables
+        self._on_miss = on_miss
+        self._fail = fail
+        self._misses: deque[DeadlineMiss] = deque()
+        self._aborted: dict[tuple[int, int], None] = {}
+
+    def add(self, decisions: list[Decision], now: int) -> list[int]:
+        """Take in decisions; return the executions that the core dropped."""
+        self.tally.add(decisions)
+        dropped = []
+        for kind, dag, vertex, job, deadline, time in decisions:
+            if kind == DROP:
+                dropped.append(deadline)
+            elif kind == JOB_END:
+                self._ended(dag, job, deadline, now)
+            elif kind != SINK_DONE or time > deadline:
+                self._missed(kind, dag, vertex, job, deadline, time, now)
+        return dropped
+
+    def _ended(self, dag: int, job: int, end: int, now: int) -> None:
+        if end == ABORTED:
+            self._aborted[(dag, job)] = None
+            if len(self._aborted) > KEEP_ABORTED:
+                del self._aborted[next(iter(self._aborted))]
+        if self.record is not None and end in (ABORTED, EXPIRED):
+            self.record(
+                'abort' if end == ABORTED else 'expire', now, threading.get_native_id(), dag, job)
+
+    def was_aborted(self, dag: int, job: int) -> bool:
+        """Tell whether a job was aborted (the last few thousand are remembered)."""
+        return (dag, job) in self._aborted
+
+    def _missed(
+        self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int, now: int
+    ) -> None:
+        if self.record is not None:
+            self.record(
+                'deadline', now, threading.get_native_id(), dag,
+                self._tables.index_in_dag[vertex], job, deadline, time)
+        if self._on_miss is not None:
+            self._misses.append(DeadlineMiss(
+                self._dags[dag].name, self.tally.vertex_name(vertex), job,
+                deadline - self._tables.sink_deadline[vertex], deadline,
+                time if kind == SINK_DONE else None, _WHY[kind]))
+
+    def tell(self) -> None:
+        """Tell the user of the misses since the last call."""
+        while self._misses and self._on_miss is not None:
+            try:
+                self._on_miss(self._misses.popleft())
+            except IndexError:
+                return  # another thread told it
+            except Exception as error:
+                self._fail(error)
+
+    def released(self, dag: int, job: int, release: int, now: int) -> None:
+        """Take in that a job was released."""
+        self.tally.released(dag)
+        if self.record is not None:
+            self.record('job_release', now, threading.get_native_id(), dag, job, release)
+
+    def note_drop(self, entry: Entry, origin: Origin, reason: str, now: int) -> None:
+        """Take in that an execution was dropped."""
+        entry.dropped += 1
+        if self.record is not None:
+            _, dag, job, vertex = origin
+            self.record(
+                'drop', now, threading.get_native_id(), entry.address, dag,
+                self._tables.index_in_dag[vertex] if dag >= 0 else -1, job, reason)

@@ -1,0 +1,342 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Intake by an rcl wait set that is built once and refilled, and by a queue of timers.
+
+Theory of operation
+-------------------
+One wait: fill the wait set with the handles of all entities (rcl empties it at each wait), wait
+without the GIL, and ask it for what is ready; each of that is taken and handed over at once.
+
+What is built once for a set of entities is the wait set itself, the lists of handles and, for
+each entity, the function that takes from it, found by the address that the wait set gives. What
+makes rclpy's own executors slow with many entities, is what is not done here: asking every node
+for its entities, a callback group for each, and a new wait set, at every wait.
+
+Entities are held (``with handle``) while they are waited for, so a destroyed one goes when the
+wait ends. Taking from it enters its handle once more, which fails after ``destroy``: nothing is
+handed over for it.
+
+From a ready subscription messages are taken until there are none, at most its depth: that is as
+many as were there when it became ready. One message a wait would cost a wait for each message
+under load; more than the depth could keep the others waiting.
+
+A waitable keeps in itself what ``is_ready`` has found, for ``take_data``: the two are called one
+after the other, in the thread of the wait.
+
+Timers are not in the wait set (see ``timers``): their next due time is the wait's time-out. An
+intake of timers only, or one that has nothing else yet, sleeps on a lock instead, which is
+cheaper.
+"""
+
+from __future__ import annotations
+
+import atexit
+from collections.abc import Callable, Iterable
+import threading
+import time
+from typing import Any
+import weakref
+
+from mddag_executor.live.entities import EMPTY, EntitySet, Receiver, snapshot
+from mddag_executor.live.refilled import RefilledSet
+from mddag_executor.live.timers import sharpen_wake_ups, TimerQueue
+from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
+from rclpy.guard_condition import GuardCondition
+from rclpy.node import Node
+
+ALL_KINDS = frozenset(
+    ('subscription', 'timer', 'client', 'service', 'guard', 'waitable', 'event'))
+"""The kinds of entities; ``event`` are the waitables of QoS events."""
+
+REBUILD_SHARE = 10
+"""A wait set is built anew at the earliest after so many times what building it took last."""
+
+REBUILD_LATEST_NS = 50_000_000
+
+PATIENCE = 3
+"""So many waits in a row may bring errors before the thread slows down."""
+
+_now = time.monotonic_ns
+_started: weakref.WeakSet[Any] = weakref.WeakSet()
+
+
+def stop_at_exit(intake: Any) -> None:
+    """Have an intake that was started stopped before the interpreter and the middleware end."""
+    _started.add(intake)
+
+
+@atexit.register
+def _stop_all() -> None:
+    for intake in list(_started):
+        intake.stop()
+
+
+class WaitSetIntake:
+    """
+    Hands over what becomes ready, from a thread (``start``) or from the caller (``poll``).
+
+    In a thread, QoS events wait apart in a second one: they are many, hardly ever become ready,
+    and cost as much for each refill as the others.
+
+    :param context: the context of all nodes.
+    :param receiver: whom to hand over to.
+    :param guards: guard conditions that end a wait without anything to hand over, such as an
+        executor's own, and rclpy's ``SignalHandlerGuardCondition``. A guard condition wakes only
+        one of several waits, so give it to one intake only.
+    :param kinds: the kinds of entities to look after, of ``ALL_KINDS``.
+    :param name: what the thread is called, after ``mddag-intake-``.
+    :param on_shutdown: called in the intake's thread when it ends because the context has ended.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        receiver: Receiver,
+        guards: Iterable[GuardCondition] = (),
+        kinds: Iterable[str] = ALL_KINDS,
+        *,
+        name: str = 'waitset',
+        on_shutdown: Callable[[], None] | None = None,
+    ) -> None:
+        self._context = context
+        self._receiver = receiver
+        self._guards = tuple(guards)
+        self._kinds = frozenset(kinds)
+        if not self._kinds <= ALL_KINDS:
+            raise ValueError(f'{sorted(self._kinds - ALL_KINDS)}: no kinds of entities')
+        self._name = f'mddag-intake-{name}'
+        self._on_shutdown = on_shutdown
+        self._timers = TimerQueue(receiver, self.wake)
+        self._lock = threading.Lock()
+        self._latest = EMPTY
+        self._changed = False
+        self._rebuild_at = 0
+        self._filled: RefilledSet | None = None
+        # Whoever sleeps, sleeps on this lock or on this guard condition; a wake rings both.
+        self._bell = threading.Lock()
+        self._bell.acquire()
+        self._guard: GuardCondition | None = None
+        if self._guards or self._kinds != {'timer'}:
+            self._guard = GuardCondition(None, None, context)  # type: ignore[no-untyped-call]
+        self._thread: threading.Thread | None = None
+        self._stopping = False
+        self._failures = 0
+        self._events: WaitSetIntake | None = None
+        if 'event' in self._kinds and len(self._kinds) > 1:
+            self._events = WaitSetIntake(context, receiver, (), ('event',), name=f'{name}-events')
+        self._active = self._kinds  # those of the thread are without `event`
+        context.on_shutdown(self.wake)
+
+    # --- what to wait for ------------------------------------------------------------------------
+
+    def update(self, entities: EntitySet | Iterable[Node]) -> None:
+        """
+        Set what to wait for; from any thread. It comes into force at once, also in a wait.
+
+        :param entities: a snapshot, or the nodes to take one of. Nothing is done when nothing
+            has changed.
+        """
+        with self._lock:
+            if not isinstance(entities, EntitySet):
+                entities = snapshot(entities, self._latest)
+            if entities is self._latest:
+                return
+            self._latest = entities
+            pending = self._changed
+            self._changed = True
+        if self._events is not None:
+            self._events.update(entities)
+        if not pending:
+            self.wake()
+
+    def wake(self) -> None:
+        """End the present wait, or the next one, early; from any thread."""
+        try:
+            self._bell.release()
+        except RuntimeError:
+            pass  # it rings already
+        if self._guard is not None:
+            try:
+                self._guard.trigger()  # type: ignore[no-untyped-call]
+            except InvalidHandle:
+                pass
+
+    def _apply(self) -> None:
+        """Build the wait set for the latest entities."""
+        start = _now()
+        self._changed = False
+        kinds, latest = self._active, self._latest
+        self._drop()
+        if self._guard is not None:
+            bells = (*self._guards, self._guard)
+            self._filled = RefilledSet(self._context, latest, kinds, bells, self._receiver)
+        if 'timer' in kinds:
+            self._timers.update(latest.timers)
+        end = _now()
+        self._rebuild_at = end + min((end - start) * REBUILD_SHARE, REBUILD_LATEST_NS)
+
+    def _drop(self) -> None:
+        filled, self._filled = self._filled, None
+        if filled is not None:
+            filled.release()
+
+    # --- waiting ---------------------------------------------------------------------------------
+
+    def _wait(self, until: int | None) -> tuple[int, bool]:
+        """
+        Wait once and hand over what is ready, timers excepted.
+
+        :param until: when to end the wait at the latest (monotonic ns).
+        :return: how many things were handed over, and whether something rang to end the wait.
+        """
+        filled = self._filled
+        left = -1 if until is None else max(0, until - _now())
+        if filled is None or not (filled.size or self._guards):
+            rang = self._bell.acquire(True, left / 1e9) if left >= 0 else self._bell.acquire()
+            return 0, rang
+        try:
+            filled.wait(left)
+        except InvalidHandle:
+            # A waitable was destroyed; what it consists of is held, but it refuses to be used.
+            self._apply()
+            return 0, False
+        rang = filled.rung()
+        count, failed = filled.hand_over()
+        self._failures = self._failures + 1 if failed else 0
+        return count, rang
+
+    def poll(self, timeout_sec: float | None = None) -> int:
+        """
+        Wait once, in the calling thread, and hand over what is ready.
+
+        Not while the intake's thread runs.
+
+        :param timeout_sec: seconds to wait; None or negative: until something is ready.
+        :return: how many things were handed over: 0 after the time, and when a guard condition
+            or ``wake`` ended the wait.
+        :raises RuntimeError: when the intake's thread runs.
+        :raises RCLError: when rcl can not wait, as in a context that has been shut down.
+        """
+        if self.running:
+            raise RuntimeError('the intake runs in a thread of its own')
+        self._active = self._kinds
+        limit = None
+        if timeout_sec is not None and timeout_sec >= 0:
+            limit = _now() + int(min(timeout_sec, 1e9) * 1e9)
+        self._timers.scan()
+        if self._changed or self._filled is None or not self._filled.hold():
+            self._apply()
+        try:
+            while True:
+                count = self._timers.fire(_now())
+                look = self._timers.next_look()
+                until = limit if look is None or (limit is not None and limit < look) else look
+                more, rang = self._wait(0 if count else until)
+                count += more + self._timers.fire(_now())
+                if count or rang or (limit is not None and _now() >= limit):
+                    return count
+        finally:
+            if self._filled is not None:
+                self._filled.release()
+
+    @property
+    def running(self) -> bool:
+        """Whether the intake's thread runs."""
+        return self._thread is not None and self._thread.is_alive()
+
+    # --- thread ----------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """
+        Hand over from a thread of the intake's own until ``stop``.
+
+        :raises RuntimeError: when it runs already.
+        """
+        ending = self._thread if self._stopping else None
+        if ending is threading.current_thread():
+            raise RuntimeError('the intake ends only after what it hands over now')
+        if ending is not None:
+            ending.join()
+        elif self.running:
+            raise RuntimeError('the intake runs already')
+        stop_at_exit(self)
+        self._stopping = False
+        self._changed = True
+        self._rebuild_at = 0
+        self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+        self._active = self._kinds if self._events is None else self._kinds - {'event'}
+        self._thread.start()
+        if self._events is not None:
+            self._events.start()
+
+    def stop(self) -> None:
+        """
+        End the thread and let go of all entities; from any thread, and in any state.
+
+        What is ready by then stays where it is. Called by a receiver from the intake's thread, it
+        returns at once and the thread ends after that call.
+        """
+        if self._events is not None:
+            self._events.stop()
+        self._stopping = True
+        thread = self._thread
+        if thread is None:
+            return
+        self.wake()
+        if thread is not threading.current_thread():
+            thread.join()
+            self._thread = None
+
+    def _run(self) -> None:
+        sharpen_wake_ups()
+        self._timers.watch_clocks(True)
+        ended = False
+        try:
+            while not self._stopping and not ended:
+                try:
+                    rang = self._turn()
+                    ended = rang and not self._context.ok()
+                except Exception as error:
+                    ended = not self._context.ok()
+                    if not ended:
+                        self._failures += 1
+                        self._changed = True
+                        self._receiver.on_intake_error(error)
+                if self._failures > PATIENCE and not ended:
+                    # Something fails again and again without being used up: no busy loop.
+                    self._bell.acquire(True, min(0.1, 0.001 * self._failures))
+        finally:
+            self._timers.watch_clocks(False)
+            self._drop()
+        if ended and self._on_shutdown is not None:
+            self._on_shutdown()
+
+    def _turn(self) -> bool:
+        """Wait once in the thread; return whether something rang."""
+        if self._changed and _now() >= self._rebuild_at:
+            self._apply()
+        timers = self._timers
+        look = timers.next_look()
+        if look is not None and look <= _now():
+            timers.fire(_now())
+            look = timers.next_look()
+        if self._changed and (look is None or look > self._rebuild_at):
+            look = self._rebuild_at
+        _, rang = self._wait(look)
+        if len(timers):
+            timers.fire(_now())
+        return rang

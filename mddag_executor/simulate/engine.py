@@ -1,0 +1,154 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The event loop of simulation and rescheduling: virtual time around the core's rules.
+
+Theory of operation
+-------------------
+Time jumps from event to event; an event is the release of a job or the end of an execution.  At
+one instant first the completions are told to the core, workers in ascending order, then the
+releases in DAG order, then the core dispatches until it has nothing left to do (design section 9).
+A completion at the horizon counts, a release at the horizon does not happen.
+
+The execution time of vertex v in job k of DAG d is ``costs[cost_base[d] + k * cost_stride[d] +
+local index of v]``: a stride of zero gives every job the same times, the number of vertices of the
+DAG a row for each job.
+
+Like the rules this is plain integer arithmetic on lists, so that it can be compiled as it is.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from mddag_executor.core import rules
+from mddag_executor.core.policies import KeyFunction
+from mddag_executor.core.state import add_slot, SINK_DONE, State
+from mddag_executor.core.tables import NEVER, Tables
+
+# Kinds of log entries.
+START, END, PREEMPT = range(3)
+
+LogEntry = tuple[int, int, int, int, int, int]
+"""(time, kind, worker, DAG, global vertex, job): one change of a worker."""
+
+
+class Load(NamedTuple):
+    """
+    What arrives: releases in order of (time, DAG), with their jobs' indices and execution times.
+
+    Times in ns; the cost columns as in the theory of operation.
+    """
+
+    times: list[int]
+    dags: list[int]
+    jobs: list[int]
+    costs: list[int]
+    cost_base: list[int]
+    cost_stride: list[int]
+
+
+def run(
+    t: Tables,
+    s: State,
+    key: KeyFunction,
+    load: Load,
+    horizon: int,
+    stop_at_first_miss: bool,
+    log: list[LogEntry] | None = None,
+) -> int:
+    """
+    Run the core over a load and return the time at which the run ended, ns.
+
+    Decisions are left in ``s.decisions``.  With ``stop_at_first_miss`` the run ends with the
+    instant of the first late completion.
+    """
+    n_workers = len(s.worker_x)
+    finish_at = [NEVER] * n_workers
+    next_release = 0
+    n_releases = len(load.times)
+    now = 0
+    while True:
+        instant = NEVER
+        if next_release < n_releases and load.times[next_release] < horizon:
+            instant = load.times[next_release]
+        for w in range(n_workers):
+            if finish_at[w] < instant:
+                instant = finish_at[w]
+        if instant > horizon:
+            return horizon
+        now = instant
+        seen = len(s.decisions)
+        for w in range(n_workers):
+            if finish_at[w] == now:
+                finish_at[w] = NEVER
+                x = s.worker_x[w]
+                if log is not None:
+                    _note(t, s, log, now, END, w, x)
+                rules.complete(t, s, key, x, now)
+        if stop_at_first_miss and _any_late(s, seen):
+            return now
+        while (next_release < n_releases and load.times[next_release] == now
+               and now < horizon):
+            dag = load.dags[next_release]
+            _release(t, s, key, load, dag, load.jobs[next_release], now)
+            next_release += 1
+        _dispatch(t, s, key, now, finish_at, log)
+
+
+def _release(
+    t: Tables, s: State, key: KeyFunction, load: Load, dag: int, job: int, now: int
+) -> None:
+    slot = rules.release_job(t, s, dag, job, now, now)
+    if slot < 0:
+        add_slot(t, s, dag)
+        slot = rules.release_job(t, s, dag, job, now, now)
+    base = s.job_base[slot]
+    cost = load.cost_base[dag] + job * load.cost_stride[dag]
+    for i in range(t.n_region[dag]):
+        s.x_cost[base + i] = load.costs[cost + i]
+    rules.make_ready(t, s, key, base + t.region_offset[t.source[dag]], now)
+
+
+def _dispatch(
+    t: Tables, s: State, key: KeyFunction, now: int, finish_at: list[int],
+    log: list[LogEntry] | None,
+) -> None:
+    running = s.worker_x[:] if log is not None else s.worker_x
+    x = rules.schedule(t, s, key, now)
+    while x >= 0:
+        worker = s.x_worker[x]
+        finish_at[worker] = now + s.x_left[x]
+        if log is not None:
+            if running[worker] >= 0:
+                _note(t, s, log, now, PREEMPT, worker, running[worker])
+            running[worker] = x
+            _note(t, s, log, now, START, worker, x)
+        x = rules.schedule(t, s, key, now)
+
+
+def _note(
+    t: Tables, s: State, log: list[LogEntry], now: int, kind: int, worker: int, x: int
+) -> None:
+    vertex = s.x_vertex[x]
+    log.append((now, kind, worker, t.dag_of[vertex], vertex, s.job_index[s.x_slot[x]]))
+
+
+def _any_late(s: State, first: int) -> bool:
+    for i in range(first, len(s.decisions)):
+        decision = s.decisions[i]
+        if decision[0] == SINK_DONE and decision[5] > decision[4]:
+            return True
+    return False

@@ -1,0 +1,285 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Where the data of an MCAP file lies, and whether it is sound.
+
+Theory of operation: a file is a row of records. `scan` walks along their headers and gives out
+blocks: each a chunk, or a run of plain messages and definitions of a file without chunks. `load`
+brings in one block's records and proves them against its sizes and its CRC. The first thing that
+is not sound ends both with `Damage`; nothing after it is used, because nothing after it can be
+trusted to be what it seems.
+
+1. No length is believed before it is compared with what is there; no memory is taken for a length.
+2. A chunk's own lengths must add up to the length of its record.
+3. Message indexes follow their chunk. Where one follows anything else, the record before it was a
+   chunk whose opcode has changed.
+4. Messages stand in chunks or outside them, not both in one file: a plain message after a chunk is
+   a record whose opcode has changed.
+5. The CRC of a chunk may be 0, which says that there is none (MCAP specification); plain messages
+   never have one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import struct
+from typing import BinaryIO
+import zlib
+
+import lz4.frame
+from mddag_executor.trace import records
+from mddag_executor.trace.errors import TraceError
+import zstandard
+
+MAX_CHUNK = 256 * 1024 * 1024       # before compression; larger ones are taken for damage
+_NEVER = 2**64 - 1                  # start time of a block without messages
+_PLAIN_BLOCK = 256 * 1024
+_CHUNK_OVERHEAD = 1024              # more than a chunk's head and its framing can take
+_FOOTER_SIZE = records.RECORD.size + records.FOOTER_CONTENT.size + len(records.MAGIC)
+_WRONG_SIZE = 'a chunk does not have the size that its head says'
+_REMEDY = 'give a trace written by this program or another MCAP recording'
+
+
+class Damage(Exception):
+    """What is wrong with a file's data, and at which byte; inside this package only."""
+
+    def __init__(self, what: str, offset: int) -> None:
+        """Keep both."""
+        super().__init__(what)
+        self.what = what
+        self.offset = offset
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some of a file's records, not yet read."""
+
+    offset: int         # of its first byte in the file
+    end: int            # of the first byte after it
+    start_time: int     # least log_time of its messages, as far as the file says
+    chunk: bool         # whether it is a chunk; else plain records
+    compression: str
+    data_offset: int    # of its (compressed) records in the file
+    data_length: int
+    size: int           # of its records, uncompressed
+    crc: int            # of these; 0 where there is none
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a file's summary section says that there is."""
+
+    messages: int
+    chunks: int
+    topics: frozenset[str]
+
+
+def open_data(stream: BinaryIO, path: str, size: int) -> int:
+    """
+    Check the beginning of a file and return where its data section starts.
+
+    :raises TraceError: where it is no MCAP file, or nothing is in it
+    """
+    magic = stream.read(len(records.MAGIC))
+    if not magic:
+        raise TraceError(path, 'is empty', _REMEDY)
+    if magic != records.MAGIC:
+        raise TraceError(path, 'is no MCAP file', _REMEDY)
+    head = stream.read(records.RECORD.size)
+    if len(head) == records.RECORD.size:
+        opcode, length = records.RECORD.unpack(head)
+        start = stream.tell() + length
+        if opcode == records.HEADER and start <= size:
+            return int(start)
+    raise TraceError(path, 'ends or is damaged before its first event', _REMEDY)
+
+
+def scan(stream: BinaryIO, start: int, size: int) -> Iterator[Block]:
+    """
+    Yield the blocks of the data section, in the order of the file.
+
+    :raises Damage: where a record is not sound or the data section does not end as it should
+    """
+    position = start
+    previous = 0            # opcode of the record before, 0 for any that does not matter
+    chunks_seen = False
+    while True:
+        stream.seek(position)
+        head = stream.read(records.RECORD.size)
+        if len(head) < records.RECORD.size:
+            raise Damage('the file ends without a finish record', position)
+        opcode, length = records.RECORD.unpack(head)
+        end = position + len(head) + length
+        if end > size:
+            raise Damage('a record is cut off, or its length is wrong', position)
+
+        if opcode == records.CHUNK:
+            yield _chunk(stream, position, end)
+            chunks_seen = True
+        elif opcode == records.MESSAGE_INDEX:
+            if previous not in (records.CHUNK, records.MESSAGE_INDEX):
+                raise Damage('a message index belongs to no chunk', position)
+        elif opcode in (records.SCHEMA, records.CHANNEL, records.MESSAGE):
+            if chunks_seen and opcode == records.MESSAGE:
+                raise Damage('a message stands outside of the chunks', position)
+            block = _plain(stream, position, size, messages=not chunks_seen)
+            yield block
+            end = block.end
+        elif opcode == records.DATA_END:
+            if length != 4:
+                raise Damage('the finish record is damaged', position)
+            return
+        elif opcode in (0, records.HEADER, records.FOOTER):    # 0: a tail of zeros, no opcode
+            raise Damage('a record is where it cannot be', position)
+        previous = opcode
+        position = end
+
+
+def _chunk(stream: BinaryIO, position: int, end: int) -> Block:
+    """Return the chunk whose record starts at a position, from its head alone."""
+    head = stream.read(min(end - stream.tell(), _CHUNK_OVERHEAD))
+    cursor = records.Cursor(head)
+    try:
+        start_time, _, size, crc = records.CHUNK_HEAD.unpack(cursor.take(records.CHUNK_HEAD.size))
+        compression = cursor.string()
+        length = cursor.uint64()
+    except ValueError:
+        raise Damage('the head of a chunk is damaged', position) from None
+    data_offset = position + records.RECORD.size + cursor.position
+    if data_offset + length != end or size > MAX_CHUNK or length > MAX_CHUNK + _CHUNK_OVERHEAD:
+        raise Damage('the lengths in the head of a chunk are wrong', position)
+    return Block(position, end, start_time, True, compression, data_offset, length, size, crc)
+
+
+def _plain(stream: BinaryIO, position: int, size: int, messages: bool) -> Block:
+    """Return the run of plain records from a position on, at least one."""
+    allowed = [records.SCHEMA, records.CHANNEL] + [records.MESSAGE] * messages
+    times = []
+    end = position
+    while True:
+        stream.seek(end)
+        head = stream.read(records.RECORD.size + records.MESSAGE_HEAD.size)
+        if len(head) < records.RECORD.size:
+            break       # what is wrong here is for the scan to say
+        opcode, length = records.RECORD.unpack_from(head)
+        after = end + records.RECORD.size + length
+        if opcode not in allowed or after > size:
+            break
+        if end > position and after - position > _PLAIN_BLOCK:
+            break
+        if after - position > MAX_CHUNK:
+            raise Damage('a record is too large', position)
+        if opcode == records.MESSAGE and length >= records.MESSAGE_HEAD.size:
+            times.append(records.MESSAGE_HEAD.unpack_from(head, records.RECORD.size)[2])
+        end = after
+    length = end - position
+    return Block(position, end, min(times, default=_NEVER), False, '', position, length, length, 0)
+
+
+def load(stream: BinaryIO, block: Block) -> bytes:
+    """
+    Return the records of a block.
+
+    :raises Damage: where they are not what the block's head says
+    """
+    stream.seek(block.data_offset)
+    data = stream.read(block.data_length)
+    if len(data) < block.data_length:
+        raise Damage('the file has become shorter', block.offset)
+    try:
+        data = _decompress(data, block.compression, block.size)
+    except (zstandard.ZstdError, RuntimeError, MemoryError):
+        raise Damage('a chunk cannot be decompressed', block.offset) from None
+    except ValueError as error:
+        raise Damage(str(error), block.offset) from None
+    if len(data) != block.size:
+        raise Damage(_WRONG_SIZE, block.offset)
+    if block.crc and zlib.crc32(data) != block.crc:
+        raise Damage('the CRC of a chunk is wrong', block.offset)
+    return data
+
+
+def _decompress(data: bytes, compression: str, size: int) -> bytes:
+    """Return at most a little more than `size` bytes, whatever the data claims to hold."""
+    if compression == '' or (size == 0 and not data):
+        return data
+    if compression == 'zstd':
+        claimed = zstandard.frame_content_size(data)
+        if claimed not in (size, -1):
+            raise ValueError(_WRONG_SIZE)       # before memory is taken for it
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=max(size, 1))
+    if compression == 'lz4':
+        result: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        return result
+    raise ValueError(f'the compression of a chunk, {compression[:20]!r}, is unknown')
+
+
+def read_summary(stream: BinaryIO, size: int) -> tuple[bool, Summary | None]:
+    """
+    Return whether the file ends as a finished one, and its summary if it has one.
+
+    A summary whose CRC is wrong makes the file one that does not end as it should.
+    """
+    if size < _FOOTER_SIZE:
+        return False, None
+    footer_start = size - _FOOTER_SIZE
+    stream.seek(footer_start)
+    footer = stream.read(_FOOTER_SIZE)
+    content = footer[records.RECORD.size:-len(records.MAGIC)]
+    expected = records.RECORD.pack(records.FOOTER, records.FOOTER_CONTENT.size)
+    if not (footer.endswith(records.MAGIC) and footer.startswith(expected)):
+        return False, None
+    start, _, crc = records.FOOTER_CONTENT.unpack(content)
+    if start == 0:
+        return True, None
+    if start > footer_start or (crc and crc != _crc(stream, start, size - len(records.MAGIC) - 4)):
+        return False, None
+    try:
+        return True, _parse_summary(stream, start, footer_start)
+    except (ValueError, struct.error):
+        return False, None
+
+
+def _crc(stream: BinaryIO, start: int, end: int) -> int:
+    crc = 0
+    stream.seek(start)
+    while start < end:
+        data = stream.read(min(end - start, 1 << 20))
+        if not data:
+            break
+        crc = zlib.crc32(data, crc)
+        start += len(data)
+    return crc
+
+
+def _parse_summary(stream: BinaryIO, start: int, end: int) -> Summary | None:
+    messages = chunks = None
+    topics = set()
+    while start < end:
+        stream.seek(start)
+        opcode, length = records.RECORD.unpack(stream.read(records.RECORD.size))
+        if opcode in (records.STATISTICS, records.CHANNEL):
+            cursor = records.Cursor(stream.read(min(length, 1 << 20)))
+            if opcode == records.STATISTICS:
+                head = cursor.take(records.STATISTICS_HEAD.size)
+                messages, _, _, _, _, chunks, _, _ = records.STATISTICS_HEAD.unpack(head)
+            else:
+                cursor.take(4)
+                topics.add(cursor.string())
+        start += records.RECORD.size + length
+    if messages is None or chunks is None:
+        return None
+    return Summary(messages, chunks, frozenset(topics))

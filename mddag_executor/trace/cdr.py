@@ -1,0 +1,225 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+CDR encoding of flat ROS messages, and the ros2msg text that describes them.
+
+Theory of operation: a flat message is a row of fields, each a primitive, a string, or an array or
+sequence of these. Plain CDR (XCDR1, little endian, what ROS 2 puts on the wire and into bags) puts
+a 4-byte encapsulation header first; offsets count from its end. Every primitive is aligned to its
+own size. A string is its length in bytes with the closing NUL as uint32, the UTF-8 bytes, the NUL.
+A sequence is its number of elements as uint32, then the elements; an array has no number. An
+empty sequence does not align for elements that are not there (as Fast CDR and rosbags do).
+
+A message of single primitives has one fixed layout, so one `struct.Struct` with its padding
+written out does the whole message; anything else is done field by field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import re
+import struct
+from typing import Any
+
+ENCAPSULATION = b'\x00\x01\x00\x00'     # plain CDR, little endian, no options
+
+_CODES = {
+    'bool': '?', 'byte': 'B', 'char': 'B', 'float32': 'f', 'float64': 'd',
+    'int8': 'b', 'int16': 'h', 'int32': 'i', 'int64': 'q',
+    'uint8': 'B', 'uint16': 'H', 'uint32': 'I', 'uint64': 'Q',
+}
+_SIZES = {base: struct.calcsize('<' + code) for base, code in _CODES.items()}
+_UINT32 = struct.Struct('<I')
+
+_TYPE = re.compile(r'([a-z]+[0-9]*)(<=[0-9]+)?(\[(?:<=[0-9]+|([0-9]+))?\])?')
+_FIELD = re.compile(r'(\S+)\s+([A-Za-z][A-Za-z0-9_]*)(?:\s+[^=\s].*)?')
+_CONSTANT = re.compile(r'\S+\s+[A-Za-z][A-Za-z0-9_]*\s*=.*')
+
+
+@dataclass(frozen=True)
+class FieldType:
+    """
+    The type of one field: its base, and how many of it.
+
+    `count` is None for a single value, -1 for a sequence, else the length of an array.
+    """
+
+    base: str
+    count: int | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> FieldType:
+        """
+        Return the type that a ros2msg type name means.
+
+        Bounds (`string<=10`, `uint8[<=4]`) do not change the encoding and are left out.
+
+        :raises ValueError: for a nested message, a wstring or anything else that is not flat
+        """
+        match = _TYPE.fullmatch(text)
+        if match is None:
+            raise ValueError(f'type {text!r} is no primitive')
+        base, bound, array, length = match.groups()
+        if base != 'string' and (base not in _CODES or bound):
+            raise ValueError(f'type {text!r} is no primitive')
+        if array is None:
+            return cls(base)
+        return cls(base, int(length) if length else -1)
+
+    @property
+    def kind(self) -> str:
+        """Return what values of this type are in Python: int, float, bool, str or tuple."""
+        if self.count is not None:
+            return 'tuple'
+        return {'string': 'str', 'bool': 'bool', 'float32': 'float',
+                'float64': 'float'}.get(self.base, 'int')
+
+    def write(self, out: bytearray, value: Any) -> None:
+        """Append a value, with the padding before it."""
+        if self.count is None:
+            self._write_values(out, (value,))
+            return
+        if self.count < 0:
+            _align(out, 4)
+            out += _UINT32.pack(len(value))
+        elif len(value) != self.count:
+            raise ValueError(f'{len(value)} values for an array of {self.count}')
+        self._write_values(out, value)
+
+    def _write_values(self, out: bytearray, values: Sequence[Any]) -> None:
+        if self.base == 'string':
+            for value in values:
+                # Text that is no valid Unicode (a path, say) must not cost the event.
+                text = value.encode('utf-8', 'backslashreplace')
+                _align(out, 4)
+                out += _UINT32.pack(len(text) + 1) + text + b'\0'
+        elif values:
+            _align(out, _SIZES[self.base])
+            out += struct.pack(f'<{len(values)}{_CODES[self.base]}', *values)
+
+    def read(self, data: bytes, position: int) -> tuple[Any, int]:
+        """
+        Return the value at a position and the position after it.
+
+        :raises ValueError, struct.error: where the data is too short for it
+        """
+        if self.count is None:
+            values, position = self._read_values(data, position, 1)
+            return values[0], position
+        count = self.count
+        if count < 0:
+            position += -position % 4
+            count, = _UINT32.unpack_from(data, position)
+            position += 4
+        return self._read_values(data, position, count)
+
+    def _read_values(self, data: bytes, position: int, count: int) -> tuple[tuple[Any, ...], int]:
+        if count == 0:
+            return (), position
+        if self.base == 'string':
+            texts = []
+            for _ in range(count):      # ends soon: each takes 4 bytes or raises
+                text, position = _read_string(data, position)
+                texts.append(text)
+            return tuple(texts), position
+        size = _SIZES[self.base]
+        position += -position % size
+        end = position + count * size
+        if end > len(data):             # before struct makes room for what a length claims
+            raise ValueError('the message is shorter than its fields')
+        return struct.unpack_from(f'<{count}{_CODES[self.base]}', data, position), end
+
+
+def _align(out: bytearray, size: int) -> None:
+    out += bytes(-len(out) % size)
+
+
+def _read_string(data: bytes, position: int) -> tuple[str, int]:
+    position += -position % 4
+    length, = _UINT32.unpack_from(data, position)
+    position += 4
+    end = position + length
+    if end > len(data):
+        raise ValueError('a string is longer than its message')
+    if length and data[end - 1]:
+        raise ValueError('a string does not end with NUL')
+    return data[position:max(position, end - 1)].decode('utf-8', 'backslashreplace'), end
+
+
+def fixed_layout(types: Sequence[FieldType]) -> str | None:
+    """Return the struct format of a message of single primitives, None for any other message."""
+    layout = []
+    position = 0
+    for kind in types:
+        if kind.count is not None or kind.base == 'string':
+            return None
+        padding = -position % _SIZES[kind.base]
+        position += padding + _SIZES[kind.base]
+        layout.append('x' * padding + _CODES[kind.base])
+    return ''.join(layout)
+
+
+def encode(types: Sequence[FieldType], values: Sequence[Any]) -> bytes:
+    """
+    Return the message without its encapsulation header.
+
+    :raises ValueError, struct.error, TypeError, AttributeError: where a value does not fit
+    """
+    if len(values) != len(types):
+        raise ValueError(f'{len(values)} values for {len(types)} fields')
+    out = bytearray()
+    for kind, value in zip(types, values):
+        kind.write(out, value)
+    return bytes(out)
+
+
+def decode(types: Sequence[FieldType], data: bytes) -> tuple[Any, ...]:
+    """
+    Return the values of a message given without its encapsulation header.
+
+    :raises ValueError, struct.error: where the data is too short for the types
+    """
+    values = []
+    position = 0
+    for kind in types:
+        value, position = kind.read(data, position)
+        values.append(value)
+    return tuple(values)
+
+
+def parse_ros2msg(text: str) -> list[tuple[str, FieldType]]:
+    """
+    Return the fields of a flat message definition.
+
+    Comments, constants and default values are passed over, and so are the definitions of further
+    messages that may follow after a line of `=`.
+
+    :raises ValueError: where a field is not flat or a line is no field
+    """
+    fields = []
+    for line in text.splitlines():
+        line = line.partition('#')[0].strip()
+        if line.startswith('====='):
+            break
+        if not line or _CONSTANT.fullmatch(line):
+            continue
+        match = _FIELD.fullmatch(line)
+        if match is None:
+            raise ValueError(f'line {line[:40]!r} is no field')
+        fields.append((match[2], FieldType.parse(match[1])))
+    if len({name for name, _ in fields}) != len(fields):
+        raise ValueError('a field is there twice')
+    return fields

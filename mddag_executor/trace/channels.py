@@ -1,0 +1,184 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What the channels of a trace hold: decoders made from the schemas in the file.
+
+Theory of operation:
+
+1. A channel is an event's where its topic is `/trace/<provider>/<event>`. All others (an ordinary
+   recording has many) are passed over.
+2. The schema in the file says how to decode, not this program's table: another version, another
+   writer or an importer may have other fields. A channel whose schema is not a flat CDR message
+   with the preamble cannot be decoded; its messages are left out and counted.
+3. An event of the table comes out with the table's fields in the table's order, whatever the file
+   has: fields that the file does not have are None, others are left out. A field of another kind
+   than the table's (text for a number) makes the channel one that cannot be decoded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+import re
+import struct
+from typing import Any
+
+from mddag_executor.trace import cdr
+from mddag_executor.trace.cdr import FieldType
+from mddag_executor.trace.records import Cursor
+from mddag_executor.trace.schema import EVENTS, PREAMBLE
+
+Event = tuple[Any, ...]
+Decoder = tuple[Event, Callable[[bytes], Event]]
+
+_TOPIC = re.compile(r'/trace/([A-Za-z][A-Za-z0-9_]*)/([A-Za-z][A-Za-z0-9_]*)')
+_DEFINITIONS_LIMIT = 64 * 1024 * 1024       # bytes of all schemas and channels
+
+
+@dataclass(frozen=True)
+class Layout:
+    """An event's full name and the names of its fields without the preamble."""
+
+    name: str
+    fields: tuple[str, ...]
+
+
+class Channels:
+    """
+    The schemas and channels of a file, as they come along.
+
+    With `as_table` the events of the table have the table's fields, and an event starts with its
+    full name. Without it they have those of the file, and an event starts with its `Layout`.
+    """
+
+    def __init__(self, names: set[str] | None, as_table: bool) -> None:
+        """Keep what to decode: the named events, or all."""
+        self._names = names
+        self._as_table = as_table
+        self._schemas: dict[int, bytes] = {}
+        self._channels: dict[int, bytes] = {}
+        self._size = 0
+        #: The topics of the channels.
+        self.topics: dict[int, str] = {}
+        #: Channels whose messages are not wanted.
+        self.passed_over: set[int] = set()
+        #: Channels whose messages have one fixed layout: the beginning of their events, the size
+        #: of a message's fields, and what returns the rest of the event from data and the offset
+        #: of the fields there.
+        self.fast: dict[int, tuple[Event, int, Callable[[bytes, int], Event]]] = {}
+        #: The fields of the events met, by full name.
+        self.fields: dict[str, tuple[str, ...]] = {}
+        self._decoders: dict[int, Decoder | str] = {}       # or the reason why there is none
+
+    def add_schema(self, content: bytes) -> None:
+        """
+        Take in the content of a schema record.
+
+        :raises ValueError: where it is malformed, or defines a known schema anew
+        """
+        self._keep(self._schemas, content)
+
+    def add_channel(self, content: bytes) -> None:
+        """
+        Take in the content of a channel record.
+
+        :raises ValueError: where it is malformed, or defines a known channel anew
+        """
+        number = self._keep(self._channels, content)
+        if number in self.topics:
+            return
+        cursor = Cursor(content)
+        cursor.take(2)
+        schema = cursor.uint16()
+        topic = cursor.string()
+        encoding = cursor.string()
+        cursor.block()
+        self.topics[number] = topic
+        match = _TOPIC.fullmatch(topic)
+        name = f'{match[1]}:{match[2]}' if match else ''
+        if match is None or (self._names is not None and name not in self._names):
+            self.passed_over.add(number)
+            return
+        try:
+            if encoding != 'cdr':
+                raise ValueError(f'the encoding is {encoding[:20]!r} instead of cdr')
+            self._decode(number, name, self._fields_of(schema))
+        except ValueError as error:
+            self._decoders[number] = str(error)
+
+    def decoder(self, number: int) -> Decoder:
+        """
+        Return the beginning of a channel's events and what returns the rest from a message.
+
+        :raises ValueError: where the channel cannot be decoded
+        """
+        decoder = self._decoders.get(number, 'the channel is not defined')
+        if isinstance(decoder, str):
+            raise ValueError(decoder)
+        return decoder
+
+    def _keep(self, kept: dict[int, bytes], content: bytes) -> int:
+        number = Cursor(content).uint16()
+        if kept.setdefault(number, content) != content:
+            raise ValueError('a schema or channel changes its meaning')
+        self._size += len(content)
+        if self._size > _DEFINITIONS_LIMIT:
+            raise ValueError('the schemas are too large')
+        return number
+
+    def _decode(self, number: int, name: str, fields: dict[str, FieldType]) -> None:
+        """Make the decoder of a channel of events; raise ValueError if there can be none."""
+        table = dict(EVENTS[name].fields) if name in EVENTS else {}
+        _check(fields, table)
+        preamble = [field for field, _ in PREAMBLE]
+        wanted = table if self._as_table and table else fields
+        layout = Layout(name, tuple(field for field in wanted if field not in preamble))
+        self.fields.setdefault(name, layout.fields)
+
+        head = (name if self._as_table else layout,)
+        names, types = list(fields), list(fields.values())
+        places = [names.index(field) if field in fields else -1
+                  for field in (*preamble, *layout.fields)]
+
+        def decode(data: bytes) -> Event:
+            values = (*cdr.decode(types, data), None)       # place -1 is None
+            return tuple(values[place] for place in places)
+
+        self._decoders[number] = head, decode
+        fixed = cdr.fixed_layout(types)
+        if fixed is not None and places == list(range(len(names))):
+            unpacker = struct.Struct('<' + fixed)
+            self.fast[number] = head, unpacker.size, unpacker.unpack_from
+
+    def _fields_of(self, schema: int) -> dict[str, FieldType]:
+        if schema not in self._schemas:
+            raise ValueError('there is no schema')
+        cursor = Cursor(self._schemas[schema])
+        cursor.take(2)
+        cursor.block()
+        encoding = cursor.string()
+        if encoding != 'ros2msg':
+            raise ValueError(f'schema encoding {encoding[:20]!r} instead of ros2msg')
+        return dict(cdr.parse_ros2msg(cursor.string()))
+
+
+def _check(fields: Mapping[str, FieldType], table: Mapping[str, str]) -> None:
+    """Raise ValueError where the file's fields cannot stand for those of the table."""
+    for field, _ in PREAMBLE:
+        if field not in fields:
+            raise ValueError(f'there is no field {field}')
+    for field, kind in (*PREAMBLE, *table.items()):
+        if field in fields and fields[field].kind != FieldType.parse(kind).kind:
+            raise ValueError(f'field {field} is {fields[field].base} instead of {kind}')

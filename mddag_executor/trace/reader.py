@@ -1,0 +1,161 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Reading traces as a stream.
+
+The reading itself, with its orders and what it does on damage, is in `reading`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+import os
+import stat
+from typing import Any, BinaryIO
+import warnings
+
+from mddag_executor.trace.blocks import open_data, read_summary, scan
+from mddag_executor.trace.channels import Channels, Event
+from mddag_executor.trace.errors import TraceError, TraceWarning
+from mddag_executor.trace.reading import Reading
+
+_TASK_SET = 'mddag:task_set'
+
+
+class TraceReader:
+    """
+    Reads a trace file; every call of `events` reads it anew.
+
+    `warnings` has what was found to be missing or could not be decoded, one line each, once the
+    reading has come to its end. `fields` has the names of the fields of the events met so far.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """
+        Check that there is a trace.
+
+        :raises TraceError: where there is no file, no MCAP file, or nothing in it
+        """
+        self.path = os.fspath(path)
+        self.warnings: list[str] = []
+        self.fields: dict[str, tuple[str, ...]] = {}
+        with self._open() as stream:
+            size = os.fstat(stream.fileno()).st_size
+            open_data(stream, self.path, size)
+            self._finished, self._summary = read_summary(stream, size)
+
+    @property
+    def message_count(self) -> int | None:
+        """Return how many messages the file's summary counts, None where it has no sound one."""
+        return self._summary.messages if self._summary else None
+
+    @property
+    def task_set_text(self) -> str | None:
+        """
+        Return the declaration that the trace was recorded with (YAML), None where it has none.
+
+        :raises TraceError: where the file can no longer be read
+        """
+        topic = '/trace/' + _TASK_SET.replace(':', '/')
+        if self._summary and topic not in self._summary.topics:
+            return None
+        for event in self.events({_TASK_SET}):
+            return str(event[4])
+        return None
+
+    def events(self, names: Iterable[str] | None = None, *,
+               sorted: bool = False) -> Iterator[Event]:      # noqa: A002
+        """
+        Yield events as tuples: full name, timestamp (ns), process id, thread id, then the fields.
+
+        Fields are in the order of the table (`schema.EVENTS`), None where the file lacks one; for
+        events that are not in the table, in the order of the file (`fields`).
+
+        :param names: full names (`ros2:callback_start`) of the events wanted, None for all
+        :param sorted: whether to yield in the order of time instead of that of the file
+        :raises TraceError: where the file can no longer be read, or is too unordered to be sorted
+        """
+        return self._read(Channels(None if names is None else set(names), True), sorted)
+
+    def layout_events(self, names: Iterable[str] | None) -> Iterator[Event]:
+        """
+        Yield events in the order of time, with a `Layout` instead of the name.
+
+        They have the fields that the file has, not those of the table.
+        """
+        return self._read(Channels(None if names is None else set(names), False), True)
+
+    def _read(self, channels: Channels, in_time_order: bool) -> Iterator[Event]:
+        reading = Reading(self.path, channels)
+        self.fields = channels.fields
+        try:
+            with self._open() as stream:
+                size = os.fstat(stream.fileno()).st_size
+                blocks = scan(stream, open_data(stream, self.path, size), size)
+                if in_time_order:
+                    yield from reading.by_time(stream, blocks)
+                else:
+                    yield from reading.by_file(stream, blocks)
+        except OSError as error:
+            raise TraceError(self.path, f'reading failed ({error.strerror})',
+                             'check the disk it is on') from None
+        for text in (self._missing(reading, size), reading.undecoded()):
+            if text and text not in self.warnings:
+                self.warnings.append(text)
+
+    def _open(self) -> BinaryIO:
+        try:
+            if not stat.S_ISREG(os.stat(self.path).st_mode):    # a pipe would wait for its writer
+                raise TraceError(self.path, 'is no file', 'give the .mcap file itself')
+            return open(self.path, 'rb')
+        except (OSError, ValueError) as error:
+            reason = getattr(error, 'strerror', None) or str(error)
+            raise TraceError(self.path, f'cannot be read ({reason})',
+                             'check the name and that you may read it') from None
+
+    def _missing(self, reading: Reading, size: int) -> str | None:
+        """Return the line that says what is missing, None where nothing is."""
+        damage, summary = reading.damage, self._summary
+        found = f'{reading.chunks} chunks with {reading.messages} messages'
+        stated = (f'{summary.chunks} chunks with {summary.messages} messages are said to be there'
+                  if summary else 'what there should be is not known')
+        if damage:
+            return (f'{self.path}: {damage.what} (at byte {damage.offset}): used {found} before '
+                    f'it, not the {size - damage.offset} bytes from there on; {stated}')
+        if not self._finished:
+            return (f'{self.path}: the summary at the end is damaged or missing: used all of the '
+                    f'data, {found}')
+        if summary and (summary.chunks, summary.messages) != (reading.chunks, reading.messages):
+            return f'{self.path}: events are missing: found and used {found}; {stated}'
+        return None
+
+
+def read_events(path: str | os.PathLike[str],
+                names: Iterable[str] | None = None) -> Iterator[dict[str, Any]]:
+    """
+    Yield the events of a trace in the order of time, as CARET's analysis takes them.
+
+    Each is a dict of `_name` (as in `ros2:callback_start`), `_timestamp` (ns), `_vpid`, `_vtid`
+    and the event's fields as the file has them. A `TraceWarning` at the end says what is missing.
+
+    :param names: full names of the events wanted, None for all
+    :raises TraceError: where the file cannot be read
+    """
+    reader = TraceReader(path)
+    for layout, timestamp, vpid, vtid, *fields in reader.layout_events(names):
+        yield {'_name': layout.name, '_timestamp': timestamp, '_vpid': vpid, '_vtid': vtid,
+               **dict(zip(layout.fields, fields))}
+    for text in reader.warnings:
+        warnings.warn(text, TraceWarning, stacklevel=2)

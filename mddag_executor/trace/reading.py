@@ -1,0 +1,199 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+One pass over a trace file, in the order of the file or of time.
+
+Theory of operation:
+
+1. The file is read block by block (`blocks`), and a block's events are given out one by one; what
+   is in memory is one chunk, whatever the file's length.
+2. In the order of the file the events of one thread are in order, those of different threads are
+   not: each thread appends an event after it took its time, whenever it gets to run.
+3. In the order of time, chunks are loaded by the least time that their heads state, and an event
+   is given out once no chunk that is still to be loaded can hold an earlier one. That is exact for
+   any disorder; it takes memory only for chunks that overlap in time, and there is a limit to it.
+   A head that states a time after its chunk's first event would break the order: that is damage.
+   Events of equal time come in the order of the file.
+4. In both orders a block is used only when everything before it in the file is sound, so what
+   damage leaves is always the beginning of the recording. It is kept in `damage`, not raised.
+5. A message in a sound chunk that does not decode is left out and counted.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Iterator
+from itertools import islice
+from operator import itemgetter
+import struct
+from typing import BinaryIO
+
+from mddag_executor.trace import records
+from mddag_executor.trace.blocks import Block, Damage, load
+from mddag_executor.trace.cdr import ENCAPSULATION
+from mddag_executor.trace.channels import Channels, Event
+from mddag_executor.trace.errors import TraceError
+
+_PENDING_LIMIT = 2_000_000      # events in memory while putting them into the order of time
+
+# Opcode, length, channel; then, behind sequence and times, how the message is encoded.
+_HEAD = struct.Struct('<BQH20xH')
+_CONTENT = records.RECORD.size
+_FIELDS = _CONTENT + records.MESSAGE_HEAD.size + 4      # 4: the encapsulation header
+_LITTLE_ENDIAN = 0x0100         # plain CDR, little endian, as _HEAD reads it
+_time_of = itemgetter(1)
+
+
+class Reading:
+    """One pass over a file: what it found, and what it could not use."""
+
+    def __init__(self, path: str, channels: Channels) -> None:
+        """Begin; `channels` decides what becomes of the messages."""
+        self.chunks = 0             # used
+        self.messages = 0           # in what was used, of all channels
+        self.damage: Damage | None = None
+        self._path = path
+        self._channels = channels
+        self._undecoded: Counter[str] = Counter()       # by topic and reason
+
+    def by_file(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Event]:
+        """Yield the events in the order of the file."""
+        try:
+            for block in blocks:
+                yield from self._decode(load(stream, block), block)
+        except Damage as damage:
+            self.damage = damage
+
+    def by_time(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Event]:
+        """
+        Yield the events in the order of time.
+
+        :raises TraceError: where too many chunks overlap in time
+        """
+        known = self._scan(blocks)
+        order = sorted(range(len(known)), key=lambda number: known[number].start_time)
+        starts = [known[number].start_time for number in order]
+        sound = 0                       # blocks before this one have been found sound,
+        usable = len(known)             # those from this one on have not and are not used
+        loaded: dict[int, list[Event]] = {}
+        for number, next_start in zip(order, (*starts[1:], None)):
+            if number < usable:
+                try:
+                    while sound < number:
+                        # This pass counts nothing: the block's turn is still to come.
+                        Reading(self._path, self._channels)._in_order(stream, known[sound], 0)
+                        sound += 1
+                    pending = sum(map(len, loaded.values()))
+                    loaded[number] = self._in_order(stream, known[number], pending)
+                    sound = max(sound, number + 1)
+                except Damage as damage:
+                    self.damage = damage
+                    usable = min(sound, number)
+            yield from _take(loaded, next_start)
+
+    def _scan(self, blocks: Iterator[Block]) -> list[Block]:
+        known = []
+        try:
+            for block in blocks:
+                known.append(block)
+        except Damage as damage:
+            self.damage = damage
+        return known
+
+    def _in_order(self, stream: BinaryIO, block: Block, pending: int) -> list[Event]:
+        """Return the events of a block in the order of time."""
+        room = _PENDING_LIMIT - pending
+        events = list(islice(self._decode(load(stream, block), block), room + 1))
+        if len(events) > room:
+            raise TraceError(self._path, 'holds too much in disorder to put it into order of time',
+                             'sort it first, as with `mcap sort`')
+        events.sort(key=_time_of)
+        if events and events[0][1] < block.start_time:
+            raise Damage('a chunk holds an event from before the time in its head', block.offset)
+        return events
+
+    def _decode(self, data: bytes, block: Block) -> Iterator[Event]:
+        """Yield the events of a block's records; raise Damage where they are malformed."""
+        fast, passed_over = self._channels.fast, self._channels.passed_over
+        end = len(data)
+        data += bytes(_HEAD.size)       # a head can be read at any record, however short
+        position = 0
+        messages = 0
+        while position < end:
+            opcode, length, channel, encapsulation = _HEAD.unpack_from(data, position)
+            after = position + _CONTENT + length
+            if after > end:
+                raise Damage('the records of a chunk do not fit into it', block.offset)
+            if opcode == records.MESSAGE:
+                messages += 1
+                decoder = fast.get(channel)
+                if (decoder is not None and encapsulation == _LITTLE_ENDIAN
+                        and position + _FIELDS + decoder[1] <= after):
+                    yield decoder[0] + decoder[2](data, position + _FIELDS)
+                elif channel not in passed_over:
+                    event = self._decode_any(channel, data[position:after])
+                    if event is not None:
+                        yield event
+            elif opcode in (records.SCHEMA, records.CHANNEL):
+                self._define(opcode, data[position + _CONTENT:after], block)
+            position = after
+        self.messages += messages
+        self.chunks += block.chunk
+
+    def _decode_any(self, channel: int, message: bytes) -> Event | None:
+        """Return the event in a message record; count it and return None where there is none."""
+        try:
+            if message[_FIELDS - 4:_FIELDS - 2] != ENCAPSULATION[:2]:
+                raise ValueError('it is not plain little endian CDR')
+            head, unpack = self._channels.decoder(channel)
+            return head + unpack(message[_FIELDS:])
+        except (ValueError, struct.error) as error:
+            topic = self._channels.topics.get(channel, f'channel {channel}')
+            self._undecoded[f'{topic}: {error}'] += 1
+            return None
+
+    def _define(self, opcode: int, content: bytes, block: Block) -> None:
+        try:
+            if opcode == records.SCHEMA:
+                self._channels.add_schema(content)
+            else:
+                self._channels.add_channel(content)
+        except ValueError as error:
+            raise Damage(str(error), block.offset) from None
+
+    def undecoded(self) -> str | None:
+        """Return the line about messages that could not be decoded, None where all could."""
+        if not self._undecoded:
+            return None
+        reason, count = self._undecoded.most_common(1)[0]
+        total = sum(self._undecoded.values())
+        return (f'{self._path}: {total} messages could not be decoded and are left out, '
+                f'most of them ({count}) of {reason}')
+
+
+def _take(loaded: dict[int, list[Event]], before: int | None) -> list[Event]:
+    """Take out the events before a time (None: all), in the order of time, then of the file."""
+    taken = []
+    for number in sorted(loaded):
+        events = loaded[number]
+        count = len(events) if before is None else bisect_left(events, before, key=_time_of)
+        if count:
+            taken += events[:count]
+            loaded[number] = events[count:]
+        if not loaded[number]:
+            del loaded[number]
+    taken.sort(key=_time_of)
+    return taken

@@ -1,0 +1,124 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Building blocks of an MCAP file: opcodes, record layouts, and how a record is put together.
+
+Source: the MCAP format specification (https://mcap.dev/spec). A file is the magic, a header
+record, the data section (ended by a data-end record), the summary section, a footer and the magic
+again. A record is its opcode (1 byte), the length of its content (8 bytes) and the content. All
+numbers are little endian, a string is its length in bytes (4 bytes) and UTF-8.
+"""
+
+from __future__ import annotations
+
+import struct
+
+MAGIC = b'\x89MCAP0\r\n'
+
+HEADER = 0x01
+FOOTER = 0x02
+SCHEMA = 0x03
+CHANNEL = 0x04
+MESSAGE = 0x05
+CHUNK = 0x06
+MESSAGE_INDEX = 0x07
+CHUNK_INDEX = 0x08
+STATISTICS = 0x0B
+SUMMARY_OFFSET = 0x0E
+DATA_END = 0x0F
+
+RECORD = struct.Struct('<BQ')               # opcode, length of the content
+MESSAGE_HEAD = struct.Struct('<HIQQ')       # channel, sequence, log_time, publish_time
+CHUNK_HEAD = struct.Struct('<QQQI')         # start, end, size, CRC; compression and records follow
+FOOTER_CONTENT = struct.Struct('<QQI')      # summary start, summary offset start, summary CRC
+# messages, schemas, channels, attachments, metadata, chunks, start, end; per channel counts follow
+STATISTICS_HEAD = struct.Struct('<QHIIIIQQ')
+
+UINT16 = struct.Struct('<H')
+UINT32 = struct.Struct('<I')
+UINT64 = struct.Struct('<Q')
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    """Return a whole record."""
+    return RECORD.pack(opcode, len(content)) + content
+
+
+def string(text: str) -> bytes:
+    """Return a string as records hold it."""
+    return block(text.encode())
+
+
+def block(data: bytes) -> bytes:
+    """Return bytes, or a map or array already put together, with its length in front."""
+    return UINT32.pack(len(data)) + data
+
+
+def schema(number: int, name: str, text: str) -> bytes:
+    """Return the schema record of a ros2msg definition."""
+    return record(SCHEMA, UINT16.pack(number) + string(name) + string('ros2msg') + string(text))
+
+
+def channel(number: int, schema_number: int, topic: str) -> bytes:
+    """Return the record of a channel of CDR messages without metadata."""
+    return record(CHANNEL, UINT16.pack(number) + UINT16.pack(schema_number) + string(topic)
+                  + string('cdr') + block(b''))
+
+
+class Cursor:
+    """
+    Reads the parts of a record's content one after the other.
+
+    Whatever is asked for beyond the end raises ValueError, so no length in a file is trusted.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        """Start at the first byte."""
+        self._data = data
+        self._position = 0
+
+    def take(self, count: int) -> bytes:
+        """Return the next bytes."""
+        end = self._position + count
+        if end > len(self._data):
+            raise ValueError('a record is shorter than what it should hold')
+        part = self._data[self._position:end]
+        self._position = end
+        return part
+
+    def uint16(self) -> int:
+        """Return the next two bytes as a number."""
+        return int.from_bytes(self.take(2), 'little')
+
+    def uint32(self) -> int:
+        """Return the next four bytes as a number."""
+        return int.from_bytes(self.take(4), 'little')
+
+    def uint64(self) -> int:
+        """Return the next eight bytes as a number."""
+        return int.from_bytes(self.take(8), 'little')
+
+    def block(self) -> bytes:
+        """Return the next bytes, whose length stands in front of them."""
+        return self.take(self.uint32())
+
+    def string(self) -> str:
+        """Return the next string; raise ValueError (UnicodeDecodeError) where it is no UTF-8."""
+        return self.block().decode()
+
+    @property
+    def position(self) -> int:
+        """Return how many bytes have been read."""
+        return self._position

@@ -1,0 +1,151 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The events of a trace: one table that the writer and the reader both go by.
+
+Names and fields are those of ros2_tracing (provider `ros2`) and CARET (`ros2_caret`), so that
+their tools understand them; provider `mddag` is this project's. Each event is a message
+`int64 timestamp`, `int32 vpid`, `int32 vtid`, then its fields: addresses are uint64, times are
+int64 nanoseconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import re
+
+from mddag_executor.trace.cdr import FieldType
+
+PREAMBLE = (('timestamp', 'int64'), ('vpid', 'int32'), ('vtid', 'int32'))
+
+_NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
+
+
+@dataclass(frozen=True)
+class EventType:
+    """
+    One kind of event: its provider, its name, and its fields as pairs of name and ros2msg type.
+
+    :raises ValueError: for a name or type that a flat ROS message cannot have
+    """
+
+    provider: str
+    name: str
+    fields: tuple[tuple[str, str], ...]
+
+    def __post_init__(self) -> None:
+        """Check the names and the types."""
+        names = [name for name, _ in PREAMBLE + self.fields]
+        for name in (self.provider, self.name, *names):
+            if not _NAME.fullmatch(name):
+                raise ValueError(f'{name!r} in event {self.key} is no ROS name')
+        if len(set(names)) != len(names):
+            raise ValueError(f'event {self.key} has a field twice')
+        for _, kind in self.fields:
+            FieldType.parse(kind)
+
+    @property
+    def key(self) -> str:
+        """Return the full name, as in `ros2:callback_start`."""
+        return f'{self.provider}:{self.name}'
+
+    @property
+    def topic(self) -> str:
+        """Return the topic that the event is recorded as."""
+        return f'/trace/{self.provider}/{self.name}'
+
+    @property
+    def types(self) -> tuple[FieldType, ...]:
+        """Return the types of the whole message, with the preamble."""
+        return tuple(FieldType.parse(kind) for _, kind in PREAMBLE + self.fields)
+
+    @property
+    def text(self) -> str:
+        """Return the message definition in ros2msg."""
+        return ''.join(f'{kind} {name}\n' for name, kind in PREAMBLE + self.fields)
+
+
+def camel_case(name: str) -> str:
+    """Return an event's name as that of a message: `callback_start` becomes `CallbackStart`."""
+    return ''.join(part[:1].upper() + part[1:] for part in name.split('_'))
+
+
+def _event(provider: str, name: str, /, **fields: str) -> EventType:
+    return EventType(provider, name, tuple(fields.items()))
+
+
+_U64, _I64, _I32, _STR, _BOOL = 'uint64', 'int64', 'int32', 'string', 'bool'
+
+_ALL = (
+    # ros2_tracing: what there is
+    _event('ros2', 'rcl_node_init',
+           node_handle=_U64, rmw_handle=_U64, node_name=_STR, namespace=_STR),
+    _event('ros2', 'rcl_publisher_init', publisher_handle=_U64, node_handle=_U64,
+           rmw_publisher_handle=_U64, topic_name=_STR, queue_depth=_U64),
+    _event('ros2', 'rcl_subscription_init', subscription_handle=_U64, node_handle=_U64,
+           rmw_subscription_handle=_U64, topic_name=_STR, queue_depth=_U64),
+    _event('ros2', 'rclcpp_subscription_init', subscription_handle=_U64, subscription=_U64),
+    _event('ros2', 'rclcpp_subscription_callback_added', subscription=_U64, callback=_U64),
+    _event('ros2', 'rcl_service_init', service_handle=_U64, node_handle=_U64,
+           rmw_service_handle=_U64, service_name=_STR),
+    _event('ros2', 'rclcpp_service_callback_added', service_handle=_U64, callback=_U64),
+    _event('ros2', 'rcl_timer_init', timer_handle=_U64, period=_I64),
+    _event('ros2', 'rclcpp_timer_callback_added', timer_handle=_U64, callback=_U64),
+    _event('ros2', 'rclcpp_timer_link_node', timer_handle=_U64, node_handle=_U64),
+    _event('ros2', 'rclcpp_callback_register', callback=_U64, symbol=_STR),
+    # ros2_tracing: what happens
+    _event('ros2', 'callback_start', callback=_U64, is_intra_process=_BOOL),
+    _event('ros2', 'callback_end', callback=_U64),
+    _event('ros2', 'rclcpp_publish',
+           publisher_handle=_U64, message=_U64, message_timestamp=_U64),
+    _event('ros2', 'rcl_publish', publisher_handle=_U64, message=_U64),
+    _event('ros2', 'rmw_take', rmw_subscription_handle=_U64, message=_U64,
+           source_timestamp=_I64, taken=_BOOL),
+    # CARET
+    _event('ros2_caret', 'caret_init', clock_offset=_I64, distribution=_STR),
+    _event('ros2_caret', 'rmw_implementation', rmw_impl=_STR),
+    _event('ros2_caret', 'construct_executor', executor_addr=_U64, executor_type_name=_STR),
+    _event('ros2_caret', 'add_callback_group',
+           executor_addr=_U64, callback_group_addr=_U64, group_type_name=_STR),
+    _event('ros2_caret', 'callback_group_add_timer', callback_group_addr=_U64, timer_handle=_U64),
+    _event('ros2_caret', 'callback_group_add_subscription',
+           callback_group_addr=_U64, subscription_handle=_U64),
+    _event('ros2_caret', 'callback_group_add_service',
+           callback_group_addr=_U64, service_handle=_U64),
+    _event('ros2_caret', 'callback_group_add_client',
+           callback_group_addr=_U64, client_handle=_U64),
+    _event('ros2_caret', 'dds_write', message=_U64),
+    _event('ros2_caret', 'dds_bind_addr_to_stamp', addr=_U64, source_stamp=_I64),
+    _event('ros2_caret', 'sim_time', stamp=_I64),
+    # this project
+    _event('mddag', 'task_set', yaml=_STR, file=_STR, policy=_STR, workers=_I32,
+           default_deadline=_I64, max_active_jobs=_I32, preemptive=_BOOL),
+    _event('mddag', 'job_release', dag=_I32, job=_I64, release=_I64),
+    _event('mddag', 'dispatch', callback=_U64, dag=_I32, vertex=_I32, job=_I64, worker=_I32,
+           ready=_I64, reference_deadline=_I64),
+    _event('mddag', 'complete',
+           callback=_U64, dag=_I32, vertex=_I32, job=_I64, last_leg=_BOOL, completed=_I64,
+           leg=_I32),
+    _event('mddag', 'deadline',
+           dag=_I32, vertex=_I32, job=_I64, deadline=_I64, completed=_I64),
+    _event('mddag', 'drop', callback=_U64, dag=_I32, vertex=_I32, job=_I64, reason=_STR),
+    _event('mddag', 'expire', dag=_I32, job=_I64),
+    _event('mddag', 'abort', dag=_I32, job=_I64),
+    _event('mddag', 'lost', count=_I64),
+    _event('mddag', 'shutdown', end=_I64),
+)
+
+#: Every event of the table by its full name.
+EVENTS = {event.key: event for event in _ALL}

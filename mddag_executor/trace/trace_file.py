@@ -1,0 +1,311 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A trace file being written: events are encoded, gathered into chunks, and written.
+
+Theory of operation:
+
+1. Everything that a reader needs stands inside chunks, where a CRC protects it: the schema and the
+   channel of an event are put into the chunk of its first message, just before that message.
+2. A chunk is at most 256 KiB before compression (a single larger event has a chunk of its own). It
+   goes to the operating system with its message indexes in one piece, so a process that is killed
+   leaves a file of whole chunks and at most one that is cut off.
+3. The summary (schemas, channels, statistics, chunk indexes) and the footer follow only when the
+   file is finished. They make seeking possible and tell a reader what should be there; nothing
+   else depends on them.
+4. When writing fails the file is cut back to its last whole chunk.
+
+All methods are for one thread; `TraceWriter` is what many threads may call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+import functools
+import os
+import struct
+from types import TracebackType
+from typing import Any
+import zlib
+
+from mddag_executor.trace import cdr, records
+from mddag_executor.trace.errors import TraceError
+from mddag_executor.trace.schema import camel_case, EVENTS, EventType
+import zstandard
+
+CHUNK_LIMIT = 256 * 1024
+LIBRARY = 'mddag_executor'
+_COMPRESSION_LEVEL = 1      # of zstd; higher levels cost more than they save on such data
+
+
+class _Channel:
+    """What the writer knows of one kind of event."""
+
+    __slots__ = ('channel', 'count', 'encode', 'index', 'number', 'schema', 'undefined')
+
+    def __init__(self, event: EventType, number: int, schema_name: str) -> None:
+        self.number = number            # of the channel and of its schema
+        self.schema = records.schema(number, schema_name, event.text)
+        self.channel = records.channel(number, number, event.topic)
+        self.undefined = len(self.schema) + len(self.channel)   # 0 once they are in the file
+        self.count = 0                  # messages so far
+        self.index: list[int] = []      # log_time and offset of each message in the open chunk
+        self.encode = _encoder(event, number)
+
+
+def _encoder(event: EventType, number: int) -> Callable[..., bytes]:
+    """
+    Return what makes a message record.
+
+    It takes sequence, log_time, publish_time, encapsulation, then the values of the message.
+    """
+    layout = cdr.fixed_layout(event.types)
+    if layout is not None:
+        packer = struct.Struct('<BQHIQQ4s' + layout)
+        length = packer.size - records.RECORD.size
+        return functools.partial(packer.pack, records.MESSAGE, length, number)
+
+    types = event.types
+
+    def encode(sequence: int, log_time: int, publish_time: int, encapsulation: bytes,
+               *values: Any) -> bytes:
+        head = records.MESSAGE_HEAD.pack(number, sequence, log_time, publish_time)
+        return records.record(records.MESSAGE, head + encapsulation + cdr.encode(types, values))
+
+    return encode
+
+
+def _channels(events: Iterable[EventType]) -> dict[str, _Channel]:
+    """Return the channels by full and by short event name; of equal short names the first wins."""
+    channels: dict[str, _Channel] = {}
+    schema_names: set[str] = set()
+    for number, event in enumerate(events, 1):
+        name = camel_case(event.name)
+        if name in schema_names:
+            name = camel_case(event.provider) + name
+        schema_names.add(name)
+        channel = _Channel(event, number, f'mddag_trace/msg/{name}')
+        channels[event.key] = channel
+        channels.setdefault(event.name, channel)
+    return channels
+
+
+class TraceFile:
+    """
+    A trace file being written, event by event, by one thread.
+
+    For importers and simulations; what runs live uses `TraceWriter`. The file is complete after
+    `finish()`; leaving a `with` block does that, or gives the file up when an exception leaves it.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *,
+                 extra_events: Iterable[EventType] = ()) -> None:
+        """
+        Open the file, over what was there.
+
+        :param extra_events: events beyond the table, or other fields for one of the table
+        :raises TraceError: where the file cannot be written
+        """
+        self.path = os.fspath(path)
+        #: Events that are in the file, in whole chunks.
+        self.written = 0
+        #: Events that could not be encoded, and the reason of the first.
+        self.rejected = 0
+        self.rejection: str | None = None
+        events = {**EVENTS, **{event.key: event for event in extra_events}}
+        self._channels = _channels(events.values())
+        self._in_order = list(dict.fromkeys(self._channels.values()))
+        self._zstd = zstandard.ZstdCompressor(level=_COMPRESSION_LEVEL)
+        self._records: list[bytes] = []     # of the open chunk
+        self._size = 0                      # their total size
+        self._offset = 0                    # what has been written of the file
+        self._chunk_indexes: list[bytes] = []
+        self._start: int | None = None      # least and greatest time of all messages
+        self._end = 0
+        try:
+            self._stream = open(self.path, 'wb', buffering=0)
+        except (OSError, ValueError) as error:
+            reason = getattr(error, 'strerror', None) or str(error)
+            raise TraceError(self.path, f'cannot be written ({reason})',
+                             'name a file in an existing folder that you may write') from None
+        content = records.string('ros2') + records.string(LIBRARY)
+        self._write(records.MAGIC + records.record(records.HEADER, content))
+
+    def add(self, event: str, timestamp: int, vpid: int, vtid: int, *fields: Any) -> None:
+        """
+        Write one event.
+
+        :param event: its full name (`ros2:callback_start`), or its short one where that is unique
+        :param timestamp: ns on the trace's clock
+        :param vpid: process id
+        :param vtid: native thread id
+        :param fields: the values of its fields, in the order of its type
+        :raises TraceError: for an unknown event, unfit values, or where writing fails
+        """
+        if self._stream.closed:
+            raise TraceError(self.path, 'is closed', 'write events before finishing it')
+        rejected = self.rejected
+        self.rejection = None
+        self.extend(((event, timestamp, vtid, *fields),), vpid)
+        if self.rejected > rejected:
+            raise TraceError(self.path, str(self.rejection),
+                             'give an event of the table, and its fields with their types')
+
+    def extend(self, entries: Iterable[Sequence[Any]], vpid: int) -> None:
+        """
+        Write events, given as name, timestamp, thread id and fields.
+
+        An event that is unknown or does not fit its type is left out and counted in `rejected`.
+
+        :raises TraceError: where writing fails
+        """
+        channels = self._channels
+        for entry in entries:
+            try:
+                channel = channels[entry[0]]
+                timestamp = entry[1]
+                message = channel.encode(channel.count & 0xFFFFFFFF, timestamp, timestamp,
+                                         cdr.ENCAPSULATION, timestamp, vpid, *entry[2:])
+            except Exception as error:      # whatever a caller gave: it costs this event only
+                self._reject(entry, error)
+                continue
+            if self._size + len(message) + channel.undefined > CHUNK_LIMIT:
+                self.flush()
+            if channel.undefined:
+                self._define(channel)
+            channel.index += (timestamp, self._size)
+            channel.count += 1
+            self._records.append(message)
+            self._size += len(message)
+
+    def _reject(self, entry: Sequence[Any], error: Exception) -> None:
+        self.rejected += 1
+        if self.rejection is None:
+            name = entry[0] if entry else ''
+            reason = 'no such event' if isinstance(error, KeyError) else str(error)
+            self.rejection = f'event {name!r} cannot be written ({reason})'
+
+    def _define(self, channel: _Channel) -> None:
+        self._records += (channel.schema, channel.channel)
+        self._size += channel.undefined
+        channel.undefined = 0
+
+    def flush(self) -> None:
+        """
+        Write what there is as a chunk and hand it to the operating system.
+
+        :raises TraceError: where writing fails
+        """
+        if not self._records:
+            return
+        used = [channel for channel in self._in_order if channel.index]
+        start = min(min(channel.index[::2]) for channel in used)
+        end = max(max(channel.index[::2]) for channel in used)
+        data = b''.join(self._records)
+        packed = self._zstd.compress(data)
+        chunk = records.record(
+            records.CHUNK,
+            records.CHUNK_HEAD.pack(start, end, len(data), zlib.crc32(data))
+            + records.string('zstd') + records.UINT64.pack(len(packed)) + packed)
+
+        messages = 0
+        indexes = b''
+        index_offsets = b''
+        for channel in used:
+            index_offsets += struct.pack('<HQ', channel.number,
+                                         self._offset + len(chunk) + len(indexes))
+            entries = struct.pack(f'<{len(channel.index)}Q', *channel.index)
+            indexes += records.record(records.MESSAGE_INDEX, records.UINT16.pack(channel.number)
+                                      + records.block(entries))
+            messages += len(channel.index) // 2
+            channel.index = []
+        self._chunk_indexes.append(records.record(
+            records.CHUNK_INDEX,
+            struct.pack('<QQQQ', start, end, self._offset, len(chunk))
+            + records.block(index_offsets) + records.UINT64.pack(len(indexes))
+            + records.string('zstd') + struct.pack('<QQ', len(packed), len(data))))
+        self._start = start if self._start is None else min(self._start, start)
+        self._end = max(self._end, end)
+        self._records = []
+        self._size = 0
+        self._write(chunk + indexes)
+        self.written += messages
+
+    def finish(self) -> None:
+        """
+        Write the rest, the summary and the footer, and close the file; a second call does nothing.
+
+        :raises TraceError: where writing fails
+        """
+        if self._stream.closed:
+            return
+        self.flush()
+        self._write(records.record(records.DATA_END, records.UINT32.pack(0)))
+        summary_start = self._offset
+        summary = self._summary()
+        content = records.FOOTER_CONTENT.pack(summary_start, 0, 0)[:-4]
+        footer = records.RECORD.pack(records.FOOTER, len(content) + 4) + content
+        crc = zlib.crc32(summary + footer)      # of all from the summary's start to the CRC itself
+        self._write(summary + footer + records.UINT32.pack(crc) + records.MAGIC)
+        self._stream.close()
+
+    def _summary(self) -> bytes:
+        defined = [channel for channel in self._in_order if not channel.undefined]
+        counts = b''.join(struct.pack('<HQ', channel.number, channel.count)
+                          for channel in defined)
+        statistics = records.STATISTICS_HEAD.pack(
+            sum(channel.count for channel in defined), len(defined), len(defined), 0, 0,
+            len(self._chunk_indexes), self._start or 0, self._end)
+        return b''.join((
+            *(channel.schema for channel in defined),
+            *(channel.channel for channel in defined),
+            records.record(records.STATISTICS, statistics + records.block(counts)),
+            *self._chunk_indexes))
+
+    def abandon(self) -> None:
+        """Close the file without what is not yet written, without summary and footer."""
+        self._stream.close()
+
+    def _write(self, data: bytes) -> None:
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[self._stream.write(rest):]      # a full disk may take only a part
+        except (OSError, ValueError) as error:
+            self._cut_back()
+            reason = getattr(error, 'strerror', None) or str(error)
+            raise TraceError(self.path, f'writing failed ({reason})',
+                             'what was written before is there; free space, then record again'
+                             ) from None
+        self._offset += len(data)
+
+    def _cut_back(self) -> None:
+        try:
+            self._stream.truncate(self._offset)
+        except (OSError, ValueError):
+            pass        # not a plain file, or gone: a reader copes with a cut chunk
+        self._stream.close()
+
+    def __enter__(self) -> TraceFile:
+        """Return the file itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 traceback: TracebackType | None) -> None:
+        """Finish the file, or give it up when an exception leaves the block."""
+        if kind is None:
+            self.finish()
+        else:
+            self.abandon()

@@ -1,0 +1,212 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The trace writer of a live run: many threads record, one thread writes.
+
+Theory of operation:
+
+1. `record()` is in the executor's hot path. It appends one tuple to a deque, which is atomic in
+   CPython, takes no lock and never waits. When the deque is full the event is counted as lost.
+2. The writer thread empties the deque every `flush_interval_s` and hands whole chunks to the
+   operating system, so a process that is killed loses that much and a little more.
+3. Encoding needs the interpreter lock, which the workers need too: the thread encodes a small
+   slice of events, then naps, so that no worker waits for more than one slice. When it falls
+   behind it skips the naps.
+4. Losses are written into the trace as `mddag:lost`, so that a reader knows of them.
+5. When writing fails, recording ends and the run goes on; `error` holds the reason and `close()`
+   raises it.
+"""
+
+from __future__ import annotations
+
+import atexit
+from collections import deque
+from collections.abc import Iterable
+import logging
+import os
+import threading
+import time
+from types import TracebackType
+from typing import Any, TYPE_CHECKING
+
+from mddag_executor.trace.errors import TraceError
+from mddag_executor.trace.schema import EventType
+from mddag_executor.trace.trace_file import TraceFile
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+_LOGGER = logging.getLogger(__name__)
+_SLICE = 128            # events encoded in one go: about 0.2 ms
+_NAP_S = 50e-6          # long enough for a waiting thread to take the interpreter lock
+
+
+class TraceWriter:
+    """
+    Records events from many threads into a trace file; usable as a context manager.
+
+    The file is readable at any time up to its last whole chunk, and complete after `close()`.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, clock_offset: int | None = None,
+                 flush_interval_s: float = 0.25, capacity: int = 1 << 17,
+                 extra_events: Iterable[EventType] = ()) -> None:
+        """
+        Open the file, over what was there, and start the writer thread.
+
+        :param clock_offset: ns between the trace's clock and `time.monotonic_ns()`; without it,
+            such that the trace's clock counts from the epoch
+        :param flush_interval_s: how often what was recorded goes to the operating system
+        :param capacity: how many events may wait for the writer thread
+        :param extra_events: events beyond the table
+        :raises TraceError: where the file cannot be written
+        """
+        if clock_offset is None:
+            clock_offset = time.time_ns() - time.monotonic_ns()
+        #: What to add to `time.monotonic_ns()` for a time on the trace's clock.
+        self.clock_offset = clock_offset
+        #: Why recording ended early, None while all is well.
+        self.error: TraceError | None = None
+        self._file = TraceFile(path, extra_events=extra_events)
+        self._interval_s = flush_interval_s
+        self._pending: deque[tuple[Any, ...]] = deque()
+        self._capacity = capacity       # 0: nothing is taken any more
+        self._lost = 0
+        # Reentrant, for a finalizer or signal handler that records while its thread counts a loss.
+        self._lost_lock = threading.RLock()
+        self._taken = 0                 # events that went from the deque to the file object
+        self._reported_lost = 0         # by `mddag:lost` events so far
+        self._reported_rejection = False
+        self._vpid = os.getpid()
+        self._stop = threading.Event()
+        self._close_lock = threading.Lock()
+        self._closed = False
+        # A daemon, so that a program that forgets close() ends; atexit completes its file.
+        self._thread = threading.Thread(target=self._run, name='mddag trace writer', daemon=True)
+        self._thread.start()
+        atexit.register(self._end)
+
+    # The tuple of all arguments is what is kept, so it is not taken apart: it is half the cost.
+    def record(self, *event: Unpack[tuple[str, int, int, Unpack[tuple[Any, ...]]]]) -> None:
+        """
+        Record one event: its name, its time, the native thread id, then its fields.
+
+        Never waits, never raises. An event that is unknown or whose fields do not fit is left out
+        by the writer thread, counted in `dropped`, and logged once.
+
+        :param event: name (as in `callback_start`), ns on the trace's clock, native id of the
+            thread, the values of the event's fields in the order of its type
+        """
+        if len(self._pending) < self._capacity:
+            self._pending.append(event)
+        else:
+            with self._lost_lock:
+                self._lost += 1
+
+    def now(self) -> int:
+        """Return the time in ns on the trace's clock."""
+        return time.monotonic_ns() + self.clock_offset
+
+    @property
+    def path(self) -> str:
+        """Return the path of the file."""
+        return self._file.path
+
+    @property
+    def dropped(self) -> int:
+        """Return how many recorded events are not in the file and will not be."""
+        late = len(self._pending) if self._closed or self.error else 0
+        return self._lost + self._file.rejected + late
+
+    def close(self) -> None:
+        """
+        Write the rest and the summary, and end the writer thread; a second call does nothing.
+
+        :raises TraceError: (the first time) where writing failed, now or before
+        """
+        if self._end() and self.error:
+            raise self.error
+
+    def _end(self) -> bool:
+        with self._close_lock:
+            # In a forked child there is neither the thread nor a right to the parent's file.
+            if self._closed or os.getpid() != self._vpid:
+                return False
+            self._capacity = 0
+            self._stop.set()
+            self._thread.join()
+            self._closed = True
+            atexit.unregister(self._end)
+            return True
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.wait(self._interval_s):
+                self._drain()
+                self._file.flush()
+            self._drain()
+            self._file.finish()
+        except TraceError as error:
+            self._give_up(error)
+        except Exception as error:      # a defect here must not end the run that is being traced
+            self._file.abandon()
+            self._give_up(TraceError(self._file.path, f'recording ended ({error!r})',
+                                     'please report this; what was written before is there'))
+
+    def _drain(self) -> None:
+        pending = self._pending
+        # No more than what waits now: those who record must not keep this loop from its flush.
+        waiting = len(pending)
+        while waiting > 0:
+            count = min(waiting, _SLICE)
+            self._extend([pending.popleft() for _ in range(count)])
+            waiting -= count
+            if len(pending) * 2 < self._capacity:
+                time.sleep(_NAP_S)
+        self._report_losses()
+
+    def _report_losses(self) -> None:
+        lost = self._lost + self._file.rejected
+        if lost == self._reported_lost:
+            return
+        if self._file.rejection and not self._reported_rejection:
+            self._reported_rejection = True
+            _LOGGER.warning('%s: %s', self._file.path, self._file.rejection)
+        count = lost - self._reported_lost
+        self._reported_lost = lost
+        self._extend([('mddag:lost', self.now(), threading.get_native_id(), count)])
+
+    def _extend(self, events: list[tuple[Any, ...]]) -> None:
+        self._taken += len(events)
+        self._file.extend(events, self._vpid)
+
+    def _give_up(self, error: TraceError) -> None:
+        self._capacity = 0
+        with self._lost_lock:
+            self._lost += self._taken - self._file.rejected - self._file.written
+        self.error = error
+        _LOGGER.error('%s', error)
+
+    def __enter__(self) -> TraceWriter:
+        """Return the writer itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 traceback: TracebackType | None) -> None:
+        """Close the writer; what a failed `close()` raises does not hide an exception."""
+        if kind is None:
+            self.close()
+        else:
+            self._end()

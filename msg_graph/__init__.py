@@ -1,0 +1,96 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Declared message graphs to DAG tasks.
+
+``load`` reads a declaration and derives its DAG tasks; the result, a ``TaskSet``, is immutable and
+all that the rest of a program needs to know about the graph. The rules are in ``derive``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import gc
+from os import fspath, PathLike
+
+from msg_graph.declaration import parse_declaration
+from msg_graph.derive import derive
+from msg_graph.duration import DurationError, format_duration, parse_duration
+from msg_graph.errors import GraphError
+from msg_graph.model import (
+    Callback,
+    Dag,
+    ExecutionTime,
+    Path,
+    QueueEdge,
+    TaskSet,
+    Vertex,
+)
+from msg_graph.yamltext import decode, MAX_BYTES
+
+__all__ = [
+    'Callback', 'Dag', 'DurationError', 'ExecutionTime', 'GraphError', 'Path', 'QueueEdge',
+    'TaskSet', 'Vertex', 'format_duration', 'load', 'loads', 'parse_duration',
+]
+
+
+def load(path: str | PathLike[str]) -> TaskSet:
+    """
+    Return the task set of a declaration file.
+
+    :raises GraphError: the file cannot be read, is not YAML, or breaks a rule of the language or
+        of the model.
+    """
+    name = fspath(path)
+    try:
+        with open(path, 'rb') as file:
+            data = file.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else None
+        raise GraphError(
+            name, None, f'the file cannot be read ({reason or error})',
+            'give the path of a declaration') from None
+    return loads(data, name)
+
+
+def loads(text: str | bytes, name: str = '<string>') -> TaskSet:
+    """
+    Return the task set of a declaration.
+
+    :param text: the YAML; bytes must be UTF-8.
+    :param name: what errors call it.
+    :raises GraphError: it is not YAML, or breaks a rule of the language or of the model.
+    """
+    text = decode(text, name) if isinstance(text, bytes) else text
+    with _no_collection():
+        return derive(parse_declaration(text, name), text)
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """
+    Hold the cyclic garbage collector off while a declaration is read.
+
+    Hundreds of thousands of objects come to be and none of them dies; looking for garbage among
+    them again and again takes a quarter of the time.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()

@@ -1,0 +1,84 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Figures of a DAG that reports show: topological order, longest path, utilisation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from msg_graph.model import Dag
+
+
+def topological_order(dag: Dag) -> list[int]:
+    """Return the vertices (indices in the DAG) so that each comes after its predecessors."""
+    waiting = [len(vertex.predecessors) for vertex in dag.vertices]
+    order = [dag.source]
+    for index in order:
+        for after in dag.vertices[index].successors:
+            waiting[after] -= 1
+            if waiting[after] == 0:
+                order.append(after)
+    return order
+
+
+def path_lengths(dag: Dag, weights: Sequence[int]) -> list[int]:
+    """
+    Return for each vertex the length of the longest path from the source through it.
+
+    :param weights: weight of each vertex, by its index in the DAG; the vertex's own counts.
+    """
+    lengths = [0] * len(dag.vertices)
+    for index in topological_order(dag):
+        before = dag.vertices[index].predecessors
+        lengths[index] = weights[index] + max((lengths[p] for p in before), default=0)
+    return lengths
+
+
+def longest_path(dag: Dag, weights: Sequence[int], end: int | None = None) -> tuple[int, ...]:
+    """
+    Return the vertices along a longest path (critical path), from the source on.
+
+    Of several the one whose vertices have the smallest indices, looking back from the end.
+
+    :param weights: weight of each vertex, by its index in the DAG.
+    :param end: the vertex that it ends at; None for the sink with the longest path.
+    """
+    lengths = path_lengths(dag, weights)
+    at = max(dag.sinks, key=lengths.__getitem__) if end is None else end
+    path = [at]
+    while dag.vertices[at].predecessors:
+        at = max(dag.vertices[at].predecessors, key=lengths.__getitem__)
+        path.append(at)
+    return tuple(reversed(path))
+
+
+def mean_execution_times(dag: Dag) -> list[int] | None:
+    """Return each vertex's mean execution time in ns, or None where one is not declared."""
+    means = []
+    for vertex in dag.vertices:
+        if vertex.callback.execution_time is None:
+            return None
+        means.append(vertex.callback.execution_time.mean_ns)
+    return means
+
+
+def utilisation(dag: Dag) -> float | None:
+    """
+    Return the share of one processor that the DAG needs with mean execution times.
+
+    None where an execution time is not declared.
+    """
+    means = mean_execution_times(dag)
+    return None if means is None else sum(means) / dag.period_ns

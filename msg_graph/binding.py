@@ -1,0 +1,137 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Binding of running or recorded timers, subscriptions and services to declared callbacks.
+
+Theory of operation
+-------------------
+A declaration names callbacks as their authors count them; a running or recorded system has timers
+with periods, subscriptions with topics and services with names.
+
+1. They are matched by node and by what starts them.
+2. Several callbacks of one node that are started alike (two subscriptions of one topic) are handed
+   out in the order of their declaration: nodes make their entities in the order in which tools
+   count the callbacks.
+3. A sync callback has one entity for each of its topics, its *legs*.
+4. What no declared callback is left for is not declared.
+"""
+
+from __future__ import annotations
+
+from heapq import heappop, heappush
+
+from msg_graph.model import Callback, TaskSet
+
+# A timer made from a float of seconds is off by rounding (rclpy cuts off fractions of a ns), and
+# declared periods like 33.333ms are rounded themselves.
+_PERIOD_TOLERANCE = 1e-3
+
+
+class Binder:
+    """
+    Hands out the declared callbacks of a task set to the entities that start them.
+
+    Every ``bind_...`` returns None where nothing (more) is declared that fits, so the entity's
+    callback is an undeclared one.
+    """
+
+    def __init__(self, task_set: TaskSet) -> None:
+        self._callbacks = task_set.callbacks
+        self._free: dict[tuple[str, str, str], list[int]] = {}
+        self._periods: dict[str, set[int]] = {}
+        self._place: dict[str, int] = {}
+        self._bound: list[set[str]] = []
+        for place, callback in enumerate(task_set.callbacks):
+            self._place[callback.key] = place
+            self._bound.append(set())
+            for leg in _legs(callback):
+                self._free.setdefault((callback.node, *leg), []).append(place)
+            if callback.timer_period_ns is not None:
+                self._periods.setdefault(callback.node, set()).add(callback.timer_period_ns)
+
+    def bind_timer(self, node: str, period_ns: int) -> Callback | None:
+        """
+        Return the callback of a timer.
+
+        The declared period may differ by a thousandth; of several the nearest one is meant.
+
+        :param node: fully qualified name of the timer's node.
+        """
+        declared = [
+            period for period in self._periods.get(node, ())
+            if abs(period - period_ns) <= _PERIOD_TOLERANCE * period
+            and self._free[node, 'timer', str(period)]]
+        if not declared:
+            return None
+        nearest = min(declared, key=lambda period: (abs(period - period_ns), period))
+        return self._take(node, 'timer', str(nearest))
+
+    def bind_subscription(self, node: str, topic: str) -> Callback | None:
+        """
+        Return the callback of a subscription; of a sync callback's leg, the sync callback.
+
+        :param node: fully qualified name of the subscription's node.
+        :param topic: fully qualified name of its topic.
+        """
+        return self._take(node, 'topic', topic)
+
+    def bind_service(self, node: str, service: str) -> Callback | None:
+        """
+        Return the callback of a service.
+
+        :param node: fully qualified name of the service's node.
+        :param service: fully qualified name of the service.
+        """
+        return self._take(node, 'service', service)
+
+    def release(self, callback: Callback, topic: str | None = None) -> None:
+        """
+        Take a binding back, as its entity is gone; the callback can be bound anew.
+
+        :param topic: the leg of a sync callback; None for all that are bound.
+        :raises KeyError: the callback, or that leg of it, is not bound.
+        """
+        place = self._place[callback.key]
+        bound = self._bound[place]
+        starts = sorted(bound) if topic is None else [topic]
+        if not bound or not bound.issuperset(starts):
+            raise KeyError(callback.key if topic is None else topic)
+        kinds = {start: kind for kind, start in _legs(callback)}
+        for start in starts:
+            bound.remove(start)
+            heappush(self._free[callback.node, kinds[start], start], place)
+
+    def unbound(self) -> tuple[Callback, ...]:
+        """Return the callbacks that are not bound, or not by all their legs, in file order."""
+        return tuple(
+            callback for callback, bound in zip(self._callbacks, self._bound, strict=True)
+            if len(bound) < len(_legs(callback)))
+
+    def _take(self, node: str, kind: str, start: str) -> Callback | None:
+        free = self._free.get((node, kind, start))
+        if not free:
+            return None
+        place = heappop(free)
+        self._bound[place].add(start)
+        return self._callbacks[place]
+
+
+def _legs(callback: Callback) -> list[tuple[str, str]]:
+    """Return what starts a callback, as pairs of kind and name."""
+    if callback.kind == 'timer':
+        return [('timer', str(callback.timer_period_ns))]
+    if callback.kind == 'service':
+        return [('service', str(callback.service))]
+    return [('topic', topic) for topic in callback.topics]

@@ -1,0 +1,241 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The declaration language: YAML to callbacks, each entry checked by itself.
+
+What needs more than one entry to judge (publishers, cycles, sinks, sources, …) is ``derive``'s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+from msg_graph.duration import DAY, format_duration
+from msg_graph.errors import GraphError, shown
+from msg_graph.fields import (
+    check_callback,
+    check_dag,
+    check_group,
+    check_key,
+    check_node,
+    check_path,
+    check_read,
+    check_service,
+    check_topic,
+    Fields,
+)
+from msg_graph.model import Callback, ExecutionTime, Kind, OnMiss, Path, ReleaseFrom
+from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Tree
+
+_FORMAT = '1'
+_MOST_WORKERS = 1024
+_MOST_ACTIVE_JOBS = 1_000_000
+
+_FILE_KEYS = ('mddag', 'workers', 'nodes', 'paths')
+_NODE_KEYS = ('node', 'callbacks')
+_TRIGGERS = ('timer', 'subscription', 'sync', 'service')
+_CALLBACK_KEYS = (
+    'name', *_TRIGGERS, 'period', 'publishes', 'reads', 'deadline', 'release_from',
+    'execution_time', 'group', 'dag', 'on_miss', 'max_active_jobs')
+_PATH_KEYS = ('name', 'callbacks')
+_TIME_KEYS = ('quantiles_us', 'percent')
+_RELEASE_FROM = ('arrival', 'source_timestamp', 'header_stamp')
+_ON_MISS = ('continue', 'abort')
+
+# The quantiles that the published figures of the Autoware workload come with.
+_PERCENT_29 = (
+    0.0, 0.1, 0.5, 1.0, 2.0, *(float(percent) for percent in range(5, 100, 5)),
+    98.0, 99.0, 99.5, 99.9, 100.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A callback and the mapping that declares it, which knows the lines."""
+
+    callback: Callback
+    fields: Fields
+
+
+@dataclass(frozen=True, slots=True)
+class PathEntry:
+    """A path and the mapping that declares it."""
+
+    path: Path
+    fields: Fields
+
+
+@dataclass(frozen=True, slots=True)
+class Declaration:
+    """A declaration as it stands in the file; callbacks in file order."""
+
+    file: str
+    workers: int | None
+    entries: tuple[Entry, ...]
+    paths: tuple[PathEntry, ...]
+
+
+def parse_declaration(text: str, file: str) -> Declaration:
+    """
+    Return the declaration that a YAML text holds.
+
+    :raises GraphError: it is not YAML, or an entry is wrong by itself.
+    """
+    tree = parse_yaml(text, file)
+    if tree is None or (isinstance(tree, Scalar) and tree.is_null):
+        raise GraphError(
+            file, None, 'the file is empty', "write a declaration that starts with 'mddag: 1'")
+    if not isinstance(tree, Mapping):
+        raise GraphError(
+            file, tree.line, 'this is not a declaration', "write one that starts with 'mddag: 1'")
+    fields = Fields(tree, file, 'the declaration', _FILE_KEYS)
+    fields.text('mddag', _check_format)
+    workers = fields.integer_or_none('workers', 1, _MOST_WORKERS)
+    entries = _entries(fields.sequence('nodes'), file)
+    paths = _paths(fields.sequence('paths'), file) if fields.has('paths') else ()
+    return Declaration(file, workers, entries, paths)
+
+
+def _check_format(text: str) -> tuple[str, str] | None:
+    if text == _FORMAT:
+        return None
+    return f'{shown(text)} is no known version of the format', f"write 'mddag: {_FORMAT}'"
+
+
+def _entries(nodes: list[Tree], file: str) -> tuple[Entry, ...]:
+    entries: dict[str, Entry] = {}
+    for place, node_tree in enumerate(nodes, 1):
+        fields = Fields(node_tree, file, f'node {place}', _NODE_KEYS)
+        node = fields.text('node', check_node)
+        fields.entry = f'node {shown(node)}'
+        for number, tree in enumerate(fields.sequence('callbacks'), 1):
+            entry = _callback(
+                Fields(tree, file, f'callback {number} of node {shown(node)}', _CALLBACK_KEYS),
+                node)
+            key = entry.callback.key
+            if key in entries:
+                raise entry.fields.error(
+                    'name', f'this name is taken in line {entries[key].callback.line}',
+                    'give each callback of a node a name of its own')
+            entries[key] = entry
+    return tuple(entries.values())
+
+
+def _callback(fields: Fields, node: str) -> Entry:
+    name = fields.text('name', check_callback)
+    key = f'{node}:{name}'
+    fields.entry = f'callback {shown(key)}'
+    kind = fields.one_of(_TRIGGERS, 'what starts the callback')
+    timer_period = fields.duration_or_none('timer')
+    topics: tuple[str, ...] = ()
+    if kind == 'subscription':
+        topics = (fields.text('subscription', check_topic),)
+    elif kind == 'sync':
+        topics = fields.texts('sync', check_topic, least=2)
+    callback = Callback(
+        node=node,
+        name=name,
+        key=key,
+        kind=cast(Kind, kind),
+        timer_period_ns=timer_period,
+        topics=topics,
+        service=fields.text_or_none('service', check_service),
+        period_ns=_period(fields, timer_period),
+        publishes=fields.texts('publishes', check_topic),
+        reads=fields.texts('reads', check_read),
+        deadline_ns=fields.duration_or_none('deadline'),
+        release_from=cast(ReleaseFrom, fields.choice('release_from', _RELEASE_FROM)),
+        group=fields.text_or_none('group', check_group),
+        dag=fields.text_or_none('dag', check_dag),
+        execution_time=_execution_time(fields),
+        line=fields.line,
+        on_miss=cast(OnMiss, fields.choice('on_miss', _ON_MISS)),
+        max_active_jobs=fields.integer_or_none('max_active_jobs', 1, _MOST_ACTIVE_JOBS),
+    )
+    return Entry(callback, fields)
+
+
+def _period(fields: Fields, timer_period: int | None) -> int | None:
+    """Return the declared period, or the timer's; where both stand they must agree."""
+    period = fields.duration_or_none('period')
+    if timer_period is None or period is None:
+        return timer_period if period is None else period
+    if period != timer_period:
+        raise fields.error(
+            'period',
+            f'its period of {format_duration(period)} is not that of its timer, '
+            f'{format_duration(timer_period)}',
+            "remove 'period:', a timer has its own")
+    return period
+
+
+def _execution_time(fields: Fields) -> ExecutionTime | None:
+    value = fields.tree_or_none('execution_time')
+    if value is None:
+        return None
+    if isinstance(value, Scalar):
+        constant = fields.duration_or_none('execution_time', minimum_ns=1)
+        assert constant is not None
+        return ExecutionTime((constant,), (50.0,))
+    inner = Fields(value, fields.file, f'execution time of {fields.entry}', _TIME_KEYS)
+    quantiles_us = inner.numbers('quantiles_us')
+    _check_quantiles(inner, quantiles_us)
+    percent = _percent(inner, len(quantiles_us))
+    return ExecutionTime(tuple(round(us * 1000) for us in quantiles_us), percent)
+
+
+def _check_quantiles(fields: Fields, quantiles_us: list[float]) -> None:
+    key = 'quantiles_us'
+    if quantiles_us[0] < 0:
+        raise fields.error(key, f'the quantile {quantiles_us[0]} is negative', 'write times in us')
+    for before, after in zip(quantiles_us, quantiles_us[1:]):
+        if after < before:
+            raise fields.error(
+                key, f'the quantile {after} comes after {before}', 'write them in rising order')
+    if not 1 <= quantiles_us[-1] * 1000 <= DAY:
+        raise fields.error(
+            key, f'the largest quantile, {quantiles_us[-1]} us, makes no sense',
+            'write times from 0.001 us to a day, in us')
+
+
+def _percent(fields: Fields, count: int) -> tuple[float, ...]:
+    """Return the shares that the quantiles belong to, declared or the default for their number."""
+    if not fields.has('percent'):
+        if count == len(_PERCENT_29):
+            return _PERCENT_29
+        return tuple(100.0 * i / (count - 1) for i in range(count)) if count > 1 else (50.0,)
+    percent = fields.numbers('percent')
+    if len(percent) != count:
+        raise fields.error(
+            'percent', f'{len(percent)} shares for {count} quantiles', 'give one for each')
+    if percent[0] < 0 or percent[-1] > 100:
+        raise fields.error('percent', 'a share is not within 0 and 100', 'write percentages')
+    if any(after <= before for before, after in zip(percent, percent[1:])):
+        raise fields.error('percent', 'the shares do not rise', 'write them in rising order')
+    return tuple(percent)
+
+
+def _paths(trees: list[Tree], file: str) -> tuple[PathEntry, ...]:
+    paths: dict[str, PathEntry] = {}
+    for place, tree in enumerate(trees, 1):
+        fields = Fields(tree, file, f'path {place}', _PATH_KEYS)
+        name = fields.text('name', check_path)
+        fields.entry = f'path {shown(name)}'
+        if name in paths:
+            raise fields.error('name', 'this name is taken', 'give each path a name of its own')
+        fields.sequence('callbacks')
+        callbacks = fields.texts('callbacks', check_key, least=2)
+        paths[name] = PathEntry(Path(name, callbacks), fields)
+    return tuple(paths.values())

@@ -1,0 +1,105 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Times as people write them (``100ms``, ``20 us``, ``1.5s``) to integer nanoseconds and back."""
+
+from __future__ import annotations
+
+from decimal import Decimal, ROUND_HALF_EVEN
+import re
+
+from msg_graph.errors import shown
+
+MICROSECOND = 1_000
+MILLISECOND = 1_000_000
+SECOND = 1_000_000_000
+DAY = 86_400 * SECOND
+
+_UNITS = {
+    'ns': 1,
+    'us': MICROSECOND,
+    'µs': MICROSECOND,  # micro sign
+    'μs': MICROSECOND,  # Greek letter mu
+    'ms': MILLISECOND,
+    's': SECOND,
+    'min': 60 * SECOND,
+}
+_NUMBER = r'(?P<sign>[+-]?)(?P<number>[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})'
+_DURATION = re.compile(_NUMBER + r'[ \t]*(?P<unit>[^\W\d_]*)')
+
+
+class DurationError(ValueError):
+    """
+    A text that is no usable time.
+
+    :ivar problem: what is wrong with it.
+    :ivar remedy: what to write instead.
+    """
+
+    def __init__(self, problem: str, remedy: str) -> None:
+        super().__init__(problem, remedy)
+        self.problem = problem
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        """Return the error as one line."""
+        return f'{self.problem}: {self.remedy}'
+
+
+def parse_duration(
+    text: str, *, minimum_ns: int = MICROSECOND, maximum_ns: int = DAY
+) -> int:
+    """
+    Return the nanoseconds that a text like ``100ms``, ``20 us`` or ``1.5s`` means.
+
+    Units are ns, us (or µs), ms, s and min. Fractions of a nanosecond are rounded to the nearest.
+
+    :param minimum_ns: the least time that makes sense here, in ns.
+    :param maximum_ns: the longest time that makes sense here, in ns.
+    :raises DurationError: (a ``ValueError``) no number, no unit or an unknown one, a negative
+        time, or one outside of the bounds.
+    """
+    match = _DURATION.fullmatch(text.strip(' \t'))
+    if match is None:
+        raise DurationError(
+            f'{shown(text)} is not a time', "write a number and a unit, as '100ms'")
+    unit = match['unit']
+    if not unit:
+        raise DurationError(
+            f'{shown(text)} has no unit',
+            f"add one, as '{match['number']}ms' (ns, us, ms, s, min)")
+    if unit not in _UNITS:
+        raise DurationError(
+            f'{shown(text)} has the unknown unit {shown(unit)}', 'use ns, us, ms, s or min')
+    if match['sign'] == '-':
+        raise DurationError(f'{shown(text)} is negative', 'write a time above zero')
+    exact = Decimal(match['number']) * _UNITS[unit]
+    value = int(exact.to_integral_value(ROUND_HALF_EVEN))
+    if value < minimum_ns:
+        raise DurationError(
+            f'{shown(text)} is too short',
+            f'write at least {format_duration(minimum_ns)} (units are ns, us, ms, s, min)')
+    if value > maximum_ns:
+        raise DurationError(
+            f'{shown(text)} is too long',
+            f'write at most {format_duration(maximum_ns)} (units are ns, us, ms, s, min)')
+    return value
+
+
+def format_duration(ns: int) -> str:
+    """Return a time for people, in the largest unit that fits, to three decimals at most."""
+    for unit, factor in (('s', SECOND), ('ms', MILLISECOND), ('us', MICROSECOND)):
+        if abs(ns) >= factor:
+            return f'{ns / factor:.3f}'.rstrip('0').rstrip('.') + unit
+    return f'{ns}ns'

@@ -1,0 +1,261 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The derived task set: what the rest of the program knows about a message graph.
+
+Everything here is immutable. All times are integers in nanoseconds.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from typing import Literal
+
+Kind = Literal['timer', 'subscription', 'sync', 'service']
+ReleaseFrom = Literal['arrival', 'source_timestamp', 'header_stamp']
+OnMiss = Literal['continue', 'abort']
+
+
+@dataclass(frozen=True, slots=True)
+class ExecutionTime:
+    """
+    Execution time of a callback, as a distribution given by quantiles.
+
+    :ivar quantiles_ns: the quantiles, never decreasing; a single value is a constant.
+    :ivar percent: the share (0 to 100, increasing) of executions that take at most the quantile
+        at the same place. Below the first and above the last the distribution is flat.
+    """
+
+    quantiles_ns: tuple[int, ...]
+    percent: tuple[float, ...]
+
+    def draw(self, u: float) -> int:
+        """
+        Return the execution time (ns) at the share ``u`` of the distribution.
+
+        Interpolates linearly between the quantiles: a uniform ``u`` draws from the distribution.
+
+        :raises ValueError: ``u`` is not within 0 and 1.
+        """
+        if not 0.0 <= u <= 1.0:
+            raise ValueError(f'u is {u}: draw with a number from 0 to 1')
+        at = u * 100.0
+        if at <= self.percent[0]:
+            return self.quantiles_ns[0]
+        if at >= self.percent[-1]:
+            return self.quantiles_ns[-1]
+        above = bisect_right(self.percent, at)
+        low, high = self.percent[above - 1], self.percent[above]
+        first, second = self.quantiles_ns[above - 1], self.quantiles_ns[above]
+        return round(first + (second - first) * (at - low) / (high - low))
+
+    @property
+    def mean_ns(self) -> int:
+        """Mean of the distribution that ``draw`` draws from, in ns."""
+        percent, quantiles = self.percent, self.quantiles_ns
+        area = quantiles[0] * percent[0] + quantiles[-1] * (100.0 - percent[-1])
+        for i in range(1, len(percent)):
+            area += (quantiles[i - 1] + quantiles[i]) / 2 * (percent[i] - percent[i - 1])
+        return round(area / 100.0)
+
+    @property
+    def median_ns(self) -> int:
+        """Median of the distribution, in ns."""
+        return self.draw(0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Callback:
+    """
+    A declared callback: the unit that an executor runs.
+
+    :ivar node: fully qualified name of its node.
+    :ivar name: its name within the node.
+    :ivar key: ``node:name``, unique in the declaration.
+    :ivar kind: what starts it.
+    :ivar timer_period_ns: period of its timer; None for other kinds.
+    :ivar topics: the topics that start it: one for a subscription, two or more for a sync.
+    :ivar service: the service that it serves, or None.
+    :ivar period_ns: period of the DAG that it is the source of, declared or its timer's, or None.
+    :ivar publishes: topics that it publishes.
+    :ivar reads: topics and callbacks of its node whose data it reads later (queue edges).
+    :ivar deadline_ns: relative deadline, if it is a sink; else None.
+    :ivar release_from: where a source's release time comes from.
+    :ivar group: name of its mutually exclusive callback group within the node, or None.
+    :ivar dag: declared name of the DAG that it is the source of, or None.
+    :ivar execution_time: its execution time, or None where it is not declared.
+    :ivar line: line of its declaration, counted from 1.
+    :ivar on_miss: what is done with a late job of the DAG that it is the source of.
+    :ivar max_active_jobs: bound on the open jobs of the DAG that it is the source of, or None.
+    """
+
+    node: str
+    name: str
+    key: str
+    kind: Kind
+    timer_period_ns: int | None
+    topics: tuple[str, ...]
+    service: str | None
+    period_ns: int | None
+    publishes: tuple[str, ...]
+    reads: tuple[str, ...]
+    deadline_ns: int | None
+    release_from: ReleaseFrom
+    group: str | None
+    dag: str | None
+    execution_time: ExecutionTime | None
+    line: int
+    on_miss: OnMiss = 'continue'
+    max_active_jobs: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Vertex:
+    """
+    One callback in one DAG; a callback that several messages of a job start is several vertices.
+
+    :ivar name: the callback's key where this is its only vertex; else ``key@dag``, and where one
+        DAG holds the callback several times ``key@dag#1``, ``key@dag#2``, … in order of index.
+    :ivar dag: index of its DAG.
+    :ivar index: its place in its DAG.
+    :ivar predecessors: indices, in the DAG, of the vertices that start it, ascending.
+    :ivar successors: indices, in the DAG, of the vertices that it starts, ascending.
+    :ivar deadline_ns: relative deadline; not None if and only if it is a sink.
+    """
+
+    name: str
+    callback: Callback
+    dag: int
+    index: int
+    predecessors: tuple[int, ...]
+    successors: tuple[int, ...]
+    deadline_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Dag:
+    """
+    A DAG task: period, graph, and one relative deadline for each sink.
+
+    :ivar name: unique among the DAGs: the source's ``dag:``, else its node.
+    :ivar index: its place among the DAGs, which is its source's place in the file.
+    :ivar period_ns: time between two releases.
+    :ivar source: index of the one vertex with no predecessor.
+    :ivar sinks: indices of the vertices with no successor, ascending.
+    :ivar edges: trigger edges as pairs of indices, ascending.
+    :ivar release_from: where a job's release time comes from, if the source is no timer.
+    :ivar on_miss: whether a late job goes on or is aborted.
+    :ivar max_active_jobs: bound on the open jobs, or None where the declaration has none.
+    """
+
+    name: str
+    index: int
+    period_ns: int
+    vertices: tuple[Vertex, ...]
+    source: int
+    sinks: tuple[int, ...]
+    edges: tuple[tuple[int, int], ...]
+    release_from: ReleaseFrom
+    on_miss: OnMiss
+    max_active_jobs: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class QueueEdge:
+    """
+    Data that a callback reads without being started by it.
+
+    :ivar reader: key of the reading callback.
+    :ivar topic: the topic that is taken from; None for a member variable.
+    :ivar writers: keys of the callbacks that publish the topic, or that write the variable.
+    """
+
+    reader: str
+    topic: str | None
+    writers: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """
+    An end-to-end path over trigger and queue edges.
+
+    :ivar name: unique among the paths.
+    :ivar callbacks: keys of the callbacks along it, in the order in which data passes them.
+    """
+
+    name: str
+    callbacks: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSet:
+    """
+    The DAG tasks of a declaration.
+
+    :ivar dags: the DAGs, by index.
+    :ivar callbacks: every declared callback, in file order.
+    :ivar queue_edges: by reader in file order, then in the order of its ``reads``.
+    :ivar paths: the declared end-to-end paths, in file order.
+    :ivar workers: declared number of workers, or None.
+    :ivar file: name of the file that this was read from.
+    :ivar text: the declaration as it was read.
+    :ivar vertices: the vertices of all DAGs, DAG by DAG.
+    """
+
+    dags: tuple[Dag, ...]
+    callbacks: tuple[Callback, ...]
+    queue_edges: tuple[QueueEdge, ...]
+    paths: tuple[Path, ...]
+    workers: int | None
+    file: str
+    text: str
+    vertices: tuple[Vertex, ...] = field(init=False, repr=False, compare=False)
+    _vertex: dict[str, Vertex] = field(init=False, repr=False, compare=False)
+    _dag: dict[str, Dag] = field(init=False, repr=False, compare=False)
+    _callback: dict[str, Callback] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Build what the look-ups by name need."""
+        every = tuple(vertex for dag in self.dags for vertex in dag.vertices)
+        object.__setattr__(self, 'vertices', every)
+        object.__setattr__(self, '_vertex', {vertex.name: vertex for vertex in every})
+        object.__setattr__(self, '_dag', {dag.name: dag for dag in self.dags})
+        object.__setattr__(self, '_callback', {c.key: c for c in self.callbacks})
+
+    def vertex(self, name: str) -> Vertex:
+        """
+        Return the vertex of that name.
+
+        :raises KeyError: there is none.
+        """
+        return self._vertex[name]
+
+    def dag(self, name: str) -> Dag:
+        """
+        Return the DAG of that name.
+
+        :raises KeyError: there is none.
+        """
+        return self._dag[name]
+
+    def callback(self, key: str) -> Callback:
+        """
+        Return the callback ``node:name``.
+
+        :raises KeyError: there is none.
+        """
+        return self._callback[key]

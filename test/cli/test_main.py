@@ -1,0 +1,227 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The program as a whole: verbs, exit status, the one line on standard error."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+import os
+from pathlib import Path
+import subprocess
+import sys
+from types import ModuleType
+
+from mddag_executor import __version__
+from mddag_executor.cli import main as program
+from mddag_executor.errors import InputError, MddagError, UsageError
+import pytest
+
+Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+
+
+@pytest.fixture
+def verb(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[argparse.Namespace], int]], None]:
+    """Give a function that makes `mddag probe [--number N] [FILE …]` do what a callable does."""
+    def install(action: Callable[[argparse.Namespace], int]) -> None:
+        def add_arguments(parser: argparse.ArgumentParser) -> None:
+            parser.add_argument('files', nargs='*')
+            parser.add_argument('--number', type=int)
+
+        module = ModuleType('probe')
+        module.__dict__.update(NAME='probe', HELP='try things', EXAMPLE='mddag probe graph.yaml',
+                               add_arguments=add_arguments, main=action)
+        row = program.Verb('probe', 'try things')
+        monkeypatch.setattr(program, 'available', lambda: {'probe': row})
+        monkeypatch.setattr(program, 'load', lambda _: module)
+    return install
+
+
+def fail_with(error: BaseException) -> Callable[[argparse.Namespace], int]:
+    def action(_: argparse.Namespace) -> int:
+        raise error
+    return action
+
+
+@pytest.mark.parametrize('status', [0, 1])
+def test_the_status_is_that_of_the_verb(verb, status: int) -> None:
+    verb(lambda args: status)
+    assert program.main(['probe']) == status
+
+
+@pytest.mark.parametrize(('error', 'line'), [
+    (InputError('a.yaml', 'no source', 'add a timer', line=3),
+     'error: a.yaml:3: no source: add a timer'),
+    (InputError('a.mcap', 'this is no MCAP', 'name a trace'),
+     'error: a.mcap: this is no MCAP: name a trace'),
+    (UsageError('--x: impossible: leave it'), 'error: --x: impossible: leave it'),
+    (MddagError('a\n  b\tc\x1b[31m\u202e'), 'error: a b c\\x1b[31m\\u202e'),
+    (FileNotFoundError(2, 'No such file or directory', 'gone.yaml'),
+     'error: gone.yaml: no such file or directory: check the path'),
+    (IsADirectoryError(21, 'Is a directory', 'folder'),
+     'error: folder: is a directory: name a file'),
+    (PermissionError(13, 'Permission denied', 'a', None, 'b'),
+     'error: b: permission denied: change its permissions or name another file'),
+    (OSError(28, 'No space left on device', 'out.json'),
+     'error: out.json: no space left on device: check the path and what it lies on'),
+])
+def test_bad_input_is_one_line(verb, capsys: pytest.CaptureFixture[str],
+                               error: BaseException, line: str) -> None:
+    verb(fail_with(error))
+    assert program.main(['probe']) == 2
+    assert capsys.readouterr() == ('', line + '\n')
+
+
+def test_errors_of_the_neighbours_are_known(verb, capsys: pytest.CaptureFixture[str]) -> None:
+    import msg_graph
+
+    def action(args: argparse.Namespace) -> int:
+        msg_graph.loads('', name='empty.yaml')
+        return 0
+
+    verb(action)
+    assert program.main(['probe']) == 2
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert err.startswith('error: empty.yaml') and err.count('\n') == 1
+
+
+def test_a_defect_keeps_its_traceback(verb, capsys: pytest.CaptureFixture[str]) -> None:
+    verb(fail_with(ZeroDivisionError('a defect')))
+    assert program.main(['probe']) == 70
+    err = capsys.readouterr().err
+    assert 'Traceback' in err and 'in action' in err and 'a defect' in err
+
+
+def test_debugging_shows_the_traceback_of_bad_input(
+        verb, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('MDDAG_DEBUG', '1')
+    verb(fail_with(InputError('a.yaml', 'no source', 'add a timer')))
+    assert program.main(['probe']) == 2
+    err = capsys.readouterr().err
+    assert 'Traceback' in err
+    assert err.endswith('error: a.yaml: no source: add a timer\n')
+
+
+def test_an_interrupt_is_quiet(verb, capsys: pytest.CaptureFixture[str]) -> None:
+    verb(fail_with(KeyboardInterrupt()))
+    assert program.main(['probe']) == 130
+    assert capsys.readouterr() == ('', '')
+
+
+@pytest.mark.parametrize(('argv', 'says'), [
+    ([], 'required: VERB'),
+    (['nonsense'], "'nonsense'"),
+    (['probe', '--number', 'x'], "argument --number: invalid int value: 'x'"),
+    (['probe', '--num', '3'], 'unrecognized arguments: --num'),
+    (['probe', '--\x1b[2J\n'], 'unrecognized arguments: --\\x1b[2J'),
+    (['--nonsense'], 'required: VERB'),
+])
+def test_wrong_usage_is_one_line(verb, capsys: pytest.CaptureFixture[str],
+                                 argv: list[str], says: str) -> None:
+    verb(lambda args: 0)
+    assert program.main(argv) == 2
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert err.startswith('error: mddag') and err.count('\n') == 1 and '\x1b' not in err
+    assert says in err
+    assert "--help'" in err
+
+
+def test_help_has_an_example(verb, capsys: pytest.CaptureFixture[str]) -> None:
+    verb(lambda args: 0)
+    with pytest.raises(SystemExit) as stop:
+        program.main(['probe', '--help'])
+    assert stop.value.code == 0
+    out = capsys.readouterr().out
+    assert 'Try things.' in out
+    assert 'example:\n  mddag probe graph.yaml' in out
+
+
+def test_only_the_chosen_verb_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded = []
+
+    def load(verb: program.Verb) -> ModuleType:
+        loaded.append(verb.module)
+        module = ModuleType(verb.module)
+        module.__dict__.update(HELP='x', EXAMPLE='x', add_arguments=lambda parser: None,
+                               main=lambda args: 0)
+        return module
+
+    monkeypatch.setattr(program, 'load', load)
+    monkeypatch.setattr(program, 'available', lambda: program.VERBS)
+    assert program.main(['replay']) == 0
+    assert loaded == ['replay']
+
+
+def test_a_verb_without_module_is_not_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(program.VERBS, 'absent', program.Verb('no_such_module', 'nothing'))
+    assert 'absent' not in program.available()
+    assert 'absent' not in program.build_parser(None).format_help()
+
+
+@pytest.mark.parametrize('name', sorted(program.available()))
+def test_each_verb_agrees_with_the_table(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    row = program.VERBS[name]
+    module = program.load(row)
+    assert module.NAME == name
+    assert module.HELP == row.summary
+    assert f'mddag {name}' in module.EXAMPLE
+    with pytest.raises(SystemExit) as stop:
+        program.main([name, '--help'])
+    assert stop.value.code == 0
+    assert module.EXAMPLE.strip().splitlines()[0] in capsys.readouterr().out
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = ('import sys\n'
+            'from mddag_executor.cli.main import main\n'
+            'try:\n'
+            "    main(['--help'])\n"
+            'except SystemExit as stop:\n'
+            '    assert stop.code == 0\n'
+            "heavy = {'rclpy', 'numpy', 'yaml', 'mcap', 'rosbags', 'zstandard', 'asyncio'}\n"
+            "own = {'msg_graph', 'mddag_executor.core', 'mddag_executor.trace'}\n"
+            'assert not (heavy | own) & set(sys.modules), (heavy | own) & set(sys.modules)\n')
+    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                            check=False)
+    assert result.returncode == 0, result.stderr
+    assert 'verbs:' in result.stdout
+
+
+def test_module_and_program_are_the_same(mddag: Mddag) -> None:
+    result = mddag('--version')
+    assert (result.returncode, result.stdout) == (0, f'mddag {__version__}\n')
+    script = Path(sys.executable).with_name('mddag')
+    if script.exists():  # not where colcon installs it
+        again = subprocess.run([script, '--version'], capture_output=True, text=True, check=True)
+        assert again.stdout == result.stdout
+
+
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, 'w') as gone:
+        result = subprocess.run(
+            [sys.executable, '-c',
+             'import sys, types\n'
+             'from mddag_executor.cli import main as program\n'
+             "module = types.SimpleNamespace(HELP='x', EXAMPLE='x', add_arguments=id,\n"
+             '                               main=lambda args: print("x" * 100000) or 0)\n'
+             "program.available = lambda: {'probe': program.Verb('probe', 'x')}\n"
+             'program.load = lambda verb: module\n'
+             "sys.exit(program.main(['probe']))"],
+            stdout=gone, stderr=subprocess.PIPE, text=True, check=False)
+    assert (result.returncode, result.stderr) == (141, '')

@@ -1,0 +1,136 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is printed for people."""
+
+from __future__ import annotations
+
+import io
+
+from hypothesis import given, strategies
+from mddag_executor.cli.text import format_ns, one_line, printable, Progress, table
+import pytest
+
+
+@pytest.mark.parametrize(('ns', 'text'), [
+    (0, '0 ns'),
+    (999, '999 ns'),
+    (1_000, '1 us'),
+    (12_345, '12.35 us'),
+    (999_960, '1.000 ms'),
+    (999_940, '999.9 us'),
+    (100_000_000, '100 ms'),
+    (100_040_000, '100.0 ms'),
+    (100_060_000, '100.1 ms'),
+    (30_500_000, '30.5 ms'),
+    (1_500_000_000, '1.5 s'),
+    (20_000_000_000, '20 s'),
+    (123_456_789_012_345, '123457 s'),
+    (-1_500_000, '-1.5 ms'),
+])
+def test_times(ns: int, text: str) -> None:
+    assert format_ns(ns) == text
+
+
+@given(strategies.integers(-10**15, 10**15))
+def test_times_are_right_to_four_digits(ns: int) -> None:
+    number, unit = format_ns(ns).split()
+    value = float(number) * {'ns': 1, 'us': 1e3, 'ms': 1e6, 's': 1e9}[unit]
+    assert value == pytest.approx(ns, rel=5.01e-4)
+    assert abs(float(number)) < 1000 or unit == 's'
+
+
+@given(strategies.text())
+def test_no_control_character_reaches_the_terminal(text: str) -> None:
+    for line in (printable(text), one_line(text)):
+        assert line.isprintable()
+    if text.isprintable():
+        assert printable(text) == text
+
+
+def test_escapes_can_be_recognised() -> None:
+    assert printable('/node\x1b]0;title\x07\n') == '/node\\x1b]0;title\\x07\\n'
+    assert printable('\u202eevil\udcff') == '\\u202eevil\\udcff'
+    assert printable('/küche/ロボット') == '/küche/ロボット'
+
+
+def test_tables_align_names_left_and_numbers_right() -> None:
+    text = table(['sink', 'late', 'p99', 'share', 'first'],
+                 [['/a:b', 3, '9.5 ms', 99.5, None],
+                  ['/longer:c', 12, '100 ms', 100.0, 'x']])
+    assert text == ('sink       late     p99   share  first\n'
+                    '/a:b          3  9.5 ms   99.50  -\n'
+                    '/longer:c    12  100 ms  100.00  x\n')
+
+
+def test_a_table_of_nothing_is_its_header() -> None:
+    assert table(['a', 'b'], []) == 'a  b\n'
+
+
+def test_a_table_is_harmless() -> None:
+    assert '\x1b' not in table(['a'], [['\x1b[2J']])
+    assert table(['a'], [['x\ny']]) == 'a\nx\\ny\n'
+
+
+def test_a_row_of_wrong_length_is_an_error() -> None:
+    with pytest.raises(ValueError, match='1 cells under 2 titles'):
+        table(['a', 'b'], [['x']])
+
+
+class Terminal(io.StringIO):
+
+    def isatty(self) -> bool:
+        return True
+
+
+class Clock:
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_progress_waits_two_seconds() -> None:
+    stream, clock = Terminal(), Clock()
+    with Progress('simulating', 10, stream=stream, clock=clock) as progress:
+        clock.now += 1.9
+        progress.update(3)
+        assert stream.getvalue() == ''
+        clock.now += 0.2
+        progress.update(4, 'run\x1b 4')
+        assert stream.getvalue() == '\rsimulating: 40 % run\\x1b 4'
+        progress.update(5)
+        assert '50 %' not in stream.getvalue(), 'more often than five times a second'
+        clock.now += 0.2
+        progress.update(20)
+        assert '100 %' in stream.getvalue()
+    assert stream.getvalue().endswith('\r'), 'the line is wiped'
+
+
+def test_progress_is_quiet_where_nobody_looks() -> None:
+    stream, clock = io.StringIO(), Clock()
+    with Progress('simulating', 10, stream=stream, clock=clock) as progress:
+        clock.now += 10
+        progress.update(3)
+    assert stream.getvalue() == ''
+
+
+def test_progress_of_unknown_length() -> None:
+    stream, clock = Terminal(), Clock()
+    with Progress('reading', stream=stream, clock=clock) as progress:
+        clock.now += 3
+        progress.update(1500)
+    assert '\rreading: 1500' in stream.getvalue()

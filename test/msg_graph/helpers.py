@@ -1,0 +1,53 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Short ways to write declarations and to look at errors."""
+
+from __future__ import annotations
+
+import textwrap
+
+from msg_graph import GraphError, loads, TaskSet
+import pytest
+
+MARK = '# <-'
+
+
+def graph(text: str) -> TaskSet:
+    """Derive a declaration whose head is left out."""
+    return loads('mddag: 1\nnodes:\n' + textwrap.indent(textwrap.dedent(text), '  '), 'g.yaml')
+
+
+def error(text: str) -> GraphError:
+    """Return the error of a whole declaration; it must be in the line that ends with MARK."""
+    with pytest.raises(GraphError) as caught:
+        loads(text, 'g.yaml')
+    found = caught.value
+    marked = [i for i, line in enumerate(text.split('\n'), 1) if line.endswith(MARK)]
+    assert len(marked) <= 1
+    assert found.line == (marked[0] if marked else None), str(found)
+    assert found.file == 'g.yaml'
+    place = f'g.yaml:{found.line}' if found.line else 'g.yaml'
+    assert str(found).startswith(f'{place}: ')
+    assert str(found).isprintable()
+    assert found.problem and found.remedy
+    return found
+
+
+def nodes_error(text: str, *says: str) -> GraphError:
+    """Return the error of a declaration whose head is left out, which must say all of that."""
+    found = error('mddag: 1\nnodes:\n' + textwrap.indent(textwrap.dedent(text), '  '))
+    for part in says:
+        assert part in str(found), str(found)
+    return found

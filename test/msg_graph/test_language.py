@@ -1,0 +1,350 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The declaration language: what entries mean, and what each is refused for."""
+
+from __future__ import annotations
+
+from msg_graph import loads
+import pytest
+
+from .helpers import error, graph, MARK, nodes_error
+
+EVERYTHING = """\
+mddag: 1
+workers: 7
+nodes:
+  - node: /camera/driver
+    callbacks:
+      - name: frame
+        subscription: /camera/raw
+        period: 50ms
+        release_from: header_stamp
+        dag: camera
+        on_miss: abort
+        max_active_jobs: 3
+        publishes: [/image, /info]
+        execution_time: 3ms
+        group: io
+  - node: /detector
+    callbacks:
+      - name: call-1.x
+        sync: [/image, /info]
+        reads: [/set, settings]
+        publishes: [/boxes]
+        execution_time: {quantiles_us: [1, 2.5, 1e3]}
+  - node: /detector
+    callbacks:
+      - name: settings
+        service: /detector/set
+        period: 1 s
+        publishes: [/set]
+        deadline: 2s
+      - {name: tick, timer: 20ms, dag: tick, deadline: 1min}
+  - node: /sink
+    callbacks:
+      - name: show
+        subscription: /boxes
+        deadline: 120ms
+        execution_time: {quantiles_us: [0, 5], percent: [10, 99.9]}
+paths:
+  - name: frame_to_show
+    callbacks: ['/camera/driver:frame', '/detector:call-1.x', '/sink:show']
+  - name: set_to_show
+    callbacks: ['/detector:settings', '/detector:call-1.x', '/sink:show']
+"""
+
+
+def test_every_key() -> None:
+    tasks = loads(EVERYTHING, 'all.yaml')
+    assert (tasks.workers, tasks.file, tasks.text) == (7, 'all.yaml', EVERYTHING)
+    frame, call, settings, tick, show = tasks.callbacks
+    assert (frame.node, frame.name, frame.key) == (
+        '/camera/driver', 'frame', '/camera/driver:frame')
+    assert (frame.kind, frame.topics, frame.period_ns, frame.timer_period_ns) == (
+        'subscription', ('/camera/raw',), 50_000_000, None)
+    assert (frame.release_from, frame.dag, frame.on_miss, frame.max_active_jobs) == (
+        'header_stamp', 'camera', 'abort', 3)
+    assert (frame.publishes, frame.group, frame.line) == (('/image', '/info'), 'io', 6)
+    assert frame.execution_time is not None
+    assert (frame.execution_time.quantiles_ns, frame.execution_time.percent) == (
+        (3_000_000,), (50.0,))
+    assert (call.kind, call.topics, call.reads) == (
+        'sync', ('/image', '/info'), ('/set', 'settings'))
+    assert call.execution_time is not None
+    assert call.execution_time.quantiles_ns == (1_000, 2_500, 1_000_000)
+    assert call.execution_time.percent == (0.0, 50.0, 100.0)
+    assert (call.period_ns, call.deadline_ns, call.group, call.dag) == (None, None, None, None)
+    assert (call.release_from, call.on_miss, call.max_active_jobs) == ('arrival', 'continue', None)
+    assert (settings.kind, settings.service, settings.topics, settings.period_ns) == (
+        'service', '/detector/set', (), 1_000_000_000)
+    assert (tick.kind, tick.timer_period_ns, tick.period_ns, tick.deadline_ns, tick.line) == (
+        'timer', 20_000_000, 20_000_000, 60_000_000_000, 30)
+    assert show.execution_time is not None
+    assert show.execution_time.quantiles_ns == (0, 5_000)
+    assert show.execution_time.percent == (10.0, 99.9)
+    assert [(d.name, d.release_from, d.on_miss, d.max_active_jobs) for d in tasks.dags] == [
+        ('camera', 'header_stamp', 'abort', 3), ('/detector', 'arrival', 'continue', None),
+        ('tick', 'arrival', 'continue', None)]
+    assert [(e.reader, e.topic, e.writers) for e in tasks.queue_edges] == [
+        ('/detector:call-1.x', '/set', ('/detector:settings',)),
+        ('/detector:call-1.x', None, ('/detector:settings',))]
+    assert [(p.name, len(p.callbacks)) for p in tasks.paths] == [
+        ('frame_to_show', 3), ('set_to_show', 3)]
+
+
+def test_default_percents_of_29_quantiles() -> None:
+    numbers = ', '.join(map(str, range(29)))
+    tasks = graph(f"""
+        - node: /a
+          callbacks:
+            - name: t
+              timer: 10ms
+              deadline: 10ms
+              execution_time: {{quantiles_us: [{numbers}]}}
+    """)
+    time = tasks.callbacks[0].execution_time
+    assert time is not None
+    assert time.percent == (
+        0, .1, .5, 1, 2, 5, 10, 15, 20, 25, 30, 35, 40, 45, 50, 55, 60, 65, 70, 75, 80, 85, 90,
+        95, 98, 99, 99.5, 99.9, 100)
+    assert time.median_ns == 14_000
+
+
+def test_a_period_that_agrees_with_the_timer_is_allowed() -> None:
+    tasks = graph("""
+        - node: /a
+          callbacks:
+            - {name: t, timer: 100ms, period: 0.1s, deadline: 1s, release_from: arrival}
+    """)
+    assert tasks.dags[0].period_ns == 100_000_000
+
+
+HEAD = 'nodes:\n- node: /a\n  callbacks:\n  - {name: t, timer: 1ms, deadline: 1ms}\n'
+
+
+@pytest.mark.parametrize('text, says', [
+    (HEAD + '', "'mddag' is missing: add 'mddag:'"),
+    (f'mddag: 2 {MARK}\n' + HEAD, "'2' is no known version"),
+    (f'mddag: [1] {MARK}\n' + HEAD, "'mddag': is a list"),
+    (f'mddag: {MARK}\n' + HEAD, "'mddag' has no value"),
+    ('mddag: 1\n', "'nodes' is missing"),
+    (f'mddag: 1\nnodes: {MARK}\n', "'nodes' has no value"),
+    (f'mddag: 1\nnodes: [] {MARK}\n', "'nodes' is empty"),
+    (f'mddag: 1\nnodes: {{}} {MARK}\n', "'nodes' is a mapping"),
+    (f'mddag: 1\nnodes:\n- /a {MARK}\n', "node 1 is the text '/a'"),
+    (f'mddag: 1\nnodes:\n- {MARK}\n', 'node 1 is empty'),
+    (f'mddag: 1\nnode: [] {MARK}\n', "unknown key 'node': did you mean 'nodes'?"),
+    (f'mddag: 1\nxyz: [] {MARK}\n', "unknown key 'xyz': use mddag, workers, nodes, paths"),
+    (f'mddag: 1\nworkers: 0 {MARK}\n' + HEAD, 'from 1 to 1024'),
+    (f'mddag: 1\nworkers: -7 {MARK}\n' + HEAD, 'from 1 to 1024'),
+    (f'mddag: 1\nworkers: 1025 {MARK}\n' + HEAD, 'from 1 to 1024'),
+    (f'mddag: 1\nworkers: seven {MARK}\n' + HEAD, 'whole number'),
+    (f'mddag: 1\nworkers: 7.0 {MARK}\n' + HEAD, 'whole number'),
+    (f'mddag: 1\nworkers: "7" {MARK}\n' + HEAD, 'whole number'),
+    (f'mddag: 1\nworkers: [7] {MARK}\n' + HEAD, 'a list'),
+    (f'mddag: 1\nworkers: {"9" * 5000} {MARK}\n' + HEAD, 'whole number'),
+])
+def test_head(text: str, says: str) -> None:
+    # Without a line of its own to blame, the mapping that lacks something starts at the top.
+    if MARK not in text:
+        text = text.replace('\n', f' {MARK}\n', 1)
+    assert says in str(error(text))
+
+
+@pytest.mark.parametrize('entry, says', [
+    (f'node: a {MARK}', ["'a' is not an absolute node name: write it in full, as '/a'"]),
+    (f'node: ~/a {MARK}', ["as '/a'"]),
+    (f'node: /a//b {MARK}', ["'/a//b' is not a valid node name"]),
+    (f'node: /a/ {MARK}', ['not a valid node name']),
+    (f'node: /1a {MARK}', ['start with no digit']),
+    (f'node: /a-b {MARK}', ['not a valid node name']),
+    (f'node: "/a\\nb" {MARK}', ["'/a\\nb' is not a valid"]),
+    (f'node: /{"a" * 300} {MARK}', ['too long']),
+    (f'node: [/a] {MARK}', ["node 1: 'node': is a list"]),
+    (f'node: {MARK}', ["'node' has no value"]),
+    (f'nod: /a {MARK}', ["unknown key 'nod': did you mean 'node'?"]),
+])
+def test_node_names(entry: str, says: list[str]) -> None:
+    nodes_error(
+        f'- {entry}\n  callbacks:\n  - {{name: t, timer: 1ms, deadline: 1ms}}\n', *says)
+
+
+def test_node_without_callbacks() -> None:
+    nodes_error(f'- node: /a {MARK}\n', "node '/a': 'callbacks' is missing")
+    nodes_error(f'- node: /a\n  callbacks: [] {MARK}\n', "'callbacks' is empty")
+    nodes_error(f'- callbacks: [] {MARK}\n', "node 1: 'node' is missing")
+
+
+@pytest.mark.parametrize('entries, says', [
+    # names
+    ([f'timer: 1ms {MARK}'], ["callback 1 of node '/a': 'name' is missing"]),
+    ([f'name: "a b" {MARK}'], ["'a b' is no name for a callback"]),
+    ([f'name: a:b {MARK}'], ['no name for a callback']),
+    ([f'name: a@b {MARK}'], ['no name for a callback']),
+    ([f'name: {"n" * 300} {MARK}'], ['too long']),
+    # unknown keys
+    (['name: t', f'subscribtion: /x {MARK}'],
+     ["callback 1 of node '/a': unknown key 'subscribtion': did you mean 'subscription'?"]),
+    (['name: t', f'deadine: 1ms {MARK}'], ["did you mean 'deadline'?"]),
+    (['name: t', f'qqq: 1ms {MARK}'], ["unknown key 'qqq': use name, timer, subscription"]),
+    (['name: t', f'"tim\\ner": 1ms {MARK}'], ["'tim\\ner': did you mean 'timer'?"]),
+    (['name: t', f'{"k" * 100_000}: 1ms {MARK}'], ['unknown key']),
+    # what starts it
+    ([f'name: t {MARK}', 'deadline: 1ms'],
+     ["callback '/a:t': nothing says what starts the callback: add one of timer, subscription"]),
+    (['name: t', 'timer: 1ms', f'subscription: /x {MARK}'],
+     ["'timer', 'subscription' exclude each other"]),
+    (['name: t', f'subscription: x {MARK}'], ["'subscription': 'x' is not an absolute topic"]),
+    (['name: t', f'subscription: [/x, /y] {MARK}'], ["'subscription': is a list: write a text"]),
+    (['name: t', f'subscription: {MARK}'], ["'subscription' has no value"]),
+    (['name: t', f'subscription: /{"x" * 247} {MARK}'], ['at most 247']),
+    (['name: t', f'sync: /x {MARK}'], ["'sync' is the text '/x': write a list"]),
+    (['name: t', f'sync: [/x] {MARK}'], ["'sync' has 1 entries: give at least 2"]),
+    (['name: t', f'sync: [/x, /x] {MARK}'], ["'/x' stands there twice"]),
+    (['name: t', 'sync:', '- /x', f'- [/y] {MARK}'], ["'sync': is a list"]),
+    (['name: t', 'sync:', '- /x', f'- {MARK}'], ["'sync': has an empty entry"]),
+    (['name: t', f'service: /x/ {MARK}'], ['not a valid service name']),
+    # times
+    (['name: t', f'timer: 100 {MARK}'],
+     ["callback '/a:t': 'timer': '100' has no unit: add one, as '100ms'"]),
+    (['name: t', f'timer: -1ms {MARK}'], ['negative']),
+    (['name: t', f'timer: 0s {MARK}'], ['too short']),
+    (['name: t', f'timer: 10ns {MARK}'], ['at least 1us']),
+    (['name: t', f'timer: 25000min {MARK}'], ['at most 86400s']),
+    (['name: t', f'timer: .nan {MARK}'], ['not a time']),
+    (['name: t', f'timer: often {MARK}'], ['not a time']),
+    (['name: t', f'timer: [1ms] {MARK}'], ["'timer' is a list"]),
+    (['name: t', f'timer: {MARK}'], ["'timer' has no value"]),
+    (['name: t', 'timer: 1ms', f'period: 2ms {MARK}'],
+     ['period of 2ms is not that of its timer, 1ms']),
+    (['name: t', 'subscription: /x', f'period: 0ms {MARK}'], ["'period': '0ms' is too short"]),
+    (['name: t', 'timer: 1ms', f'deadline: -1ms {MARK}'], ["'deadline': '-1ms' is negative"]),
+    (['name: t', 'timer: 1ms', f'deadline: 2000min {MARK}'], ["'deadline': '2000min' is too"]),
+    (['name: t', 'timer: 1ms', f'deadline: {{}} {MARK}'], ["'deadline' is a mapping"]),
+    # execution times
+    (['name: t', 'timer: 1ms', f'execution_time: 0ms {MARK}'], ['too short']),
+    (['name: t', 'timer: 1ms', f'execution_time: 3 {MARK}'], ['no unit']),
+    (['name: t', 'timer: 1ms', f'execution_time: [3ms] {MARK}'],
+     ["execution time of callback '/a:t' is a list: write a mapping"]),
+    (['name: t', 'timer: 1ms', f'execution_time: {{}} {MARK}'], ["'quantiles_us' is missing"]),
+    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles: [1]}} {MARK}'],
+     ["did you mean 'quantiles_us'?"]),
+    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: 1}} {MARK}'], ['the text']),
+    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: []}} {MARK}'], ['is empty']),
+    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, x]}} {MARK}'],
+     ["'x' is not a number"]),
+    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, [2]]}} {MARK}'],
+     ['a list is not a number']),
+    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, .nan]}} {MARK}'],
+     ["'.nan' is not a number"]),
+    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, 1e999]}} {MARK}'],
+     ["'1e999' is not a number"]),
+    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [2, 1]}} {MARK}'],
+     ['rising order']),
+    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [-1, 1]}} {MARK}'],
+     ['negative']),
+    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [0, 0]}} {MARK}'],
+     ['makes no sense']),
+    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, 1e12]}} {MARK}'],
+     ['makes no sense']),
+    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, 2], percent: [1]}} {MARK}'],
+     ['1 shares for 2 quantiles']),
+    (['name: t', 'timer: 1ms',
+      f'execution_time: {{quantiles_us: [1, 2], percent: [5, 5]}} {MARK}'], ['do not rise']),
+    (['name: t', 'timer: 1ms',
+      f'execution_time: {{quantiles_us: [1, 2], percent: [-1, 5]}} {MARK}'], ['0 and 100']),
+    (['name: t', 'timer: 1ms',
+      f'execution_time: {{quantiles_us: [1, 2], percent: [1, 101]}} {MARK}'], ['0 and 100']),
+    (['name: t', 'timer: 1ms', 'execution_time:', '  quantiles_us: [1,', f'    x] {MARK}'],
+     ["'x' is not a number"]),
+    # lists of names
+    (['name: t', 'timer: 1ms', f'publishes: /x {MARK}'], ["write a list, as publishes: [a, b]"]),
+    (['name: t', 'timer: 1ms', 'publishes:', '- /x', f'- x {MARK}'], ["'publishes': 'x' is not"]),
+    (['name: t', 'timer: 1ms', 'publishes:', '- /x', f'- /x {MARK}'], ["'/x' stands there twice"]),
+    (['name: t', 'timer: 1ms', f'reads: [a b] {MARK}'], ["'a b' is no name for a callback"]),
+    (['name: t', 'timer: 1ms', f'reads: ["/b:c"] {MARK}'], ['names a callback with its node']),
+    (['name: t', 'timer: 1ms', f'reads: [/b c] {MARK}'], ['not a valid topic name']),
+    # words
+    (['name: t', 'timer: 1ms', f'release_from: arival {MARK}'], ["did you mean 'arrival'?"]),
+    (['name: t', 'timer: 1ms', f'release_from: 7 {MARK}'],
+     ["'7' is not known: use arrival, source_timestamp, header_stamp"]),
+    (['name: t', 'timer: 1ms', f'on_miss: stop {MARK}'], ['use continue, abort']),
+    (['name: t', 'timer: 1ms', f'max_active_jobs: 0 {MARK}'], ['from 1 to 1000000']),
+    (['name: t', 'timer: 1ms', f'group: a/b {MARK}'], ['no name for a callback group']),
+    (['name: t', 'timer: 1ms', f'dag: a@b {MARK}'], ['no name for a DAG']),
+    (['name: t', 'timer: 1ms', f'dag: [a] {MARK}'], ["'dag': is a list"]),
+])
+def test_callback_entries(entries: list[str], says: list[str]) -> None:
+    lines = '\n'.join(f'    {entry}' for entry in entries)
+    nodes_error(f'- node: /a\n  callbacks:\n  - {lines[4:]}\n', *says)
+
+
+def test_duplicate_callback_names() -> None:
+    text = f"""
+        - node: /a
+          callbacks:
+            - {{name: t, timer: 1ms, deadline: 1ms}}
+        - node: /b
+          callbacks:
+            - {{name: t, timer: 1ms, deadline: 1ms}}
+        - node: /a
+          callbacks:
+            - timer: 2ms
+              name: t {MARK}
+              deadline: 1ms
+    """
+    nodes_error(text, "callback '/a:t': this name is taken in line 6")
+
+
+PATHS = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: t, timer: 1ms, publishes: [/x]}
+      - {name: s, subscription: /x, deadline: 1ms}
+      - {name: u, timer: 1ms, dag: u, deadline: 1ms, reads: [s, /x]}
+paths:
+"""
+
+
+@pytest.mark.parametrize('text, says', [
+    (f'- name: p\n  callbacks: ["/a:t", "/a:n"] {MARK}', "unknown callback '/a:n'"),
+    (f'- name: p\n  callbacks:\n  - /a:t\n  - /aa:s {MARK}', "did you mean '/a:s'?"),
+    (f'- name: p\n  callbacks: ["/a:s", "/a:t"] {MARK}',
+     "path 'p': no trigger or queue edge leads from '/a:s' to '/a:t'"),
+    (f'- name: p\n  callbacks:\n  - /a:t\n  - /a:s\n  - /a:u\n  - /a:t {MARK}',
+     "'/a:t' stands there twice"),
+    (f'- name: p\n  callbacks:\n  - /a:u\n  - /a:s {MARK}', "from '/a:u' to '/a:s'"),
+    (f'- name: p\n  callbacks: [t, "/a:s"] {MARK}', "'t' names no callback"),
+    (f'- name: p\n  callbacks: ["/a:t"] {MARK}', 'at least 2'),
+    (f'- name: p\n  callbacks: [] {MARK}', 'is empty'),
+    (f'- name: p {MARK}', "'callbacks' is missing"),
+    (f'- callbacks: ["/a:t", "/a:s"] {MARK}', "'name' is missing"),
+    (f'- name: p\n  callback: x {MARK}', "did you mean 'callbacks'?"),
+    (f'- name: p\n  callbacks: ["/a:t", "/a:s"]\n'
+     f'- name: p {MARK}\n  callbacks: ["/a:t", "/a:s"]', "path 'p': this name is taken"),
+    (f'- p {MARK}', "path 1 is the text 'p'"),
+])
+def test_paths(text: str, says: str) -> None:
+    assert says in str(error(PATHS + text + '\n'))
+
+
+def test_paths_run_over_trigger_and_queue_edges() -> None:
+    tasks = loads(PATHS + """
+  - {name: variable, callbacks: ['/a:t', '/a:s', '/a:u']}
+  - {name: take, callbacks: ['/a:t', '/a:u']}
+""")
+    assert [path.name for path in tasks.paths] == ['variable', 'take']

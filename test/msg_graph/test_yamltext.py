@@ -1,0 +1,175 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Text that is no YAML, no declaration, or meant to do harm."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from msg_graph import GraphError, load, loads, yamltext
+import pytest
+import yaml
+
+from .helpers import error, MARK
+
+SMALL = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: t, timer: 10ms, deadline: 10ms}
+"""
+
+
+@pytest.fixture(params=['CSafeLoader', 'SafeLoader'], autouse=True)
+def loader(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run every test with libyaml and without."""
+    monkeypatch.setattr(yamltext, '_LOADER', getattr(yaml, request.param))
+
+
+@pytest.mark.parametrize('text', ['', '\n\n', '# nothing\n', '~\n', '---\n', '\ufeff'])
+def test_empty(text: str) -> None:
+    assert 'empty' in str(error(text))
+
+
+@pytest.mark.parametrize('text', [
+    f'hello {MARK}', f'- a {MARK}\n- b', f'[] {MARK}', f"'' {MARK}"])
+def test_no_declaration(text: str) -> None:
+    assert 'not a declaration' in str(error(text))
+
+
+@pytest.mark.parametrize('text', [
+    f'mddag: 1\nnodes: [1 {MARK}\n'.replace(MARK, '') + MARK,
+    f'mddag: 1\n"nodes {MARK}',
+    f'mddag: 1\nnodes:\n\t- a {MARK}',
+    f'mddag: 1\nnodes: ] {MARK}',
+    f'mddag: 1\na: b: c {MARK}',
+    f'%YAML 7.0 {MARK}\n---\nmddag: 1',
+])
+def test_not_yaml(text: str) -> None:
+    with pytest.raises(GraphError) as caught:
+        loads(text, 'g.yaml')
+    assert 'not YAML' in str(caught.value)
+    assert caught.value.line is not None
+    assert 1 <= caught.value.line <= text.count('\n') + 2
+
+
+@pytest.mark.parametrize('strange', ['\x00', '\x1b', '\x07', '\x7f', '\ud800', '\uffff'])
+def test_characters_that_yaml_has_not(strange: str) -> None:
+    assert 'not YAML' in str(error(f'mddag: 1\n# {strange} {MARK}\n'))
+
+
+def test_bytes() -> None:
+    assert len(loads(SMALL.encode()).dags) == 1
+    assert len(loads(b'\xef\xbb\xbf' + SMALL.encode()).dags) == 1
+    with pytest.raises(GraphError, match=r'g:2: byte 9 is not UTF-8'):
+        loads(b'mddag: 1\n\xff', 'g')
+    with pytest.raises(GraphError, match='not UTF-8'):
+        loads(SMALL.encode('utf-16'))
+
+
+def test_windows_line_ends() -> None:
+    assert loads(SMALL.replace('\n', '\r\n')).callbacks[0].line == 5
+
+
+@pytest.mark.parametrize('text, says', [
+    (f'mddag: 1\nmddag: 1 {MARK}\n', "'mddag' stands here twice"),
+    (f'mddag: 1\nnodes:\n- node: /a\n  node: /b {MARK}\n', 'line 3'),
+    (f'mddag: 1\nnodes: !!python/object/apply:os.system [ls] {MARK}\n', 'python'),
+    (f'mddag: !!int 1 {MARK}\n', 'tag'),
+    (f'mddag: 1\n? [a] {MARK}\n: b\n', 'a key is a list'),
+    (f'mddag: 1\nnodes: *none {MARK}\n', "alias 'none' has no anchor"),
+    (f'mddag: 1\nnodes: &a [*a] {MARK}\n', 'inside of its own anchor'),
+    (f'mddag: 1\n--- {MARK}\nmddag: 1\n', 'second YAML document'),
+    (f'mddag: 1\n<<: {{}} {MARK}\n', "unknown key '<<'"),
+])
+def test_yaml_that_is_refused(text: str, says: str) -> None:
+    assert says in str(error(text))
+
+
+@pytest.mark.parametrize('opening', ['[', '{a: ', '- ', '- - ? '])
+def test_nesting_is_bounded(opening: str) -> None:
+    with pytest.raises(GraphError, match='levels of nesting|a key is'):
+        loads('mddag: 1\nnodes:\n  ' + opening * 100_000)
+
+
+def test_aliases_do_not_explode() -> None:
+    text = 'a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n'
+    for i in range(1, 30):
+        text += f'a{i}: &a{i} [{", ".join([f"*a{i - 1}"] * 10)}]\n'
+    with pytest.raises(GraphError, match=r':7: more than 2000000 entries'):
+        loads(text, 'g')
+
+
+def test_aliases_work() -> None:
+    tasks = loads("""\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: t, timer: &p 10ms, deadline: *p, execution_time: &e {quantiles_us: [1, 2]}}
+      - {name: s, timer: *p, dag: s, deadline: 3ms, execution_time: *e}
+""")
+    assert tasks.callback('/a:s').timer_period_ns == 10_000_000
+    assert tasks.callback('/a:s').execution_time == tasks.callback('/a:t').execution_time
+
+
+def test_size_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    big = SMALL + '#' * (16 * 1024 * 1024)
+    for given in (big, big.encode()):
+        with pytest.raises(GraphError, match='larger than 16 MiB'):
+            loads(given)
+    path = tmp_path / 'big.yaml'
+    path.write_text(big)
+    with pytest.raises(GraphError, match='larger than 16 MiB'):
+        load(path)
+    monkeypatch.setattr(yamltext, 'MAX_SIZE', 40)
+    with pytest.raises(GraphError, match='g:1: more than 40 entries'):
+        loads(f'[{"a, " * 50}]', 'g')
+    assert len(loads(SMALL).dags) == 1
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    for path in (tmp_path / 'none.yaml', tmp_path):
+        with pytest.raises(GraphError) as caught:
+            load(path)
+        assert str(caught.value).startswith(f'{path}: the file cannot be read (')
+        assert caught.value.line is None
+    with pytest.raises(GraphError, match='cannot be read'):
+        load('nul\x00byte')
+
+
+def test_load_is_loads_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / 'g.yaml'
+    path.write_text(SMALL)
+    tasks = load(path)
+    assert tasks == loads(SMALL, str(path))
+    assert tasks.file == str(path)
+    assert tasks.text == SMALL
+    assert load(str(path)) == tasks
+
+
+def test_scalars_are_what_stands_there() -> None:
+    """Words that YAML 1.1 takes for truth values, dates or numbers are names like any other."""
+    tasks = loads("""\
+mddag: 1
+nodes:
+  - node: /on
+    callbacks:
+      - {name: yes, timer: 10ms, deadline: 10ms, group: 1e3, dag: 2026-01-01}
+""")
+    assert tasks.callbacks[0].key == '/on:yes'
+    assert tasks.callbacks[0].group == '1e3'
+    assert tasks.dags[0].name == '2026-01-01'

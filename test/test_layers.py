@@ -1,0 +1,155 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The parts of the program know one another in one direction only.
+
+    cli -> report -> (live | replay | simulate) -> trace, core -> msg_graph
+
+Imports are read from the sources, those inside functions and for type checkers included.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+TOP = Path(__file__).resolve().parent.parent
+
+LEVELS = {
+    'msg_graph': 0,
+    'mddag_executor.errors': 1,
+    'mddag_executor.resources': 2,
+    'mddag_executor': 3,  # __init__.py: the version and the lazy names
+    'mddag_executor.core': 4,
+    'mddag_executor.trace': 4,
+    'mddag_executor.live': 5,
+    'mddag_executor.replay': 5,
+    'mddag_executor.simulate': 5,
+    'mddag_executor.report': 6,
+    'mddag_executor.cli': 7,
+    'mddag_executor.__main__': 8,
+}
+# The core takes events with their times and answers with decisions; it asks nobody.
+NOT_IN_CORE = {
+    'asyncio', 'concurrent', 'datetime', 'io', 'logging', 'multiprocessing', 'os', 'pathlib',
+    'queue', 'random', 'rclpy', 'selectors', 'signal', 'socket', 'subprocess', 'sys', 'threading',
+    'time', 'yaml',
+}
+# Offline parts work on a machine without ROS.
+ROS = {'rclpy', 'rcl_interfaces', 'std_msgs', 'diagnostic_msgs', 'builtin_interfaces', 'launch',
+       'launch_ros', 'ament_index_python'}
+MAY_USE_ROS = {'mddag_executor.live', 'mddag_executor.cli'}
+
+
+def part_of(module: str) -> str | None:
+    """Return the part of the program that a module belongs to; None for foreign ones."""
+    names = module.split('.')
+    if names[0] not in ('msg_graph', 'mddag_executor'):
+        return None
+    part = '.'.join(names[:2])
+    return part if part in LEVELS else names[0]
+
+
+def imports(module: str, text: str, is_package: bool) -> Iterator[tuple[int, str]]:
+    """Yield line and full name of what a module imports."""
+    package = module.split('.') if is_package else module.split('.')[:-1]
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name
+        elif isinstance(node, ast.ImportFrom):
+            base = package[:len(package) - node.level + 1] if node.level else []
+            name = '.'.join([*base, *([node.module] if node.module else [])])
+            for alias in node.names:
+                yield node.lineno, f'{name}.{alias.name}'
+
+
+def violations(module: str, text: str, is_package: bool = False) -> list[str]:
+    """Return what a module imports and must not."""
+    mine = part_of(module)
+    assert mine is not None
+    found = []
+    for line, name in imports(module, text, is_package):
+        theirs = part_of(name)
+        foreign = name.split('.')[0]
+        if theirs is not None and theirs != mine and LEVELS[theirs] >= LEVELS[mine]:
+            found.append(f'{module}:{line} imports {name}: {theirs} is no part below {mine}')
+        if mine == 'mddag_executor.core' and foreign in NOT_IN_CORE:
+            found.append(f'{module}:{line} imports {name}: the core knows no clock and no thread')
+        if foreign in ROS and mine not in MAY_USE_ROS:
+            found.append(f'{module}:{line} imports {name}: {mine} works without ROS')
+    return found
+
+
+def modules() -> list[tuple[str, Path]]:
+    found = []
+    for package in ('msg_graph', 'mddag_executor'):
+        for path in sorted((TOP / package).rglob('*.py')):
+            names = list(path.relative_to(TOP).with_suffix('').parts)
+            if names[-1] == '__init__':
+                names.pop()
+            found.append(('.'.join(names), path))
+    return found
+
+
+@pytest.mark.linter
+def test_imports_point_one_way() -> None:
+    found = modules()
+    assert len(found) > 10
+    assert not [line for module, path in found
+                for line in violations(module, path.read_text(encoding='utf-8'),
+                                       path.name == '__init__.py')]
+
+
+@pytest.mark.linter
+def test_every_folder_has_its_level() -> None:
+    folders = {f'mddag_executor.{path.parent.name}'
+               for path in (TOP / 'mddag_executor').glob('*/__init__.py')}
+    assert folders - set(LEVELS) == set()
+
+
+@pytest.mark.parametrize(('module', 'text'), [
+    ('msg_graph.model', 'import mddag_executor'),
+    ('msg_graph.model', 'from mddag_executor.core import Tables'),
+    ('mddag_executor.core.tables', 'from mddag_executor.trace import TraceReader'),
+    ('mddag_executor.core.tables', 'from ..live import executor'),
+    ('mddag_executor.core.tables', 'from .. import live'),
+    ('mddag_executor.core.tables', 'def f():\n    import time'),
+    ('mddag_executor.core.tables', 'from threading import Lock'),
+    ('mddag_executor.trace.reader', 'from mddag_executor import core'),
+    ('mddag_executor.trace.reader', 'import rclpy'),
+    ('mddag_executor.simulate.run', 'from mddag_executor.replay.run import replay'),
+    ('mddag_executor.simulate.run', 'def f():\n    from std_msgs.msg import Header'),
+    ('mddag_executor.live.executor', 'from mddag_executor.cli.common import write_json'),
+    ('mddag_executor.report.html', 'import mddag_executor.cli.text'),
+    ('mddag_executor.errors', 'from mddag_executor.resources import find'),
+])
+def test_a_wrong_import_is_found(module: str, text: str) -> None:
+    assert violations(module, text)
+
+
+@pytest.mark.parametrize(('module', 'text'), [
+    ('mddag_executor.core.tables', 'from msg_graph import TaskSet'),
+    ('mddag_executor.core.tables', 'from .rules import release\nfrom . import rules'),
+    ('mddag_executor.live.executor', 'import rclpy\nfrom mddag_executor.core import Tables'),
+    ('mddag_executor.cli.run', 'from mddag_executor.report.table import sinks'),
+    ('mddag_executor.trace.reader', 'from mddag_executor.errors import MddagError'),
+    ('mddag_executor.trace.reader', 'from mddag_executor import __version__'),
+])
+def test_a_right_import_is_none(module: str, text: str) -> None:
+    assert violations(module, text) == []

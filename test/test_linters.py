@@ -1,0 +1,197 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The linters of ament, ruff and mypy, and what they leave out: headers, lengths of files."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+
+pytestmark = pytest.mark.linter
+
+TOP = Path(__file__).resolve().parent.parent
+ROOTS = [name for name in ('setup.py', 'mddag_executor', 'msg_graph', 'launch', 'config', 'test')
+         if (TOP / name).exists()]
+SOURCES = sorted(path for root in ROOTS
+                 for path in ((TOP / root).rglob('*.py') if (TOP / root).is_dir()
+                              else [TOP / root]))
+MOST_LINES = 420  # "below about 400"
+
+HEADER = re.compile(
+    r'# Copyright 20\d\d The mddag_executor developers\n'
+    r'#\n'
+    r'# Licensed under the Apache License, Version 2\.0 \(the "License"\);\n'
+    r'# you may not use this file except in compliance with the License\.\n'
+    r'(#.*\n)+'
+    r'# limitations under the License\.\n'
+    r'\n')
+
+# What the packages import, with the key in package.xml and the name in setup.py that bring it.
+# None in setup.py: the extra `ros` does. None in package.xml: another key does.
+THIRD_PARTY: dict[str, tuple[str | None, str | None]] = {
+    'ament_index_python': ('ament_index_python', None),
+    'action_msgs': ('action_msgs', None),
+    'builtin_interfaces': ('builtin_interfaces', None),
+    'diagnostic_msgs': ('diagnostic_msgs', None),
+    'launch': ('launch', None),
+    'launch_ros': ('launch_ros', None),
+    'lz4': ('mcap-ros2-support', 'lz4'),
+    'mcap': ('mcap-ros2-support', 'mcap'),
+    'numpy': ('python3-numpy', 'numpy'),
+    'rcl_interfaces': ('rcl_interfaces', None),
+    'rclpy': ('rclpy', None),
+    'rosbags': ('python3-rosbags-pip', 'rosbags'),
+    'rosgraph_msgs': ('rosgraph_msgs', None),
+    'std_msgs': ('std_msgs', None),
+    'yaml': ('python3-yaml', 'PyYAML'),
+    'zstandard': ('mcap-ros2-support', 'zstandard'),
+}
+
+
+def run(*command: str) -> None:
+    result = subprocess.run([sys.executable, '-m', *command], cwd=TOP, text=True,
+                            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
+    assert result.returncode == 0, result.stdout
+
+
+def test_ruff() -> None:
+    run('ruff', 'check', '--no-cache', *ROOTS)
+
+
+def test_mypy() -> None:
+    run('mypy')
+
+
+def test_ament_flake8() -> None:
+    run('ament_flake8.main', *ROOTS)
+
+
+def test_ament_pep257() -> None:
+    run('ament_pep257.main', *ROOTS)
+
+
+def test_copyright() -> None:
+    assert SOURCES
+    assert not [str(path.relative_to(TOP)) for path in SOURCES
+                if not HEADER.match(path.read_text(encoding='utf-8'))]
+    assert 'Apache License' in (TOP / 'LICENSE').read_text(encoding='utf-8')
+
+
+def test_files_are_short() -> None:
+    lengths = {str(path.relative_to(TOP)): len(path.read_text(encoding='utf-8').splitlines())
+               for path in SOURCES}
+    assert {name: length for name, length in lengths.items() if length > MOST_LINES} == {}
+
+
+def package() -> ElementTree.Element:
+    return ElementTree.parse(TOP / 'package.xml').getroot()
+
+
+def dependencies(*tags: str) -> list[str]:
+    return [element.text or '' for element in package() if element.tag in tags]
+
+
+def test_package_xml_has_format_3() -> None:
+    root = package()
+    assert (root.tag, root.attrib) == ('package', {'format': '3'})
+    # REP 149, with the tags that this package has no use for left out.
+    once = {'name', 'version', 'description', 'export'}
+    many = {'maintainer', 'license', 'url', 'author', 'exec_depend', 'test_depend'}
+    tags = [element.tag for element in root]
+    assert set(tags) <= once | many
+    assert once | {'maintainer', 'license'} <= set(tags)
+    assert [tag for tag in once if tags.count(tag) != 1] == []
+    assert root.findtext('export/build_type') == 'ament_python'
+    assert root.findtext('license') == 'Apache-2.0'
+    maintainer = root.find('maintainer')
+    assert maintainer is not None and '@' in maintainer.get('email', '')
+    for tag in ('exec_depend', 'test_depend'):
+        names = dependencies(tag)
+        assert names == sorted(set(names)), f'{tag}: sorted, each once'
+
+
+def test_names_and_versions_agree() -> None:
+    from mddag_executor import __version__
+    root = package()
+    assert re.fullmatch(r'\d+\.\d+\.\d+', __version__)
+    assert root.findtext('version') == __version__
+    name = root.findtext('name')
+    assert name == 'mddag_executor'
+    assert (TOP / 'resource' / name).is_file()
+    # ros2 run looks for programs where setup.cfg puts them.
+    config = (TOP / 'setup.cfg').read_text(encoding='utf-8')
+    assert config.count(f'=$base/lib/{name}\n') == 2
+
+
+def run_nodes(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield all nodes but those that only type checkers read."""
+    yield node
+    if isinstance(node, ast.If) and ast.unparse(node.test).endswith('TYPE_CHECKING'):
+        children: list[ast.AST] = list(node.orelse)
+    else:
+        children = list(ast.iter_child_nodes(node))
+    for child in children:
+        yield from run_nodes(child)
+
+
+def test_what_is_imported_is_declared() -> None:
+    imported: dict[str, str] = {}
+    for path in SOURCES:
+        if path.relative_to(TOP).parts[0] not in ('mddag_executor', 'msg_graph', 'launch'):
+            continue
+        for node in run_nodes(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                names = [node.module or '']
+            else:
+                continue
+            for name in names:
+                imported.setdefault(name.split('.')[0], str(path.relative_to(TOP)))
+    foreign = set(imported) - set(sys.stdlib_module_names) - {'mddag_executor', 'msg_graph'}
+    assert {'numpy', 'yaml'} & foreign
+    unknown = {name: imported[name] for name in foreign - set(THIRD_PARTY)}
+    assert unknown == {}, 'add them to package.xml, setup.py and THIRD_PARTY'
+    keys = dependencies('exec_depend')
+    requirements = (TOP / 'setup.py').read_text(encoding='utf-8')
+    for name in foreign:
+        key, requirement = THIRD_PARTY[name]
+        assert key in keys, f'{name}, imported by {imported[name]}, is not in package.xml'
+        assert requirement is None or f"'{requirement}>=" in requirements, (
+            f'{name}, imported by {imported[name]}, is not in setup.py')
+
+
+def test_ruff_finds_a_mistake(tmp_path: Path) -> None:
+    """The linters are really run, with this project's rules."""
+    wrong = tmp_path / 'wrong.py'
+    wrong.write_text('import sys\nimport os\nname = "double"\n', encoding='utf-8')
+    with pytest.raises(AssertionError, match=r'(?s)D100.*Q000|Q000.*D100'):
+        run('ruff', 'check', '--no-cache', '--config', str(TOP / 'pyproject.toml'),
+            '--output-format', 'concise', str(wrong))
+
+
+def test_ament_flake8_finds_a_mistake(tmp_path: Path) -> None:
+    """The plug-ins for quotes and for the order of imports are there."""
+    wrong = tmp_path / 'wrong.py'
+    wrong.write_text('import sys\nimport os\nname = "double"\n', encoding='utf-8')
+    with pytest.raises(AssertionError, match=r'(?s)I100.*Q000|Q000.*I100'):
+        run('ament_flake8.main', str(wrong))

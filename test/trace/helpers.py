@@ -1,0 +1,126 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Events, files and child processes that the trace tests share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import struct
+import subprocess
+import sys
+from typing import Any
+
+from hypothesis import strategies as st
+from mddag_executor.trace import EVENTS, EventType, TraceFile, TraceReader
+from mddag_executor.trace.cdr import FieldType
+
+VPID = 4321
+START = 1_732_166_766_000_000_000
+
+_RANGES = {
+    'uint8': (0, 2**8 - 1), 'uint16': (0, 2**16 - 1), 'uint32': (0, 2**32 - 1),
+    'uint64': (0, 2**64 - 1), 'int8': (-2**7, 2**7 - 1), 'int16': (-2**15, 2**15 - 1),
+    'int32': (-2**31, 2**31 - 1), 'int64': (-2**63, 2**63 - 1),
+    # rosbags takes a byte for signed, ROS 2 does not
+    'byte': (0, 127), 'char': (0, 255),
+}
+
+
+def values(kind: FieldType) -> st.SearchStrategy[Any]:
+    """Return a strategy for values of a type, ends of the ranges included."""
+    one: st.SearchStrategy[Any]
+    if kind.base == 'string':
+        one = st.text(st.characters(exclude_categories=['Cs']), max_size=20)
+    elif kind.base == 'bool':
+        one = st.booleans()
+    elif kind.base in _RANGES:
+        low, high = _RANGES[kind.base]
+        one = st.integers(low, high) | st.sampled_from([low, high])
+    else:
+        one = st.floats(width=32 if kind.base == 'float32' else 64, allow_nan=False)
+    if kind.count is None:
+        return one
+    size = dict(min_size=max(kind.count, 0), max_size=kind.count if kind.count >= 0 else 5)
+    return st.lists(one, **size).map(tuple)
+
+
+def entries(event: EventType) -> st.SearchStrategy[tuple[Any, ...]]:
+    """Return a strategy for recordings of an event: name, timestamp, thread id, fields."""
+    return st.tuples(st.just(event.key), st.integers(0, 2**63 - 1),
+                     st.integers(-2**31, 2**31 - 1),
+                     *(values(FieldType.parse(kind)) for _, kind in event.fields))
+
+
+def sample(event: EventType, number: int) -> tuple[Any, ...]:
+    """Return one recording of an event, different for each number."""
+    def value(kind: str, place: int) -> Any:
+        if kind == 'string':
+            return f'/höhe/{number}-{place}'
+        if kind == 'bool':
+            return number % 2 == 0
+        return number * 16 + place
+    return (event.key, START + number * 1000, 100 + number % 7,
+            *(value(kind, place) for place, (_, kind) in enumerate(event.fields)))
+
+
+def mixture(count: int, first: int = 0) -> list[tuple[Any, ...]]:
+    """Return recordings of all events of the table in turn, in the order of time."""
+    events = list(EVENTS.values())
+    return [sample(events[number % len(events)], number)
+            for number in range(first, first + count)]
+
+
+def read_back(recorded: list[tuple[Any, ...]], vpid: int = VPID) -> list[tuple[Any, ...]]:
+    """Return recordings as the reader gives them."""
+    return [(name, timestamp, vpid, *rest) for name, timestamp, *rest in recorded]
+
+
+def write_chunks(path: Path, chunks: list[list[tuple[Any, ...]]], finish: bool = True) -> None:
+    """Write a file with the given recordings in each chunk."""
+    file = TraceFile(path)
+    for chunk in chunks:
+        file.extend(chunk, VPID)
+        file.flush()
+    assert file.rejected == 0, file.rejection
+    if finish:
+        file.finish()
+    else:
+        file.abandon()
+
+
+def read(path: Path, in_time_order: bool = False) -> tuple[list[tuple[Any, ...]], list[str]]:
+    """Return the events of a file and the warnings."""
+    reader = TraceReader(path)
+    events = list(reader.events(sorted=in_time_order))
+    return events, reader.warnings
+
+
+def records_of(data: bytes) -> list[tuple[int, int, int]]:
+    """Return opcode, offset and end of the records of a sound file."""
+    found = []
+    position = 8
+    while position < len(data) - 8:
+        opcode, length = struct.unpack_from('<BQ', data, position)
+        found.append((opcode, position, position + 9 + length))
+        position += 9 + length
+    return found
+
+
+def run_child(script: str, *arguments: object, timeout: float = 60) -> str:
+    """Run a script in a Python process of its own and return what it prints."""
+    done = subprocess.run([sys.executable, '-c', script, *map(str, arguments)], text=True,
+                          capture_output=True, timeout=timeout, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout

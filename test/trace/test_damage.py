@@ -1,0 +1,393 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Damaged and hostile files: a prefix of the events and one warning, or a one-line error.
+
+The sample has several chunks, each with a definition that the ones before do not have, so every
+way to lose or to mistake one shows.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import random
+import struct
+from typing import Any, Iterator
+import zlib
+
+import lz4.frame
+from mddag_executor.trace import records, TraceError, TraceReader
+from mddag_executor.trace.schema import EVENTS
+import pytest
+import zstandard
+
+from .helpers import mixture, read, read_back, records_of, run_child, write_chunks
+
+SIZES = [9, 17, 1, 12, 30]
+HEADER_END = 8 + 9 + 4 + len('ros2') + 4 + len('mddag_executor')
+
+
+@pytest.fixture(scope='module')
+def sample(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[list[Any]]]:
+    """Return a finished file and what was recorded in each of its chunks."""
+    path = tmp_path_factory.mktemp('sample') / 'a.mcap'
+    recorded = mixture(sum(SIZES))
+    chunks = []
+    for size in SIZES:
+        chunks.append(recorded[:size])
+        recorded = recorded[size:]
+    write_chunks(path, chunks)
+    return path.read_bytes(), [read_back(chunk) for chunk in chunks]
+
+
+def check(path: Path, data: bytes, chunks: list[list[Any]]) -> int:
+    """Check that a changed file gives a prefix in both orders, and return of how many chunks."""
+    path.write_bytes(data)
+    results = []
+    for in_time_order in (False, True):
+        try:
+            events, warnings = read(path, in_time_order)
+        except TraceError as error:
+            assert str(error).startswith(f'{path}: ') and '\n' not in str(error)
+            results.append(-1)
+            continue
+        assert len(warnings) <= 1
+        for text in warnings:
+            assert text.startswith(f'{path}: ') and '\n' not in text
+        prefix: list[Any] = []
+        whole = 0
+        while len(prefix) < len(events):
+            prefix += chunks[whole]
+            whole += 1
+        assert events == prefix
+        assert whole == len(chunks) or len(warnings) == 1
+        results.append(whole)
+    assert results[1] in (results[0], min(results[0], results[1]))
+    return results[0]
+
+
+def test_the_sample_is_sound(tmp_path: Path, sample: Any) -> None:
+    data, chunks = sample
+    path = tmp_path / 'a.mcap'
+    assert check(path, data, chunks) == len(SIZES)
+    assert TraceReader(path).warnings == []
+
+
+def test_cut_at_every_byte(tmp_path: Path, sample: Any) -> None:
+    data, chunks = sample
+    path = tmp_path / 'a.mcap'
+    ends = [end for opcode, _, end in records_of(data) if opcode == records.CHUNK]
+    for length in range(len(data)):
+        found = check(path, data[:length], chunks)
+        if length < HEADER_END:
+            assert found == -1
+        else:
+            assert found == sum(end <= length for end in ends)
+            assert len(read(path)[1]) == 1      # that something is missing is always said
+
+
+def test_warnings_have_counts(tmp_path: Path, sample: Any) -> None:
+    data, _ = sample
+    path = tmp_path / 'a.mcap'
+    chunk = [(start, end) for opcode, start, end in records_of(data) if opcode == records.CHUNK][2]
+    path.write_bytes(data[:chunk[0] + 20])
+    assert read(path)[1] == [
+        f'{path}: a record is cut off, or its length is wrong (at byte {chunk[0]}): used 2 chunks '
+        'with 26 messages before it, not the 20 bytes from there on; what there should be is not '
+        'known']
+    changed = bytearray(data)
+    changed[chunk[1] - 10] ^= 1
+    path.write_bytes(changed)
+    text = read(path)[1][0]
+    assert 'a chunk' in text and f'used 2 chunks with 26 messages before it, not the ' \
+        f'{len(data) - chunk[0]} bytes from there on; 5 chunks with 69 messages' in text
+    path.write_bytes(data[:-1])
+    assert read(path)[1] == [f'{path}: the summary at the end is damaged or missing: used all of '
+                             'the data, 5 chunks with 69 messages']
+
+
+def flips(data: bytes, count: int, seed: int) -> Iterator[tuple[int, bytes]]:
+    """Yield positions and the data with one bit flipped there, every position at least once."""
+    generator = random.Random(seed)
+    for number in range(count):
+        position = number if number < len(data) else generator.randrange(len(data))
+        changed = bytearray(data)
+        changed[position] ^= 1 << generator.randrange(8)
+        yield position, bytes(changed)
+
+
+def test_flipped_bits(tmp_path: Path, sample: Any) -> None:
+    data, chunks = sample
+    path = tmp_path / 'a.mcap'
+    where = {position: (opcode, number)
+             for number, (opcode, start, end) in enumerate(records_of(data))
+             for position in range(start, end)}
+    first_chunk = [number for _, (opcode, number) in where.items() if opcode == records.CHUNK][0]
+    for position, changed in flips(data, 3 * len(data), 1):
+        found = check(path, changed, chunks)
+        opcode, number = where.get(position, (0, 0))
+        if position >= HEADER_END and number == first_chunk:
+            # a flip in a chunk's head may be in its times, which only sorting needs
+            assert found <= 0 or position < HEADER_END + 9 + 24
+        if opcode in (records.SCHEMA, records.CHANNEL, records.STATISTICS, records.CHUNK_INDEX,
+                      records.FOOTER):
+            assert found == len(chunks)
+            assert len(read(path)[1]) == 1          # the summary's CRC
+
+
+def test_flipped_bits_without_a_summary(tmp_path: Path, sample: Any) -> None:
+    """A killed writer's file: nothing says how many chunks there were."""
+    data, chunks = sample
+    end = next(start for opcode, start, _ in records_of(data) if opcode == records.DATA_END)
+    for _, changed in flips(data[:end], 3 * end, 2):
+        check(tmp_path / 'a.mcap', changed, chunks)
+
+
+def test_mutations(tmp_path: Path, sample: Any) -> None:
+    """Whole bytes and stretches changed, put in, taken out, moved."""
+    data, chunks = sample
+    generator = random.Random(3)
+    for _ in range(3000):
+        changed = bytearray(data)
+        for _ in range(generator.choice([1, 1, 1, 3])):
+            first = generator.randrange(len(changed))
+            last = min(len(changed), first + generator.choice([1, 2, 8, 60, 500]))
+            stretch = generator.choice([
+                bytes(last - first), b'\xff' * (last - first), b'',
+                generator.randbytes(last - first), bytes(changed[first:last]) * 2,
+                bytes(changed[last:last + 50] + changed[first:last])])
+            changed[first:last] = stretch
+        path = tmp_path / 'a.mcap'
+        path.write_bytes(changed)
+        for in_time_order in (False, True):
+            try:
+                events, warnings = read(path, in_time_order)
+            except TraceError:
+                continue
+            assert len(warnings) <= 2
+            # A whole chunk may have been doubled or taken out; each event is one of those recorded.
+            assert {event[:2] for event in events} <= {
+                event[:2] for chunk in chunks for event in chunk}
+            assert all(event in chunks_of(chunks, event) for event in events)
+
+
+def chunks_of(chunks: list[list[Any]], event: Any) -> list[Any]:
+    """Return the recorded events of the same time."""
+    return [recorded for chunk in chunks for recorded in chunk if recorded[1] == event[1]]
+
+
+def test_a_lost_chunk_is_noticed(tmp_path: Path, sample: Any) -> None:
+    """A chunk turned into a record of unknown kind would be passed over but for its indexes."""
+    data, _ = sample
+    path = tmp_path / 'a.mcap'
+    found = records_of(data)
+    place = next(number for number, record in enumerate(found) if record[0] == records.CHUNK) + 1
+    place = next(number for number, record in enumerate(found[place:], place)
+                 if record[0] == records.CHUNK)
+    for opcode in (0x86, 0x46, 0x0C, 0x09):
+        changed = bytearray(data)
+        changed[found[place][1]] = opcode
+        path.write_bytes(changed)
+        events, warnings = read(path)
+        assert len(events) == SIZES[0] and len(warnings) == 1
+        assert 'a message index belongs to no chunk' in warnings[0]
+    # without the indexes too, the summary's counts tell
+    end = next(start for opcode, start, _ in found[place + 1:] if opcode != records.MESSAGE_INDEX)
+    gap = end - found[place][1] - 9
+    padding = struct.pack('<BQ', 0x90, gap) + bytes(gap)
+    path.write_bytes(data[:found[place][1]] + padding + data[end:])
+    events, warnings = read(path)
+    assert len(warnings) == 1
+    assert 'events are missing: found and used 4 chunks with 52 messages; 5 chunks' in warnings[0]
+
+
+@pytest.mark.parametrize('content, problem', [
+    (b'', 'is empty'), (b'12345678', 'is no MCAP file'), (b'\x89MCAP0\r', 'is no MCAP file'),
+    (b'#ROSBAG V2.0\n' * 10, 'is no MCAP file'),
+    (records.MAGIC, 'ends or is damaged before its first event'),
+    (records.MAGIC * 2, 'ends or is damaged before its first event'),
+    (records.MAGIC + bytes(1000), 'ends or is damaged before its first event'),
+    (records.MAGIC + b'\x01' + b'\xff' * 50, 'ends or is damaged before its first event'),
+])
+def test_what_is_no_trace(tmp_path: Path, content: bytes, problem: str) -> None:
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(content)
+    with pytest.raises(TraceError) as caught:
+        TraceReader(path)
+    assert str(caught.value) == (f'{path}: {problem}: give a trace written by this program or '
+                                 'another MCAP recording')
+
+
+def test_what_is_no_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / 'pipe')
+    for path in (tmp_path, tmp_path / 'pipe', '/dev/zero'):
+        with pytest.raises(TraceError, match='is no file: give the .mcap file itself'):
+            TraceReader(path)
+    for name in ('missing', 'missing/a.mcap', 'a\0b', 'x' * 1000):
+        with pytest.raises(TraceError, match=r'cannot be read \(.*\): check the name'):
+            TraceReader(tmp_path / name)
+    if os.getuid() != 0:
+        (tmp_path / 'secret').write_bytes(records.MAGIC)
+        (tmp_path / 'secret').chmod(0)
+        with pytest.raises(TraceError, match='Permission denied'):
+            TraceReader(tmp_path / 'secret')
+
+
+def test_a_file_that_goes_away_or_shrinks(tmp_path: Path, sample: Any) -> None:
+    data, chunks = sample
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(data)
+    reader = TraceReader(path)
+    events = reader.events()
+    assert next(events) == chunks[0][0]
+    os.truncate(path, HEADER_END)
+    rest = list(events)
+    assert [chunks[0][0], *rest] == [event for chunk in chunks for event in chunk][:len(rest) + 1]
+    path.unlink()
+    with pytest.raises(TraceError, match='cannot be read'):
+        list(reader.events())
+
+
+def chunk(content: bytes, **changes: Any) -> bytes:
+    """Return a chunk record around packed content, with some of its head changed."""
+    head = {'size': 100, 'crc': 0, 'compression': 'zstd', 'length': len(content), **changes}
+    return records.record(
+        records.CHUNK,
+        records.CHUNK_HEAD.pack(0, 0, head['size'], head['crc'])
+        + records.string(head['compression']) + records.UINT64.pack(head['length']) + content)
+
+
+def definitions(text: str = EVENTS['ros2:callback_end'].text) -> bytes:
+    """Return the records that make channel 1 one of callback_end."""
+    return records.schema(1, 'a', text) + records.channel(1, 1, '/trace/ros2/callback_end')
+
+
+def message(fields: bytes) -> bytes:
+    """Return a message record on channel 1."""
+    return records.record(records.MESSAGE, records.MESSAGE_HEAD.pack(1, 0, 1, 1)
+                          + b'\0\1\0\0' + struct.pack('<qii', 1, 2, 3) + fields)
+
+
+def hostile() -> dict[str, bytes]:
+    """Return data sections that claim more than there is, or hold more than they say."""
+    zeros = bytes(1 << 20)
+    bomb = zstandard.ZstdCompressor().compress(zeros * 300)
+    compressor = zstandard.ZstdCompressor(write_content_size=False)
+    unsized = compressor.compress(zeros * 300)
+    window = zstandard.ZstdCompressionParameters(window_log=27, write_content_size=False)
+    claims = b'\x28\xb5\x2f\xfd\xe0' + (1 << 40).to_bytes(8, 'little') + b'\1\0\0'
+    good = definitions() + message(bytes(8))
+
+    def one(content: bytes, **changes: Any) -> bytes:
+        packed = zstandard.compress(content)
+        return chunk(packed, size=len(content), crc=zlib.crc32(content), **changes)
+    return {
+        'record of 2**63 bytes': struct.pack('<BQ', 6, 2**63) + bytes(100),
+        'record of 2**64-1 bytes': struct.pack('<BQ', 6, 2**64 - 1) + bytes(100),
+        'message of 2**62 bytes': struct.pack('<BQ', 5, 2**62) + bytes(100),
+        'schema of 2**40 bytes': struct.pack('<BQ', 3, 2**40) + bytes(100),
+        'uncompressed size of 2**60': chunk(bomb, size=2**60),
+        'uncompressed size of 255 MiB': chunk(bomb[:100], size=255 << 20),
+        'records length of 2**60': chunk(bomb, length=2**60),
+        'compression name of 2**32-1 bytes': records.record(
+            records.CHUNK, records.CHUNK_HEAD.pack(0, 0, 1, 0) + b'\xff' * 40),
+        'zstd bomb': chunk(bomb), 'zstd bomb of unknown size': chunk(unsized),
+        'zstd frame of 2**40 bytes': chunk(claims), 'zstd frame as it claims': chunk(
+            claims, size=2**40),
+        'zstd bomb with a large window': chunk(
+            zstandard.ZstdCompressor(compression_params=window).compress(zeros * 300)),
+        'lz4 bomb': chunk(lz4.frame.compress(zeros * 300), compression='lz4'),
+        'lz4 bomb of 255 MiB': chunk(lz4.frame.compress(zeros * 300), compression='lz4',
+                                     size=255 << 20),
+        'no zstd': chunk(b'nonsense'), 'no lz4': chunk(b'nonsense', compression='lz4'),
+        'empty zstd': chunk(b''), 'empty lz4': chunk(b'', compression='lz4'),
+        'zstd of no bytes': chunk(b'', size=0), 'content but size 0': chunk(bomb, size=0),
+        'unknown compression': chunk(bomb, compression='snappy' * 50),
+        'record longer than its chunk': one(struct.pack('<BQ', 5, 2**63) + bytes(50)),
+        'record cut off in its chunk': one(good + b'\x05\x01'),
+        'schema longer than its record': one(records.record(
+            records.SCHEMA, b'\1\0' + b'\xff' * 20)),
+        'channel changes': one(definitions() + records.channel(1, 1, '/other')),
+        'short definition': one(records.record(records.CHANNEL, b'\1')),
+        'undefined channel': one(message(bytes(8))), 'message without a head': one(
+            definitions() + records.record(records.MESSAGE, b'\1\0')),
+        'string of 4 GiB': one(definitions('int64 timestamp\nint32 vpid\nint32 vtid\nstring s\n')
+                               + message(b'\xff\xff\xff\xff')),
+        'sequence of 4 G': one(definitions(
+            'int64 timestamp\nint32 vpid\nint32 vtid\nfloat64[] s\n') + message(b'\xff' * 4)),
+        'array of 10**12': one(definitions(
+            'int64 timestamp\nint32 vpid\nint32 vtid\nuint8[1000000000000] s\n')
+            + message(b'\xff' * 4)),
+        'names of 10**6': one(definitions('int64 timestamp\nint32 vpid\nint32 vtid\n' + ''.join(
+            f'int8 a{number}\n' for number in range(30_000))) + message(bytes(8))),
+        'a line of 10**6': one(definitions('int8 ' + 'a ' * 500_000) + message(bytes(8))),
+        'a chunk in a chunk': one(chunk(bomb)),
+        'a tail of zeros': one(good) + bytes(100_000),
+        'a row of empty records': one(good) + struct.pack('<BQ', 0x90, 0) * 10_000,
+    }
+
+
+READ_ALL = """
+import resource, sys, time
+from mddag_executor.trace import TraceError, TraceReader
+resource.setrlimit(resource.RLIMIT_AS, (700 << 20, 700 << 20))
+for path in sys.argv[1:]:
+    for in_time_order in (False, True):
+        start = time.monotonic()
+        try:
+            reader = TraceReader(path)
+            list(reader.events(sorted=in_time_order))
+            text = reader.warnings[0] if reader.warnings else 'no warning'
+        except TraceError as error:
+            text = f'error {error}'
+        assert time.monotonic() - start < 5, path
+        print(text)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+"""
+
+
+@pytest.mark.parametrize('finished', [False, True])
+def test_hostile_lengths(tmp_path: Path, finished: bool) -> None:
+    start = records.MAGIC + records.record(records.HEADER, records.string('ros2') * 2)
+    end = (records.record(records.DATA_END, bytes(4))
+           + records.record(records.FOOTER, bytes(20)) + records.MAGIC) if finished else b''
+    paths = []
+    for name, data in hostile().items():
+        paths.append(tmp_path / f'{name.replace("/", "-")}.mcap')
+        paths[-1].write_bytes(start + data + end)
+    *texts, megabytes = run_child(READ_ALL, *paths).splitlines()
+    assert len(texts) == 2 * len(paths)
+    assert int(megabytes) < 420         # the interpreter, and one chunk of at most 256 MiB
+    for path, text in zip(paths, texts[::2]):
+        assert text.startswith(str(path)), (path, text)
+        assert len(text) < 600
+    assert texts[::2] == texts[1::2]
+
+
+@pytest.mark.parametrize('change', [
+    dict(summary_start=2**63), dict(summary_start=2**40), dict(summary_start=1),
+    dict(length=2**63), dict(crc=1),
+])
+def test_hostile_footers(tmp_path: Path, sample: Any, change: dict[str, int]) -> None:
+    data, chunks = sample
+    path = tmp_path / 'a.mcap'
+    start, = struct.unpack_from('<Q', data, len(data) - 28)
+    path.write_bytes(data[:-37] + struct.pack(
+        '<BQQQI', 2, change.get('length', 20), change.get('summary_start', start), 0,
+        change.get('crc', 0)) + records.MAGIC)
+    events, warnings = read(path)
+    assert events == [event for chunk in chunks for event in chunk]
+    assert len(warnings) == 1 and 'the summary at the end is damaged' in warnings[0]

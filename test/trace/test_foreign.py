@@ -1,0 +1,251 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Files by other writers, and the order of time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import random
+import struct
+from typing import Any
+
+from mcap.writer import CompressionType, IndexType, Writer
+from mddag_executor.trace import EVENTS, read_events, TraceError, TraceReader, TraceWarning
+from mddag_executor.trace import reading
+from mddag_executor.trace.cdr import encode, ENCAPSULATION
+import pytest
+from rosbags.interfaces import ConnectionExtRosbag2
+from rosbags.rosbag2 import StoragePlugin, Writer as RosbagWriter
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+
+from .helpers import mixture, read, read_back, run_child, VPID, write_chunks
+
+
+def message(entry: tuple[Any, ...]) -> bytes:
+    name, timestamp, *rest = entry
+    return ENCAPSULATION + encode(EVENTS[name].types, (timestamp, VPID, *rest))
+
+
+def write_with_mcap(path: Path, recorded: list[tuple[Any, ...]], **options: Any) -> None:
+    """Write with the mcap package: other schema ids, other names, channels in another order."""
+    with open(path, 'wb') as stream:
+        writer = Writer(stream, **options)
+        writer.start(profile='ros2')
+        writer.register_schema('std_msgs/msg/String', 'ros2msg', b'string data')
+        other = writer.register_channel('/chatter', 'cdr', 1)
+        channels = {}
+        for name, *_ in reversed(recorded):
+            if name not in channels:
+                event = EVENTS[name]
+                schema = writer.register_schema(f'x/msg/{event.name}', 'ros2msg',
+                                                event.text.encode())
+                channels[name] = writer.register_channel(event.topic, 'cdr', schema)
+        for number, entry in enumerate(recorded):
+            writer.add_message(channels[entry[0]], entry[1], message(entry), entry[1])
+            if number % 3 == 0:
+                writer.add_message(other, entry[1], b'\0\1\0\0\1\0\0\0\0', entry[1])
+            if number == 20:
+                writer.add_attachment(0, entry[1], 'a', 'text/plain', b'abc')
+                writer.add_metadata('m', {'a': 'b'})
+        writer.finish()
+
+
+@pytest.mark.parametrize('options', [
+    {'chunk_size': 2000, 'compression': CompressionType.ZSTD},
+    {'chunk_size': 2000, 'compression': CompressionType.LZ4},
+    {'chunk_size': 2000, 'compression': CompressionType.NONE},
+    {'chunk_size': 2000, 'enable_crcs': False, 'use_statistics': False},
+    {'chunk_size': 2000, 'index_types': IndexType.NONE, 'repeat_channels': False},
+    {'use_chunking': False},
+    {'use_chunking': False, 'repeat_channels': False, 'repeat_schemas': False,
+     'use_statistics': False, 'use_summary_offsets': False, 'index_types': IndexType.NONE},
+], ids=str)
+@pytest.mark.parametrize('in_time_order', [False, True])
+def test_files_by_the_mcap_package(tmp_path: Path, options: dict[str, Any],
+                                   in_time_order: bool) -> None:
+    path = tmp_path / 'a.mcap'
+    recorded = mixture(300)
+    write_with_mcap(path, recorded, **options)
+    assert read(path, in_time_order) == (read_back(recorded), [])
+
+
+def test_files_by_rosbags(tmp_path: Path) -> None:
+    recorded = mixture(100)
+    store = get_typestore(Stores.EMPTY)
+    with RosbagWriter(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections: dict[str, Any] = {}
+        for entry in recorded:
+            event = EVENTS[entry[0]]
+            name = f'mddag_trace/msg/{event.provider}_{event.name}'
+            if event.key not in connections:
+                store.register(get_types_from_msg(event.text, name))
+                connections[event.key] = writer.add_connection(
+                    event.topic, name, typestore=store,
+                    serialization_format=ConnectionExtRosbag2('cdr', []).serialization_format)
+            writer.write(connections[event.key], entry[1], message(entry))
+    assert read(tmp_path / 'bag' / 'bag.mcap') == (read_back(recorded), [])
+
+
+def write_one(path: Path, schema: str, data: bytes, topic: str = '/trace/ros2/callback_end',
+              schema_encoding: str = 'ros2msg', encoding: str = 'cdr', repeat: int = 1) -> None:
+    with open(path, 'wb') as stream:
+        writer = Writer(stream)
+        writer.start(profile='ros2')
+        number = writer.register_schema('x/msg/X', schema_encoding, schema.encode())
+        channel = writer.register_channel(topic, encoding, number)
+        for _ in range(repeat):
+            writer.add_message(channel, 1, data, 1)
+        writer.finish()
+
+
+PREAMBLE = 'int64 timestamp\nint32 vpid\nint32 vtid\n'
+HEAD = ENCAPSULATION + struct.pack('<qii', 1, 2, 3)
+
+
+@pytest.mark.parametrize('schema, data, expected', [
+    # the table's event with its fields elsewhere, more of them, and the preamble in the midst
+    ('string more\nuint64 callback\nint32 vtid\nint32 vpid\nint64 timestamp\n',
+     ENCAPSULATION + b'\2\0\0\0x\0' + bytes(2) + struct.pack('<QiiQ', 9, 3, 2, 1),
+     ('ros2:callback_end', 1, 2, 3, 9)),
+    # another size of the same kind
+    (PREAMBLE + 'int32 callback\n', HEAD + struct.pack('<i', 9), ('ros2:callback_end', 1, 2, 3, 9)),
+    # a field is missing
+    (PREAMBLE, HEAD, ('ros2:callback_end', 1, 2, 3, None)),
+    # padding at the end
+    (PREAMBLE + 'uint64 callback', HEAD + struct.pack('<Q4x', 9), ('ros2:callback_end', 1, 2, 3, 9)),
+])
+def test_other_fields_than_the_table(tmp_path: Path, schema: str, data: bytes,
+                                     expected: tuple[Any, ...]) -> None:
+    path = tmp_path / 'a.mcap'
+    write_one(path, schema, data)
+    assert read(path) == ([expected], [])
+    assert read(path, in_time_order=True) == ([expected], [])
+
+
+def test_an_event_that_is_not_in_the_table(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    write_one(path, PREAMBLE + 'uint8[] gid\nstring[2] names\nfloat32 f\n',
+              HEAD + b'\2\0\0\0\x07\x08\0\0' + b'\2\0\0\0a\0\0\0' + b'\2\0\0\0b\0\0\0'
+              + struct.pack('<f', 0.5), topic='/trace/other/thing')
+    assert list(read_events(path)) == [
+        {'_name': 'other:thing', '_timestamp': 1, '_vpid': 2, '_vtid': 3, 'gid': (7, 8),
+         'names': ('a', 'b'), 'f': 0.5}]
+    reader = TraceReader(path)
+    assert list(reader.events({'other:thing'})) == [('other:thing', 1, 2, 3, (7, 8), ('a', 'b'), 0.5)]
+    assert reader.fields == {'other:thing': ('gid', 'names', 'f')}
+    assert list(reader.events({'ros2:callback_end'})) == []
+
+
+@pytest.mark.parametrize('options, reason', [
+    ({'schema': PREAMBLE + 'std_msgs/Header callback'}, "type 'std_msgs/Header' is no primitive"),
+    ({'schema': PREAMBLE + 'string callback'}, 'field callback is string instead of uint64'),
+    ({'schema': 'int64 timestamp\nuint64 callback'}, 'there is no field vpid'),
+    ({'schema': 'string timestamp\nint32 vpid\nint32 vtid\n'}, 'timestamp is string'),
+    ({'schema': '\0\1\2'}, 'is no field'),
+    ({'schema': PREAMBLE, 'schema_encoding': 'protobuf'}, "'protobuf' instead of ros2msg"),
+    ({'schema': PREAMBLE, 'encoding': 'json'}, "'json' instead of cdr"),
+    ({'schema': PREAMBLE, 'data': b'\0\0' + HEAD[2:]}, 'not plain little endian CDR'),
+    ({'schema': PREAMBLE, 'data': b''}, 'not plain little endian CDR'),
+    ({'schema': PREAMBLE, 'data': HEAD[:-1]}, 'shorter than its fields'),
+    ({'schema': PREAMBLE + 'string more', 'data': HEAD}, 'unpack_from requires'),
+    ({'schema': PREAMBLE + 'string more', 'data': HEAD + b'\xff\xff\xff\xff'}, 'longer than'),
+])
+def test_events_that_cannot_be_decoded_are_counted(
+        tmp_path: Path, options: dict[str, Any], reason: str) -> None:
+    path = tmp_path / 'a.mcap'
+    write_one(path, **{'data': HEAD + bytes(8), 'repeat': 5, **options})
+    for in_time_order in (False, True):
+        events, warnings = read(path, in_time_order)
+        assert not events
+        assert len(warnings) == 1
+        assert '5 messages could not be decoded and are left out, most of them (5) of ' \
+               '/trace/ros2/callback_end: ' in warnings[0]
+        assert reason in warnings[0]
+    with pytest.warns(TraceWarning, match='5 messages could not be decoded'):
+        assert list(read_events(path)) == []
+
+
+def test_names_select(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    recorded = mixture(300)
+    write_chunks(path, [recorded[:100], recorded[100:]])
+    names = {'ros2:callback_end', 'mddag:task_set', 'no:such'}
+    wanted = [event for event in read_back(recorded) if event[0] in names]
+    reader = TraceReader(path)
+    assert reader.message_count == 300
+    for in_time_order in (False, True):
+        assert list(reader.events(names, sorted=in_time_order)) == wanted
+    assert list(reader.events(set())) == []
+    assert reader.warnings == []
+
+
+@pytest.mark.parametrize('seed', range(20))
+@pytest.mark.parametrize('finish', [True, False])
+def test_any_disorder_is_put_into_order(tmp_path: Path, seed: int, finish: bool) -> None:
+    """Also of chunks whose definitions stand in a chunk that starts later."""
+    random_ = random.Random(seed)
+    path = tmp_path / 'a.mcap'
+    recorded = mixture(400)
+    reach = random_.choice([0, 3, 50, 400])
+    recorded = [entry for _, entry in sorted(
+        enumerate(recorded), key=lambda item: item[0] + random_.uniform(0, reach))]
+    recorded = [(name, time - time % random_.choice([1, 10_000]), *rest)
+                for name, time, *rest in recorded]      # some at the same time
+    cuts = sorted(random_.sample(range(400), random_.randrange(10)))
+    chunks = [recorded[first:last] for first, last in zip([0, *cuts], [*cuts, 400])]
+    write_chunks(path, chunks, finish=finish)
+    assert read(path)[0] == read_back(recorded)
+    # a stable sort: events of the same time are in the order of the file
+    in_time_order, warnings = read(path, in_time_order=True)
+    assert in_time_order == sorted(read_back(recorded), key=lambda event: event[1])
+    assert len(warnings) == (not finish)
+
+
+def test_too_much_disorder_for_the_memory(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading, '_PENDING_LIMIT', 150)
+    path = tmp_path / 'a.mcap'
+    recorded = mixture(400)
+    write_chunks(path, [recorded[:100], recorded[100:200], recorded[200:300], recorded[300:]])
+    assert read(path, in_time_order=True) == (read_back(recorded), [])
+    write_chunks(path, [recorded[number::4] for number in range(4)])
+    assert len(read(path)[0]) == 400
+    with pytest.raises(TraceError, match='too much in disorder'):
+        read(path, in_time_order=True)
+
+
+BIG = """
+import resource, sys
+from mddag_executor.trace import TraceFile, TraceReader, read_events
+path, count = sys.argv[1], int(sys.argv[2])
+with TraceFile(path) as file:
+    for first in range(0, count, 1000):
+        file.extend([('callback_start', number * 1000 ^ 8192, 5, number, True)
+                     for number in range(first, first + 1000)], 1)
+reader = TraceReader(path)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+assert sum(1 for _ in reader.events()) == count
+last = -1
+for event in reader.events(sorted=True):
+    assert event[1] > last
+    last = event[1]
+assert not reader.warnings
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
+"""
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
+    megabytes = int(run_child(BIG, tmp_path / 'a.mcap', 500_000))
+    assert megabytes < 20       # all events at once would take more than 100

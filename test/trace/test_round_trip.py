@@ -1,0 +1,268 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is written is what this reader, the mcap package and rosbags read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hypothesis import given, HealthCheck, settings, strategies as st
+from mcap.reader import make_reader, NonSeekingReader
+from mddag_executor.trace import EVENTS, EventType, read_events, TraceError, TraceFile, TraceReader
+from mddag_executor.trace.cdr import decode
+from mddag_executor.trace.trace_file import CHUNK_LIMIT
+import pytest
+from rosbags.highlevel import AnyReader
+
+from .helpers import entries, mixture, read, read_back, records_of, VPID, write_chunks
+
+ANY_EVENTS = st.lists(st.sampled_from(list(EVENTS.values())).flatmap(entries), max_size=30)
+
+
+@settings(max_examples=150, deadline=None,
+          suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@given(recorded=ANY_EVENTS)
+def test_every_value_comes_back(tmp_path: Path, recorded: list[tuple[Any, ...]]) -> None:
+    path = tmp_path / 'a.mcap'
+    half = len(recorded) // 2
+    write_chunks(path, [recorded[:half], recorded[half:]])
+    assert read(path) == (read_back(recorded), [])
+    by_time = sorted(read_back(recorded), key=lambda event: event[1])
+    assert read(path, in_time_order=True) == (by_time, [])
+
+
+@pytest.mark.parametrize('event', EVENTS.values(), ids=lambda event: event.key)
+def test_every_event_of_the_table(tmp_path: Path, event: EventType) -> None:
+    path = tmp_path / 'a.mcap'
+
+    @settings(max_examples=25, deadline=None)
+    @given(st.lists(entries(event), min_size=1, max_size=5))
+    def check(recorded: list[tuple[Any, ...]]) -> None:
+        write_chunks(path, [recorded])
+        assert read(path) == (read_back(recorded), [])
+    check()
+
+
+def test_dicts_for_caret(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    with TraceFile(path) as file:
+        file.add('callback_end', 20, 1, 2, 77)
+        file.add('ros2:rcl_timer_init', 10, 1, 3, 2**64 - 1, -5)
+    assert list(read_events(path)) == [
+        {'_name': 'ros2:rcl_timer_init', '_timestamp': 10, '_vpid': 1, '_vtid': 3,
+         'timer_handle': 2**64 - 1, 'period': -5},
+        {'_name': 'ros2:callback_end', '_timestamp': 20, '_vpid': 1, '_vtid': 2, 'callback': 77}]
+
+
+@pytest.mark.parametrize('seeking', [True, False])
+def test_mcap_reads_it(tmp_path: Path, seeking: bool) -> None:
+    path = tmp_path / 'a.mcap'
+    recorded = mixture(200)
+    write_chunks(path, [recorded[:50], recorded[50:]])
+    found = []
+    with open(path, 'rb') as stream:
+        reader = (make_reader(stream, validate_crcs=True) if seeking
+                  else NonSeekingReader(stream, validate_crcs=True))
+        for schema, channel, message in reader.iter_messages():
+            assert channel.message_encoding == 'cdr'
+            assert schema is not None and schema.encoding == 'ros2msg'
+            assert message.log_time == message.publish_time
+            assert message.data[:4] == b'\0\1\0\0'
+            _, provider, name = channel.topic[1:].split('/')
+            event = EVENTS[f'{provider}:{name}']
+            assert schema.data.decode() == event.text
+            assert schema.name == 'mddag_trace/msg/' + ''.join(
+                part.capitalize() for part in name.split('_'))
+            values = decode(event.types, message.data[4:])
+            assert values[0] == message.log_time
+            found.append((event.key, *values))
+    assert found == read_back(recorded)
+
+
+def test_mcap_agrees_with_the_summary(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    recorded = mixture(300)
+    recorded[0], recorded[99] = recorded[99], recorded[0]       # out of order within a chunk
+    write_chunks(path, [recorded[:100], recorded[100:]])
+    data = path.read_bytes()
+    with open(path, 'rb') as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        header = reader.get_header()
+        summary = reader.get_summary()
+    assert (header.profile, header.library) == ('ros2', 'mddag_executor')
+    assert summary is not None and summary.statistics is not None
+    statistics = summary.statistics
+    times = [event[1] for event in recorded]
+    assert (statistics.message_count, statistics.chunk_count) == (300, 2)
+    assert statistics.channel_count == statistics.schema_count == len(EVENTS)
+    assert (statistics.message_start_time, statistics.message_end_time) == (min(times), max(times))
+    assert sum(statistics.channel_message_counts.values()) == 300
+    chunks = [(start, end) for opcode, start, end in records_of(data) if opcode == 6]
+    assert [(index.chunk_start_offset, index.chunk_start_offset + index.chunk_length)
+            for index in summary.chunk_indexes] == chunks
+    assert [(index.message_start_time, index.message_end_time)
+            for index in summary.chunk_indexes] == [
+        (min(times[:100]), max(times[:100])), (min(times[100:]), max(times[100:]))]
+    for index in summary.chunk_indexes:
+        for channel, offset in index.message_index_offsets.items():
+            assert data[offset] == 7 and data[offset + 9:offset + 11] == channel.to_bytes(
+                2, 'little')
+
+
+def test_message_indexes_point_at_messages(tmp_path: Path) -> None:
+    """Those who seek inside a chunk (Foxglove, the C++ reader) go by them."""
+    from mcap.records import Chunk, MessageIndex
+    from mcap.stream_reader import get_chunk_data_stream, StreamReader
+    path = tmp_path / 'a.mcap'
+    write_chunks(path, [mixture(100)])
+    content = b''
+    checked = 0
+    with open(path, 'rb') as stream:
+        for record in StreamReader(stream, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                chunk_stream, length = get_chunk_data_stream(record, validate_crc=True)
+                content = chunk_stream.read(length)
+            elif isinstance(record, MessageIndex):
+                for time, offset in record.records:
+                    assert content[offset] == 5
+                    assert int.from_bytes(content[offset + 9:offset + 11], 'little') == (
+                        record.channel_id)
+                    assert int.from_bytes(content[offset + 15:offset + 23], 'little') == time
+                    checked += 1
+    assert checked == 100
+
+
+def test_rosbags_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    recorded = mixture(200)
+    write_chunks(path, [recorded[:50], recorded[50:]])
+    found = []
+    with AnyReader([path]) as reader:
+        assert reader.message_count == 200
+        for connection, time, data in reader.messages():
+            _, provider, name = connection.topic[1:].split('/')
+            event = EVENTS[f'{provider}:{name}']
+            message = reader.deserialize(data, connection.msgtype)
+            assert message.timestamp == time
+            found.append((event.key, time, message.vpid, message.vtid,
+                          *(getattr(message, field) for field, _ in event.fields)))
+    assert found == read_back(recorded)
+
+
+def test_chunks_keep_their_limit(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    yaml = 'x' * (CHUNK_LIMIT + 1000)
+    recorded = mixture(20_000)
+    large = ('mddag:task_set', 5, 1, yaml, 'f', 'rad', 7, 1, 2, False)
+    write_chunks(path, [[*recorded[:10_000], large, *recorded[10_000:]]])
+    with open(path, 'rb') as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    sizes = [index.uncompressed_size for index in summary.chunk_indexes]
+    assert sum(size > CHUNK_LIMIT for size in sizes) == 1       # the one too large by itself
+    assert min(sizes[:2]) > CHUNK_LIMIT * 0.9
+    events, warnings = read(path)
+    assert not warnings and len(events) == 20_001
+    assert yaml in [event[4] for event in events if event[0] == 'mddag:task_set']
+
+
+def test_events_beyond_the_table(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    extra = [
+        # as CARET records a tracepoint of ros2 again, with one field more
+        EventType('ros2_caret', 'rcl_node_init', (('node_handle', 'uint64'),
+                                                  ('init_timestamp', 'int64'))),
+        EventType('ros2', 'rmw_publisher_init', (('gid', 'uint8[16]'), ('more', 'string[]'))),
+        # other fields for one of the table
+        EventType('ros2', 'rcl_publish', (('message', 'uint64'), ('node', 'string'))),
+    ]
+    with TraceFile(path, extra_events=extra) as file:
+        file.add('rcl_node_init', 1, VPID, 2, 3, 4, 'name', '/')        # the table's goes first
+        file.add('ros2_caret:rcl_node_init', 2, VPID, 2, 3, -4)
+        file.add('rmw_publisher_init', 3, VPID, 2, range(16), ['a', 'b'])
+        file.add('rcl_publish', 4, VPID, 2, 7, 'n')
+    reader = TraceReader(path)
+    assert list(reader.events()) == [
+        ('ros2:rcl_node_init', 1, VPID, 2, 3, 4, 'name', '/'),
+        ('ros2_caret:rcl_node_init', 2, VPID, 2, 3, -4),
+        ('ros2:rmw_publisher_init', 3, VPID, 2, tuple(range(16)), ('a', 'b')),
+        ('ros2:rcl_publish', 4, VPID, 2, None, 7)]      # the table's fields, None where missing
+    assert reader.fields['ros2:rmw_publisher_init'] == ('gid', 'more')
+    assert reader.fields['ros2:rcl_publish'] == ('publisher_handle', 'message')
+    assert reader.warnings == []
+    assert list(read_events(path))[3] == {
+        '_name': 'ros2:rcl_publish', '_timestamp': 4, '_vpid': VPID, '_vtid': 2,
+        'message': 7, 'node': 'n'}                      # dicts have what the file has
+    with AnyReader([path]) as rosbags_reader:           # two schemas of one name would fail here
+        assert {connection.msgtype for connection in rosbags_reader.connections} == {
+            'mddag_trace/msg/RclNodeInit', 'mddag_trace/msg/Ros2CaretRclNodeInit',
+            'mddag_trace/msg/RmwPublisherInit', 'mddag_trace/msg/RclPublish'}
+
+
+@pytest.mark.parametrize('provider, name, fields', [
+    ('ros2', 'a b', ()), ('', 'a', ()), ('ros2', 'a', (('x', 'int'),)),
+    ('ros2', 'a', (('x', 'int32'), ('x', 'int32'))), ('ros2', 'a', (('timestamp', 'int64'),)),
+    ('ros2', 'a', (('x', 'std_msgs/Header'),)), ('ros2', 'a', (('1x', 'int32'),)),
+])
+def test_bad_event_types_are_refused(provider: str, name: str, fields: Any) -> None:
+    with pytest.raises(ValueError):
+        EventType(provider, name, fields)
+
+
+def test_add_refuses_what_it_cannot_write(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    with TraceFile(path) as file:
+        file.add('callback_end', 1, 2, 3, 4)
+        for entry in (('nonsense', 1, 2, 3), ('callback_end', 1, 2, 3),
+                      ('callback_end', 1, 2, 3, 4, 5), ('callback_end', 1, 2, 3, -4),
+                      ('callback_end', -1, 2, 3, 4), ('callback_end', 1, 2, 2**31, 4)):
+            with pytest.raises(TraceError, match=r'a\.mcap: event .* cannot be written .*: give'):
+                file.add(*entry)
+        file.add('callback_end', 2, 2, 3, 4)
+    with pytest.raises(TraceError, match='is closed'):
+        file.add('callback_end', 3, 2, 3, 4)
+    events, warnings = read(path)
+    assert [event[1] for event in events] == [1, 2] and not warnings
+
+
+def test_the_declaration_in_the_trace(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    with TraceFile(path) as file:
+        file.add('callback_end', 1, 2, 3, 4)
+        file.add('task_set', 5, 1, 1, 'mddag: 1\n', 'f', 'rad', 7, 1, 2, False)
+    assert TraceReader(path).task_set_text == 'mddag: 1\n'
+
+
+def test_an_empty_trace(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    with TraceFile(path):
+        pass
+    assert read(path) == ([], [])
+    assert TraceReader(path).message_count == 0
+    assert TraceReader(path).task_set_text is None
+    with open(path, 'rb') as stream:
+        assert list(make_reader(stream, validate_crcs=True).iter_messages()) == []
+
+
+def test_a_block_left_by_an_exception_gives_the_file_up(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    with pytest.raises(KeyError), TraceFile(path) as file:
+        file.add('callback_end', 1, 2, 3, 4)
+        file.flush()
+        raise KeyError
+    events, warnings = read(path)
+    assert len(events) == 1
+    assert len(warnings) == 1 and 'without a finish record' in warnings[0]

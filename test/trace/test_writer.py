@@ -1,0 +1,314 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The live writer: many threads, kills, full buffers, full disks."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+from mddag_executor.trace import EventType, TraceError, TraceReader, TraceWriter
+import pytest
+
+from .helpers import mixture, read, read_back, run_child, START
+
+FAST = 0.01     # flush interval of tests that need not wait
+
+
+def wait_for_file(path: Path, size: int) -> None:
+    """Wait until the writer thread has written more than some bytes."""
+    deadline = time.monotonic() + 10
+    while path.stat().st_size <= size:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_it_records(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    recorded = mixture(1000)
+    with TraceWriter(path) as writer:
+        for entry in recorded:
+            writer.record(*entry)
+        writer.record('callback_end', 7, 8, 9)      # by its short name
+    assert read(path) == (read_back([*recorded, ('ros2:callback_end', 7, 8, 9)], os.getpid()), [])
+    assert writer.dropped == 0 and writer.error is None
+    writer.close()
+    writer.record('callback_end', 7, 8, 9)          # after the end: counted, nothing else
+    assert writer.dropped == 1
+
+
+def test_the_clock(tmp_path: Path) -> None:
+    with TraceWriter(tmp_path / 'a.mcap') as writer:
+        assert abs(writer.now() - time.time_ns()) < 1_000_000_000
+        assert writer.now() - writer.clock_offset <= time.monotonic_ns()
+    with TraceWriter(tmp_path / 'a.mcap', clock_offset=0) as writer:
+        before = time.monotonic_ns()
+        assert before <= writer.now() <= time.monotonic_ns()
+
+
+def test_a_live_trace_is_readable(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    recorded = mixture(100)
+    with TraceWriter(path, flush_interval_s=FAST) as writer:
+        empty = path.stat().st_size
+        for entry in recorded:
+            writer.record(*entry)
+        deadline = time.monotonic() + 10
+        while len(read(path)[0]) < 100:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert path.stat().st_size > empty
+        events, warnings = read(path)
+        assert events == read_back(recorded, os.getpid())
+        assert len(warnings) == 1 and 'without a finish record' in warnings[0]
+
+
+def test_many_threads_lose_nothing(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    count, threads = 20_000, 6
+    writer = TraceWriter(path, capacity=count * threads, flush_interval_s=FAST)
+    start = threading.Barrier(threads)
+
+    def run(thread: int) -> None:
+        start.wait()
+        for number in range(count):
+            writer.record('callback_start', START + number, thread, number, number % 2 == 0)
+
+    workers = [threading.Thread(target=run, args=(thread,)) for thread in range(threads)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    writer.close()
+    assert writer.dropped == 0
+    events, warnings = read(path)
+    assert not warnings
+    by_thread: dict[int, list[int]] = {thread: [] for thread in range(threads)}
+    for _, _, _, thread, number, _ in events:
+        by_thread[thread].append(number)
+    assert all(numbers == list(range(count)) for numbers in by_thread.values())
+    in_time_order, _ = read(path, in_time_order=True)
+    assert in_time_order == sorted(events, key=lambda event: event[1])
+
+
+def test_a_full_buffer_is_counted(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    with TraceWriter(path, capacity=100, flush_interval_s=60) as writer:
+        for number in range(1000):
+            writer.record('callback_end', START + number, 1, number)
+        assert writer.dropped == 900
+    events, warnings = read(path)
+    assert not warnings
+    assert [event[4] for event in events if event[0] == 'ros2:callback_end'] == list(range(100))
+    assert [event[4] for event in events if event[0] == 'mddag:lost'] == [900]
+    assert writer.dropped == 900
+
+
+def test_every_event_is_in_the_file_or_counted(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    writer = TraceWriter(path, capacity=500, flush_interval_s=0.001)
+
+    def run() -> None:
+        for number in range(20_000):
+            writer.record('callback_end', START + number, 1, number)
+
+    workers = [threading.Thread(target=run) for _ in range(4)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    writer.close()
+    events, _ = read(path)
+    lost = sum(event[4] for event in events if event[0] == 'mddag:lost')
+    there = sum(event[0] == 'ros2:callback_end' for event in events)
+    assert writer.dropped == lost > 0
+    assert there + lost == 80_000
+
+
+def test_what_cannot_be_written_costs_nothing_else(
+        tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / 'a.mcap'
+    bad: list[tuple[Any, ...]] = [
+        ('nonsense', START, 1, 2), ('callback_end', START, 1), ('callback_end', START, 1, -1),
+        ('callback_end', START, 1, 'text'), ('callback_end', -START, 1, 2), (), ([], START, 1),
+        ('callback_end', START, 1, object()), ('callback_end', None, 1, 2),
+        ('task_set', START, 1, b'bytes', 'f', 'rad', 1, 1, 1, True)]
+    with TraceWriter(path, flush_interval_s=FAST) as writer:
+        for number, entry in enumerate(bad):
+            writer.record('callback_end', START + number, 1, number)
+            writer.record(*entry)
+        wait_for_file(path, 100)
+        writer.record(*bad[0])
+    assert writer.dropped == len(bad) + 1
+    events, warnings = read(path)
+    assert not warnings
+    assert [event[4] for event in events if event[0] == 'ros2:callback_end'] == (
+        list(range(len(bad))))
+    assert sum(event[4] for event in events if event[0] == 'mddag:lost') == len(bad) + 1
+    assert len(caplog.records) == 1
+    assert "event 'nonsense' cannot be written (no such event)" in caplog.text
+
+
+def test_extra_events(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    extra = EventType('mine', 'thing', (('x', 'float64[]'),))
+    with TraceWriter(path, extra_events=[extra]) as writer:
+        writer.record('thing', 1, 2, (0.5, 1.5))
+    assert read(path) == ([('mine:thing', 1, os.getpid(), 2, (0.5, 1.5))], [])
+
+
+@pytest.mark.parametrize('name', ['missing/a.mcap', '.', 'a\0b'])
+def test_a_path_that_cannot_be_written(tmp_path: Path, name: str) -> None:
+    with pytest.raises(TraceError, match='cannot be written') as caught:
+        TraceWriter(str(tmp_path / name))
+    assert '\n' not in str(caught.value)
+    assert str(caught.value).startswith(str(tmp_path / name))
+
+
+@pytest.mark.skipif(not os.path.exists('/dev/full'), reason='needs /dev/full')
+def test_a_full_disk_at_the_start() -> None:
+    threads = threading.active_count()
+    with pytest.raises(TraceError, match='/dev/full: writing failed .*No space left'):
+        TraceWriter('/dev/full')
+    assert threading.active_count() == threads
+
+
+KILLED = """
+import sys, time
+from mddag_executor.trace import TraceWriter
+writer = TraceWriter(sys.argv[1], clock_offset=0)
+number = 0
+while True:
+    writer.record('callback_end', writer.now(), 1, number)
+    number += 1
+    if number % 10 == 0:
+        time.sleep(0.001)
+    if number % 100 == 0:
+        print(number, flush=True)
+"""
+
+
+@pytest.mark.parametrize('seconds', [0.6, 1.1, 1.45])
+def test_a_killed_process_loses_at_most_the_last_second(tmp_path: Path, seconds: float) -> None:
+    path = tmp_path / 'a.mcap'
+    with subprocess.Popen([sys.executable, '-c', KILLED, str(path)],
+                          stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        time.sleep(seconds)
+        child.send_signal(signal.SIGKILL)
+        killed = time.monotonic_ns()
+        output = child.stdout.read().split()
+    events, warnings = read(path)
+    assert [event[4] for event in events] == list(range(len(events)))     # from the first on
+    assert killed - events[-1][1] < 1_000_000_000
+    assert int(output[-1]) - len(events) < len(events) + 20_000
+    assert len(warnings) == 1 and 'without a finish record' in warnings[0]
+    assert read(path, in_time_order=True) == (events, warnings)
+
+
+LIMITED = """
+import resource, sys, time
+from mddag_executor.trace import TraceError, TraceWriter
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+writer = TraceWriter(sys.argv[1], flush_interval_s=0.005)
+number = 0
+while writer.error is None:
+    writer.record('callback_end', writer.now(), 1, number * 7919 * 2**20 % 2**64)
+    number += 1
+    if number % 50 == 0:
+        time.sleep(0.001)
+for _ in range(10):
+    writer.record('callback_end', writer.now(), 1, 0)
+assert not writer._thread.is_alive() or writer._thread.join(5) is None
+try:
+    writer.close()
+except TraceError as error:
+    print(error)
+writer.close()
+print(number + 10, writer.dropped)
+"""
+
+
+def test_a_disk_that_gets_full(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    output = run_child(LIMITED, path).splitlines()
+    assert output[0] == (f'{path}: writing failed ({os.strerror(errno.EFBIG)}): what was written '
+                         'before is there; free space, then record again')
+    recorded, dropped = map(int, output[1].split())
+    events, warnings = read(path)
+    there = [event for event in events if event[0] == 'ros2:callback_end']
+    reported = sum(event[4] for event in events if event[0] == 'mddag:lost')
+    assert 0 < len(there) == recorded - dropped
+    assert reported == 0
+    assert path.stat().st_size < 20_000         # cut back to whole chunks
+    assert len(warnings) == 1 and 'the 0 bytes from there on' in warnings[0]
+
+
+def test_the_error_does_not_hide_an_exception(tmp_path: Path) -> None:
+    with pytest.raises(KeyError), TraceWriter(tmp_path / 'a.mcap') as writer:
+        writer.error = TraceError('a', 'b', 'c')
+        raise KeyError
+
+
+FORGOTTEN = """
+import sys
+from mddag_executor.trace import TraceWriter
+writer = TraceWriter(sys.argv[1], flush_interval_s=60)
+writer.record('callback_end', 1, 2, 3)
+"""
+
+FORKED = """
+import os, sys, threading
+from mddag_executor.trace import TraceWriter
+writer = TraceWriter(sys.argv[1], flush_interval_s=60)
+writer.record('callback_end', 1, 2, 3)
+child = os.fork()
+if child == 0:
+    writer.record('callback_end', 2, 2, 3)
+    writer.close()
+    sys.exit(0)
+os.waitpid(child, 0)
+writer.record('callback_end', 3, 2, 3)
+writer.close()
+"""
+
+
+def test_a_forgotten_writer_completes_its_file_at_exit(tmp_path: Path) -> None:
+    run_child(FORGOTTEN, tmp_path / 'a.mcap')
+    events, warnings = read(tmp_path / 'a.mcap')
+    assert len(events) == 1 and not warnings
+
+
+def test_a_forked_child_leaves_the_file_alone(tmp_path: Path) -> None:
+    run_child(FORKED, tmp_path / 'a.mcap')
+    events, warnings = read(tmp_path / 'a.mcap')
+    assert [event[1] for event in events] == [1, 3] and not warnings
+
+
+def test_close_leaves_no_thread(tmp_path: Path) -> None:
+    threads = set(threading.enumerate())
+    writer = TraceWriter(tmp_path / 'a.mcap')
+    writer.close()
+    writer.close()
+    assert set(threading.enumerate()) == threads
+    assert TraceReader(tmp_path / 'a.mcap').message_count == 0
