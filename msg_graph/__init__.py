@@ -27,7 +27,7 @@ import gc
 from os import fspath, PathLike
 
 from msg_graph.declaration import parse_declaration
-from msg_graph.derive import derive
+from msg_graph.derive import derive_task_set
 from msg_graph.duration import DurationError, format_duration, parse_duration
 from msg_graph.errors import GraphError
 from msg_graph.model import (
@@ -76,7 +76,7 @@ def loads(text: str | bytes, name: str = '<string>') -> TaskSet:
     """
     text = decode(text, name) if isinstance(text, bytes) else text
     with _no_collection():
-        return derive(parse_declaration(text, name), text)
+        return derive_task_set(parse_declaration(text, name), text)
 
 
 @contextmanager

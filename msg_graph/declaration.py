@@ -143,7 +143,11 @@ def _callback(fields: Fields, node: str) -> Entry:
     if kind == 'subscription':
         topics = (fields.text('subscription', check_topic),)
     elif kind == 'sync':
-        topics = fields.texts('sync', check_topic, least=2)
+        topics = fields.texts('sync', check_topic)
+        if len(topics) < 2:
+            raise fields.error(
+                'sync', f'a sync callback joins topics, and here is {len(topics)}',
+                "give at least 2, or write 'subscription:' for one topic")
     callback = Callback(
         node=node,
         name=name,
@@ -236,6 +240,8 @@ def _paths(trees: list[Tree], file: str) -> tuple[PathEntry, ...]:
         if name in paths:
             raise fields.error('name', 'this name is taken', 'give each path a name of its own')
         fields.sequence('callbacks')
-        callbacks = fields.texts('callbacks', check_key, least=2)
+        callbacks = fields.texts('callbacks', check_key)
+        if len(callbacks) < 2:
+            raise fields.error('callbacks', 'a path of one callback', 'give at least 2')
         paths[name] = PathEntry(Path(name, callbacks), fields)
     return tuple(paths.values())

@@ -60,7 +60,7 @@ MAX_VERTICES = 100_000
 MAX_EDGES = 1_000_000
 
 
-def derive(declaration: Declaration, text: str) -> TaskSet:
+def derive_task_set(declaration: Declaration, text: str) -> TaskSet:
     """
     Return the task set of a declaration.
 

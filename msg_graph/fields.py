@@ -138,7 +138,7 @@ class Fields:
 
     @property
     def line(self) -> int:
-        """The line that the mapping starts in."""
+        """Return the line that the mapping starts in."""
         return self._tree.line
 
     def has(self, key: str) -> bool:
@@ -206,7 +206,7 @@ class Fields:
         value = self.tree_or_none(key)
         return None if value is None else self._text_of(key, value, check)
 
-    def texts(self, key: str, check: Check, *, least: int = 0) -> tuple[str, ...]:
+    def texts(self, key: str, check: Check) -> tuple[str, ...]:
         """Return a list of different texts; none where the key is missing."""
         value = self.tree_or_none(key)
         if value is None:
@@ -221,9 +221,6 @@ class Fields:
                 raise self._value_error(
                     key, item, f'{shown(text)} stands there twice', 'remove one of them')
             result[text] = None
-        if len(result) < least:
-            raise self.error(
-                key, f'{shown(key)} has {len(result)} entries', f'give at least {least}')
         return tuple(result)
 
     def choice(self, key: str, choices: tuple[str, ...]) -> str:

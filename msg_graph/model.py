@@ -64,7 +64,7 @@ class ExecutionTime:
 
     @property
     def mean_ns(self) -> int:
-        """Mean of the distribution that ``draw`` draws from, in ns."""
+        """Return the mean of the distribution that ``draw`` draws from, in ns."""
         percent, quantiles = self.percent, self.quantiles_ns
         area = quantiles[0] * percent[0] + quantiles[-1] * (100.0 - percent[-1])
         for i in range(1, len(percent)):
@@ -73,7 +73,7 @@ class ExecutionTime:
 
     @property
     def median_ns(self) -> int:
-        """Median of the distribution, in ns."""
+        """Return the median of the distribution, in ns."""
         return self.draw(0.5)
 
 

@@ -121,7 +121,6 @@ def ros_context(no_thread_leak: None) -> Iterator[Any]:
     rclpy.init(context=context)
     yield context
     context.try_shutdown()
-    context.destroy()
 
 
 @pytest.fixture

@@ -73,6 +73,8 @@ VERBS = {
     'export': Verb('export', 'turn a trace into a file for Perfetto, spreadsheets or data frames'),
     'bench': Verb('bench', 'measure the executor, the core, the replayer and the simulator'),
 }
+# What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.
+_ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_python')
 # Where the error classes of the neighbours are, of which not all derive from MddagError (msg_graph
 # stands below this package). They are looked up in sys.modules: a module that was not imported
 # cannot have raised.
@@ -174,6 +176,9 @@ def user_line(error: BaseException) -> str | None:
         name = error.filename if error.filename2 is None else error.filename2
         place = name if isinstance(name, int) else os.fsdecode(name)
         return one_line(f'{place}: {reason[:1].lower()}{reason[1:]}: {remedy}')
+    if isinstance(error, ModuleNotFoundError) and error.name in _ROS:
+        return (f'{error.name}: ROS 2 is not there: source the setup file of your ROS 2, '
+                "or install 'mddag_executor[ros]' with pip")
     return None
 
 

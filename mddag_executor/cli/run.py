@@ -17,27 +17,30 @@ The verb `run`: real nodes, or nodes made from the declaration, under the execut
 
 Everything that can be wrong with the command line is found before a node starts: the declaration,
 the names of policy and nodes, whether trace and result can be written.  A run ends after
-`--duration`, with Ctrl-C (or SIGTERM), when a node calls `rclpy.shutdown`, or when all programs have
-ended; however it ends, its summary is printed.
+`--duration`, with Ctrl-C (or SIGTERM), when a callback calls `rclpy.shutdown`, or when all
+programs have ended; however it ends, its summary is printed.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+import os
 from pathlib import Path
+import re
 import signal
 import sys
+import tempfile
 import threading
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common
-from mddag_executor.cli.results import percent, sink_table, total
 from mddag_executor.cli.text import printable, Progress
 from mddag_executor.core import POLICIES
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import MddagError, UsageError
+from mddag_executor.report.tables import percent, sink_table, total
 
 if TYPE_CHECKING:
     from mddag_executor.live.execution import ExecutionPlan
@@ -104,7 +107,6 @@ def main(args: argparse.Namespace) -> int:
     if args.synthetic is not None:
         from mddag_executor.live.execution import ExecutionPlan
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
-        _warn(plan)
     else:
         from mddag_executor.live.loading import resolve
         programs = [resolve(spec) for spec in args.node]
@@ -113,16 +115,33 @@ def main(args: argparse.Namespace) -> int:
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
             intake=args.intake)
+        # With `--json -` what nodes print must not get into the JSON.
+        output = sys.stdout if common.wants_tables(args) else sys.stderr
         try:
-            result, error = _run(args, task_set, executor, programs, plan)
+            with redirect_stdout(output):
+                result, error = _run(args, task_set, executor, programs, plan)
         except MddagError:
             if args.trace is not None:  # nothing ran: leave no empty trace behind
                 Path(args.trace).unlink(missing_ok=True)
             raise
     _report(args, result)
+    _leave_threads_behind(error)
     if error is not None:
         raise error
     return 0
+
+
+def _leave_threads_behind(error: BaseException | None) -> None:
+    """End the process here if a node's thread would keep the interpreter from ending."""
+    left = [t.name for t in threading.enumerate()
+            if not t.daemon and t is not threading.main_thread()]
+    if not left or error is not None:
+        return
+    print(f'warning: threads that nodes started still run and are left behind: {_listed(left)}',
+          file=sys.stderr)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 def _check_arguments(args: argparse.Namespace) -> None:
@@ -151,21 +170,41 @@ def _warn(plan: ExecutionPlan) -> None:
 
 @contextmanager
 def _rclpy(ros_args: Sequence[str]) -> Iterator[None]:
-    """Initialise rclpy, whose own signal handlers would take Ctrl-C away from the summary."""
-    import rclpy
-    from rclpy.signals import SignalHandlerOptions
+    """Keep rclpy initialised."""
     from rclpy.utilities import try_shutdown
-    arguments = [sys.argv[0], '--ros-args', *ros_args] if ros_args else []
     try:
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        _init([sys.argv[0], '--ros-args', *ros_args] if ros_args else [])
     except Exception as error:
-        lines = str(error).split('\n')
+        reason = re.sub(r', at /\S+:\d+', '', str(error).split('\n')[0])
         raise UsageError(
-            f'--ros-args {" ".join(ros_args)}: {lines[0]}: correct it, or leave it out') from error
+            f'--ros-args {" ".join(ros_args)}: {reason}: correct it, or leave it out'
+        ) from error
     try:
         yield
     finally:
         try_shutdown()
+
+
+def _init(arguments: list[str]) -> None:
+    """
+    Initialise rclpy without its signal handlers, which would take Ctrl-C from the summary.
+
+    What native code writes to standard error is shown only when there is no exception: else it is
+    the same once more.
+    """
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as kept:
+        stderr = os.dup(2)
+        os.dup2(kept.fileno(), 2)
+        try:
+            rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+        kept.seek(0)
+        os.write(2, kept.read())
 
 
 def _run(
@@ -179,6 +218,7 @@ def _run(
     measured: dict[str, Any] | None = None
     with _signals(session), Progress('running', seconds) as progress:
         if plan is not None:
+            _warn(plan)
             measured = _run_synthetic(session, task_set, plan, seconds, progress)
         else:
             _run_programs(session, programs, args.ros_args or [], seconds, progress)
@@ -186,7 +226,7 @@ def _run(
         'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
         **executor.statistics(), 'measured': measured}
     if not session.clean:
-        print('warning: a callback did not end in time; it is left behind', file=sys.stderr)
+        print('warning: a callback has not ended in time; it is left behind', file=sys.stderr)
     return result, session.error
 
 
@@ -240,7 +280,7 @@ def _signals(session: Session) -> Iterator[None]:
 
     def handler(number: int, frame: object) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        session.stop()
+        session.stop(hurried=True)
 
     before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -275,9 +315,11 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
     if skipped:
         yield f'{sum(skipped.values())} timer releases skipped' + _details(skipped)
     yield f'{result["undeclared"]} runs of undeclared callbacks'
-    never = result['never_ran']
+    never = [*result['never_ran'], *(
+        name for name, counts in result['callbacks'].items()
+        if counts['declared'] and not counts['ran'])]
     if never:
-        yield f'{len(never)} declared callbacks never ran: ' + _listed(never)
+        yield f'declared callbacks that never ran: {len(never)}: ' + _listed(never)
     if result['trace'] is not None:
         lost = result['trace']['lost']
         yield (f'trace: {printable(str(Path(result["trace"]["path"]).absolute()))}'

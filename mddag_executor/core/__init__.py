@@ -14,7 +14,7 @@
 
 """The scheduler core: events with their times in, decisions out (see ``rules``)."""
 
-from mddag_executor.core.policies import POLICIES, policy, Policy, PolicyError
+from mddag_executor.core.policies import POLICIES, Policy, policy, PolicyError
 from mddag_executor.core.scheduler import Scheduler
 from mddag_executor.core.tables import NEVER, rad_offsets, Tables
 from mddag_executor.core.tally import quantile, Tally

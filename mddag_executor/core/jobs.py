@@ -23,7 +23,15 @@ from __future__ import annotations
 
 from mddag_executor.core.state import (
     ABORTED,
-    DONE,
+    EXPIRED,
+    FREE,
+    IDLE,
+    JOB_END,
+    OPEN,
+    SINK_ABORTED,
+    SINK_EXPIRED,
+    SINK_MISSED,
+    State,
 )
 from mddag_executor.core.tables import Tables
 
@@ -69,7 +77,7 @@ def _link_newest(s: State, dag: int, slot: int) -> None:
     s.n_open[dag] += 1
 
 
-def _close(s: State, slot: int, end: int, now: int) -> None:
+def close_job(s: State, slot: int, end: int, now: int) -> None:
     """End an open job (rule 8): it leaves the open jobs and, when nothing is active, its slot."""
     dag = s.job_dag[slot]
     before, after = s.job_previous[slot], s.job_next[slot]
@@ -109,13 +117,14 @@ def expire_idle(t: Tables, s: State, dag: int, now: int) -> None:
 def expire_job(t: Tables, s: State, slot: int, now: int) -> None:
     """Expire an open job: each sink that has not completed is missed and expired."""
     _give_up_sinks(t, s, slot, SINK_EXPIRED)
-    _close(s, slot, EXPIRED, now)
+    close_job(s, slot, EXPIRED, now)
 
 
 def abort_job(t: Tables, s: State, slot: int, now: int) -> None:
     """Abort an open job (rule 7): each sink that has not completed is missed and aborted."""
+    """Abort an open job (rule 7): each sink that has not completed is missed and aborted."""
     _give_up_sinks(t, s, slot, SINK_ABORTED)
-    _close(s, slot, ABORTED, now)
+    close_job(s, slot, ABORTED, now)
 
 
 def _give_up_sinks(t: Tables, s: State, slot: int, kind: int) -> None:
@@ -127,7 +136,7 @@ def _give_up_sinks(t: Tables, s: State, slot: int, kind: int) -> None:
             s.decisions.append((kind, dag, vertex, s.job_index[slot], deadline, -1))
 
 
-def _overdue(t: Tables, s: State, slot: int, now: int) -> bool:
+def overdue(t: Tables, s: State, slot: int, now: int) -> bool:
     """Tell whether a sink that has not completed is past its absolute deadline."""
     dag = s.job_dag[slot]
     for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
@@ -154,7 +163,7 @@ def finish(t: Tables, s: State, now: int) -> None:
             slot = s.job_next[slot]
 
 
-def _deactivate(s: State, slot: int) -> None:
+def deactivate(s: State, slot: int) -> None:
     """Count one waiting or running execution of a job less; free the slot of an ended job."""
     s.job_active[slot] -= 1
     if s.job_active[slot] == 0 and s.job_state[slot] != OPEN:

@@ -28,7 +28,8 @@ arguments, because it is compiled for the simulator and called as it is by the l
 
 from __future__ import annotations
 
-from typing import Callable, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 from mddag_executor.core.tables import Tables
 from mddag_executor.errors import MddagError

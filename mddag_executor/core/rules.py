@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The scheduling rules, all of them and only here.
+The scheduling rules, all of them and only here (what concerns whole jobs is in ``jobs``).
 
 Theory of operation
 -------------------
@@ -45,8 +45,8 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
     deadline) is late; at the deadline is in time.  ``finish`` judges what is open when the run
     ends: an absolute deadline at or before the end has been missed.
 7.  **Misses.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops what is left of it, as soon
-    as the miss is known: at a late completion, or when something of it would be dispatched after
-    the deadline of a sink that is not done.  What has started runs on.
+    as the miss is known: at a late completion, or when something of it comes first in the ready
+    queue after the deadline of a sink that is not done.  What has started runs on.
 8.  **Ends.**  A job ends in exactly one of completed, late, aborted, expired.  After an abort
     executions of the job that have not started are dropped; after an expiry they run (live: each
     stands for a message, which is never lost silently) but make no further edge true and are not
@@ -56,17 +56,39 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
 
 from __future__ import annotations
 
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 
+from mddag_executor.core.jobs import abort_job, close_job, deactivate, overdue
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.state import (
-    ABORTED, COMPLETED, DISPATCH_OVERHEAD, DONE, DROP, DROPPED, EXPIRED, FREE, IDLE, JOB_END, LATE,
-    N_IDLE, OPEN, ORDER, PREEMPTIVE, PROPAGATE, RUNNING, SINK_ABORTED, SINK_DONE, SINK_EXPIRED,
-    SINK_MISSED, State, SUSPENDED, SWITCH_OVERHEAD, WAITING)
+    ABORTED,
+    COMPLETED,
+    DISPATCH_OVERHEAD,
+    DONE,
+    DROP,
+    DROPPED,
+    Entry,
+    EXPIRED,
+    LATE,
+    N_IDLE,
+    N_STALE,
+    OPEN,
+    ORDER,
+    PREEMPTIVE,
+    PROPAGATE,
+    RUNNING,
+    SINK_DONE,
+    State,
+    SUSPENDED,
+    SWITCH_OVERHEAD,
+    WAITING,
+)
 from mddag_executor.core.tables import ABORT, Tables
 
 PUT_BACK = 0
 FRESH = 1
+SWEEP_AT = 64
+"""So many stale entries may stand in the queues anyway."""
 
 
 # --- readiness -----------------------------------------------------------------------------------
@@ -101,10 +123,53 @@ def edge(t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int
 
 
 def drop(s: State, x: int, now: int) -> None:
-    """Drop a waiting execution, for example because its queue is full; it never runs."""
+    """
+    Drop a waiting execution, for example because its queue is full; it never runs.
+
+    Its entry stays in a queue, stale, until it gets to the top or stale ones are the larger part.
+    An undeclared callback's job has nothing else, so it ends here.
+    """
     s.x_state[x] = DROPPED
     slot = s.x_slot[x]
-    s.decisions.append((DROP, s.job_dag[slot], s.x_vertex[x], s.job_index[slot], x, now))
+    dag = s.job_dag[slot]
+    s.decisions.append((DROP, dag, s.x_vertex[x], s.job_index[slot], x, now))
+    group = s.x_group[x]
+    if group >= 0 and (s.group_owner[group] == -1 or s.group_owner[group] == x):
+        _release_group(s, group)  # it may have stood in the ready queue for those of its group
+    if dag == len(s.oldest) - 1 and s.job_state[slot] == OPEN:
+        close_job(s, slot, EXPIRED, now)
+    deactivate(s, slot)
+    s.scalars[N_STALE] += 1
+    if s.scalars[N_STALE] > SWEEP_AT:
+        _sweep(s)
+
+
+def _is_stale(s: State, entry: Entry) -> bool:
+    """Tell whether a queue's entry is of a dropped execution (whose id may be in use again)."""
+    return s.x_state[entry[4]] != WAITING or s.x_key[entry[4]] != entry
+
+
+def _sweep(s: State) -> None:
+    """Take stale entries out of all queues when they are the larger part: memory is bounded."""
+    length = len(s.ready)
+    for group in range(len(s.group_heap)):
+        length += len(s.group_heap[group])
+    if 2 * s.scalars[N_STALE] <= length:
+        return
+    _keep_valid(s, s.ready)
+    for group in range(len(s.group_heap)):
+        _keep_valid(s, s.group_heap[group])
+    s.scalars[N_STALE] = 0
+
+
+def _keep_valid(s: State, heap: list[Entry]) -> None:
+    kept = 0
+    for i in range(len(heap)):
+        if not _is_stale(s, heap[i]):
+            heap[kept] = heap[i]
+            kept += 1
+    del heap[kept:]
+    heapify(heap)
 
 
 # --- dispatch ------------------------------------------------------------------------------------
@@ -117,26 +182,23 @@ def peek(t: Tables, s: State, now: int) -> int:
     those whose group is busy into their group's heap (rule 4).
     """
     while s.ready:
-        x = s.ready[0][4]
-        slot = s.x_slot[x]
-        if s.x_state[x] == WAITING:
-            dag = s.job_dag[slot]
-            if (t.on_miss[dag] == ABORT and s.job_state[slot] == OPEN
-                    and _overdue(t, s, slot, now)):
-                abort_job(t, s, slot, now)
-            if s.job_state[slot] == ABORTED and s.x_started[x] < 0:
-                drop(s, x, now)
-        if s.x_state[x] == WAITING:
-            group = s.x_group[x]
-            if group < 0 or s.group_owner[group] == -1 or s.group_owner[group] == x:
-                return x
-            heappush(s.group_heap[group], heappop(s.ready))
-        else:
+        entry = s.ready[0]
+        if _is_stale(s, entry):
             heappop(s.ready)
-            group = s.x_group[x]
-            if group >= 0 and s.group_owner[group] == -1:
-                _release_group(s, group)  # it was here as the smallest of its group
-            _deactivate(s, slot)
+            s.scalars[N_STALE] -= 1
+            continue
+        x = entry[4]
+        group = s.x_group[x]
+        if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
+            heappush(s.group_heap[group], heappop(s.ready))
+            continue
+        slot = s.x_slot[x]
+        if (t.on_miss[s.job_dag[slot]] == ABORT and s.job_state[slot] == OPEN
+                and overdue(t, s, slot, now)):
+            abort_job(t, s, slot, now)
+        if s.job_state[slot] != ABORTED or s.x_started[x] >= 0:
+            return x
+        drop(s, x, now)
     return -1
 
 
@@ -237,7 +299,7 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     _leave_worker(s, x)
     s.x_state[x] = DONE
     group = s.x_group[x]
-    if group >= 0:
+    if group >= 0 and s.group_owner[group] == x:
         _release_group(s, group)
     slot = s.x_slot[x]
     vertex = s.x_vertex[x]
@@ -250,14 +312,18 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
         s.x_pending[head] = -1
         if s.job_state[slot] == OPEN:
             _complete_vertex(t, s, key, slot, vertex, now)
-    _deactivate(s, slot)
+    deactivate(s, slot)
     return whole
 
 
 def _release_group(s: State, group: int) -> None:
     s.group_owner[group] = -1
-    if s.group_heap[group]:
-        heappush(s.ready, heappop(s.group_heap[group]))
+    heap = s.group_heap[group]
+    while heap and _is_stale(s, heap[0]):
+        heappop(heap)
+        s.scalars[N_STALE] -= 1
+    if heap:
+        heappush(s.ready, heappop(heap))
 
 
 def _complete_vertex(
@@ -265,7 +331,7 @@ def _complete_vertex(
 ) -> None:
     dag = s.job_dag[slot]
     if dag == t.n_dags:
-        _close(s, slot, COMPLETED, now)
+        close_job(s, slot, COMPLETED, now)
         return
     if t.sink_deadline[vertex] >= 0:
         deadline = s.job_release[slot] + t.sink_deadline[vertex]
@@ -274,7 +340,7 @@ def _complete_vertex(
         if now > deadline:
             s.job_late[slot] += 1
         if s.job_sinks_left[slot] == 0:
-            _close(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
+            close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
         elif now > deadline and t.on_miss[dag] == ABORT:
             abort_job(t, s, slot, now)
     if s.scalars[PROPAGATE] != 0 and s.job_state[slot] == OPEN:

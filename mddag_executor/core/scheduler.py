@@ -16,9 +16,9 @@
 
 from __future__ import annotations
 
-from mddag_executor.core import rules
+from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import policy
-from mddag_executor.core.state import add_group, add_slot, Decision, N_IDLE, new_state
+from mddag_executor.core.state import add_group, add_slot, Decision, N_IDLE, N_STALE, new_state
 from mddag_executor.core.tables import Tables
 
 
@@ -55,10 +55,10 @@ class Scheduler:
 
     def release(self, dag: int, job: int, release: int, now: int) -> int:
         """Open a job of a DAG and return its slot."""
-        slot = rules.release_job(self.tables, self.state, dag, job, release, now)
+        slot = jobs.release_job(self.tables, self.state, dag, job, release, now)
         if slot < 0:
             add_slot(self.tables, self.state, dag)
-            slot = rules.release_job(self.tables, self.state, dag, job, release, now)
+            slot = jobs.release_job(self.tables, self.state, dag, job, release, now)
         return slot
 
     def execution(self, slot: int, vertex: int, leg: int = 0) -> int:
@@ -115,20 +115,20 @@ class Scheduler:
 
     def expire(self, slot: int, now: int) -> None:
         """Expire the open job in a slot."""
-        rules.expire_job(self.tables, self.state, slot, now)
+        jobs.expire_job(self.tables, self.state, slot, now)
 
     def abort(self, slot: int, now: int) -> None:
         """Abort the open job in a slot."""
-        rules.abort_job(self.tables, self.state, slot, now)
+        jobs.abort_job(self.tables, self.state, slot, now)
 
     def expire_idle(self, now: int) -> None:
         """Expire every job that can no longer complete."""
         for dag in range(self.tables.n_dags):
-            rules.expire_idle(self.tables, self.state, dag, now)
+            jobs.expire_idle(self.tables, self.state, dag, now)
 
     def finish(self, now: int) -> None:
         """Judge what is open at the run's end."""
-        rules.finish(self.tables, self.state, now)
+        jobs.finish(self.tables, self.state, now)
 
     def new_group(self) -> int:
         """Add a mutually exclusive callback group and return its number."""
@@ -142,11 +142,11 @@ class Scheduler:
 
     @property
     def idle_workers(self) -> int:
-        """Number of workers that run nothing."""
+        """Count the workers that run nothing."""
         return self.state.scalars[N_IDLE]
 
     @property
     def queue_length(self) -> int:
-        """Number of executions that wait, for a worker or for their group."""
+        """Count the executions that wait, for a worker or for their group."""
         waiting = sum(len(heap) for heap in self.state.group_heap)
-        return len(self.state.ready) + waiting
+        return len(self.state.ready) + waiting - self.state.scalars[N_STALE]

@@ -34,7 +34,8 @@ IDLE, WAITING, RUNNING, SUSPENDED, DONE, DROPPED = range(6)
 FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED = range(6)
 
 # Columns of ``scalars``.
-ORDER, N_IDLE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, N_SCALARS = range(7)
+(ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD,
+ N_SCALARS) = range(8)
 
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  The deadline is that of the
 # sink; the time that of the decision, for a sink that completed the completion, else -1.

@@ -22,11 +22,22 @@ mean the same.
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from mddag_executor.core.state import (
-    ABORTED, COMPLETED, Decision, DROP, EXPIRED, JOB_END, LATE, SINK_ABORTED, SINK_DONE,
-    SINK_EXPIRED, SINK_MISSED)
+    ABORTED,
+    COMPLETED,
+    Decision,
+    DROP,
+    EXPIRED,
+    JOB_END,
+    LATE,
+    SINK_ABORTED,
+    SINK_DONE,
+    SINK_EXPIRED,
+    SINK_MISSED,
+)
 from mddag_executor.core.tables import Tables
 from msg_graph import TaskSet
 
@@ -90,7 +101,9 @@ class Tally:
         self.ends = [dict.fromkeys(_OUTCOMES, 0) for _ in range(tables.n_dags)]
         self.sinks = {v: SinkTally(tables.sink_deadline[v], keep) for v in tables.sinks}
         self.dropped = 0
+        #: The miss that was known first; of those judged at the run's end, the first deadline's.
         self.first_miss: dict[str, Any] | None = None
+        self._first_kind = -1
 
     def released(self, dag: int) -> None:
         """Count the release of a job."""
@@ -122,7 +135,10 @@ class Tally:
             sink.expired += 1
         elif kind == SINK_ABORTED:
             sink.aborted += 1
-        if missed and self.first_miss is None:
+        if missed and (self.first_miss is None or (
+                kind == self._first_kind == SINK_MISSED
+                and deadline < self.first_miss['deadline_ns'])):
+            self._first_kind = kind
             self.first_miss = {
                 'dag': self._dags[dag].name, 'vertex': self.vertex_name(vertex), 'job': job,
                 'deadline_ns': deadline, 'completed_ns': time if kind == SINK_DONE else None}

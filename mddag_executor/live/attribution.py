@@ -36,9 +36,10 @@ is learnt from messages that only one window holds.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 import threading
 import time
-from typing import Any, Callable, NamedTuple
+from typing import Any, NamedTuple
 
 KEEP = 1024
 """How many publications of a topic are remembered."""

@@ -27,9 +27,10 @@ is the order in which the core saw them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import threading
 from time import monotonic_ns
-from typing import Any, Callable
+from typing import Any
 
 from mddag_executor.core import Scheduler, Tables
 from mddag_executor.core.state import IDLE, OPEN, SUSPENDED

@@ -84,9 +84,9 @@ class EntitySet:
     """
     What some nodes have to wait for, at one moment, in the order of their creation by node.
 
-    ``events`` holds the QoS events (rclpy's ``EventHandler``), ``waitables`` all other waitables:
-    a node has a few of the former for every publisher and subscription, and they hardly ever
-    become ready.
+    ``events`` holds the QoS events (rclpy's ``EventHandler``, as it is), ``waitables`` all other
+    waitables: a node has a few of the former for every publisher and subscription, and they
+    hardly ever become ready.
     """
 
     subscriptions: list[Subscription]
@@ -162,6 +162,14 @@ def _flatten(nodes: dict[Node, _Lists], accept: Callable[[Any], bool] | None) ->
     waitables = flat(5)
     return EntitySet(
         flat(0), flat(1), flat(2), flat(3), flat(4),
-        [w for w in waitables if not isinstance(w, EventHandler)],
-        [w for w in waitables if isinstance(w, EventHandler)],
+        [w for w in waitables if not is_qos_event(w)],
+        [w for w in waitables if is_qos_event(w)],
         nodes)
+
+
+def is_qos_event(waitable: Waitable) -> bool:
+    """Return whether a waitable is an ``EventHandler`` that waits and takes as rclpy's does."""
+    kind = type(waitable)
+    return isinstance(waitable, EventHandler) and all(
+        getattr(kind, name) is getattr(EventHandler, name)
+        for name in ('add_to_wait_set', 'is_ready', 'take_data', 'get_num_entities'))

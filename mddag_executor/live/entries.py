@@ -16,8 +16,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import types
-from typing import Any, Callable
+from typing import Any
 
 from mddag_executor.core import Tables
 from mddag_executor.live.attribution import Origin

@@ -15,14 +15,18 @@
 """
 Intake by events: the middleware calls, and nothing is asked again for each wake-up.
 
-Subscriptions, services and clients go through rclpy's native EventsExecutor (see ``native``).
-The others can not, or crash it, and get threads of their own: timers; guard conditions, actions
-and other waitables, if there are any; QoS events, if there are any.
+Subscriptions, services and clients go through one native EventsExecutor of rclpy, QoS events
+through another (see ``native``). What can not, or crashes it, gets threads of its own: timers;
+guard conditions, actions and other waitables. A thread is started when there is something for it.
+
+A native executor can not be repaired, and not even be disposed of, when the middleware refuses an
+entity half way. Should that happen, it is left lying, and a wait set takes over.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 import threading
 import time
 from typing import Any
@@ -42,6 +46,17 @@ SPIN_SEC = 3600.0
 
 PROBE_SEC = 2.0
 
+_PARTS = {
+    'events': ('subscriptions', 'services', 'clients'),
+    'qos': ('events',),
+    'timers': ('timers',),
+    'waitables': ('waitables', 'guards'),
+}
+_NATIVE = ('events', 'qos')
+_SINGULAR = {
+    'subscriptions': 'subscription', 'services': 'service', 'clients': 'client',
+    'events': 'event', 'timers': 'timer', 'waitables': 'waitable', 'guards': 'guard'}
+
 
 class _OpenContext:
     """
@@ -52,9 +67,15 @@ class _OpenContext:
     noticed here anyway.
     """
 
+    def __init__(self, handle: Any) -> None:
+        self.handle = handle
+
     def ok(self) -> bool:
         """Return True."""
         return True
+
+
+_left_lying: list[Any] = []
 
 
 class _NativeThread:
@@ -63,24 +84,27 @@ class _NativeThread:
 
     It installs no signal handler; rclpy's own, where it is installed, ends its spin on SIGINT and
     SIGTERM. So the context is looked at whenever a spin ends.
+
+    :param on_end: called at the end of the thread, unless by ``stop``, with whether the context
+        has ended; if not, the native executor has failed.
     """
 
     def __init__(
-        self, context: Context, receiver: Receiver, entities: EntitySet,
-        on_shutdown: Callable[[], None],
+        self, name: str, kinds: Iterable[str], context: Context, receiver: Receiver,
+        entities: EntitySet, on_end: Callable[[bool], None],
     ) -> None:
         self._context = context
         self._receiver = receiver
-        self._on_shutdown = on_shutdown
-        self._native: Any = _rclpy.EventsExecutor(_OpenContext())
-        self._node = NodeStandIn(receiver, self._native.wake)
+        self._on_end = on_end
+        self._native: Any = _rclpy.EventsExecutor(_OpenContext(context.handle))
+        self._node = NodeStandIn(kinds, receiver, self._native.wake)
         self._node.wanted = entities
         self._native.add_node(self._node)
         self._lock = threading.Lock()
         self._stopping = False
         self._future: Any = None
         self._thread = threading.Thread(
-            target=self._run, name='mddag-intake-events', daemon=True)
+            target=self._run, name=f'mddag-intake-{name}', daemon=True)
         self._thread.start()
 
     def update(self, entities: EntitySet) -> None:
@@ -110,34 +134,40 @@ class _NativeThread:
         return True
 
     def _run(self) -> None:
+        ended = broken = False
         failures = 0
-        ended = False
         try:
-            while not ended:
+            while not ended and not broken:
                 with self._lock:
                     if self._stopping:
                         break
-                    future = self._future = Future()  # type: ignore[no-untyped-call]
+                    future = self._future = Future()
                 try:
                     self._native.spin_until_future_complete(future, SPIN_SEC)
                     failures = 0
                 except ExternalShutdownException:
                     pass
                 except Exception as error:
-                    # A take failed. What was announced with it will not be announced again.
                     failures += 1
                     self._receiver.on_intake_error(error)
-                    self._node.drain()
+                    broken = self._node.failed(error)
+                    if not broken:
+                        # A take failed. What was announced with it is announced no more.
+                        self._node.drain()
                     if failures > PATIENCE:
                         time.sleep(min(0.1, 0.001 * failures))
                 ended = not self._context.ok()
         finally:
             with self._lock:
                 self._future = None
-            self._native.shutdown()
-            self._node.close()
-        if ended and not self._stopping:
-            self._on_shutdown()
+            if broken:
+                _left_lying.append((self._native, self._node))
+                self._node.withdraw()
+            else:
+                self._native.shutdown()
+                self._node.close()
+        if (ended or broken) and not self._stopping:
+            self._on_end(ended)
 
 
 class EventsIntake:
@@ -168,18 +198,10 @@ class EventsIntake:
         self._lock = threading.RLock()
         self._latest = EMPTY
         self._running = False
-        self._native: _NativeThread | None = None
-        self._ending: _NativeThread | None = None
-        self._parts = {
-            'timers': self._part('timers', 'timer'),
-            'waitables': self._part('waitables', 'waitable', 'guard'),
-            'qos': self._part('qos', 'event'),
-        }
-        self._started: set[str] = set()
+        self._parts: dict[str, Any] = {}
+        self._ending: list[Any] = []
+        self._refused: set[str] = set()
         context.on_shutdown(self.wake)
-
-    def _part(self, name: str, *kinds: str) -> WaitSetIntake:
-        return WaitSetIntake(self._context, self._receiver, (), kinds, name=name)
 
     @classmethod
     def available(cls) -> bool:
@@ -208,31 +230,46 @@ class EventsIntake:
             if entities is self._latest:
                 return
             self._latest = entities
-            if self._native is not None:
-                self._native.update(entities)
-            for part in self._parts.values():
+            for part in list(self._parts.values()):
                 part.update(entities)
             if self._running:
                 self._start_parts()
 
     def _start_parts(self) -> None:
         """Start the threads that have something to do, and have not had until now."""
-        latest = self._latest
-        for name, needed in (
-            ('timers', latest.timers),
-            ('waitables', latest.waitables or latest.guards),
-            ('qos', latest.events),
-        ):
-            if needed and name not in self._started:
-                self._started.add(name)
-                self._parts[name].start()
+        for name, kinds in _PARTS.items():
+            # The first one always: it is whom signals wake.
+            needed = name == 'events' or any(getattr(self._latest, kind) for kind in kinds)
+            if not needed or name in self._parts:
+                continue
+            if name in _NATIVE and name not in self._refused:
+                self._parts[name] = _NativeThread(
+                    name, kinds, self._context, self._receiver, self._latest,
+                    partial(self._native_ended, name))
+            else:
+                self._start_wait_set(name, [_SINGULAR[kind] for kind in kinds])
+
+    def _start_wait_set(self, name: str, kinds: Iterable[str]) -> None:
+        part = self._parts[name] = WaitSetIntake(
+            self._context, self._receiver, (), kinds, name=name)
+        part.update(self._latest)
+        part.start()
+
+    def _native_ended(self, name: str, context_ended: bool) -> None:
+        """React in a native executor's thread to its end."""
+        if context_ended:
+            self.wake()  # a signal has ended the context, which the others do not notice
+            if self._on_shutdown is not None:
+                self._on_shutdown()
+            return
+        with self._lock:
+            self._refused.add(name)
+            if self._parts.pop(name, None) is not None and self._running:
+                self._start_parts()
 
     def wake(self) -> None:
         """Have all threads look around: whether the context has ended; from any thread."""
-        native = self._native
-        if native is not None:
-            native.wake()
-        for part in self._parts.values():
+        for part in list(self._parts.values()):
             part.wake()
 
     def start(self) -> None:
@@ -245,12 +282,12 @@ class EventsIntake:
             if self._running:
                 raise RuntimeError('the intake runs already')
             # One native executor's end would undo what the next one has told the middleware.
-            if self._ending is not None and not self._ending.join():
-                raise RuntimeError('the intake ends only after what it hands over now')
+            for part in self._ending:
+                if not part.join():
+                    raise RuntimeError('the intake ends only after what it hands over now')
+            self._ending = []
             self._running = True
             stop_at_exit(self)
-            self._native = _NativeThread(
-                self._context, self._receiver, self._latest, self._context_ended)
             self._start_parts()
 
     def stop(self) -> None:
@@ -262,20 +299,10 @@ class EventsIntake:
         """
         with self._lock:
             self._running = False
-            native, self._native = self._native, None
-            self._ending = native
-            started, self._started = self._started, set()
-        if native is not None:
-            native.stop()
-        for name in started:
-            self._parts[name].stop()
-
-    def _context_ended(self) -> None:
-        """Let the other threads notice too that a signal has ended the context."""
-        for part in self._parts.values():
-            part.wake()
-        if self._on_shutdown is not None:
-            self._on_shutdown()
+            parts, self._parts = self._parts, {}
+            self._ending = [part for part in parts.values() if isinstance(part, _NativeThread)]
+        for part in parts.values():
+            part.stop()
 
 
 class _Probe:
@@ -295,8 +322,8 @@ class _Probe:
 
 
 def _probe() -> bool:
-    native = _rclpy.EventsExecutor(_OpenContext())
-    future: Any = Future()  # type: ignore[no-untyped-call]
+    native = _rclpy.EventsExecutor(_OpenContext(None))
+    future: Any = Future()
     node = _Probe(future)
     native.add_node(node)
     native.wake()

@@ -30,32 +30,34 @@ Whatever has been taken and not run yet stays with the core and runs with the ne
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-import inspect
+import os
 import sys
 import threading
 import time
-from typing import Any, Callable, Iterator, TYPE_CHECKING
-
-import rclpy
-from rclpy.exceptions import InvalidHandle
-from rclpy.executors import Executor, ExternalShutdownException, TimeoutObject
-from rclpy.task import Future, Task
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.errors import UsageError
 from mddag_executor.live import hooks
 from mddag_executor.live.dispatcher import Dispatcher
-from mddag_executor.live.entries import Entry, TASK, TaskWork
+from mddag_executor.live.entities import EntitySet, snapshot
+from mddag_executor.live.entries import Entry, TASK
 from mddag_executor.live.events import EventsIntake
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.receiver import Receiver
 from mddag_executor.live.recorder import Recorder
-from mddag_executor.live.registry import Registry
-from mddag_executor.live.statistics import snapshot
+from mddag_executor.live.registry import looked_after, Registry
+from mddag_executor.live.statistics import statistics
+from mddag_executor.live.tasks import make_task
 from mddag_executor.live.threads import thread_setting
 from mddag_executor.live.verdicts import DeadlineMiss
 from mddag_executor.live.waitset import ALL_KINDS, WaitSetIntake
 from msg_graph import load, parse_duration, TaskSet
+import rclpy
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import Executor, ExternalShutdownException, TimeoutObject
+from rclpy.task import Future, Task
 
 if TYPE_CHECKING:
     from rclpy.context import Context
@@ -66,19 +68,6 @@ LOOK_AFTER_S = 0.1
 
 EXPIRE_AFTER_NS = 1_000_000_000
 MAX_ACTIVE_JOBS = 64
-
-
-class ObservedTask(Task):
-    """A task that knows whether somebody waits for it, and so takes care of its exception."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.observed = False
-        super().__init__(*args, **kwargs)
-
-    def add_done_callback(self, callback: Callable[[Future], None]) -> None:
-        """Add a callback for when the task is done."""
-        self.observed = True
-        super().add_done_callback(callback)
 
 
 class MultiDeadlineExecutor(Executor):
@@ -106,9 +95,11 @@ class MultiDeadlineExecutor(Executor):
         when the trace can not be written.
     """
 
+    _sigint_gc: Any = None  # for the base class' finalizer, where construction fails
+
     def __init__(
         self,
-        graph: str | TaskSet | None = None,
+        graph: str | os.PathLike[str] | TaskSet | None = None,
         num_workers: int | None = None,
         *,
         policy: str = 'rad',
@@ -122,7 +113,7 @@ class MultiDeadlineExecutor(Executor):
         worker_priority: int | None = None,
         worker_cpus: set[int] | None = None,
     ) -> None:
-        task_set = load(graph) if isinstance(graph, str) or hasattr(graph, '__fspath__') else graph
+        task_set = load(graph) if isinstance(graph, (str, os.PathLike)) else graph
         if num_workers is None:
             num_workers = (task_set.workers if task_set is not None else None) or 7
         if num_workers < 1:
@@ -142,6 +133,7 @@ class MultiDeadlineExecutor(Executor):
         self._errors: deque[BaseException] = deque()
         self._attention = threading.Event()
         self._changed = True
+        self._entities: EntitySet | None = None
         self._spinning = threading.Lock()
         self._refreshing = threading.Lock()
         self._finished = False
@@ -179,6 +171,10 @@ class MultiDeadlineExecutor(Executor):
     def wake(self) -> None:
         """Take note of entities that were created or destroyed, or of a change of state."""
         self._changed = True
+        self._ring()
+
+    def _ring(self) -> None:
+        """End the wait of whoever spins."""
         self._attention.set()
         guard = self._guard
         if guard is not None:
@@ -199,40 +195,21 @@ class MultiDeadlineExecutor(Executor):
                 self._dispatcher.remove(entry)
             if self._recorder is not None:
                 self._recorder.entities(nodes, added)
+            self._entities = snapshot(nodes, self._entities, looked_after)
             for intake in (self._intake, self._inline):
                 if intake is not None:
-                    intake.update(nodes)
+                    intake.update(self._entities)
 
     # --- tasks -----------------------------------------------------------------------------------
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
         """Run a function or coroutine in this executor; return its task, which is a future."""
-        coroutine = None
-        if inspect.iscoroutinefunction(callback):
-            callback, args, kwargs = callback(*args, **kwargs), (), {}
-        if inspect.iscoroutine(callback):
-            coroutine = callback
-        task = ObservedTask(callback, args, kwargs, executor=self)
-        work = TaskWork(self._task_entry, task, ())
-        work.coroutine = coroutine
-        work.then = self._task_done
-        if coroutine is not None:
-            Future.add_done_callback(task, lambda _: self._dispatcher.resume(work))
+        task, work = make_task(
+            self._task_entry, self, self._dispatcher.resume, callback, args, kwargs)
         self._dispatcher.undeclared_ready(self._task_entry, work)
-        self._attention.set()
-        guard = self._guard
-        if guard is not None and not self._pool.running:
-            try:
-                guard.trigger()
-            except InvalidHandle:
-                pass
+        if not self._pool.running:
+            self._ring()
         return task
-
-    def _task_done(self, task: ObservedTask) -> None:
-        if not task.observed:
-            error = task.exception()
-            if error is not None:
-                raise error
 
     # --- spinning --------------------------------------------------------------------------------
 
@@ -300,12 +277,15 @@ class MultiDeadlineExecutor(Executor):
         kind = self._intake_kind
         if kind == 'auto':
             kind = 'events' if EventsIntake.available() else 'waitset'
-        guards = (self._guard, self._sigint_gc)
         intake_type = EventsIntake if kind == 'events' else WaitSetIntake
-        self._intake = intake_type(self._context, self._receiver, guards)
+        self._intake = intake_type(
+            self._context, self._receiver, self._guards(), on_shutdown=self._attention.set)
         self._changed = True
         self._refresh()
         self._intake.start()
+
+    def _guards(self) -> tuple[Any, ...]:
+        return self._guard, self._sigint_gc
 
     def _stop_intake(self) -> None:
         intake, self._intake = self._intake, None
@@ -315,13 +295,7 @@ class MultiDeadlineExecutor(Executor):
     def _fail(self, error: BaseException) -> None:
         """Take an exception from a worker or the intake; it comes out of the spin."""
         self._errors.append(error)
-        self._attention.set()
-        guard = self._guard
-        if guard is not None:
-            try:
-                guard.trigger()
-            except InvalidHandle:
-                pass
+        self._ring()
 
     def _raise_error(self) -> None:
         if self._errors:
@@ -345,10 +319,9 @@ class MultiDeadlineExecutor(Executor):
         self, future: Future, timeout_sec: float | TimeoutObject | None = None
     ) -> None:
         """Wait for one callback, or until a future is done, and run it."""
-        if isinstance(timeout_sec, TimeoutObject):
-            timeout_sec = timeout_sec.timeout
+        seconds = timeout_sec.timeout if isinstance(timeout_sec, TimeoutObject) else timeout_sec
         future.add_done_callback(lambda _: self.wake())
-        self._spin_once(timeout_sec, lambda: future.done() or future.cancelled())
+        self._spin_once(seconds, lambda: future.done() or future.cancelled())
 
     def _spin_once(self, timeout_sec: float | None, done: Callable[[], bool]) -> None:
         if not self._spinning.acquire(blocking=False):
@@ -371,7 +344,7 @@ class MultiDeadlineExecutor(Executor):
         self._raise_error()
         if self._inline is None:
             self._inline = WaitSetIntake(
-                self._context, self._receiver, (self._guard, self._sigint_gc), ALL_KINDS)
+                self._context, self._receiver, self._guards(), ALL_KINDS)
             self._changed = True
         self._refresh()
         self._pool.resume_polled()
@@ -437,4 +410,4 @@ class MultiDeadlineExecutor(Executor):
         ``dags`` is in the result format of ``mddag replay``; ``callbacks`` counts for each
         entity what became ready, ran, was dropped for QoS or skipped; times in ns.
         """
-        return snapshot(self._dispatcher, self._pool, self._registry, self._recorder)
+        return statistics(self._dispatcher, self._pool, self._registry, self._recorder)

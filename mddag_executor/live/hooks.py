@@ -90,5 +90,5 @@ def install() -> None:
 
     publish.__doc__ = send.__doc__
     call_and_wait.__doc__ = call.__doc__
-    Publisher.publish = publish
-    Client.call = call_and_wait
+    Publisher.publish = publish  # type: ignore[method-assign]
+    Client.call = call_and_wait  # type: ignore[method-assign]

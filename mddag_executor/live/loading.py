@@ -263,7 +263,7 @@ def describe(error: BaseException) -> str:
 
 
 def _kind(value: object) -> str:
-    return f'a {type(value).__name__}'
+    return f'of type {type(value).__name__}'
 
 
 def _callables(module: ModuleType) -> list[str]:

@@ -37,9 +37,10 @@ rules keep it from using what is gone, or what has come in its place:
    is noticed when its handle is entered, and from there to the adding no bytecode runs, so no
    other thread can destroy it in between.
 
-Before an entity is shown, everything is taken from it. For the native executor takes as many as
-the middleware announces, and what an executor before this one was told of and did not take is
-announced no more.
+Before an entity is shown, everything is taken from it, and once more an update later. For the
+native executor takes as many as the middleware announces, and that does not announce everything
+that was there before: messages that an executor before this one was told of and did not take, QoS
+events.
 """
 
 from __future__ import annotations
@@ -50,9 +51,11 @@ from typing import Any
 from mddag_executor.live.entities import EMPTY, EntitySet, Receiver
 from mddag_executor.live.takes import take_function
 from rclpy.client import Client
+from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.service import Service
 from rclpy.subscription import Subscription
+from rclpy.waitable import NumberOfEntities
 
 DRAIN_TURNS = 16
 """So many times ``takes.MOST_AT_ONCE`` messages are taken from a new entity at the most."""
@@ -72,8 +75,8 @@ class _StandIn:
 
     __slots__ = ('handle', 'live', 'take', '_on_error')
 
-    def __init__(self, kind: str, entity: Any, receiver: Receiver) -> None:
-        self.handle: Any = entity.handle
+    def __init__(self, kind: str, entity: Any, handle: Any, receiver: Receiver) -> None:
+        self.handle: Any = handle
         self.live = True
         self.take = take_function(kind, entity, receiver)
         self._on_error = receiver.on_intake_error
@@ -82,7 +85,7 @@ class _StandIn:
     def drain(self) -> None:
         """Take what is there."""
         try:
-            for _ in range(DRAIN_TURNS):
+            for _ in range(DRAIN_TURNS if self.live else 0):
                 if not self.take():
                     return
         except InvalidHandle:
@@ -107,7 +110,7 @@ class SubscriptionStandIn(_StandIn):
     CallbackType = Subscription.CallbackType
 
     def __init__(self, subscription: Subscription, receiver: Receiver) -> None:
-        super().__init__('subscription', subscription, receiver)
+        super().__init__('subscription', subscription, subscription.handle, receiver)
         self.msg_type = subscription.msg_type
         self.raw = subscription.raw
         self._callback_type = Subscription.CallbackType.WithMessageInfo
@@ -136,7 +139,7 @@ class ServiceStandIn(_StandIn):
     __slots__ = ('srv_type', 'callback', '_service', '_on_request')
 
     def __init__(self, service: Service, receiver: Receiver) -> None:
-        super().__init__('service', service, receiver)
+        super().__init__('service', service, service.handle, receiver)
         self.srv_type = service.srv_type
         self.callback = _keep_request
         self._service = service
@@ -157,7 +160,7 @@ class ClientStandIn(_StandIn):
     __slots__ = ('srv_type', '_client', '_on_response', '_sequence')
 
     def __init__(self, client: Client, receiver: Receiver) -> None:
-        super().__init__('client', client, receiver)
+        super().__init__('client', client, client.handle, receiver)
         self.srv_type = client.srv_type
         self._client = client
         self._on_response = receiver.on_response
@@ -180,23 +183,108 @@ class ClientStandIn(_StandIn):
                 self._on_error(error)
 
 
+class _Capture:
+    """Stand in for a wait set, to get at the handle of a QoS event, which has no other access."""
+
+    handle: Any = None
+
+    def add_event(self, handle: Any) -> int:
+        """Note the handle; return its index."""
+        self.handle = handle
+        return 0
+
+
+class EventStandIn(_StandIn):
+    """
+    Stand in for a QoS event, as the waitable that the native executor takes it for.
+
+    It makes a task of what ``execute`` returns; that one does nothing.
+    """
+
+    __slots__ = ('_event', '_on_waitable')
+
+    _futures = ()
+
+    def __init__(self, event: EventHandler, receiver: Receiver) -> None:
+        capture = _Capture()
+        event.add_to_wait_set(capture)
+        super().__init__('waitable', event, capture.handle, receiver)
+        self.take = self._take
+        self._event = event
+        self._on_waitable = receiver.on_waitable
+
+    def __enter__(self) -> None:
+        """Do nothing: the handle is held anyway, and this must not fail."""
+
+    def __exit__(self, *_: Any) -> None:
+        """Do nothing."""
+
+    def get_num_entities(self) -> NumberOfEntities:
+        """Return that it is one event."""
+        return NumberOfEntities(num_events=1)
+
+    def add_to_wait_set(self, wait_set: Any) -> None:
+        """Add the event (so does the native executor learn what there is to call it)."""
+        wait_set.add_event(self.handle)
+
+    def is_ready(self, _: Any) -> bool:
+        """Return True: it is asked only then."""
+        return True
+
+    def take_data(self) -> None:
+        """Take the event's status and hand it over, if it has any news."""
+        if self.live:
+            self.drain()
+
+    def _take(self) -> int:
+        with self.handle:
+            data = self.handle.take_event()
+        if data is not None and _has_news(data):
+            try:
+                self._on_waitable(self._event, data)
+            except Exception as error:
+                self._on_error(error)
+        return 0
+
+    def execute(self, _: Any) -> Callable[..., None]:
+        """Return what is run as a task."""
+        return _ignore
+
+
+def _has_news(status: Any) -> bool:
+    """
+    Return whether a QoS event's status tells of a change since it was taken last.
+
+    A status can be taken at any time; and where the middleware has announced several changes, the
+    first take gives them all.
+    """
+    return any(getattr(status, name) for name in dir(status) if name.endswith('_change'))
+
+
 class NodeStandIn:
     """
-    Stand in for a node that has all subscriptions, services and clients.
+    Stand in for a node that has all entities of some kinds.
 
+    :param kinds: of ``subscriptions``, ``services``, ``clients``, ``events``.
     :param wake: the native executor's ``wake``.
     """
 
     timers = clients = services = waitables = guards = ()  # type: Any
 
-    def __init__(self, receiver: Receiver, wake: Callable[[], None]) -> None:
+    def __init__(
+        self, kinds: Iterable[str], receiver: Receiver, wake: Callable[[], None]
+    ) -> None:
         self._receiver = receiver
         self._wake = wake
         self.wanted: EntitySet = EMPTY
         self._shown: EntitySet = EMPTY
-        self._by_kind: tuple[dict[int, Any], dict[int, Any], dict[int, Any]] = ({}, {}, {})
+        self._by_kind: dict[str, dict[int, Any]] = {kind: {} for kind in kinds}
         self._subscriptions: list[SubscriptionStandIn] = []
         self._updates = 0
+        # From when something new is shown until the next update: then the native executor has
+        # survived this one.
+        self.updating = False
+        self._fresh: list[_StandIn] = []
         self._withdrawn: list[tuple[int, _StandIn]] = []
 
     @property
@@ -211,26 +299,37 @@ class NodeStandIn:
     def subscriptions(self) -> list[SubscriptionStandIn]:
         """What the native executor reads first in each of its updates, in its own thread."""
         self._updates += 1
-        if self.wanted is not self._shown:
+        fresh, self._fresh = self._fresh, []
+        for stand_in in fresh:
+            stand_in.drain()
+        self.updating = self.wanted is not self._shown
+        if self.updating:
             try:
                 self._change()
             except Exception as error:
                 self._receiver.on_intake_error(error)
         self._let_go(self._updates - 2)
-        if self._withdrawn:
+        if self.updating or self._withdrawn:
             self._wake()
         return self._subscriptions
 
+    def failed(self, error: Exception) -> bool:
+        """Return whether what came out of the native executor was its failure to update."""
+        return self.updating and (
+            type(error) in (RuntimeError, KeyError) or isinstance(error, InvalidHandle))
+
     def _change(self) -> None:
         wanted = self._shown = self.wanted
-        subscriptions, services, clients = self._by_kind
-        subscriptions = self._changed(subscriptions, wanted.subscriptions, SubscriptionStandIn)
-        services = self._changed(services, wanted.services, ServiceStandIn)
-        clients = self._changed(clients, wanted.clients, ClientStandIn)
-        self._by_kind = subscriptions, services, clients
-        self._subscriptions = list(subscriptions.values())
-        self.services = list(services.values())
-        self.clients = list(clients.values())
+        for kind, known in self._by_kind.items():
+            self._by_kind[kind] = self._changed(known, getattr(wanted, kind), _STAND_INS[kind])
+        self._show()
+
+    def _show(self) -> None:
+        shown = {kind: list(known.values()) for kind, known in self._by_kind.items()}
+        self._subscriptions = shown.get('subscriptions', [])
+        self.services = shown.get('services', [])
+        self.clients = shown.get('clients', [])
+        self.waitables = shown.get('events', [])
 
     def _changed(
         self, known: dict[int, Any], entities: Iterable[Any], stand_in: Callable[..., Any]
@@ -247,6 +346,7 @@ class NodeStandIn:
             except InvalidHandle:
                 continue
             new.drain()
+            self._fresh.append(new)
             found[key] = new
         for old in known.values():
             old.withdraw()
@@ -261,17 +361,30 @@ class NodeStandIn:
 
     def drain(self) -> None:
         """Take what is there from all entities, in the native executor's thread."""
-        for known in self._by_kind:
+        for known in self._by_kind.values():
             for stand_in in list(known.values()):
                 stand_in.drain()
 
-    def close(self) -> None:
-        """Let go of everything, after the native executor has been shut down."""
-        for known in self._by_kind:
+    def withdraw(self) -> None:
+        """Hand over nothing any more, and hold on to everything."""
+        for known in self._by_kind.values():
             for stand_in in known.values():
                 stand_in.withdraw()
+
+    def close(self) -> None:
+        """Let go of everything, after the native executor has been shut down."""
+        self.withdraw()
+        for kind, known in self._by_kind.items():
+            for stand_in in known.values():
                 stand_in.let_go()
-        self._by_kind = ({}, {}, {})
-        self._subscriptions = []
-        self.services = self.clients = []
+            self._by_kind[kind] = {}
+        self._show()
         self._let_go(self._updates)
+
+
+_STAND_INS: dict[str, Callable[..., Any]] = {
+    'subscriptions': SubscriptionStandIn,
+    'services': ServiceStandIn,
+    'clients': ClientStandIn,
+    'events': EventStandIn,
+}

@@ -30,10 +30,11 @@ becomes ready again, under the key it had, when the future is done.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 import threading
 from time import monotonic_ns
-from typing import Any, Callable, Iterator
+from typing import Any
 
 from mddag_executor.core.state import N_IDLE
 from mddag_executor.live.attribution import PublisherState
@@ -109,6 +110,8 @@ class Pool:
     def start(self) -> None:
         """Let workers run what is ready; starts their threads the first time."""
         with self._lock:
+            if self._closed:
+                return
             for worker in range(len(self._seats), self.dispatcher.n_workers):
                 self._seats.append(self._new_seat(worker))
             self.running = True

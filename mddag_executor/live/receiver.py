@@ -16,8 +16,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import time
-from typing import Any, Callable
+from typing import Any
 
 from mddag_executor.live.attribution import Origin
 from mddag_executor.live.dispatcher import Dispatcher

@@ -16,9 +16,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import threading
 import time
-from typing import Any, Iterable
+from typing import Any
 
 from mddag_executor.live.entries import Entry, SERVICE, SUBSCRIPTION, TIMER
 from mddag_executor.trace import TraceWriter

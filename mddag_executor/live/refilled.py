@@ -75,7 +75,7 @@ class RefilledSet:
                     takes[handle.pointer] = take_function(kind, entity, self._receiver)
             if takes:
                 self._takes.append((name, takes))
-        counts = NumberOfEntities(  # type: ignore[no-untyped-call]
+        counts = NumberOfEntities(
             len(handles['subscription']), len(handles['guard_condition']), 0,
             len(handles['client']), len(handles['service']), 0)
         for waitable in (

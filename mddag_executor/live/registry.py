@@ -16,12 +16,21 @@
 
 from __future__ import annotations
 
-from typing import Any, Iterable
+from collections.abc import Iterable
+from typing import Any
 import weakref
 
 from mddag_executor.core import Scheduler, Tables
 from mddag_executor.live.entries import (
-    CLIENT, Entry, GUARD, link, SERVICE, SUBSCRIPTION, TIMER, WAITABLE)
+    CLIENT,
+    Entry,
+    GUARD,
+    link,
+    SERVICE,
+    SUBSCRIPTION,
+    TIMER,
+    WAITABLE,
+)
 from msg_graph import Callback, TaskSet
 from msg_graph.binding import Binder
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -35,6 +44,17 @@ KINDS = (
 def source_depth(period_ns: int, deadline_ns: int) -> int:
     """Return how many releases of a timer source may wait: as many as can still be in time."""
     return max(1, -(-deadline_ns // period_ns))
+
+
+def looked_after(entity: Any) -> bool:
+    """
+    Tell whether the executor is to take from an entity.
+
+    Not from the subscriptions that ``rclpy.wait_for_message`` makes for a moment: it takes from
+    them itself, and would wait in vain for what the executor has taken before.
+    """
+    callback = getattr(entity, 'callback', None)
+    return getattr(callback, '__module__', None) != 'rclpy.wait_for_message'
 
 
 class Registry:

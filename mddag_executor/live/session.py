@@ -23,7 +23,7 @@ run (time, a signal, an exception of a callback, the end of the programs) sets o
 
 A synthetic run has these steps: wait until publishers and subscriptions have met, start all timers
 and sensors together, let ``WARM_UP_S`` pass, read the counters, wait for the measured window, read
-them again, release nothing more, and shut the executor down.  Only then the figures are made.
+them again, stop the sensors, and shut the executor down.  Only then the figures are made.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ from mddag_executor.live.synthetic import SyntheticWorkload
 from rclpy.executors import Executor, ExternalShutdownException
 
 WARM_UP_S = 1.0
-END_TIMEOUT_S = 0.5
+END_TIMEOUT_S = 5.0
+HURRIED_END_TIMEOUT_S = 0.5
 MATCH_TIMEOUT_S = 30.0
 
 Tick = Callable[[float], None]
@@ -62,6 +63,8 @@ class Session:
         self.executor = executor
         self.error: BaseException | None = None
         self.clean = True
+        self._ended = False
+        self._patience_s = END_TIMEOUT_S
         self._stop = threading.Event()
         self._spin = executor.spin if spin is None else spin
         self._thread = threading.Thread(target=self._run, name='mddag-spin', daemon=True)
@@ -85,8 +88,14 @@ class Session:
         finally:
             self._stop.set()
 
-    def stop(self) -> None:
-        """Let the run end; from any thread, also from a signal's handler."""
+    def stop(self, hurried: bool = False) -> None:
+        """
+        Let the run end; from any thread, also from a signal's handler.
+
+        :param hurried: wait less for callbacks that don't end.
+        """
+        if hurried:
+            self._patience_s = HURRIED_END_TIMEOUT_S
         self._stop.set()
 
     @property
@@ -107,17 +116,22 @@ class Session:
 
     def end(self) -> None:
         """
-        Shut the executor down; later calls change nothing.
+        Shut the executor down, once.
 
-        ``clean`` tells whether all callbacks ended within ``END_TIMEOUT_S``.
+        ``clean`` tells whether all callbacks have ended; one that doesn't is left behind.
         """
-        if self._thread.is_alive() or not self._stop.is_set():
-            self._stop.set()
-            self.clean = self.executor.shutdown(END_TIMEOUT_S) is not False
-            self._thread.join(END_TIMEOUT_S)
-            self.clean = self.clean and not self._thread.is_alive()
-        else:
-            self.clean = self.executor.shutdown(END_TIMEOUT_S) is not False and self.clean
+        self._stop.set()
+        if self._ended:
+            return
+        self._ended = True
+        begin = time.monotonic()
+        # In steps: a signal may shorten the patience meanwhile.
+        while self.executor.shutdown(0.1) is False:
+            if time.monotonic() - begin > self._patience_s:
+                self.clean = False
+                return
+        self._thread.join(max(0.2, begin + self._patience_s - time.monotonic()))
+        self.clean = not self._thread.is_alive()
 
 
 def run_synthetic(

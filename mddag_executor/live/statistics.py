@@ -24,7 +24,7 @@ from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 
 
-def snapshot(
+def statistics(
     dispatcher: Dispatcher, pool: Pool, registry: Registry, recorder: Recorder | None
 ) -> dict[str, Any]:
     """

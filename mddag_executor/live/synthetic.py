@@ -42,7 +42,8 @@ Queue edges (``reads:``) start nothing and are not subscribed to.  QoS is reliab
 deep enough that nothing is lost unless a callback falls ten periods behind.  Callbacks without a
 declared group may overlap themselves (one ``ReentrantCallbackGroup`` for each node), as jobs do in
 the paper; each declared group is a ``MutuallyExclusiveCallbackGroup`` of its node.  The nodes have
-no parameter services and no rosout publisher, so that a hundred of them start within a second.
+no services for parameters and types and no rosout publisher, so that a hundred of them start
+within a second.
 
 All timers are started together, only when every publisher has met its subscribers, so that no
 release is lost to discovery; the DAGs' first releases are one period after that instant.
@@ -79,6 +80,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
@@ -193,10 +195,13 @@ class SyntheticWorkload:
             self._sensor_thread.start()
 
     def stop(self) -> None:
-        """Release no more jobs."""
+        """
+        Stop the sensors and whoever waits for the start.
+
+        Timers go on: rclpy's executors raise when a timer is cancelled that they are about to
+        call.  They end with the executor.
+        """
         self._stop.set()
-        for _, timer in self._timers:
-            timer.cancel()
         if self._sensor_thread is not None:
             self._sensor_thread.join()
 
@@ -239,7 +244,8 @@ class SyntheticWorkload:
         namespace, _, name = full_name.rpartition('/')
         return Node(
             name, namespace=namespace or '/', context=self._context, enable_rosout=False,
-            start_parameter_services=False)
+            start_parameter_services=False,
+            parameter_overrides=[Parameter('start_type_description_service', value=False)])
 
     def _publisher(self, node: Node, topic: str) -> Publisher:
         # Callbacks of a node that publish the same topic share the publisher, as members do.

@@ -16,8 +16,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import os
-from typing import Callable
 
 from mddag_executor.errors import UsageError
 
@@ -38,7 +38,8 @@ def thread_setting(
                 'worker_priority: there is no policy for it: give worker_policy too')
         return None
     if policy is not None and policy not in POLICIES:
-        raise UsageError(f"worker_policy: '{policy}' is unknown: give one of {', '.join(POLICIES)}")
+        raise UsageError(
+            f"worker_policy: '{policy}' is unknown: give one of {', '.join(POLICIES)}")
     if not hasattr(os, 'sched_setscheduler'):
         raise UsageError('worker_policy: this system has none: leave it out')
     if cpus is not None and not cpus <= os.sched_getaffinity(0):

@@ -17,13 +17,23 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 import threading
-from typing import Any, Callable, Protocol
+from typing import Any, Protocol
 
 from mddag_executor.core import Tables, Tally
 from mddag_executor.core.state import (
-    ABORTED, Decision, DROP, EXPIRED, JOB_END, SINK_ABORTED, SINK_DONE, SINK_EXPIRED, SINK_MISSED)
+    ABORTED,
+    Decision,
+    DROP,
+    EXPIRED,
+    JOB_END,
+    SINK_ABORTED,
+    SINK_DONE,
+    SINK_EXPIRED,
+    SINK_MISSED,
+)
 from mddag_executor.live.attribution import Origin
 from mddag_executor.live.entries import Entry
 from msg_graph import TaskSet

@@ -67,6 +67,11 @@ REBUILD_SHARE = 10
 
 REBUILD_LATEST_NS = 50_000_000
 
+EVENTS_NS = 100_000_000
+"""A thread looks at QoS events so often, if that takes no more than 0.5 % of a CPU."""
+
+EVENTS_SHARE = 200
+
 PATIENCE = 3
 """So many waits in a row may bring errors before the thread slows down."""
 
@@ -89,8 +94,11 @@ class WaitSetIntake:
     """
     Hands over what becomes ready, from a thread (``start``) or from the caller (``poll``).
 
-    In a thread, QoS events wait apart in a second one: they are many, hardly ever become ready,
-    and cost as much for each refill as the others.
+    In a thread, QoS events are only looked at ten times a second, or less often if they are that
+    many: there are several for each publisher and subscription, they hardly ever become ready, and
+    waiting for them would cost more than all the rest. (Waiting for them in a thread of their own
+    does not help: with Fast DDS a message that is not taken yet ends the wait for the events of
+    its subscription.)
 
     :param context: the context of all nodes.
     :param receiver: whom to hand over to.
@@ -131,14 +139,14 @@ class WaitSetIntake:
         self._bell.acquire()
         self._guard: GuardCondition | None = None
         if self._guards or self._kinds != {'timer'}:
-            self._guard = GuardCondition(None, None, context)  # type: ignore[no-untyped-call]
+            self._guard = GuardCondition(None, None, context)
         self._thread: threading.Thread | None = None
         self._stopping = False
         self._failures = 0
-        self._events: WaitSetIntake | None = None
-        if 'event' in self._kinds and len(self._kinds) > 1:
-            self._events = WaitSetIntake(context, receiver, (), ('event',), name=f'{name}-events')
-        self._active = self._kinds  # those of the thread are without `event`
+        self._threaded = False
+        self._polling = False
+        self._events: RefilledSet | None = None  # apart from the others in a thread only
+        self._events_at = 0
         context.on_shutdown(self.wake)
 
     # --- what to wait for ------------------------------------------------------------------------
@@ -158,9 +166,7 @@ class WaitSetIntake:
             self._latest = entities
             pending = self._changed
             self._changed = True
-        if self._events is not None:
-            self._events.update(entities)
-        if not pending:
+        if not pending and (self._polling or self.running):
             self.wake()
 
     def wake(self) -> None:
@@ -171,7 +177,7 @@ class WaitSetIntake:
             pass  # it rings already
         if self._guard is not None:
             try:
-                self._guard.trigger()  # type: ignore[no-untyped-call]
+                self._guard.trigger()
             except InvalidHandle:
                 pass
 
@@ -179,20 +185,26 @@ class WaitSetIntake:
         """Build the wait set for the latest entities."""
         start = _now()
         self._changed = False
-        kinds, latest = self._active, self._latest
+        latest = self._latest
         self._drop()
         if self._guard is not None:
             bells = (*self._guards, self._guard)
+            kinds = self._kinds - {'event'} if self._threaded else self._kinds
             self._filled = RefilledSet(self._context, latest, kinds, bells, self._receiver)
-        if 'timer' in kinds:
+            if 'event' in self._kinds and latest.events and self._threaded:
+                self._events = RefilledSet(
+                    self._context, latest, frozenset({'event'}), (), self._receiver)
+                self._events_at = 0
+        if 'timer' in self._kinds:
             self._timers.update(latest.timers)
         end = _now()
         self._rebuild_at = end + min((end - start) * REBUILD_SHARE, REBUILD_LATEST_NS)
 
     def _drop(self) -> None:
-        filled, self._filled = self._filled, None
-        if filled is not None:
-            filled.release()
+        for some in self._filled, self._events:
+            if some is not None:
+                some.release()
+        self._filled = self._events = None
 
     # --- waiting ---------------------------------------------------------------------------------
 
@@ -233,14 +245,15 @@ class WaitSetIntake:
         """
         if self.running:
             raise RuntimeError('the intake runs in a thread of its own')
-        self._active = self._kinds
+        self._threaded = False
+        self._polling = True
         limit = None
         if timeout_sec is not None and timeout_sec >= 0:
             limit = _now() + int(min(timeout_sec, 1e9) * 1e9)
-        self._timers.scan()
-        if self._changed or self._filled is None or not self._filled.hold():
-            self._apply()
         try:
+            self._timers.scan()
+            if self._changed or self._filled is None or not self._filled.hold():
+                self._apply()
             while True:
                 count = self._timers.fire(_now())
                 look = self._timers.next_look()
@@ -250,6 +263,7 @@ class WaitSetIntake:
                 if count or rang or (limit is not None and _now() >= limit):
                     return count
         finally:
+            self._polling = False
             if self._filled is not None:
                 self._filled.release()
 
@@ -277,11 +291,9 @@ class WaitSetIntake:
         self._stopping = False
         self._changed = True
         self._rebuild_at = 0
+        self._threaded = True
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-        self._active = self._kinds if self._events is None else self._kinds - {'event'}
         self._thread.start()
-        if self._events is not None:
-            self._events.start()
 
     def stop(self) -> None:
         """
@@ -290,8 +302,6 @@ class WaitSetIntake:
         What is ready by then stays where it is. Called by a receiver from the intake's thread, it
         returns at once and the thread ends after that call.
         """
-        if self._events is not None:
-            self._events.stop()
         self._stopping = True
         thread = self._thread
         if thread is None:
@@ -334,9 +344,23 @@ class WaitSetIntake:
         if look is not None and look <= _now():
             timers.fire(_now())
             look = timers.next_look()
+        if self._events is not None:
+            if _now() >= self._events_at:
+                self._look_at_events(self._events)
+            look = self._events_at if look is None else min(look, self._events_at)
         if self._changed and (look is None or look > self._rebuild_at):
             look = self._rebuild_at
         _, rang = self._wait(look)
         if len(timers):
             timers.fire(_now())
         return rang
+
+    def _look_at_events(self, events: RefilledSet) -> None:
+        start = _now()
+        try:
+            events.wait(0)
+            events.hand_over()
+        except InvalidHandle:
+            self._changed = True  # one was destroyed
+        end = _now()
+        self._events_at = end + max(EVENTS_NS, (end - start) * EVENTS_SHARE)

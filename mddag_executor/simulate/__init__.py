@@ -14,12 +14,22 @@
 
 """Simulation in virtual time: the core over releases and execution times."""
 
-from mddag_executor.simulate.engine import Load
+from mddag_executor.simulate.engine import END, Load, LogEntry, PREEMPT, START
 from mddag_executor.simulate.run import (
-    draw_execution_times, periodic_load, read_execution_times, Run, Settings, simulate,
-    SimulationError, utilisation)
+    draw_execution_times,
+    JUDGES,
+    periodic_load,
+    read_execution_times,
+    Run,
+    scale_execution_times,
+    Settings,
+    simulate,
+    SimulationError,
+    utilisation,
+)
 
 __all__ = [
-    'Load', 'Run', 'Settings', 'SimulationError', 'draw_execution_times', 'periodic_load',
-    'read_execution_times', 'simulate', 'utilisation',
+    'END', 'JUDGES', 'Load', 'LogEntry', 'PREEMPT', 'Run', 'START', 'Settings', 'SimulationError',
+    'draw_execution_times', 'periodic_load', 'read_execution_times', 'scale_execution_times',
+    'simulate', 'utilisation',
 ]

@@ -20,7 +20,10 @@ Theory of operation
 Time jumps from event to event; an event is the release of a job or the end of an execution.  At
 one instant first the completions are told to the core, workers in ascending order, then the
 releases in DAG order, then the core dispatches until it has nothing left to do (design section 9).
-A completion at the horizon counts, a release at the horizon does not happen.
+A completion at the horizon counts; nothing is released or dispatched there any more.
+
+A job's deadlines count from its release, which is the time at which its source becomes ready,
+unless ``releases`` says that it was earlier (a sensor's message that arrived later).
 
 The execution time of vertex v in job k of DAG d is ``costs[cost_base[d] + k * cost_stride[d] +
 local index of v]``: a stride of zero gives every job the same times, the number of vertices of the
@@ -31,11 +34,12 @@ Like the rules this is plain integer arithmetic on lists, so that it can be comp
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
-from mddag_executor.core import rules
+from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.state import add_slot, SINK_DONE, State
+from mddag_executor.core.state import add_slot, SINK_ABORTED, SINK_DONE, SINK_EXPIRED, State
 from mddag_executor.core.tables import NEVER, Tables
 
 # Kinds of log entries.
@@ -49,7 +53,8 @@ class Load(NamedTuple):
     """
     What arrives: releases in order of (time, DAG), with their jobs' indices and execution times.
 
-    Times in ns; the cost columns as in the theory of operation.
+    Times in ns; the cost columns as in the theory of operation.  ``releases`` is empty where each
+    job's source becomes ready (``times``) at its release.
     """
 
     times: list[int]
@@ -58,6 +63,7 @@ class Load(NamedTuple):
     costs: list[int]
     cost_base: list[int]
     cost_stride: list[int]
+    releases: list[int] = []
 
 
 def run(
@@ -68,12 +74,14 @@ def run(
     horizon: int,
     stop_at_first_miss: bool,
     log: list[LogEntry] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> int:
     """
     Run the core over a load and return the time at which the run ended, ns.
 
     Decisions are left in ``s.decisions``.  With ``stop_at_first_miss`` the run ends with the
-    instant of the first late completion.
+    instant at which the first miss is known: a late completion, an expiry or an abort.
+    ``progress`` is told the virtual time at each event.
     """
     n_workers = len(s.worker_x)
     finish_at = [NEVER] * n_workers
@@ -90,6 +98,8 @@ def run(
         if instant > horizon:
             return horizon
         now = instant
+        if progress is not None:
+            progress(now)
         seen = len(s.decisions)
         for w in range(n_workers):
             if finish_at[w] == now:
@@ -98,27 +108,30 @@ def run(
                 if log is not None:
                     _note(t, s, log, now, END, w, x)
                 rules.complete(t, s, key, x, now)
-        if stop_at_first_miss and _any_late(s, seen):
-            return now
-        while (next_release < n_releases and load.times[next_release] == now
-               and now < horizon):
-            dag = load.dags[next_release]
-            _release(t, s, key, load, dag, load.jobs[next_release], now)
+        if now == horizon:
+            return horizon
+        while next_release < n_releases and load.times[next_release] == now:
+            _release(t, s, key, load, next_release, now)
             next_release += 1
         _dispatch(t, s, key, now, finish_at, log)
+        if stop_at_first_miss and _any_missed(s, seen):
+            return now
 
 
 def _release(
-    t: Tables, s: State, key: KeyFunction, load: Load, dag: int, job: int, now: int
+    t: Tables, s: State, key: KeyFunction, load: Load, i: int, now: int
 ) -> None:
-    slot = rules.release_job(t, s, dag, job, now, now)
+    dag = load.dags[i]
+    job = load.jobs[i]
+    release = load.releases[i] if len(load.releases) > 0 else now
+    slot = jobs.release_job(t, s, dag, job, release, now)
     if slot < 0:
         add_slot(t, s, dag)
-        slot = rules.release_job(t, s, dag, job, now, now)
+        slot = jobs.release_job(t, s, dag, job, release, now)
     base = s.job_base[slot]
     cost = load.cost_base[dag] + job * load.cost_stride[dag]
-    for i in range(t.n_region[dag]):
-        s.x_cost[base + i] = load.costs[cost + i]
+    for place in range(t.n_region[dag]):
+        s.x_cost[base + place] = load.costs[cost + place]
     rules.make_ready(t, s, key, base + t.region_offset[t.source[dag]], now)
 
 
@@ -146,9 +159,9 @@ def _note(
     log.append((now, kind, worker, t.dag_of[vertex], vertex, s.job_index[s.x_slot[x]]))
 
 
-def _any_late(s: State, first: int) -> bool:
+def _any_missed(s: State, first: int) -> bool:
     for i in range(first, len(s.decisions)):
-        decision = s.decisions[i]
-        if decision[0] == SINK_DONE and decision[5] > decision[4]:
+        kind, deadline, time = s.decisions[i][0], s.decisions[i][4], s.decisions[i][5]
+        if kind == SINK_EXPIRED or kind == SINK_ABORTED or kind == SINK_DONE and time > deadline:
             return True
     return False

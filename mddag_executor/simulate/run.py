@@ -16,18 +16,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 import json
+import math
 import random
-from typing import Any, Mapping, Sequence
+from typing import Any
 
+from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core import policy as find_policy
-from mddag_executor.core import Tables, Tally
-from mddag_executor.core.rules import finish
-from mddag_executor.core.state import new_state
+from mddag_executor.core.jobs import finish
+from mddag_executor.core.state import Decision, new_state
 from mddag_executor.errors import MddagError
 from mddag_executor.simulate.engine import Load, LogEntry, run
 from msg_graph import Dag, TaskSet
+
+JUDGES = ('horizon', 'completions')
+
+_FORMAT = 'write {"DAG": {"/node:callback": microseconds}}'
+_LONGEST_US = 86_400_000_000
 
 
 class SimulationError(MddagError):
@@ -58,7 +65,11 @@ class Settings:
 
 @dataclass
 class Run:
-    """Outcome of a run: the tally, when it ended (ns) and, if asked for, every worker's log."""
+    """
+    Outcome of a run: the tally, when it ended (ns) and, if asked for, the log of every worker.
+
+    ``log`` and ``decisions`` (those of the core) are in order of time.
+    """
 
     settings: Settings
     tally: Tally
@@ -66,6 +77,7 @@ class Run:
     utilisation: float | None
     preemptive: bool
     log: list[LogEntry] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list)
 
     def result(self) -> dict[str, Any]:
         """Return the result format of ``simulate --json``."""
@@ -106,14 +118,13 @@ def read_execution_times(task_set: TaskSet, text: str, name: str) -> list[list[i
     """
     try:
         data = json.loads(text)
-    except ValueError as error:
+    except json.JSONDecodeError as error:
         raise SimulationError(
-            f'{name}: not JSON ({error}): write {{"DAG": {{"/node:callback": microseconds}}}}'
-        ) from None
+            f'{name}:{error.lineno}: not JSON ({error.msg}): {_FORMAT}') from None
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
+        raise SimulationError(f'{name}: not usable JSON ({error}): {_FORMAT}') from None
     if not isinstance(data, dict) or not all(isinstance(v, dict) for v in data.values()):
-        raise SimulationError(
-            f'{name}: not an object of objects: write {{"DAG": {{"/node:callback": microseconds}}}}'
-        )
+        raise SimulationError(f'{name}: not an object of objects: {_FORMAT}')
     known = {dag.name for dag in task_set.dags}
     for dag_name in data:
         if dag_name not in known:
@@ -125,7 +136,7 @@ def read_execution_times(task_set: TaskSet, text: str, name: str) -> list[list[i
 
 def _dag_times(dag: Dag, times: Mapping[str, Any], name: str) -> list[int]:
     row = []
-    names = set()
+    names: set[str] = set()
     for vertex in dag.vertices:
         names.update((vertex.name, vertex.callback.key))
         value = times.get(vertex.name, times.get(vertex.callback.key))
@@ -133,10 +144,10 @@ def _dag_times(dag: Dag, times: Mapping[str, Any], name: str) -> list[int]:
             raise SimulationError(
                 f'{name}: no execution time for {vertex.callback.key} of DAG {dag.name}: add it')
         if isinstance(value, bool) or not isinstance(value, (int, float)) \
-                or not 0 < value < 86_400_000_000:
+                or not 0 < value < _LONGEST_US:
             raise SimulationError(
                 f'{name}: execution time of {vertex.callback.key} of DAG {dag.name} is '
-                f'{value!r}: give microseconds, above 0 and below one day')
+                f'{_shown(value)}: give microseconds, above 0 and below one day')
         row.append(max(1, round(value * 1000)))
     for key in times:
         if key not in names:
@@ -145,10 +156,32 @@ def _dag_times(dag: Dag, times: Mapping[str, Any], name: str) -> list[int]:
     return row
 
 
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + '...'
+
+
 def utilisation(task_set: TaskSet, times: Sequence[Sequence[int]], workers: int) -> float:
     """Return the normalised utilisation: sum of execution time over period, by workers."""
     total = sum(sum(row) / dag.period_ns for dag, row in zip(task_set.dags, times))
     return total / workers
+
+
+def scale_execution_times(
+    task_set: TaskSet, times: Sequence[Sequence[int]], workers: int, target: float
+) -> list[list[int]]:
+    """
+    Return the execution times scaled by one factor to a normalised utilisation, ns.
+
+    :raises SimulationError: when the target is no number above zero, or there is nothing to scale.
+    """
+    now = utilisation(task_set, times, workers)
+    if not (target > 0 and math.isfinite(target)):
+        raise SimulationError(f'utilisation {target}: no number above zero: give one as 0.6')
+    if now == 0:
+        raise SimulationError('utilisation: all execution times are 0: give times to scale')
+    factor = target / now
+    return [[round(time * factor) for time in row] for row in times]
 
 
 def periodic_load(task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns: int) -> Load:
@@ -175,18 +208,23 @@ def simulate(
     utilisation: float | None = None,
     max_active_jobs: int | None = None,
     log: bool = False,
+    progress: Callable[[int], None] | None = None,
 ) -> Run:
     """
     Run the core over a load.
 
+    :param utilisation: of the load, for the result.
+    :param max_active_jobs: bound on the open jobs of a DAG that declares none itself.
+    :param log: keep the log of every worker.
+    :param progress: told the virtual time (ns) now and then.
     :raises SimulationError: on settings that make no sense.
+    :raises mddag_executor.core.PolicyError: when there is no such policy.
     """
-    if settings.workers < 1:
-        raise SimulationError(f'workers: {settings.workers} is too few: give at least 1')
+    _check(settings)
     policy = find_policy(settings.policy)
     preemptive = policy.preemptive if settings.preemptive is None else settings.preemptive
-    bound = {} if max_active_jobs is None else {'max_active_jobs': max_active_jobs}
-    tables = Tables.build(task_set, **bound)
+    tables = Tables.build(
+        task_set, max_active_jobs=NEVER if max_active_jobs is None else max_active_jobs)
     state = new_state(
         tables, settings.workers, preemptive=preemptive,
         dispatch_overhead=settings.dispatch_overhead_ns,
@@ -194,7 +232,7 @@ def simulate(
     entries: list[LogEntry] = []
     ended = run(
         tables, state, policy.key, load, settings.duration_ns, settings.stop_at_first_miss,
-        entries if log else None)
+        entries if log else None, progress)
     stopped = settings.stop_at_first_miss and ended < settings.duration_ns
     if settings.judge == 'horizon' and not stopped:
         finish(tables, state, ended)
@@ -203,4 +241,16 @@ def simulate(
         if time < settings.duration_ns and time <= ended:
             tally.released(dag)
     tally.add(state.decisions)
-    return Run(settings, tally, ended, utilisation, preemptive, entries)
+    return Run(settings, tally, ended, utilisation, preemptive, entries, state.decisions)
+
+
+def _check(settings: Settings) -> None:
+    if settings.workers < 1:
+        raise SimulationError(f'workers: {settings.workers} is too few: give at least 1')
+    if settings.duration_ns < 1:
+        raise SimulationError(f'duration: {settings.duration_ns} ns is too short: give at least 1')
+    if settings.judge not in JUDGES:
+        raise SimulationError(
+            f"judge '{settings.judge}': there is no such way: choose one of {', '.join(JUDGES)}")
+    if settings.dispatch_overhead_ns < 0 or settings.switch_overhead_ns < 0:
+        raise SimulationError('overhead: it is negative: give 0 or more')

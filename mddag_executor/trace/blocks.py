@@ -22,7 +22,8 @@ is not sound ends both with `Damage`; nothing after it is used, because nothing 
 trusted to be what it seems.
 
 1. No length is believed before it is compared with what is there; no memory is taken for a length.
-2. A chunk's own lengths must add up to the length of its record.
+2. The lengths inside a chunk or a message index must add up to the length of its record, or the
+   record's length might lead past the next chunk.
 3. Message indexes follow their chunk. Where one follows anything else, the record before it was a
    chunk whose opcode has changed.
 4. Messages stand in chunks or outside them, not both in one file: a plain message after a chunk is
@@ -101,9 +102,15 @@ def open_data(stream: BinaryIO, path: str, size: int) -> int:
     head = stream.read(records.RECORD.size)
     if len(head) == records.RECORD.size:
         opcode, length = records.RECORD.unpack(head)
-        start = stream.tell() + length
-        if opcode == records.HEADER and start <= size:
-            return int(start)
+        cursor = records.Cursor(stream.read(min(length, 1 << 16)))
+        try:
+            cursor.string()     # profile
+            cursor.string()     # library
+        except ValueError:
+            pass
+        # A wrong length might lead past the first chunk.
+        if opcode == records.HEADER and cursor.position == length:
+            return len(magic) + len(head) + int(length)
     raise TraceError(path, 'ends or is damaged before its first event', _REMEDY)
 
 
@@ -132,6 +139,9 @@ def scan(stream: BinaryIO, start: int, size: int) -> Iterator[Block]:
         elif opcode == records.MESSAGE_INDEX:
             if previous not in (records.CHUNK, records.MESSAGE_INDEX):
                 raise Damage('a message index belongs to no chunk', position)
+            content = stream.read(min(length, 6))
+            if len(content) < 6 or length != 6 + records.UINT32.unpack_from(content, 2)[0]:
+                raise Damage('the lengths in a message index are wrong', position)
         elif opcode in (records.SCHEMA, records.CHANNEL, records.MESSAGE):
             if chunks_seen and opcode == records.MESSAGE:
                 raise Damage('a message stands outside of the chunks', position)
@@ -280,6 +290,8 @@ def _parse_summary(stream: BinaryIO, start: int, end: int) -> Summary | None:
                 cursor.take(4)
                 topics.add(cursor.string())
         start += records.RECORD.size + length
+    if start != end:
+        raise ValueError('the summary does not end at the footer')
     if messages is None or chunks is None:
         return None
     return Summary(messages, chunks, frozenset(topics))

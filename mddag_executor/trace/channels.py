@@ -88,6 +88,10 @@ class Channels:
 
         :raises ValueError: where it is malformed, or defines a known schema anew
         """
+        cursor = Cursor(content)
+        cursor.take(2)
+        for _ in ('name', 'encoding', 'data'):
+            cursor.block()
         self._keep(self._schemas, content)
 
     def add_channel(self, content: bytes) -> None:

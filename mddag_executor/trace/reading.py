@@ -75,7 +75,7 @@ class Reading:
             for block in blocks:
                 yield from self._decode(load(stream, block), block)
         except Damage as damage:
-            self.damage = damage
+            self._keep(damage)
 
     def by_time(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Event]:
         """
@@ -100,9 +100,12 @@ class Reading:
                     loaded[number] = self._in_order(stream, known[number], pending)
                     sound = max(sound, number + 1)
                 except Damage as damage:
-                    self.damage = damage
+                    self._keep(damage)
                     usable = min(sound, number)
             yield from _take(loaded, next_start)
+
+    def _keep(self, damage: Damage) -> None:
+        self.damage = damage.with_traceback(None)       # which would keep the chunk in memory
 
     def _scan(self, blocks: Iterator[Block]) -> list[Block]:
         known = []
@@ -110,7 +113,7 @@ class Reading:
             for block in blocks:
                 known.append(block)
         except Damage as damage:
-            self.damage = damage
+            self._keep(damage)
         return known
 
     def _in_order(self, stream: BinaryIO, block: Block, pending: int) -> list[Event]:

@@ -76,6 +76,9 @@ def test_the_status_is_that_of_the_verb(verb, status: int) -> None:
      'error: b: permission denied: change its permissions or name another file'),
     (OSError(28, 'No space left on device', 'out.json'),
      'error: out.json: no space left on device: check the path and what it lies on'),
+    (ModuleNotFoundError("No module named 'rclpy'", name='rclpy'),
+     'error: rclpy: ROS 2 is not there: source the setup file of your ROS 2, '
+     "or install 'mddag_executor[ros]' with pip"),
 ])
 def test_bad_input_is_one_line(verb, capsys: pytest.CaptureFixture[str],
                                error: BaseException, line: str) -> None:
@@ -98,8 +101,12 @@ def test_errors_of_the_neighbours_are_known(verb, capsys: pytest.CaptureFixture[
     assert err.startswith('error: empty.yaml') and err.count('\n') == 1
 
 
-def test_a_defect_keeps_its_traceback(verb, capsys: pytest.CaptureFixture[str]) -> None:
-    verb(fail_with(ZeroDivisionError('a defect')))
+@pytest.mark.parametrize('error', [
+    ZeroDivisionError('a defect'), OSError('a defect'),
+    ModuleNotFoundError('a defect', name='somebodys_module')])
+def test_a_defect_keeps_its_traceback(verb, capsys: pytest.CaptureFixture[str],
+                                      error: BaseException) -> None:
+    verb(fail_with(error))
     assert program.main(['probe']) == 70
     err = capsys.readouterr().err
     assert 'Traceback' in err and 'in action' in err and 'a defect' in err
@@ -210,7 +217,8 @@ def test_module_and_program_are_the_same(mddag: Mddag) -> None:
         assert again.stdout == result.stdout
 
 
-def test_a_reader_that_goes_away_is_no_error() -> None:
+@pytest.mark.parametrize('length', [1, 100_000])  # less and more than a buffer
+def test_a_reader_that_goes_away_is_no_error(length: int) -> None:
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, 'w') as gone:
@@ -219,9 +227,10 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
              'import sys, types\n'
              'from mddag_executor.cli import main as program\n'
              "module = types.SimpleNamespace(HELP='x', EXAMPLE='x', add_arguments=id,\n"
-             '                               main=lambda args: print("x" * 100000) or 0)\n'
+             f'                               main=lambda args: print("x" * {length}) or 0)\n'
              "program.available = lambda: {'probe': program.Verb('probe', 'x')}\n"
              'program.load = lambda verb: module\n'
              "sys.exit(program.main(['probe']))"],
-            stdout=gone, stderr=subprocess.PIPE, text=True, check=False)
+            stdout=gone, stderr=subprocess.PIPE, text=True, check=False,
+            env={name: value for name, value in os.environ.items() if name != 'PYTHONUNBUFFERED'})
     assert (result.returncode, result.stderr) == (141, '')

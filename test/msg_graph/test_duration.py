@@ -16,7 +16,8 @@
 
 from __future__ import annotations
 
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 from msg_graph import DurationError, format_duration, parse_duration
 import pytest
 

@@ -20,7 +20,8 @@ import copy
 from dataclasses import fields, FrozenInstanceError
 import pickle
 
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 from msg_graph import ExecutionTime, GraphError, TaskSet
 import pytest
 

@@ -52,8 +52,8 @@ def values(kind: FieldType) -> st.SearchStrategy[Any]:
         one = st.floats(width=32 if kind.base == 'float32' else 64, allow_nan=False)
     if kind.count is None:
         return one
-    size = dict(min_size=max(kind.count, 0), max_size=kind.count if kind.count >= 0 else 5)
-    return st.lists(one, **size).map(tuple)
+    size = kind.count if kind.count >= 0 else 5
+    return st.lists(one, min_size=max(kind.count, 0), max_size=size).map(tuple)
 
 
 def entries(event: EventType) -> st.SearchStrategy[tuple[Any, ...]]:

@@ -19,7 +19,8 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mddag_executor.trace import cdr
 from mddag_executor.trace.cdr import FieldType
 import numpy as np

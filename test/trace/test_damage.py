@@ -21,11 +21,12 @@ way to lose or to mistake one shows.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import os
 from pathlib import Path
 import random
 import struct
-from typing import Any, Iterator
+from typing import Any
 import zlib
 
 import lz4.frame
@@ -34,9 +35,12 @@ from mddag_executor.trace.schema import EVENTS
 import pytest
 import zstandard
 
-from .helpers import mixture, read, read_back, records_of, run_child, write_chunks
+from . import helpers
+from .helpers import read, read_back, records_of, run_child, write_chunks
 
-SIZES = [9, 17, 1, 12, 30]
+SIZES = [3, 4, 1, 6]
+KINDS = ['ros2:callback_start', 'mddag:drop', 'ros2:rmw_take', 'ros2:rcl_node_init',
+         'ros2:callback_end', 'mddag:dispatch']
 HEADER_END = 8 + 9 + 4 + len('ros2') + 4 + len('mddag_executor')
 
 
@@ -44,7 +48,8 @@ HEADER_END = 8 + 9 + 4 + len('ros2') + 4 + len('mddag_executor')
 def sample(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[list[Any]]]:
     """Return a finished file and what was recorded in each of its chunks."""
     path = tmp_path_factory.mktemp('sample') / 'a.mcap'
-    recorded = mixture(sum(SIZES))
+    recorded = [helpers.sample(EVENTS[KINDS[number // 2 % len(KINDS)]], number)
+                for number in range(sum(SIZES))]
     chunks = []
     for size in SIZES:
         chunks.append(recorded[:size])
@@ -103,20 +108,21 @@ def test_warnings_have_counts(tmp_path: Path, sample: Any) -> None:
     data, _ = sample
     path = tmp_path / 'a.mcap'
     chunk = [(start, end) for opcode, start, end in records_of(data) if opcode == records.CHUNK][2]
+    unread = len(data) - chunk[0]
     path.write_bytes(data[:chunk[0] + 20])
     assert read(path)[1] == [
         f'{path}: a record is cut off, or its length is wrong (at byte {chunk[0]}): used 2 chunks '
-        'with 26 messages before it, not the 20 bytes from there on; what there should be is not '
+        'with 7 messages before it, not the 20 bytes from there on; what there should be is not '
         'known']
     changed = bytearray(data)
     changed[chunk[1] - 10] ^= 1
     path.write_bytes(changed)
     text = read(path)[1][0]
-    assert 'a chunk' in text and f'used 2 chunks with 26 messages before it, not the ' \
-        f'{len(data) - chunk[0]} bytes from there on; 5 chunks with 69 messages' in text
+    assert f': used 2 chunks with 7 messages before it, not the {unread} bytes from there on; ' \
+           '4 chunks with 14 messages are said to be there' in text
     path.write_bytes(data[:-1])
     assert read(path)[1] == [f'{path}: the summary at the end is damaged or missing: used all of '
-                             'the data, 5 chunks with 69 messages']
+                             'the data, 4 chunks with 14 messages']
 
 
 def flips(data: bytes, count: int, seed: int) -> Iterator[tuple[int, bytes]]:
@@ -132,18 +138,13 @@ def flips(data: bytes, count: int, seed: int) -> Iterator[tuple[int, bytes]]:
 def test_flipped_bits(tmp_path: Path, sample: Any) -> None:
     data, chunks = sample
     path = tmp_path / 'a.mcap'
-    where = {position: (opcode, number)
-             for number, (opcode, start, end) in enumerate(records_of(data))
+    in_summary = (records.SCHEMA, records.CHANNEL, records.STATISTICS, records.CHUNK_INDEX,
+                  records.FOOTER)
+    where = {position: opcode for opcode, start, end in records_of(data)
              for position in range(start, end)}
-    first_chunk = [number for _, (opcode, number) in where.items() if opcode == records.CHUNK][0]
-    for position, changed in flips(data, 3 * len(data), 1):
+    for position, changed in flips(data, len(data), 1):
         found = check(path, changed, chunks)
-        opcode, number = where.get(position, (0, 0))
-        if position >= HEADER_END and number == first_chunk:
-            # a flip in a chunk's head may be in its times, which only sorting needs
-            assert found <= 0 or position < HEADER_END + 9 + 24
-        if opcode in (records.SCHEMA, records.CHANNEL, records.STATISTICS, records.CHUNK_INDEX,
-                      records.FOOTER):
+        if where.get(position) in in_summary:
             assert found == len(chunks)
             assert len(read(path)[1]) == 1          # the summary's CRC
 
@@ -152,7 +153,7 @@ def test_flipped_bits_without_a_summary(tmp_path: Path, sample: Any) -> None:
     """A killed writer's file: nothing says how many chunks there were."""
     data, chunks = sample
     end = next(start for opcode, start, _ in records_of(data) if opcode == records.DATA_END)
-    for _, changed in flips(data[:end], 3 * end, 2):
+    for _, changed in flips(data[:end], 2 * end, 2):
         check(tmp_path / 'a.mcap', changed, chunks)
 
 
@@ -178,15 +179,8 @@ def test_mutations(tmp_path: Path, sample: Any) -> None:
             except TraceError:
                 continue
             assert len(warnings) <= 2
-            # A whole chunk may have been doubled or taken out; each event is one of those recorded.
-            assert {event[:2] for event in events} <= {
-                event[:2] for chunk in chunks for event in chunk}
-            assert all(event in chunks_of(chunks, event) for event in events)
-
-
-def chunks_of(chunks: list[list[Any]], event: Any) -> list[Any]:
-    """Return the recorded events of the same time."""
-    return [recorded for chunk in chunks for recorded in chunk if recorded[1] == event[1]]
+            # A whole chunk may have been doubled or taken out, but each event was recorded.
+            assert set(events) <= {event for chunk in chunks for event in chunk}
 
 
 def test_a_lost_chunk_is_noticed(tmp_path: Path, sample: Any) -> None:
@@ -210,8 +204,23 @@ def test_a_lost_chunk_is_noticed(tmp_path: Path, sample: Any) -> None:
     padding = struct.pack('<BQ', 0x90, gap) + bytes(gap)
     path.write_bytes(data[:found[place][1]] + padding + data[end:])
     events, warnings = read(path)
-    assert len(warnings) == 1
-    assert 'events are missing: found and used 4 chunks with 52 messages; 5 chunks' in warnings[0]
+    assert 'events are missing: found and used 3 chunks with 10 messages; 4 chunks' in warnings[0]
+
+
+def test_no_length_leads_past_a_chunk(tmp_path: Path, sample: Any) -> None:
+    """Of the header, and of the last message index before a chunk."""
+    data, chunks = sample
+    path = tmp_path / 'a.mcap'
+    found = records_of(data)
+    first, second = [number for number, record in enumerate(found)
+                     if record[0] == records.CHUNK][:2]
+    end = next(start for opcode, start, _ in found[second:] if opcode == records.MESSAGE_INDEX)
+    for number, expected in ((0, -1), (second - 1, 1)):
+        changed = bytearray(data)
+        start = found[number][1]
+        past = found[first][2] if number == 0 else end
+        struct.pack_into('<Q', changed, start + 1, past - start - 9)
+        assert check(path, bytes(changed), chunks) == expected
 
 
 @pytest.mark.parametrize('content, problem', [
@@ -340,10 +349,12 @@ def hostile() -> dict[str, bytes]:
     }
 
 
+ODD_BUT_SOUND = {'zstd of no bytes', 'a chunk in a chunk', 'a row of empty records'}
+
 READ_ALL = """
 import resource, sys, time
 from mddag_executor.trace import TraceError, TraceReader
-resource.setrlimit(resource.RLIMIT_AS, (700 << 20, 700 << 20))
+resource.setrlimit(resource.RLIMIT_AS, (900 << 20, 900 << 20))
 for path in sys.argv[1:]:
     for in_time_order in (False, True):
         start = time.monotonic()
@@ -370,16 +381,19 @@ def test_hostile_lengths(tmp_path: Path, finished: bool) -> None:
         paths[-1].write_bytes(start + data + end)
     *texts, megabytes = run_child(READ_ALL, *paths).splitlines()
     assert len(texts) == 2 * len(paths)
-    assert int(megabytes) < 420         # the interpreter, and one chunk of at most 256 MiB
+    assert int(megabytes) < 600         # the interpreter, and a chunk of at most 256 MiB twice
     for path, text in zip(paths, texts[::2]):
+        if finished and path.stem in ODD_BUT_SOUND:
+            assert text == 'no warning'
+            continue
         assert text.startswith(str(path)), (path, text)
         assert len(text) < 600
     assert texts[::2] == texts[1::2]
 
 
 @pytest.mark.parametrize('change', [
-    dict(summary_start=2**63), dict(summary_start=2**40), dict(summary_start=1),
-    dict(length=2**63), dict(crc=1),
+    {'summary_start': 2**63}, {'summary_start': 2**40}, {'summary_start': 1},
+    {'length': 2**63}, {'crc': 1},
 ])
 def test_hostile_footers(tmp_path: Path, sample: Any, change: dict[str, int]) -> None:
     data, chunks = sample

@@ -22,12 +22,19 @@ import struct
 from typing import Any
 
 from mcap.writer import CompressionType, IndexType, Writer
-from mddag_executor.trace import EVENTS, read_events, TraceError, TraceReader, TraceWarning
-from mddag_executor.trace import reading
-from mddag_executor.trace.cdr import encode, ENCAPSULATION
+from mddag_executor.trace import (
+    EVENTS,
+    read_events,
+    reading,
+    TraceError,
+    TraceReader,
+    TraceWarning,
+)
+from mddag_executor.trace.cdr import ENCAPSULATION, encode
 import pytest
 from rosbags.interfaces import ConnectionExtRosbag2
-from rosbags.rosbag2 import StoragePlugin, Writer as RosbagWriter
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 from .helpers import mixture, read, read_back, run_child, VPID, write_chunks
@@ -120,11 +127,13 @@ HEAD = ENCAPSULATION + struct.pack('<qii', 1, 2, 3)
      ENCAPSULATION + b'\2\0\0\0x\0' + bytes(2) + struct.pack('<QiiQ', 9, 3, 2, 1),
      ('ros2:callback_end', 1, 2, 3, 9)),
     # another size of the same kind
-    (PREAMBLE + 'int32 callback\n', HEAD + struct.pack('<i', 9), ('ros2:callback_end', 1, 2, 3, 9)),
+    (PREAMBLE + 'int32 callback\n', HEAD + struct.pack('<i', 9),
+     ('ros2:callback_end', 1, 2, 3, 9)),
     # a field is missing
     (PREAMBLE, HEAD, ('ros2:callback_end', 1, 2, 3, None)),
     # padding at the end
-    (PREAMBLE + 'uint64 callback', HEAD + struct.pack('<Q4x', 9), ('ros2:callback_end', 1, 2, 3, 9)),
+    (PREAMBLE + 'uint64 callback', HEAD + struct.pack('<Q4x', 9),
+     ('ros2:callback_end', 1, 2, 3, 9)),
 ])
 def test_other_fields_than_the_table(tmp_path: Path, schema: str, data: bytes,
                                      expected: tuple[Any, ...]) -> None:
@@ -143,7 +152,8 @@ def test_an_event_that_is_not_in_the_table(tmp_path: Path) -> None:
         {'_name': 'other:thing', '_timestamp': 1, '_vpid': 2, '_vtid': 3, 'gid': (7, 8),
          'names': ('a', 'b'), 'f': 0.5}]
     reader = TraceReader(path)
-    assert list(reader.events({'other:thing'})) == [('other:thing', 1, 2, 3, (7, 8), ('a', 'b'), 0.5)]
+    assert list(reader.events({'other:thing'})) == [
+        ('other:thing', 1, 2, 3, (7, 8), ('a', 'b'), 0.5)]
     assert reader.fields == {'other:thing': ('gid', 'names', 'f')}
     assert list(reader.events({'ros2:callback_end'})) == []
 

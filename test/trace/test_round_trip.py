@@ -19,7 +19,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from hypothesis import given, HealthCheck, settings, strategies as st
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
 from mcap.reader import make_reader, NonSeekingReader
 from mddag_executor.trace import EVENTS, EventType, read_events, TraceError, TraceFile, TraceReader
 from mddag_executor.trace.cdr import decode

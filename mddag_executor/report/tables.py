@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Tables of what came of each sink; live runs and the demo show them.
+Tables of what came of each sink, for live runs, simulations and replays alike.
 
 The numbers are those of the result format: ``completed`` counts all completions, ``late`` those
 after the deadline and what was overdue and open when the run ended.  For people *due* is every
@@ -26,7 +26,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-from mddag_executor.cli.text import Cell, format_ns, table
+from mddag_executor.report.text import Cell, format_ns, table
 
 HEADER = ('DAG', 'sink', 'due', 'in time', 'late', 'expired', 'median', 'p99', 'max', 'deadline')
 

@@ -1,0 +1,280 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The verb `demo`: the whole Autoware workload, run, recorded, replayed and compared.
+
+Theory of operation: each step is a process of its own, one after the other, so that none has
+another's threads, caches or nodes beside it: `mddag run --synthetic sleep`, which records; two
+times `mddag replay`; and rclpy's own MultiThreadedExecutor with the same nodes, seed and number of
+threads.  Both executors are measured by the nodes themselves, in the same way
+(`mddag_executor.live.measure`), so the figures side by side mean the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+from mddag_executor.cli import common
+from mddag_executor.cli.run import measured_lines
+from mddag_executor.cli.text import Cell, format_ns, printable, Progress, table
+from mddag_executor.errors import MddagError
+from mddag_executor.report.tables import (
+    counts,
+    percent,
+    response_cells,
+    short_names,
+    sink_table,
+)
+from mddag_executor.resources import find
+
+NAME = 'demo'
+HELP = 'run the whole Autoware workload, record it and replay the recording'
+EXAMPLE = 'mddag demo --seconds 20 --utilisation 0.6'
+
+WORKERS = 7
+DEFAULT_SEED = 0
+"""The first seed; at utilisation 0.6 its draw is feasible (`ExecutionPlan.infeasible`)."""
+
+
+class DemoError(MddagError):
+    """A step of the demo that failed."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add('--seconds', type=common.positive_float, default=20.0, metavar='S',
+        help='how long to measure this executor (default: 20)')
+    add('--baseline-seconds', type=common.positive_float, default=10.0, metavar='S',
+        help="how long to measure rclpy's MultiThreadedExecutor (default: 10)")
+    add('--utilisation', type=common.positive_float, default=0.6, metavar='U',
+        help='normalised utilisation that the execution times are scaled to (default: 0.6)')
+    add('--seed', type=int, default=DEFAULT_SEED, metavar='N',
+        help=f'what the execution times are drawn with (default: {DEFAULT_SEED})')
+    add('--output', default='build/demo', metavar='DIR',
+        help='where trace and results are written (default: build/demo)')
+    common.add_json(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Run the steps and print what each found.
+
+    :raises mddag_executor.errors.MddagError: when a step fails
+    """
+    common.check_output(args.json)
+    output = Path(args.output)
+    output.mkdir(parents=True, exist_ok=True)
+    graph = find('config/autoware.yaml')
+    say = _say if common.wants_tables(args) else _say_nothing
+    for line in _introduction(args, graph):
+        say(line)
+    live = run_live(args, graph, output)
+    say(sink_table(live['dags']))
+    for line in measured_lines(live['measured']):
+        say(line)
+    say(f'{sum(live["dropped"].values())} dropped, {live["undeclared"]} undeclared')
+    recorded, rescheduled = run_replays(graph, output)
+    say('\n== The recording, replayed ==')
+    say(replay_table(live, recorded, rescheduled))
+    say(agreement(live, recorded))
+    say(f'trace: {printable(str((output / "demo.mcap").absolute()))}')
+    say(f"\n== The same nodes on rclpy's MultiThreadedExecutor({WORKERS}), "
+        f'{args.baseline_seconds:g} s ==')
+    baseline = run_baseline(args, graph)
+    say(side_by_side(live['measured'], baseline))
+    if args.json is not None:
+        common.write_json(args.json, {
+            'live': live, 'recorded': recorded, 'rescheduled': rescheduled,
+            'baseline': baseline, 'trace': str((output / 'demo.mcap').absolute())})
+    return 0
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)  # at once, also into a pipe: the next step takes long
+
+
+def _say_nothing(text: str) -> None:
+    """Print nothing: standard output belongs to the JSON."""
+
+
+def _introduction(args: argparse.Namespace, graph: Path) -> Iterator[str]:
+    from mddag_executor.live.execution import ExecutionPlan
+    from msg_graph import load
+    task_set = load(graph)
+    plan = ExecutionPlan(task_set, args.seed, args.utilisation, WORKERS)
+    yield (f'{printable(task_set.file)}: {len(task_set.dags)} DAGs, '
+           f'{len(task_set.vertices)} vertices, {len({c.node for c in task_set.callbacks})} nodes')
+    yield (f'execution times: one draw from the measured distributions (seed {args.seed}), scaled '
+           f'by {plan.factor:.2f} to utilisation {plan.utilisation:.2f} of {WORKERS} workers; '
+           'another seed is another draw')
+    infeasible = plan.infeasible()
+    if infeasible:
+        yield (f'of this draw {len(infeasible)} sinks have a critical path longer than their '
+               'deadline: no scheduler can keep these')
+    else:
+        yield 'feasible: no critical path is longer than its deadline'
+    yield (f'\n== rclpy nodes under MultiDeadlineExecutor({WORKERS}), policy rad, recording, '
+           f'{args.seconds:g} s ==')
+
+
+def run_live(args: argparse.Namespace, graph: Path, output: Path) -> dict[str, Any]:
+    """Run the workload under the executor, recording; return the result of `mddag run`."""
+    seconds = args.seconds
+    command = [
+        'run', str(graph), '--synthetic', 'sleep', '--utilisation', str(args.utilisation),
+        '--seed', str(args.seed), '--workers', str(WORKERS), '--duration', f'{seconds:.3f}s',
+        '--trace', str(output / 'demo.mcap'), '--json', '-']
+    result = _json_of(_mddag(*command), 'running', seconds + 3)
+    if result['measured'] is None:
+        raise DemoError('mddag run: it was stopped before it measured: run the demo again')
+    return result
+
+
+def run_replays(graph: Path, output: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Replay the recording as it was, and rescheduled by the core."""
+    trace = str(output / 'demo.mcap')
+    recorded = _json_of(_mddag('replay', trace, '--json', '-'), 'replaying')
+    rescheduled = _json_of(
+        _mddag('replay', trace, str(graph), '--reschedule', '--workers', str(WORKERS),
+               '--json', '-'), 'rescheduling')
+    return recorded, rescheduled
+
+
+def run_baseline(args: argparse.Namespace, graph: Path) -> dict[str, Any]:
+    """Run the same nodes on rclpy's MultiThreadedExecutor; return what they measured."""
+    command = [
+        sys.executable, '-m', 'mddag_executor.live.baseline', str(graph), '--executor', 'multi',
+        '--utilisation', str(args.utilisation), '--seed', str(args.seed),
+        '--workers', str(WORKERS), '--seconds', str(args.baseline_seconds)]
+    return _json_of(command, 'running the baseline', args.baseline_seconds + 3)
+
+
+def _mddag(*arguments: str) -> list[str]:
+    return [sys.executable, '-m', 'mddag_executor', *arguments]
+
+
+def _json_of(command: list[str], what: str, seconds: float | None = None) -> dict[str, Any]:
+    """Run a program that prints JSON, with progress on a terminal meanwhile."""
+    # Of this machine only: the demo must not find another one's nodes, nor be found by them.
+    environment = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+    ) as process, Progress(what, seconds) as progress:
+        done = threading.Event()
+        watcher = threading.Thread(target=_tick, args=(progress, done), daemon=True)
+        watcher.start()
+        try:
+            out, err = process.communicate()
+        except BaseException:
+            process.terminate()
+            raise
+        finally:
+            done.set()
+            watcher.join()
+    if process.returncode != 0:
+        lines = err.strip().splitlines() or [f'it ended with status {process.returncode}']
+        name = ' '.join(command[2:4]).replace('mddag_executor ', 'mddag ')
+        raise DemoError(f'{name}: {lines[-1].removeprefix("error: ")}')
+    sys.stderr.write(err)
+    result: dict[str, Any] = json.loads(out)
+    return result
+
+
+def _tick(progress: Progress, done: threading.Event) -> None:
+    begin = time.monotonic()
+    while not done.wait(0.5):
+        progress.update(round(time.monotonic() - begin, 1))
+
+
+def replay_table(
+    live: dict[str, Any], recorded: dict[str, Any], rescheduled: dict[str, Any]
+) -> str:
+    """Return a table with a row for each sink: live, as recorded and rescheduled."""
+    header = (
+        'DAG', 'sink', 'live in time', 'recorded in time', 'rescheduled in time',
+        'live p99', 'recorded p99', 'rescheduled p99', 'deadline')
+    rows: list[list[Cell]] = []
+    for dag, name, shown_dag, shown_name in _sinks(live['dags']):
+        results = [r['dags'][dag]['sinks'][name] for r in (live, recorded, rescheduled)]
+        verdicts = [counts(result) for result in results]
+        rows.append([
+            shown_dag, shown_name, *(f'{v.in_time} of {v.due}' for v in verdicts),
+            *(response_cells(r['response_ns'])[1] for r in results),
+            format_ns(results[0]['relative_deadline_ns'])])
+    return table(header, rows)
+
+
+def agreement(live: dict[str, Any], recorded: dict[str, Any]) -> str:
+    """Say for how many sinks the replayer counts what the executor counted."""
+    wrong = []
+    n = 0
+    for dag, name, _, _ in _sinks(live['dags']):
+        ours, theirs = (r['dags'][dag]['sinks'][name] for r in (live, recorded))
+        n += 1
+        if any(ours[key] != theirs[key] for key in ('completed', 'late')):
+            wrong.append(
+                f'{name} (live {ours["completed"]} completed, {ours["late"]} late; recorded '
+                f'{theirs["completed"]}, {theirs["late"]})')
+    if not wrong:
+        return f'as recorded agrees with live: completed and late are equal for all {n} sinks'
+    return f'as recorded differs from live for {len(wrong)} of {n} sinks: ' + '; '.join(wrong)
+
+
+def side_by_side(ours: dict[str, Any], baseline: dict[str, Any]) -> str:
+    """Return a table of both executors: each sink's share in time, then the totals."""
+    header = ('DAG', 'sink', 'deadline', 'this: in time', 'p99', 'Multi: in time', 'p99')
+    rows: list[list[Cell]] = []
+    for dag, name, shown_dag, shown_name in _sinks(ours['dags']):
+        row: list[Cell] = [
+            shown_dag, shown_name,
+            format_ns(ours['dags'][dag]['sinks'][name]['relative_deadline_ns'])]
+        for result in (ours, baseline):
+            sink = result['dags'][dag]['sinks'][name]
+            row += [percent(sink['on_time'], sink['due']), response_cells(sink['response_ns'])[1]]
+        rows.append(row)
+    totals = [
+        ('sink jobs due', *(str(r['sink_jobs_due']) for r in (ours, baseline))),
+        ('in time', *(percent(r['on_time'], r['sink_jobs_due']) for r in (ours, baseline))),
+        ('late', *(str(r['late']) for r in (ours, baseline))),
+        ('missing', *(str(r['missing']) for r in (ours, baseline))),
+        ('callbacks a second', *(f'{r["callbacks_per_s"]:.0f}' for r in (ours, baseline))),
+        ('CPU each', *(_cpu(r) for r in (ours, baseline)))]
+    return table(header, rows) + '\n' + table(
+        ('', 'MultiDeadlineExecutor', 'MultiThreadedExecutor'), totals)
+
+
+def _cpu(result: dict[str, Any]) -> str:
+    cpu = result['cpu_us_per_callback']
+    return '-' if cpu is None else f'{cpu:.0f} us'
+
+
+def _sinks(dags: dict[str, Any]) -> Iterator[tuple[str, str, str, str]]:
+    """Yield DAG and sink by name, and as a table shows them: a DAG only in its first row."""
+    short = short_names(name for dag in dags.values() for name in dag['sinks'])
+    for dag_name, dag in dags.items():
+        shown = dag_name
+        for name in dag['sinks']:
+            yield dag_name, name, shown, short[name]
+            shown = ''

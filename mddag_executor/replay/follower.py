@@ -1,0 +1,338 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What the events of a run say: releases, executions, completions, ends of jobs.
+
+Theory of operation
+-------------------
+The executor records `job_release`, `complete`, `expire`, `abort`, `deadline` and `drop` in the
+order in which its scheduler core saw them, with times that never decrease.  So in the order of
+time (a stable one: what has the same time stays in the order of the file) they are the same
+sequence again, and whoever feeds it to a core gets the same verdicts.
+
+`dispatch`, `callback_start` and `callback_end` come from the thread that ran the callback; they
+belong together by thread and by the callback's address.  One such run is a *piece*.  An execution
+is one piece, or several where a coroutine was suspended in between; they have the same vertex, job
+and ready time.  `complete`, from the same thread, ends an execution of a declared callback.
+
+The observers are told in terms of the declaration that judges (see ``mapping``); DAG and vertex
+are -1 for what it does not declare.  Another kind of recording needs another follower, and no
+other observers.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from mddag_executor.replay.mapping import Mapping
+from mddag_executor.replay.recording import Recording, TASK_SET
+
+_PROGRESS_STEP = 4096
+_KEEP_UNDECLARED = 4096
+
+Event = tuple[Any, ...]
+Key = tuple[int, int, int, int]
+
+
+class Piece(NamedTuple):
+    """One run of a callback in a thread; `first` tells the first piece of an execution."""
+
+    callback: int
+    dag: int
+    vertex: int
+    job: int
+    worker: int
+    ready: int
+    start: int
+    end: int
+    first: bool
+
+
+class Execution(NamedTuple):
+    """A whole execution: ready, first start, last end, and the time that its pieces took, ns."""
+
+    ready: int
+    start: int
+    end: int
+    busy: int
+
+
+class Observer:
+    """Is told what happened; does nothing with it."""
+
+    def released(self, dag: int, job: int, release: int, now: int) -> None:
+        """Take in the release of a job; `now` is when the executor noticed it."""
+
+    def started(self, dag: int, vertex: int, job: int, ready: int, start: int) -> None:
+        """Take in that an execution of a vertex was dispatched (or a coroutine went on)."""
+
+    def ran(self, piece: Piece) -> None:
+        """Take in that a callback ran."""
+
+    def completed(
+        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
+        execution: Execution | None,
+    ) -> None:
+        """
+        Take in that an execution of a vertex has completed.
+
+        :param whole: whether that completed the vertex, as the executor saw it.
+        :param execution: its times, None where they are not in the trace.
+        """
+
+    def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
+        """Take in that a job was aborted or, else, has expired."""
+
+    def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
+        """Take in a miss as the executor saw it; `completed` is -1 where it never did."""
+
+    def finished(self, now: int) -> None:
+        """Take in that the run has ended; what it had begun may still complete."""
+
+
+class _Running:
+    """What a thread runs."""
+
+    __slots__ = ('callback', 'dag', 'vertex', 'job', 'worker', 'ready', 'start')
+
+    def __init__(
+        self, callback: int, dag: int, vertex: int, job: int, worker: int, ready: int, start: int,
+    ) -> None:
+        self.callback = callback
+        self.dag = dag
+        self.vertex = vertex
+        self.job = job
+        self.worker = worker
+        self.ready = ready
+        self.start = start
+
+
+class Follower:
+    """
+    Goes through the events of a recording once.
+
+    :param more: handlers of further events, by full name.
+    """
+
+    def __init__(
+        self, recording: Recording, mapping: Mapping, observers: Sequence[Observer],
+        more: dict[str, Callable[[Event], None]] | None = None,
+    ) -> None:
+        self._recording = recording
+        self._mapping = mapping
+        self._observers = observers
+        self._handlers: dict[str, Callable[[Event], None]] = {
+            'ros2:callback_start': self._start,
+            'ros2:callback_end': self._end,
+            TASK_SET: self._task_set,
+            'mddag:job_release': self._release,
+            'mddag:dispatch': self._dispatch,
+            'mddag:complete': self._complete,
+            'mddag:deadline': self._deadline,
+            'mddag:drop': self._drop,
+            'mddag:expire': self._expire,
+            'mddag:abort': self._abort,
+            'mddag:lost': self._lost,
+            'mddag:shutdown': self._shutdown,
+            **(more or {}),
+        }
+        #: The first release or the time at which the first execution became ready, ns.
+        self.start: int | None = None
+        #: The run's end, ns: as recorded, or the last thing that the executor's core saw.
+        self.end = recording.head.time
+        self.shut_down = False
+        self.jobs = 0
+        self.lost = 0
+        self.dropped: Counter[str] = Counter()
+        self._strange: Counter[str] = Counter()
+        self._running: dict[int, _Running] = {}
+        # by thread: the execution whose piece ended last; by execution: its pieces so far
+        self._last: dict[int, Key] = {}
+        self._open: dict[Key, Execution] = {}
+        self._undeclared: dict[tuple[int, int], None] = {}
+
+    def run(self, progress: Callable[[int], None] | None = None) -> None:
+        """
+        Tell the observers everything.
+
+        :param progress: told now and then how many events there have been.
+        """
+        handlers = self._handlers
+        count = 0
+        for event in self._recording.events(set(handlers)):
+            if None in event:
+                self._strange[f'{event[0]} without some of its fields'] += 1
+                continue
+            handlers[event[0]](event)
+            count += 1
+            if progress is not None and count % _PROGRESS_STEP == 0:
+                progress(count)
+        if not self.shut_down:
+            for observer in self._observers:
+                observer.finished(self.end)
+
+    def warnings(self) -> list[str]:
+        """Return what was wrong with the events, one line each."""
+        name = self._recording.name
+        lines = []
+        if not self.shut_down:
+            lines.append(
+                f'{name}: the end of the run is not recorded (the process was killed, or the '
+                'trace is cut): what was open is judged at the last recorded instant')
+        if self.lost:
+            lines.append(
+                f'{name}: {self.lost} events were lost while recording: jobs may be missing, or '
+                'count as late that were not')
+        if self._strange:
+            what, n = self._strange.most_common(1)[0]
+            lines.append(
+                f'{name}: {sum(self._strange.values())} events make no sense and are left out, '
+                f'most of them ({n}) {what}')
+        if self.jobs == 0:
+            lines.append(f'{name}: no job was released in it')
+        return lines
+
+    # --- what a thread runs ----------------------------------------------------------------------
+
+    def _dispatch(self, event: Event) -> None:
+        _, now, _, thread, callback, dag, vertex, job, worker, ready, _ = event
+        if dag >= 0:
+            dag, vertex, _ = self._mapping.look_up(dag, vertex, 0)
+        self._running[thread] = _Running(callback, dag, vertex, job, worker, ready, now)
+        if dag >= 0:
+            for observer in self._observers:
+                observer.started(dag, vertex, job, ready, now)
+
+    def _start(self, event: Event) -> None:
+        running = self._running.get(event[3])
+        if running is not None and running.callback == event[4]:
+            running.start = event[1]
+
+    def _end(self, event: Event) -> None:
+        _, now, _, thread, callback = event
+        running = self._running.pop(thread, None)
+        self._last.pop(thread, None)
+        if running is None or running.callback != callback:
+            return  # no executor of ours ran it
+        ready, start = running.ready, running.start
+        if self.start is None or ready < self.start:
+            self.start = ready
+        if running.dag >= 0:
+            key = (running.dag, running.vertex, running.job, ready)
+            before = self._open.get(key)
+            self._open[key] = Execution(ready, start, now, now - start) if before is None \
+                else Execution(ready, before.start, now, before.busy + now - start)
+            self._last[thread] = key
+            first = before is None
+        else:
+            first = self._is_new(callback, ready)
+        piece = Piece(
+            callback, running.dag, running.vertex, running.job, running.worker, ready, start, now,
+            first)
+        for observer in self._observers:
+            observer.ran(piece)
+
+    def _is_new(self, callback: int, ready: int) -> bool:
+        """Tell whether an undeclared callback's piece is the first of its execution."""
+        recent = self._undeclared
+        if (callback, ready) in recent:
+            return False
+        recent[(callback, ready)] = None
+        if len(recent) > _KEEP_UNDECLARED:
+            del recent[next(iter(recent))]
+        return True
+
+    # --- what the executor's core saw ------------------------------------------------------------
+
+    def _advance(self, now: int) -> None:
+        if now > self.end and not self.shut_down:
+            self.end = now
+
+    def _release(self, event: Event) -> None:
+        _, now, _, _, dag, job, release = event
+        self._advance(now)
+        if not 0 <= dag < len(self._mapping.dag):
+            self._strange[f'{event[0]} of a DAG that is not declared'] += 1
+            return
+        self.jobs += 1
+        if self.start is None or release < self.start:
+            self.start = release
+        dag = self._mapping.dag[dag]
+        if dag >= 0:
+            for observer in self._observers:
+                observer.released(dag, job, release, now)
+
+    def _complete(self, event: Event) -> None:
+        _, now, _, thread, _, dag, vertex, job, whole, end, leg = event
+        self._advance(now)
+        key = self._last.pop(thread, None)
+        declared = self._mapping.vertex
+        if not 0 <= dag < len(declared) or not 0 <= vertex < len(declared[dag]):
+            self._strange[f'{event[0]} of a vertex that is not declared'] += 1
+            return
+        dag, vertex, leg = self._mapping.look_up(dag, vertex, leg)
+        if dag < 0:
+            return
+        execution = None
+        if key is not None and key[:3] == (dag, vertex, job):
+            execution = self._open.pop(key, None)
+        for observer in self._observers:
+            observer.completed(dag, vertex, job, leg, whole, end, execution)
+
+    def _expire(self, event: Event) -> None:
+        self._job_end(event, False)
+
+    def _abort(self, event: Event) -> None:
+        self._job_end(event, True)
+
+    def _job_end(self, event: Event, aborted: bool) -> None:
+        _, now, _, _, dag, job = event
+        self._advance(now)
+        if not 0 <= dag < len(self._mapping.dag):
+            self._strange[f'{event[0]} of a DAG that is not declared'] += 1
+            return
+        dag = self._mapping.dag[dag]
+        if dag >= 0:
+            for observer in self._observers:
+                observer.ended(dag, job, aborted, now)
+
+    def _deadline(self, event: Event) -> None:
+        _, now, _, _, dag, vertex, job, deadline, completed = event
+        self._advance(now)
+        dag, vertex, _ = self._mapping.look_up(dag, vertex, 0)
+        for observer in self._observers:
+            observer.missed(dag, vertex, job, deadline, completed)
+
+    def _drop(self, event: Event) -> None:
+        self._advance(event[1])
+        self.dropped[event[8]] += 1
+
+    def _lost(self, event: Event) -> None:
+        self.lost += event[4]
+
+    def _task_set(self, event: Event) -> None:
+        head = self._recording.head
+        if event[4] != head.yaml:
+            self._strange[f'{event[0]} with another declaration'] += 1
+
+    def _shutdown(self, event: Event) -> None:
+        if self.shut_down:
+            return
+        self.end = event[4]
+        self.shut_down = True
+        for observer in self._observers:
+            observer.finished(self.end)

@@ -1,0 +1,190 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The verdicts of a recorded run: its events through the scheduler core, once more.
+
+Theory of operation
+-------------------
+The core is fed what the executor fed its own: releases, completions, and, because they depend on
+settings and on messages that are not in the trace, the expiries and aborts as they were recorded.
+The bounds that would decide about them anew are lifted.  So each sink has the verdicts that the
+executor counted, or, under another declaration, those that it would have counted had the callbacks
+run at the same times.
+
+The misses that the executor recorded must be the ones found here; where they are not, something is
+missing in the trace or wrong in this program, and ``differences`` says so.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from mddag_executor.core import NEVER, Scheduler, Tables, Tally
+from mddag_executor.core.state import (
+    DROP,
+    IDLE,
+    JOB_END,
+    SINK_ABORTED,
+    SINK_DONE,
+    SINK_EXPIRED,
+    SINK_MISSED,
+)
+from mddag_executor.core.tables import CONTINUE
+from mddag_executor.replay.chains import Chains
+from mddag_executor.replay.follower import Execution, Observer
+from msg_graph import TaskSet
+
+KEEP_RESPONSES = 1_000_000
+"""How many response times are kept for each sink: beyond that, quantiles are of the last ones."""
+
+_MISSES = {SINK_MISSED, SINK_ABORTED, SINK_EXPIRED}
+
+
+class Miss(NamedTuple):
+    """A missed deadline: DAG, global vertex, job, absolute deadline, completion (-1: never)."""
+
+    dag: int
+    vertex: int
+    job: int
+    deadline: int
+    completed: int
+
+
+class Judge(Observer):
+    """
+    Feeds a core and counts its verdicts.
+
+    :param task_set: the declaration that judges.
+    :param compare: whether recorded misses must equal those found.
+    """
+
+    def __init__(self, task_set: TaskSet, compare: bool) -> None:
+        tables = Tables.build(task_set, legs=True, groups=False)
+        n = tables.n_dags + 1
+        self.tables = tables._replace(
+            max_active_jobs=[NEVER] * n, expire_after=[NEVER] * n, on_miss=[CONTINUE] * n)
+        self.tally = Tally(task_set, self.tables, KEEP_RESPONSES)
+        self.chains = Chains(task_set, self.tables)
+        #: Events that contradict those before them.
+        self.contradictions = 0
+        self._scheduler = Scheduler(self.tables, 1, propagate=False)
+        self._slots: dict[tuple[int, int], int] = {}
+        self._newest: dict[int, int] = {}
+        self._compare = compare
+        # misses that only one side has seen so far: found here (+1) or recorded (-1)
+        self._open_misses: dict[Miss, int] = {}
+        self._n_recorded = 0
+
+    def released(self, dag: int, job: int, release: int, now: int) -> None:
+        """Open the job."""
+        if job <= self._newest.get(dag, -1):
+            self.contradictions += 1
+            return
+        self._newest[dag] = job
+        slot = self._scheduler.release(dag, job, release, now)
+        self._slots[(dag, job)] = slot
+        self.tally.released(dag)
+        self.chains.begin(slot, release)
+
+    def started(self, dag: int, vertex: int, job: int, ready: int, start: int) -> None:
+        """Note that a vertex of an open job runs."""
+        slot = self._slots.get((dag, job))
+        if slot is not None:
+            self.chains.started(slot, vertex, ready, start)
+
+    def completed(
+        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
+        execution: Execution | None,
+    ) -> None:
+        """Complete an execution of an open job; later ones are not judged."""
+        slot = self._slots.get((dag, job))
+        if slot is None:
+            if job > self._newest.get(dag, -1):
+                self.contradictions += 1
+            return
+        scheduler = self._scheduler
+        x = scheduler.execution(slot, vertex, leg)
+        if scheduler.state.x_state[x] != IDLE:
+            self.contradictions += 1
+            return
+        scheduler.admit(x, end)
+        if scheduler.complete(x, end) and execution is not None:
+            self.chains.completed(slot, vertex, leg, execution)
+        self._decided(slot)
+
+    def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
+        """End an open job as it was recorded."""
+        slot = self._slots.get((dag, job))
+        if slot is None:
+            # under another declaration it may have completed before
+            self.contradictions += self._compare
+        elif aborted:
+            self._scheduler.abort(slot, now)
+            self._decided(slot)
+        else:
+            self._scheduler.expire(slot, now)
+            self._decided(slot)
+
+    def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
+        """Compare a recorded miss."""
+        if self._compare:
+            self._n_recorded += 1
+            self._differ(Miss(dag, vertex, job, deadline, completed), -1)
+
+    def finished(self, now: int) -> None:
+        """Judge what is open."""
+        self._scheduler.finish(now)
+        self._decided(-1)
+
+    def _decided(self, slot: int) -> None:
+        """Count what the core has decided (about the job in a slot, except at the end)."""
+        if not self._scheduler.state.decisions:
+            return
+        decisions = self._scheduler.decisions()
+        self.tally.add(decisions)
+        for kind, dag, vertex, job, deadline, time in decisions:
+            if kind == JOB_END:
+                del self._slots[(dag, job)]
+            elif kind == SINK_DONE:
+                self.chains.sink(slot, vertex, job, time)
+                if time > deadline and self._compare:
+                    self._differ(Miss(dag, vertex, job, deadline, time), 1)
+            elif kind in _MISSES and self._compare:
+                self._differ(Miss(dag, vertex, job, deadline, time), 1)
+            else:
+                assert kind != DROP, 'nothing waits in this core, so nothing can be dropped'
+
+    def _differ(self, miss: Miss, side: int) -> None:
+        difference = self._open_misses.pop(miss, 0) + side
+        if difference:
+            self._open_misses[miss] = difference
+
+    def differences(self, shut_down: bool) -> str | None:
+        """
+        Return how the recorded misses differ from those found, None where they do not.
+
+        :param shut_down: whether the executor judged what was open at the end.
+        """
+        found = [m for m, n in self._open_misses.items()
+                 if n > 0 and (shut_down or m.completed >= 0)]
+        recorded = [m for m, n in self._open_misses.items() if n < 0]
+        if not found and not recorded:
+            return None
+        example = min(found + recorded, key=lambda miss: miss.deadline)
+        name = 'an undeclared vertex' if example.vertex < 0 \
+            else self.tally.vertex_name(example.vertex)
+        return (f'{len(recorded)} of the {self._n_recorded} misses that the executor recorded are '
+                f'not found again, {len(found)} that it did not record are found: the first is '
+                f'job {example.job} at {name}')

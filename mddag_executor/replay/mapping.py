@@ -1,0 +1,152 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+From the recorded declaration to the one that judges.
+
+Theory of operation
+-------------------
+Events name DAGs and vertices by their index in the declaration that was recorded.  The one that
+judges may be another: other deadlines, another order, more or fewer callbacks.
+
+* A recorded DAG stands for the one whose source is the same callback (``/node:callback``).
+* Within it a vertex stands for the one of the same name, or, because names have ``@dag`` only
+  where several DAGs hold a callback, for the only one of the same callback.
+* The legs of a sync vertex are matched by their topics; with other topics it is another vertex.
+
+What stands for nothing ran as a callback that no DAG declares.  What nothing stands for has never
+run: its jobs were not released, its sinks not completed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from mddag_executor.replay.recording import Recording, ReplayError
+from msg_graph import Dag, TaskSet, Vertex
+
+_LONGEST_LIST = 5
+_ORPHAN = (-1, -1, -1)
+
+
+class Mapping:
+    """
+    Where the recorded DAGs and vertices are in the declaration that judges.
+
+    :param judge: the declaration that judges; None: the recorded one.
+    :raises ReplayError: when none of its callbacks is in the trace.
+    """
+
+    def __init__(self, recording: Recording, judge: TaskSet | None) -> None:
+        recorded = recording.task_set
+        self.task_set = recorded if judge is None else judge
+        #: Whether the declaration that judges is the one that the run itself was judged by.
+        self.same = judge is None or judge.text == recorded.text
+        self.warnings: list[str] = []
+        first = _first_vertices(self.task_set)
+        if judge is not None and not self.same:
+            self._compare(recording, judge)
+        by_source = {dag.vertices[dag.source].callback.key: dag for dag in self.task_set.dags}
+        #: By recorded DAG: the DAG that it stands for, or -1.
+        self.dag: list[int] = []
+        #: By recorded DAG and vertex: the global vertex that it stands for, or -1.
+        self.vertex: list[list[int]] = []
+        #: By recorded DAG, vertex and leg: the leg that it stands for.
+        self.leg: list[list[list[int]]] = []
+        for dag in recorded.dags:
+            target = by_source.get(dag.vertices[dag.source].callback.key)
+            self.dag.append(-1 if target is None else target.index)
+            self._add_vertices(dag, target, first)
+        self._report_unreleased()
+
+    def _add_vertices(self, dag: Dag, target: Dag | None, first: list[int]) -> None:
+        vertices: list[int] = []
+        legs: list[list[int]] = []
+        for vertex in dag.vertices:
+            match = None if target is None else _match(vertex, dag, target)
+            map_of_legs = [] if match is None else _legs(vertex, match)
+            if target is None or match is None or not map_of_legs:
+                vertices.append(-1)
+            else:
+                vertices.append(first[target.index] + match.index)
+            legs.append(map_of_legs)
+        self.vertex.append(vertices)
+        self.leg.append(legs)
+
+    def look_up(self, dag: int, vertex: int, leg: int) -> tuple[int, int, int]:
+        """Return DAG, global vertex and leg of the declaration that judges, or -1 for each."""
+        if not 0 <= dag < len(self.dag) or not 0 <= vertex < len(self.vertex[dag]):
+            return _ORPHAN
+        target = self.vertex[dag][vertex]
+        legs = self.leg[dag][vertex]
+        if target < 0 or not 0 <= leg < len(legs):
+            return _ORPHAN
+        return self.dag[dag], target, legs[leg]
+
+    def _compare(self, recording: Recording, judge: TaskSet) -> None:
+        """Find out which callbacks of the graph the trace does not have."""
+        known = {callback.key for callback in recording.task_set.callbacks}
+        missing = [c.key for c in judge.callbacks if c.key not in known]
+        if not missing:
+            return
+        if len(missing) == len(judge.callbacks):
+            raise ReplayError(
+                recording.name, f'none of the callbacks of {judge.file} is in it: it has '
+                f'{_listed([c.key for c in recording.task_set.callbacks])}',
+                'give the graph of the nodes that were recorded, or none')
+        self.warnings.append(
+            f'{recording.name}: {len(missing)} of the {len(judge.callbacks)} callbacks of '
+            f'{judge.file} are not in it, so they count as never completed: {_listed(missing)}')
+
+    def _report_unreleased(self) -> None:
+        if self.same:
+            return
+        missing = [dag.name for dag in self.task_set.dags if dag.index not in self.dag]
+        if missing:
+            self.warnings.append(
+                f'{self.task_set.file}: the sources of {len(missing)} DAGs are no sources in the '
+                f'recording, so there are no jobs of them: {_listed(missing)}')
+
+
+def _first_vertices(task_set: TaskSet) -> list[int]:
+    first = [0]
+    for dag in task_set.dags:
+        first.append(first[-1] + len(dag.vertices))
+    return first
+
+
+def _match(vertex: Vertex, dag: Dag, target: Dag) -> Vertex | None:
+    """Return the vertex of a DAG that a vertex of a recorded one stands for."""
+    for other in target.vertices:
+        if other.name == vertex.name:
+            return other
+    key = vertex.callback.key
+    same = [other for other in target.vertices if other.callback.key == key]
+    alone = Counter(other.callback.key for other in dag.vertices)[key] == 1
+    return same[0] if alone and len(same) == 1 else None
+
+
+def _legs(vertex: Vertex, other: Vertex) -> list[int]:
+    """Return for each leg of a vertex the leg of the other with its topic; none: no match."""
+    topics, theirs = vertex.callback.topics, other.callback.topics
+    if max(len(topics), len(theirs)) <= 1:
+        return [0]
+    if sorted(topics) != sorted(theirs):
+        return []
+    return [theirs.index(topic) for topic in topics]
+
+
+def _listed(names: list[str]) -> str:
+    more = len(names) - _LONGEST_LIST
+    return ', '.join(names[:_LONGEST_LIST]) + (f', … ({more} more)' if more > 0 else '')

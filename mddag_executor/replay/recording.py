@@ -1,0 +1,121 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A trace of this executor: what its head says, and its events in the order of time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+import os
+from typing import Any, NamedTuple
+
+from mddag_executor.errors import InputError
+from mddag_executor.trace import TraceError, TraceReader
+from msg_graph import GraphError, loads, TaskSet
+
+TASK_SET = 'mddag:task_set'
+_RECORD = 'record a run with mddag run GRAPH … --trace'
+
+
+class ReplayError(InputError):
+    """A trace that holds nothing to replay; its text is `FILE: what is wrong: what to do`."""
+
+
+class Head(NamedTuple):
+    """What the executor wrote when it began to record: its declaration and its settings."""
+
+    time: int
+    yaml: str
+    file: str
+    policy: str
+    workers: int
+    default_deadline: int
+    max_active_jobs: int
+    preemptive: bool
+
+
+class Recording:
+    """
+    A recorded run.
+
+    :param path: the trace.
+    :param name: what messages call it, where that is not its path (standard input).
+    :raises mddag_executor.trace.TraceError: when it is no trace.
+    :raises ReplayError: when no run of this executor is recorded in it.
+    :raises msg_graph.GraphError: when the recorded declaration is wrong.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], name: str | None = None) -> None:
+        self.path = os.fspath(path)
+        self.name = name or self.path
+        with self._named():
+            self._reader = TraceReader(self.path)
+            self.head = self._read_head()
+        #: The DAG tasks that the trace was recorded with; its events refer to them by index.
+        self.task_set = self._declared()
+
+    def _read_head(self) -> Head:
+        for event in self._reader.events({TASK_SET}):
+            if None in event:
+                continue  # written by something else: fields are missing
+            return Head(event[1], *event[4:])
+        what = 'no run of this executor is recorded in it'
+        if self._reader.warnings:
+            what = 'no run of this executor is recorded in what is left of it, it is damaged'
+        raise ReplayError(
+            self.path, f'{what}: there is no event {TASK_SET}, so there are no jobs', _RECORD)
+
+    def _declared(self) -> TaskSet:
+        if not self.head.yaml.strip():
+            raise ReplayError(
+                self.name, 'it was recorded without a declaration, so there are no jobs', _RECORD)
+        try:
+            return loads(self.head.yaml, self.head.file or self.name)
+        except GraphError as error:
+            raise ReplayError(
+                self.name, f'the declaration that it was recorded with is wrong ({error})',
+                'record the run anew') from None
+
+    @property
+    def message_count(self) -> int | None:
+        """Return how many messages the trace is said to hold, None where that is not known."""
+        return self._reader.message_count
+
+    @property
+    def warnings(self) -> list[str]:
+        """Return what is missing of the trace, once ``events`` has come to its end."""
+        return [self._rename(text) for text in self._reader.warnings]
+
+    def events(self, names: Iterable[str]) -> Iterator[tuple[Any, ...]]:
+        """
+        Yield the named events in the order of time; see ``TraceReader.events``.
+
+        :raises mddag_executor.trace.TraceError: when the file can no longer be read.
+        """
+        with self._named():
+            yield from self._reader.events(names, sorted=True)
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Let errors about the file call it by its name."""
+        try:
+            yield
+        except TraceError as error:
+            raise TraceError(self._rename(error.file), error.problem, error.remedy) from None
+        except ReplayError as error:
+            raise ReplayError(self._rename(error.file), error.problem, error.remedy) from None
+
+    def _rename(self, text: str) -> str:
+        return self.name + text[len(self.path):] if text.startswith(self.path) else text

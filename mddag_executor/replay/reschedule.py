@@ -1,0 +1,196 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Replay rescheduled: what the core would have done with the recorded releases.
+
+The recorded load (see ``load``) goes through the engine of the simulator: the same core, the
+graph's edges made true by completions, virtual time.  What became of a job in the recording does
+not matter, only when it was released and how long its callbacks took.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from mddag_executor.core import NEVER, POLICIES, Tables, Tally
+from mddag_executor.core import policy as find_policy
+from mddag_executor.core.jobs import finish
+from mddag_executor.core.state import new_state
+from mddag_executor.errors import UsageError
+from mddag_executor.replay.as_recorded import Progress, recording_result, Replay
+from mddag_executor.replay.follower import Follower
+from mddag_executor.replay.judge import Judge
+from mddag_executor.replay.load import LoadBuilder, RecordedGroups, RecordedLoad, with_groups
+from mddag_executor.replay.mapping import Mapping
+from mddag_executor.replay.recording import Head, Recording, ReplayError
+from mddag_executor.replay.usage import share, Usage
+from mddag_executor.simulate.engine import LogEntry, run, START
+from msg_graph import TaskSet
+
+MAX_WORKERS = 4096
+_LONGEST_LIST = 5
+
+
+class Reschedule:
+    """
+    What the core makes of a recorded load.
+
+    :ivar recorded: the same recording as it was.
+    :ivar log: every start, end and preemption, on the trace's clock.
+    :ivar warnings: what is missing or doubtful, one line each.
+    """
+
+    def __init__(
+        self, recording: Recording, follower: Follower, recorded: Replay, work: RecordedLoad,
+        tables: Tables, policy: str, workers: int, preemptive: bool,
+    ) -> None:
+        self._recording = recording
+        self._follower = follower
+        self._work = work
+        self.recorded = recorded
+        self.task_set = recorded.task_set
+        self.tables = tables
+        self.policy = policy
+        self.workers = workers
+        self.preemptive = preemptive
+        self.warnings = recorded.warnings
+        self.log: list[LogEntry] = []
+        self.tally = Tally(self.task_set, tables)
+        self._run()
+
+    def _run(self) -> None:
+        state = new_state(self.tables, self.workers, preemptive=self.preemptive)
+        load, end = self._work.load, self._follower.end
+        run(self.tables, state, find_policy(self.policy).key, load, end, False, self.log)
+        finish(self.tables, state, end)
+        for time, dag in zip(load.times, load.dags):
+            if time < end:
+                self.tally.released(dag)
+        self.tally.add(state.decisions)
+
+    def recorded_job(self, dag: int, job: int) -> int:
+        """Return the recorded index of a job of the log or tally."""
+        return self._work.jobs[dag][job]
+
+    def worker_busy(self) -> list[int]:
+        """Return for each worker how long it was busy, ns."""
+        busy = [0] * self.workers
+        since = [-1] * self.workers
+        for time, kind, worker, *_ in self.log:
+            if since[worker] >= 0:
+                busy[worker] += time - since[worker]
+            since[worker] = time if kind == START else -1
+        for worker, start in enumerate(since):
+            if start >= 0:
+                busy[worker] += self._follower.end - start
+        return busy
+
+    def result(self) -> dict[str, Any]:
+        """Return the result format of ``replay --json``, with the recorded run beside it."""
+        duration = self.recorded.duration_ns
+        busy = self.worker_busy()
+        verdicts = self.tally.result()
+        miss = verdicts['first_miss']
+        if miss is not None:
+            dag = self.task_set.dag(miss['dag']).index
+            miss = {**miss, 'job': self.recorded_job(dag, miss['job'])}
+        return {
+            'policy': self.policy, 'workers': self.workers, 'preemptive': self.preemptive,
+            'duration_ns': duration,
+            'utilisation': share(self._work.demand, self.workers, duration),
+            **verdicts, 'first_miss': miss, 'rescheduled': True,
+            'executions': self._work.executions, 'estimated_executions': self._work.estimated,
+            'worker_use': {
+                'busy_ns': {str(w): took for w, took in enumerate(busy)},
+                'use': share(sum(busy), self.workers, duration)},
+            'recorded': {
+                'policy': self._recording.head.policy, 'workers': self._recording.head.workers,
+                **self.recorded.tally.result()},
+            'recording': recording_result(self._recording, self._follower),
+            'warnings': self.warnings}
+
+
+def reschedule(
+    path: str | os.PathLike[str],
+    task_set: TaskSet | None = None,
+    *,
+    policy: str | None = None,
+    workers: int | None = None,
+    preemptive: bool = False,
+    name: str | None = None,
+    progress: Progress | None = None,
+) -> Reschedule:
+    """
+    Run the core over the releases and execution times of a trace.
+
+    :param path: a trace of this executor.
+    :param task_set: the declaration to schedule by; None: the one in the trace.
+    :param policy: a row of ``mddag_executor.core.POLICIES``; None: as recorded.
+    :param workers: size of the pool; None: as recorded.
+    :param preemptive: whether a smaller key takes the worker of a larger one.
+    :param name: what messages call the trace, where that is not its path.
+    :param progress: told now and then how many events have been read.
+    :raises mddag_executor.trace.TraceError: when it is no trace.
+    :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, none of the
+        declaration's callbacks, or an execution time that is neither recorded nor declared.
+    :raises mddag_executor.errors.MddagError: on a policy or number of workers that can not be.
+    """
+    if policy is not None:
+        find_policy(policy)
+    if workers is not None and not 1 <= workers <= MAX_WORKERS:
+        raise UsageError(f'workers: {workers} can not be: give 1 to {MAX_WORKERS}')
+    recording = Recording(path, name)
+    policy, workers = _settings(recording.head, recording.name, policy, workers)
+    mapping = Mapping(recording, task_set)
+    head = recording.head
+    bound = head.max_active_jobs if head.max_active_jobs > 0 else NEVER
+    tables = Tables.build(
+        mapping.task_set, default_deadline=head.default_deadline, max_active_jobs=bound)
+    judge = Judge(mapping.task_set, compare=mapping.same)
+    usage = Usage(mapping.task_set)
+    builder = LoadBuilder(mapping.task_set, tables)
+    groups = RecordedGroups()
+    follower = Follower(recording, mapping, [judge, usage, builder], groups.handlers())
+    follower.run(progress)
+    recorded = Replay(recording, mapping, judge, usage, follower)
+    work = builder.build()
+    if work.unknown:
+        raise ReplayError(
+            recording.name, f'{len(work.unknown)} callbacks neither completed in it nor declare '
+            f'an execution_time: {", ".join(work.unknown[:_LONGEST_LIST])}',
+            'give a GRAPH that declares it')
+    tables = with_groups(
+        tables, builder.callback_of, groups.by_callback(), declared_first=not mapping.same)
+    return Reschedule(
+        recording, follower, recorded, work, tables, policy, workers, preemptive)
+
+
+def _settings(
+    head: Head, name: str, policy: str | None, workers: int | None
+) -> tuple[str, int]:
+    """Return policy and workers: as asked for, or else as recorded."""
+    if policy is None:
+        policy = head.policy
+        if policy not in POLICIES:
+            raise ReplayError(
+                name, f"it was recorded with policy '{policy}', which this version does not have",
+                f'give --policy, one of {", ".join(POLICIES)}')
+    if workers is None:
+        workers = head.workers
+        if not 1 <= workers <= MAX_WORKERS:
+            raise ReplayError(
+                name, f'it says that it was recorded with {workers} workers', 'give --workers')
+    return policy, workers

@@ -1,0 +1,109 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How much the callbacks ran and waited, and how busy the workers were."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from mddag_executor.replay.follower import Execution, Observer, Piece
+from msg_graph import TaskSet
+
+
+class CallbackUse:
+    """Counts and sums of one callback's executions, ns."""
+
+    __slots__ = ('executions', 'busy', 'longest', 'waiting', 'longest_wait')
+
+    def __init__(self) -> None:
+        self.executions = 0
+        self.busy = 0
+        self.longest = 0
+        self.waiting = 0
+        self.longest_wait = 0
+
+    def result(self) -> dict[str, int]:
+        """Return the callback's part of the result; the sums are over all executions."""
+        return {
+            'executions': self.executions, 'busy_ns': self.busy, 'longest_ns': self.longest,
+            'waiting_ns': self.waiting, 'longest_wait_ns': self.longest_wait}
+
+
+class Usage(Observer):
+    """
+    Adds up what ran.
+
+    An execution of a declared callback counts when it has completed; what it took so far counts
+    at once, also where it never completed.
+    """
+
+    def __init__(self, task_set: TaskSet) -> None:
+        self._by_key = {c.key: CallbackUse() for c in task_set.callbacks}
+        self._by_vertex = [self._by_key[v.callback.key] for v in task_set.vertices]
+        self.undeclared = CallbackUse()
+        self.by_worker: Counter[int] = Counter()
+
+    def ran(self, piece: Piece) -> None:
+        """Add a piece of an execution."""
+        took = piece.end - piece.start
+        self.by_worker[piece.worker] += took
+        if piece.vertex >= 0:
+            use = self._by_vertex[piece.vertex]
+        else:
+            use = self.undeclared
+            use.executions += piece.first
+            use.longest = max(use.longest, took)
+        use.busy += took
+        if piece.first:
+            waited = piece.start - piece.ready
+            use.waiting += waited
+            if waited > use.longest_wait:
+                use.longest_wait = waited
+
+    def completed(
+        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
+        execution: Execution | None,
+    ) -> None:
+        """Count an execution."""
+        use = self._by_vertex[vertex]
+        use.executions += 1
+        if execution is not None and execution.busy > use.longest:
+            use.longest = execution.busy
+
+    @property
+    def busy(self) -> int:
+        """Return how long declared callbacks ran altogether, ns."""
+        return sum(use.busy for use in self._by_key.values())
+
+    def callbacks(self) -> dict[str, dict[str, int]]:
+        """Return what each declared callback used, in file order."""
+        return {key: use.result() for key, use in self._by_key.items()}
+
+    def workers(self, count: int, duration: int) -> dict[str, Any]:
+        """Return how busy the workers were; ``lent`` is what ran beside them (blocking calls)."""
+        busy = {str(w): self.by_worker[w] for w in sorted(self.by_worker) if w >= 0}
+        total = sum(self.by_worker.values())
+        return {
+            'busy_ns': busy,
+            'lent_ns': sum(took for w, took in self.by_worker.items() if w < 0),
+            'use': share(total, count, duration)}
+
+
+def share(busy: int, workers: int, duration: int) -> float | None:
+    """Return the share of the workers' time that was busy, None where there is no time."""
+    if workers < 1 or duration <= 0:
+        return None
+    return busy / (workers * duration)

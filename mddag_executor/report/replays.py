@@ -1,0 +1,127 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Tables of a replay: where the time of each sink went, what each callback took."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from mddag_executor.report.tables import counts, percent, short_names, total
+from mddag_executor.report.text import Cell, format_ns, printable, table
+
+_TIMES_HEADER = (
+    'DAG', 'sink', 'release lag', 'waiting', 'executing', 'suspended', 'transport',
+    'worst job', 'waiting', 'executing', 'suspended', 'transport')
+_CALLBACKS_HEADER = (
+    'callback', 'executions', 'busy', 'mean', 'longest', 'mean wait', 'longest wait')
+_COMPARISON_HEADER = (
+    'DAG', 'sink', 'deadline', 'in time', 'recorded', 'median', 'recorded', 'p99', 'recorded',
+    'max', 'recorded')
+
+
+def times_table(dags: Mapping[str, Any]) -> str:
+    """Return a table of where the response times went: on average, and for the worst job."""
+    short = short_names(name for dag in dags.values() for name in dag['sinks'])
+    rows: list[list[Cell]] = []
+    for dag_name, dag in dags.items():
+        shown = dag_name
+        for name, sink in dag['sinks'].items():
+            breakdown = sink['breakdown']
+            if breakdown is None:
+                rows.append([shown, short[name], *[None] * 10])
+            else:
+                mean, worst = breakdown['mean'], breakdown['worst']
+                rows.append([
+                    shown, short[name], _time(mean['release_lag_ns']), *_parts(mean),
+                    worst['job'], *_parts(worst)])
+            shown = ''
+    return table(_TIMES_HEADER, rows)
+
+
+def _parts(parts: Mapping[str, int]) -> list[Cell]:
+    return [_time(parts[f'{key}_ns'])
+            for key in ('waiting', 'executing', 'suspended', 'transport')]
+
+
+def _time(nanoseconds: int) -> str:
+    return format_ns(nanoseconds, 3)
+
+
+def callbacks_table(callbacks: Mapping[str, Mapping[str, int]]) -> str:
+    """Return a table with a row for each declared callback."""
+    rows: list[list[Cell]] = []
+    for key, use in callbacks.items():
+        n = use['executions']
+        rows.append([
+            key, n, _time(use['busy_ns']), _time(use['busy_ns'] // n) if n else None,
+            _time(use['longest_ns']), _time(use['waiting_ns'] // n) if n else None,
+            _time(use['longest_wait_ns'])])
+    return table(_CALLBACKS_HEADER, rows)
+
+
+def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> str:
+    """Return a table of rescheduled sinks, each figure beside the recorded one."""
+    short = short_names(name for dag in dags.values() for name in dag['sinks'])
+    rows: list[list[Cell]] = []
+    for dag_name, dag in dags.items():
+        shown = dag_name
+        for name, sink in dag['sinks'].items():
+            before = recorded[dag_name]['sinks'][name]
+            row: list[Cell] = [shown, short[name], format_ns(sink['relative_deadline_ns'])]
+            for side in (sink, before):
+                verdicts = counts(side)
+                row.append(f'{verdicts.in_time} of {verdicts.due}')
+            for key in ('median', 'p99', 'max'):
+                for side in (sink, before):
+                    response = side['response_ns']
+                    row.append(None if response is None else format_ns(response[key]))
+            rows.append(row)
+            shown = ''
+    return table(_COMPARISON_HEADER, rows)
+
+
+def summary(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the lines that stand below the tables of a replay."""
+    every = total(result['dags'])
+    yield (f'{every.due} sink jobs due, {every.in_time} in time '
+           f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
+           + (f', {every.aborted} aborted' if every.aborted else ''))
+    yield (f'policy {printable(result["policy"])}, {result["workers"]} workers'
+           + (', preemptive' if result['preemptive'] else '')
+           + f', {format_ns(result["duration_ns"])}, utilisation {_share(result["utilisation"])}'
+           + f' (all callbacks: {_share(result["worker_use"]["use"])})')
+    miss = result['first_miss']
+    if miss is not None:
+        late = 'never completed' if miss['completed_ns'] is None else \
+            f'{format_ns(miss["completed_ns"] - miss["deadline_ns"])} late'
+        yield f'first miss: {printable(miss["vertex"])}, job {miss["job"]}, {late}'
+    if result['rescheduled']:
+        if result['estimated_executions']:
+            yield (f'{result["estimated_executions"]} of {result["executions"]} executions did '
+                   'not complete in the recording: they take the median of their callback')
+        return
+    undeclared = result['undeclared']
+    if undeclared['executions']:
+        yield (f'{undeclared["executions"]} runs of undeclared callbacks, '
+               f'{format_ns(undeclared["busy_ns"])} altogether')
+    dropped = result['dropped']
+    if dropped:
+        yield f'{sum(dropped.values())} dropped: ' + ', '.join(
+            f'{printable(reason)} {n}' for reason, n in dropped.items())
+
+
+def _share(value: float | None) -> str:
+    return '-' if value is None else f'{value:.3f}'

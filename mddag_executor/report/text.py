@@ -1,0 +1,92 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Text for people: aligned tables, times with units, and names from files made harmless."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+import re
+
+Cell = str | int | float | None
+
+_NUMBER = re.compile(r'[-+]?[\d,]+(\.\d+)?( ?(%|ns|us|ms|s|min|h|MB|KB))?|-|')
+_UNITS = ((1, 'ns'), (1_000, 'us'), (1_000_000, 'ms'), (1_000_000_000, 's'))
+
+
+def printable(text: str) -> str:
+    r"""
+    Return a text with control characters written as escapes (`\x1b`).
+
+    Names come from files; a terminal must never obey what stands in them. Escaped are also
+    line breaks, changes of the writing direction and lone surrogates.
+    """
+    if text.isprintable():
+        return text
+    return ''.join(c if c.isprintable() else c.encode('unicode_escape').decode() for c in text)
+
+
+def format_ns(nanoseconds: int, digits: int = 4) -> str:
+    """
+    Return a time for people, for instance `12.34 ms`.
+
+    An exact value has no zeros at the end (`100 ms`); a rounded one keeps them (`100.0 ms`).
+
+    :param nanoseconds: the time
+    :param digits: how many digits count
+    """
+    sign, size = ('-', -nanoseconds) if nanoseconds < 0 else ('', nanoseconds)
+    text, unit = '', ''
+    for scale, unit in _UNITS:
+        value = size / scale
+        decimals = max(0, digits - len(str(int(value))))
+        text = f'{value:.{decimals}f}'
+        # Rounding may carry: 999.96 us is 1.000 ms, not 1000.0 us.
+        if float(text) < 1000 or unit == 's':
+            break
+    exact = round(float(text) * scale) == size
+    if '.' in text and exact:
+        text = text.rstrip('0').rstrip('.')
+    return f'{sign}{text} {unit}'
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
+    """
+    Return an aligned table; columns of numbers (also with a unit) are right-aligned.
+
+    :param header: the titles of the columns
+    :param rows: their cells; None is printed as `-`, a float with two decimals
+    :raises ValueError: when a row has more or fewer cells than the header
+    """
+    body = [[_cell(cell) for cell in row] for row in rows]
+    for row in body:
+        if len(row) != len(header):
+            raise ValueError(f'a row of {len(row)} cells under {len(header)} titles')
+    columns = list(zip(*body)) if body else [() for _ in header]
+    right = [bool(column) and all(_NUMBER.fullmatch(cell) for cell in column)
+             for column in columns]
+    lines = [[printable(title) for title in header], *body]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    return ''.join(
+        '  '.join(cell.rjust(width) if is_right else cell.ljust(width)
+                  for cell, width, is_right in zip(line, widths, right)).rstrip() + '\n'
+        for line in lines)
+
+
+def _cell(cell: Cell) -> str:
+    if cell is None:
+        return '-'
+    if isinstance(cell, float):
+        return f'{cell:.2f}'
+    return printable(str(cell))

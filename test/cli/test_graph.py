@@ -1,0 +1,128 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `graph check`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import json
+from pathlib import Path
+import subprocess
+
+import pytest
+
+Mddag = Callable[..., subprocess.CompletedProcess[str]]
+
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: t, timer: 10ms, publishes: [/a], dag: one, execution_time: 2ms}
+      - {name: x, subscription: /a, deadline: 5ms, execution_time: {quantiles_us: [1000, 3000]}}
+      - {name: y, subscription: /a, deadline: 50ms, reads: [x], execution_time: 5ms}
+      - {name: u, timer: 20ms, deadline: 20ms}
+paths:
+  - {name: p, callbacks: ['/n:t', '/n:x', '/n:y']}
+"""
+
+
+def test_json(mddag: Mddag, tmp_path: Path) -> None:
+    (tmp_path / 'g.yaml').write_text(GRAPH)
+    done = mddag('graph', 'check', 'g.yaml', '--json', 'out.json', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert 'one' in done.stdout
+    result = json.loads((tmp_path / 'out.json').read_text())
+    assert result == {
+        'dags': {
+            'one': {
+                'period_ns': 10_000_000, 'vertices': ['/n:t', '/n:x', '/n:y'],
+                'edges': [[0, 1], [0, 2]], 'sinks': {'/n:x': 5_000_000, '/n:y': 50_000_000},
+                'rad_offset_ns': [5_000_000, 5_000_000, 50_000_000],
+                'critical_path_ns': 7_000_000, 'utilisation': 0.9},
+            '/n': {
+                'period_ns': 20_000_000, 'vertices': ['/n:u'], 'edges': [],
+                'sinks': {'/n:u': 20_000_000}, 'rad_offset_ns': [20_000_000],
+                'critical_path_ns': None, 'utilisation': None}},
+        'vertices': 4, 'callbacks': 4, 'workers': None, 'utilisation': None,
+        'queue_edges': [{'reader': '/n:y', 'topic': None, 'writers': ['/n:x']}],
+        'paths': {'p': ['/n:t', '/n:x', '/n:y']}}
+
+
+def test_table(mddag: Mddag, tmp_path: Path) -> None:
+    (tmp_path / 'g.yaml').write_text(GRAPH)
+    done = mddag('graph', 'check', 'g.yaml', cwd=tmp_path)
+    assert done.returncode == 0
+    rows = [line.split() for line in done.stdout.splitlines()]
+    assert rows[1] == ['one', '10', 'ms', '3', '7', 'ms', '0.9000', '/n:x', '5', 'ms']
+    assert rows[2] == ['/n:y', '50', 'ms']
+    assert rows[3] == ['/n', '20', 'ms', '1', '-', '-', '/n:u', '20', 'ms']
+    assert done.stdout.splitlines()[-1] == (
+        '2 DAGs, 4 vertices, 4 callbacks, 1 queue edges, 1 paths')
+
+
+def test_standard_input_and_output(mddag: Mddag) -> None:
+    text = (CONFIG / 'autoware_multi.yaml').read_text()
+    done = mddag('graph', 'check', '-', '--json', '-', input=text)
+    assert (done.returncode, done.stderr) == (0, '')
+    result = json.loads(done.stdout)
+    assert len(result['dags']) == 11
+    control = result['dags']['control']
+    assert control['rad_offset_ns'] == [15_000_000, 30_000_000, *[15_000_000] * 3]
+    assert list(control['sinks'].values()) == [30_000_000, 15_000_000]
+
+
+def test_total_of_the_workload(mddag: Mddag) -> None:
+    done = mddag('graph', 'check', CONFIG / 'autoware.yaml')
+    assert done.stdout.splitlines()[-1] == (
+        '11 DAGs, 86 vertices, 84 callbacks, 32 queue edges, 5 paths, utilisation 5.102 '
+        '(0.729 of 7 workers)')
+
+
+@pytest.mark.parametrize(('text', 'line'), [
+    (GRAPH.replace('deadline: 5ms', 'deadine: 5ms'),
+     "error: g.yaml:6: callback 2 of node '/n': unknown key 'deadine': did you mean 'deadline'?"),
+    (GRAPH.replace('subscription: /a, deadline: 5ms', 'subscription: /b, deadline: 5ms'),
+     "error: g.yaml:6: callback '/n:x': nobody publishes '/b': add it to a 'publishes:', "
+     "or add 'period:' if it comes from outside of the graph"),
+    ('', "error: g.yaml: the file is empty: write a declaration that starts with 'mddag: 1'"),
+])
+def test_bad_input_is_one_line(mddag: Mddag, tmp_path: Path, text: str, line: str) -> None:
+    (tmp_path / 'g.yaml').write_text(text)
+    done = mddag('graph', 'check', 'g.yaml', '--json', 'out.json', cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, '')
+    assert done.stderr == line + '\n'
+    assert not (tmp_path / 'out.json').exists()
+
+
+def test_missing_file_and_bad_usage(mddag: Mddag, tmp_path: Path) -> None:
+    done = mddag('graph', 'check', 'none.yaml', cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith('error: none.yaml: the file cannot be read (No such file')
+    assert done.stderr.count('\n') == 1
+    for arguments in (('graph',), ('graph', 'chek', 'g'), ('graph', 'check')):
+        done = mddag(*arguments)
+        assert done.returncode == 2
+        assert done.stderr.startswith('error: ')
+        assert done.stderr.count('\n') == 1
+
+
+def test_help_has_an_example(mddag: Mddag) -> None:
+    for arguments in (('graph', '--help'), ('graph', 'check', '--help')):
+        done = mddag(*arguments)
+        assert done.returncode == 0
+        assert 'mddag graph check config/autoware.yaml' in done.stdout
+    assert 'mean execution times' in done.stdout

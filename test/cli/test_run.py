@@ -1,0 +1,238 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+from mddag_executor.report.tables import counts, percent, short_names, sink_table, total
+import pytest
+
+Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /sensor
+    callbacks:
+      - {name: tick, timer: 20ms, dag: main, publishes: [/data], execution_time: 2ms}
+  - node: /quick
+    callbacks:
+      - {name: cb, subscription: /data, deadline: 500ms, execution_time: 1ms}
+  - node: /slow
+    callbacks:
+      - {name: cb, subscription: /data, deadline: 10ms, execution_time: 15ms}
+"""
+
+
+@pytest.fixture
+def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / 'graph.yaml'
+    path.write_text(GRAPH)
+    return path
+
+
+# --- bad input -----------------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (['none.yaml', '--synthetic', 'sleep'], 'none.yaml: '),
+    (['graph.yaml'], 'one of the arguments --node --synthetic is required'),
+    (['graph.yaml', '--synthetic', 'sleep', '--node', 'a:b'], 'not allowed with argument'),
+    (['graph.yaml', '--synthetic', 'fast'], "invalid choice: 'fast'"),
+    (['graph.yaml', '--synthetic', 'sleep', '--policy', 'edf'], "policy 'edf': there is no such"),
+    (['graph.yaml', '--synthetic', 'sleep', '--workers', '0'], "'0' is no whole number from 1"),
+    (['graph.yaml', '--synthetic', 'sleep', '--utilisation', 'nan'], 'no number above zero'),
+    (['graph.yaml', '--synthetic', 'sleep', '--utilisation', '-1'], 'no number above zero'),
+    (['graph.yaml', '--synthetic', 'sleep', '--duration', '20'], 'has no unit'),
+    (['graph.yaml', '--synthetic', 'sleep', '--duration=-1s'], 'is negative'),
+    (['graph.yaml', '--synthetic', 'sleep', '--seed', 'x'], 'invalid int value'),
+    (['graph.yaml', '--synthetic', 'sleep', '--trace', 'no/such/dir/x.mcap'],
+     'no/such/dir/x.mcap: there is no directory no/such/dir'),
+    (['graph.yaml', '--synthetic', 'sleep', '--trace', '.'], 'this is a directory'),
+    (['graph.yaml', '--synthetic', 'sleep', '--trace', '-'], 'name a file'),
+    (['graph.yaml', '--synthetic', 'sleep', '--json', 'no/such/dir/x.json'], 'no directory'),
+    (['graph.yaml', '--synthetic', 'sleep', '--ros-args', '-r', 'x'], '--ros-args -r x: '),
+    (['graph.yaml', '--node', 'os:getcwd', '--utilisation', '0.5'], 'add --synthetic or leave'),
+    (['graph.yaml', '--node', 'nowhere:main'], '--node nowhere:main: there is no module'),
+    (['bad.yaml', '--node', 'nowhere:main'], 'bad.yaml:1: '),
+    (['untimed.yaml', '--synthetic', 'sleep', '--utilisation', '0.5'], 'declare execution_time'),
+])
+def test_bad_input_is_one_line_and_starts_nothing(
+    graph: Path, mddag: Mddag, arguments: list[str], message: str
+) -> None:
+    Path('bad.yaml').write_text('mddag: 2\n')
+    Path('untimed.yaml').write_text(
+        'mddag: 1\nnodes:\n  - node: /a\n    callbacks: [{name: a, timer: 1ms, deadline: 1ms}]\n')
+    before = set(Path('.').iterdir())
+    process = mddag('run', *arguments)
+    assert process.returncode == 2
+    assert process.stdout == ''
+    assert process.stderr.startswith('error: ')
+    assert message in process.stderr
+    assert process.stderr.count('\n') == 1
+    assert set(Path('.').iterdir()) == before
+
+
+def test_the_declaration_comes_from_standard_input(graph: Path, mddag: Mddag) -> None:
+    process = mddag(
+        'run', '-', '--synthetic', 'sleep', '--duration', '0.2s', '--json', '-', input=GRAPH)
+    assert process.returncode == 0, process.stderr
+    assert json.loads(process.stdout)['file'] == '<stdin>'
+
+
+# --- runs ----------------------------------------------------------------------------------------
+
+def test_a_synthetic_run_is_counted_measured_and_recorded(graph: Path, mddag: Mddag) -> None:
+    process = mddag(
+        'run', graph, '--synthetic', 'sleep', '--duration', '2s', '--workers', '3',
+        '--trace', 'out.mcap', '--json', 'result.json')
+    assert process.returncode == 0, process.stderr
+    assert process.stderr == (
+        'warning: /slow:cb: with seed 0 its critical path takes 17.0 ms, and its deadline is '
+        '10.0 ms: no scheduler can keep it\n')
+    result = json.loads(Path('result.json').read_text())
+    assert (result['policy'], result['workers'], result['synthetic']) == ('rad', 3, 'sleep')
+    sinks = result['dags']['main']['sinks']
+    quick, slow = sinks['/quick:cb'], sinks['/slow:cb']
+    assert 120 <= quick['completed'] <= 152  # 1 s of warm-up and 2 s, every 20 ms
+    assert quick['late'] == 0
+    assert slow['late'] >= slow['completed'] >= 120
+    assert slow['response_ns']['min'] >= 16 * 10 ** 6
+    # The executor's books and the nodes' own agree.
+    measured = result['measured']['dags']['main']['sinks']
+    assert abs(measured['/quick:cb']['due'] - 100) <= 1
+    assert measured['/quick:cb']['on_time'] >= measured['/quick:cb']['due'] - 1
+    assert measured['/slow:cb']['on_time'] == 0
+    assert measured['/slow:cb']['late'] >= 99
+    assert result['measured']['attribution'] == {'wrong': 0, 'none': 0}
+    assert result['measured']['utilisation'] == pytest.approx(18 / 20 / 3)
+    assert result['measured']['utilisation_taken'] == pytest.approx(18 / 20 / 3, rel=0.25)
+    assert Path('out.mcap').read_bytes()[:5] == b'\x89MCAP'
+    for text in ('quick:cb', 'slow:cb', '500 ms', 'sink jobs due', 'measured by the nodes, 2.0 s',
+                 '0 dropped', f'trace: {graph.parent / "out.mcap"}'):
+        assert text in process.stdout
+
+
+def test_spinning_takes_cpu_which_is_not_overhead(graph: Path, mddag: Mddag) -> None:
+    process = mddag(
+        'run', graph, '--synthetic', 'spin', '--utilisation', '0.1', '--workers', '4',
+        '--duration', '2s', '--json', '-')
+    assert process.returncode == 0, process.stderr
+    measured = json.loads(process.stdout)['measured']
+    assert (measured['mode'], measured['seed']) == ('spin', 0)
+    # 0.4 of a core for 150 callbacks a second are 2.7 ms each: they must not be in the figure.
+    assert 0 < measured['cpu_us_per_callback'] < 1500
+    assert measured['callbacks_per_s'] == pytest.approx(150, rel=0.1)
+
+
+def test_a_warning_when_spinning_can_not_work(graph: Path, mddag: Mddag) -> None:
+    process = mddag(
+        'run', graph, '--synthetic', 'spin', '--utilisation', '0.6', '--duration', '0.1s')
+    assert 'share the interpreter lock' in process.stderr
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_synthetic_run_within_a_second(graph: Path, number: int) -> None:
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'run', str(graph), '--synthetic', 'sleep',
+         '--trace', 'out.mcap', '--json', 'result.json'],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    time.sleep(4.0)
+    begin = time.monotonic()
+    os.kill(process.pid, number)
+    out, err = process.communicate(timeout=20)
+    assert time.monotonic() - begin < 1.5  # with the interpreter's own end
+    assert process.returncode == 0
+    assert 'Traceback' not in err
+    result = json.loads(Path('result.json').read_text())
+    assert result['measured']['window_ns'] > 5 * 10 ** 8
+    assert result['dags']['main']['sinks']['/quick:cb']['completed'] > 50
+    assert 'sink jobs due' in out
+
+
+def test_a_signal_during_the_warm_up_leaves_a_whole_result(graph: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'run', str(graph), '--synthetic', 'sleep',
+         '--trace', 'out.mcap', '--json', '-'], stdout=subprocess.PIPE, text=True)
+    end = time.monotonic() + 20
+    while not Path('out.mcap').exists() and time.monotonic() < end:
+        time.sleep(0.01)
+    time.sleep(0.4)
+    os.kill(process.pid, signal.SIGINT)
+    out, _ = process.communicate(timeout=20)
+    assert process.returncode == 0
+    assert json.loads(out)['measured'] is None
+
+
+def test_two_workers_are_a_bound(graph: Path, mddag: Mddag) -> None:
+    process = mddag(
+        'run', graph, '--synthetic', 'sleep', '--utilisation', '0.9', '--workers', '2',
+        '--duration', '1s', '--json', '-', '--intake', 'waitset')
+    result = json.loads(process.stdout)
+    assert result['workers'] == 2
+    assert result['measured']['utilisation'] == pytest.approx(0.9, abs=0.001)
+
+
+# --- tables --------------------------------------------------------------------------------------
+
+def sink(completed: int, late: int = 0, **more: Any) -> dict[str, Any]:
+    return {
+        'relative_deadline_ns': 30_000_000, 'completed': completed, 'late': late, 'expired': 0,
+        'response_ns': {'min': 1, 'median': 2_000_000, 'p99': 3_000_000, 'max': 4_000_000}, **more}
+
+
+def test_verdicts_add_up() -> None:
+    # 100 completed, of them 3 late; 2 more were overdue at the end; 4 expired, 1 aborted.
+    found = counts(sink(100, 5, overdue=2, expired=4, aborted=1))
+    assert found == (107, 97, 5, 4, 1)
+    assert found.due == found.in_time + found.late + found.expired + found.aborted
+    sinks = {'/x:a': sink(100, 5, overdue=2), '/x:b': sink(10)}
+    dags: dict[str, Any] = {'a': {'sinks': sinks}, 'b': {'sinks': {}}}
+    assert total(dags) == (112, 107, 5, 0, 0)
+    assert total({}) == (0, 0, 0, 0, 0)
+
+
+def test_the_table_has_a_row_for_each_sink() -> None:
+    text = sink_table({
+        'one': {'sinks': {'/long/way/node:a': sink(10), '/other/node:a': sink(10)}},
+        'two': {'sinks': {'/x/lonely:b': sink(0, response_ns=None)}}})
+    lines = text.splitlines()
+    assert len(lines) == 4
+    assert lines[1].split() == ['one', '/long/way/node:a', '10', '10', '0', '0',
+                                '2', 'ms', '3', 'ms', '4', 'ms', '30', 'ms']
+    assert lines[2].split()[0] == '/other/node:a'
+    assert lines[3].split() == ['two', 'lonely:b', '0', '0', '0', '0', '-', '-', '-', '30', 'ms']
+    assert 'aborted' not in text
+    assert 'aborted' in sink_table({'a': {'sinks': {'/x:a': sink(1, aborted=2)}}})
+
+
+def test_names_are_short_where_that_is_enough() -> None:
+    assert short_names(['/a/b:x', '/c/b:x', '/c/d:x']) == {
+        '/a/b:x': '/a/b:x', '/c/b:x': '/c/b:x', '/c/d:x': 'd:x'}
+
+
+@pytest.mark.parametrize(('part', 'whole', 'text'), [
+    (0, 0, '-'), (0, 9, '0.00 %'), (9, 9, '100.00 %'), (99_999, 100_000, '99.99 %'),
+    (1, 100_000, '0.01 %'), (1, 3, '33.33 %')])
+def test_a_share_is_never_rounded_to_all_or_nothing(part: int, whole: int, text: str) -> None:
+    assert percent(part, whole) == text

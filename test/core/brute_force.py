@@ -1,0 +1,348 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+A second simulator, slow and plain, to compare the core with.
+
+Written from the project's documents (the model, its rules, and what the paper's own program does
+exactly), not from the core, with which it shares no code: it goes tick by tick through time, keeps
+what waits in an unsorted list and looks everything up anew each time.
+
+Its reading of the documents:
+
+* At one instant completions come first, workers in ascending order, each making its successors
+  ready by index; then releases in DAG order; then work is handed out, one by one, as long as there
+  is anything to hand out. Work is handed out only at instants at which something happened.
+* What becomes ready at one instant is ordered: what was preempted then, successors of completions,
+  releases.
+* A DAG with ``max_active_jobs`` open jobs loses the oldest when one more is released: it expires.
+  What it has ready or running goes on, without consequences.
+* ``abort`` takes effect at a late completion, and when what is next to be handed out belongs to a
+  job that has an unfinished sink past its deadline. What has never run of the job vanishes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from fractions import Fraction
+import math
+from typing import Any, NamedTuple
+
+from msg_graph import Dag, TaskSet, Vertex
+
+Event = tuple[int, str, int, int, int, int]
+"""(tick, 'start' | 'end' | 'preempt', worker, DAG, vertex in its DAG, job)."""
+
+PREEMPTED, SUCCESSOR, RELEASED = range(3)
+
+
+@dataclass(eq=False)
+class Job:
+    """A job with its sinks' verdicts."""
+
+    dag: Dag
+    index: int
+    release: int
+    done: set[int] = field(default_factory=set)
+    outcome: str | None = None
+    late: bool = False
+
+
+@dataclass(eq=False)
+class Execution:
+    """A vertex of a job that is ready or runs."""
+
+    job: Job
+    vertex: Vertex
+    left: int
+    arrival: tuple[int, int, int]
+    has_run: bool = False
+
+
+class Miss(NamedTuple):
+    """A missed deadline, ticks; ``completed`` is None where the sink never completed."""
+
+    dag: str
+    vertex: str
+    job: int
+    deadline: int
+    completed: int | None
+
+
+def reachable_sinks(dag: Dag, index: int) -> set[int]:
+    """Return the sinks that a vertex leads to, itself included."""
+    vertex = dag.vertices[index]
+    if not vertex.successors:
+        return {index}
+    return set().union(*(reachable_sinks(dag, after) for after in vertex.successors))
+
+
+class BruteForce:
+    """One simulated run; ``events``, ``misses`` and ``result()`` tell what came out of it."""
+
+    def __init__(
+        self, task_set: TaskSet, ticks: tuple[tuple[int, ...], ...], *, tick: int, horizon: int,
+        workers: int, policy: str, preemptive: bool, dispatch_overhead: int = 0,
+        switch_overhead: int = 0, judge: str = 'horizon', stop_at_first_miss: bool = False,
+        last_release: int | None = None,
+    ) -> None:
+        self.dags = task_set.dags
+        self.ticks = ticks
+        self.tick = tick
+        self.policy = policy
+        self.preemptive = preemptive
+        self.dispatch_overhead = dispatch_overhead
+        self.switch_overhead = switch_overhead
+        self.running: list[Execution | None] = [None] * workers
+        self.waiting: list[Execution] = []
+        self.jobs: list[Job] = []
+        self.events: list[Event] = []
+        self.misses: list[Miss] = []
+        self.counts = {
+            (dag.index, sink): {'completed': 0, 'late': 0, 'overdue': 0, 'expired': 0,
+                                'aborted': 0}
+            for dag in self.dags for sink in dag.sinks}
+        self.responses: dict[tuple[int, int], list[int]] = {key: [] for key in self.counts}
+        self.sequence = 0
+        self.now = 0
+        self._simulate(horizon, stop_at_first_miss, last_release or horizon)
+        if judge == 'horizon' and self.now == horizon:
+            self._judge_open()
+
+    def _simulate(self, horizon: int, stop: bool, last_release: int) -> None:
+        for self.now in range(horizon + 1):
+            happened = self._complete_all()
+            if self.now == horizon:
+                return
+            for dag in self.dags:
+                if self.now < last_release and self.now % self._period(dag) == 0:
+                    self._release(dag)
+                    happened = True
+            if happened:
+                while self._hand_out():
+                    pass
+            if stop and self.misses:
+                return
+            for execution in self.running:
+                if execution is not None:
+                    execution.left -= 1
+
+    # --- times and keys ---------------------------------------------------------------------------
+
+    def _period(self, dag: Dag) -> int:
+        return dag.period_ns // self.tick
+
+    def _deadline(self, job: Job, sink: int) -> int:
+        """Return the absolute deadline of a sink."""
+        relative = job.dag.vertices[sink].deadline_ns
+        assert relative is not None
+        return job.release + relative // self.tick
+
+    def priority(self, execution: Execution) -> int:
+        """Return what decides about preemption."""
+        job = execution.job
+        if self.policy == 'rad':
+            sinks = reachable_sinks(job.dag, execution.vertex.index)
+            return min(self._deadline(job, sink) for sink in sinks)
+        if self.policy == 'gedf':
+            return max(self._deadline(job, sink) for sink in job.dag.sinks)
+        if self.policy == 'rm':
+            return self._period(job.dag)
+        if self.policy == 'wc':
+            return job.index
+        assert self.policy == 'fifo'
+        return execution.arrival[0]
+
+    def key(self, execution: Execution) -> tuple[Any, ...]:
+        """Return the order in which ready executions run."""
+        job = execution.job
+        if self.policy in ('rad', 'gedf'):
+            ties: tuple[Any, ...] = (execution.vertex.index, job.dag.index)
+        elif self.policy == 'rm':
+            ties = (job.index,)
+        else:
+            ties = ()
+        return (self.priority(execution), *ties, execution.arrival)
+
+    # --- jobs -------------------------------------------------------------------------------------
+
+    def _open_jobs(self, dag: Dag) -> list[Job]:
+        return [job for job in self.jobs if job.dag is dag and job.outcome is None]
+
+    def _release(self, dag: Dag) -> None:
+        of_dag = self._open_jobs(dag)
+        if dag.max_active_jobs is not None and len(of_dag) == dag.max_active_jobs:
+            self._give_up(of_dag[0], 'expired')
+        job = Job(dag, sum(job.dag is dag for job in self.jobs), self.now)
+        self.jobs.append(job)
+        self._ready(job, dag.vertices[dag.source], RELEASED)
+
+    def _ready(self, job: Job, vertex: Vertex, why: int) -> None:
+        self.waiting.append(Execution(
+            job, vertex, self.ticks[job.dag.index][vertex.index], self._arrival(why)))
+
+    def _arrival(self, why: int) -> tuple[int, int, int]:
+        self.sequence += 1
+        return (self.now, why, self.sequence)
+
+    def _open_sinks(self, job: Job) -> list[int]:
+        return [sink for sink in job.dag.sinks if sink not in job.done]
+
+    def _give_up(self, job: Job, outcome: str) -> None:
+        job.outcome = outcome
+        for sink in self._open_sinks(job):
+            self.counts[job.dag.index, sink][outcome] += 1
+            self._miss(job, sink, None)
+        if outcome == 'aborted':
+            self.waiting = [e for e in self.waiting if e.job is not job or e.has_run]
+
+    def _miss(self, job: Job, sink: int, completed: int | None) -> None:
+        self.misses.append(Miss(
+            job.dag.name, job.dag.vertices[sink].name, job.index, self._deadline(job, sink),
+            completed))
+
+    def _judge_open(self) -> None:
+        overdue = []
+        for dag in self.dags:
+            for job in self._open_jobs(dag):
+                for sink in self._open_sinks(job):
+                    if self._deadline(job, sink) <= self.now:
+                        self.counts[dag.index, sink]['late'] += 1
+                        self.counts[dag.index, sink]['overdue'] += 1
+                        overdue.append((job, sink))
+        for job, sink in sorted(overdue, key=lambda each: self._deadline(*each)):
+            self._miss(job, sink, None)
+
+    # --- completions ------------------------------------------------------------------------------
+
+    def _complete_all(self) -> bool:
+        happened = False
+        for worker, execution in enumerate(self.running):
+            if execution is not None and execution.left == 0:
+                happened = True
+                self._note('end', worker, execution)
+                self.running[worker] = None
+                self._complete(execution.job, execution.vertex)
+        return happened
+
+    def _complete(self, job: Job, vertex: Vertex) -> None:
+        job.done.add(vertex.index)
+        if job.outcome is not None:
+            return
+        if vertex.index in job.dag.sinks:
+            self._complete_sink(job, vertex.index)
+        if job.outcome is None:
+            for after in vertex.successors:
+                if job.done.issuperset(job.dag.vertices[after].predecessors):
+                    self._ready(job, job.dag.vertices[after], SUCCESSOR)
+
+    def _complete_sink(self, job: Job, sink: int) -> None:
+        late = self.now > self._deadline(job, sink)
+        key = job.dag.index, sink
+        self.counts[key]['completed'] += 1
+        self.responses[key].append(self.now - job.release)
+        if late:
+            job.late = True
+            self.counts[key]['late'] += 1
+            self._miss(job, sink, self.now)
+        if not self._open_sinks(job):
+            job.outcome = 'late' if job.late else 'completed'
+        elif late and job.dag.on_miss == 'abort':
+            self._give_up(job, 'aborted')
+
+    # --- workers ----------------------------------------------------------------------------------
+
+    def _blocked(self, execution: Execution) -> bool:
+        """Tell whether another execution that has begun and not ended holds the group."""
+        callback = execution.vertex.callback
+        if callback.group is None:
+            return False
+        begun = [e for e in self.running if e is not None]
+        begun += [e for e in self.waiting if e.has_run]
+        return any(
+            e is not execution and (e.vertex.callback.node, e.vertex.callback.group)
+            == (callback.node, callback.group) for e in begun)
+
+    def _hand_out(self) -> bool:
+        """Hand out one execution; False when that is not possible."""
+        able = [e for e in self.waiting if not self._blocked(e)]
+        if not able:
+            return False
+        best = min(able, key=self.key)
+        job = best.job
+        if job.outcome is None and job.dag.on_miss == 'abort' and any(
+                self._deadline(job, sink) < self.now for sink in self._open_sinks(job)):
+            self._give_up(job, 'aborted')
+            return True
+        if None in self.running:
+            self._start(best, self.running.index(None))
+            return True
+        if not self.preemptive:
+            return False
+        worst, worker = max(
+            (self.priority(e), w) for w, e in enumerate(self.running) if e is not None)
+        if worst <= self.priority(best):
+            return False
+        victim = self.running[worker]
+        assert victim is not None
+        self._note('preempt', worker, victim)
+        self._start(best, worker)
+        victim.left += self.switch_overhead
+        victim.arrival = self._arrival(PREEMPTED)
+        self.waiting.append(victim)
+        return True
+
+    def _start(self, execution: Execution, worker: int) -> None:
+        self.waiting.remove(execution)
+        execution.has_run = True
+        execution.left += self.dispatch_overhead
+        self.running[worker] = execution
+        self._note('start', worker, execution)
+
+    def _note(self, kind: str, worker: int, execution: Execution) -> None:
+        job, vertex = execution.job, execution.vertex
+        self.events.append((self.now, kind, worker, job.dag.index, vertex.index, job.index))
+
+    # --- what came out of it ----------------------------------------------------------------------
+
+    def result(self) -> dict[str, Any]:
+        """Return the part of the result format that concerns jobs and sinks, times in ns."""
+        return {
+            dag.name: {
+                'jobs': sum(job.dag is dag for job in self.jobs),
+                'ends': {outcome: sum(job.dag is dag and job.outcome == outcome
+                                      for job in self.jobs)
+                         for outcome in ('completed', 'late', 'aborted', 'expired')},
+                'sinks': {dag.vertices[sink].name: self._sink(dag, sink) for sink in dag.sinks}}
+            for dag in self.dags}
+
+    def _sink(self, dag: Dag, sink: int) -> dict[str, Any]:
+        responses = sorted(self.responses[dag.index, sink])
+        response = None
+        if responses:
+            def rank(share: Fraction) -> int:
+                return responses[math.ceil(share * len(responses)) - 1] * self.tick
+
+            response = {'min': responses[0] * self.tick, 'median': rank(Fraction(1, 2)),
+                        'p99': rank(Fraction(99, 100)), 'max': responses[-1] * self.tick}
+        return {'relative_deadline_ns': dag.vertices[sink].deadline_ns,
+                **self.counts[dag.index, sink], 'response_ns': response}
+
+    def first_miss(self) -> dict[str, Any] | None:
+        """Return the miss that was known first, in the result format."""
+        if not self.misses:
+            return None
+        first = self.misses[0]
+        return {'dag': first.dag, 'vertex': first.vertex, 'job': first.job,
+                'deadline_ns': first.deadline * self.tick,
+                'completed_ns': None if first.completed is None else first.completed * self.tick}

@@ -1,0 +1,205 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Random task sets for property tests: declarations as people write them, small times.
+
+One *tick* is a microsecond, the least period that a declaration may have; every time of a random
+task set is a whole number of ticks, so that a slow simulator can go tick by tick.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import json
+import os
+from typing import Any
+
+from hypothesis import HealthCheck, settings, strategies as st
+from mddag_executor.simulate import (
+    END,
+    Load,
+    periodic_load,
+    PREEMPT,
+    Run,
+    Settings,
+    simulate,
+    START,
+)
+from msg_graph import loads, TaskSet
+
+TICK = 1_000
+KINDS = {START: 'start', END: 'end', PREEMPT: 'preempt'}
+
+Event = tuple[int, str, int, int, int, int]
+"""(tick, 'start' | 'end' | 'preempt', worker, DAG, vertex in its DAG, job)."""
+
+_FACTOR = int(os.environ.get('MDDAG_THOROUGH', '1'))
+
+
+def examples(count: int) -> settings:
+    """Return settings for that many examples; MDDAG_THOROUGH=20 in the environment: 20 fold."""
+    return settings(
+        max_examples=count * _FACTOR, deadline=None,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+
+
+@dataclass(frozen=True)
+class Case:
+    """A task set with an execution time (ticks) for each vertex, and how to run it."""
+
+    task_set: TaskSet
+    ticks: tuple[tuple[int, ...], ...]
+    workers: int
+    policy: str
+    preemptive: bool
+    dispatch_overhead: int = 0
+    switch_overhead: int = 0
+
+    @property
+    def times_ns(self) -> list[list[int]]:
+        """Execution times as the simulator takes them."""
+        return [[tick * TICK for tick in row] for row in self.ticks]
+
+    def load(self, ticks: int) -> Load:
+        """Return the periodic load of all releases before a time."""
+        return periodic_load(self.task_set, self.times_ns, ticks * TICK)
+
+    def run(self, horizon: int, judge: str = 'horizon', stop: bool = False,
+            last_release: int | None = None) -> Run:
+        """Simulate it; times in ticks."""
+        settings = Settings(
+            policy=self.policy, workers=self.workers, duration_ns=horizon * TICK,
+            preemptive=self.preemptive, judge=judge, stop_at_first_miss=stop,
+            dispatch_overhead_ns=self.dispatch_overhead * TICK,
+            switch_overhead_ns=self.switch_overhead * TICK)
+        return simulate(self.task_set, self.load(last_release or horizon), settings, log=True)
+
+    def events(self, run: Run) -> list[Event]:
+        """Return a run's log in ticks, with each vertex by its index in its DAG."""
+        first = [0]
+        for dag in self.task_set.dags:
+            first.append(first[-1] + len(dag.vertices))
+        return [(time // TICK, KINDS[kind], worker, dag, vertex - first[dag], job)
+                for time, kind, worker, dag, vertex, job in run.log]
+
+    def __repr__(self) -> str:
+        """Show what is needed to try it by hand."""
+        rest = (self.ticks, self.workers, self.policy, self.preemptive, self.dispatch_overhead,
+                self.switch_overhead)
+        return f'Case(loads({self.task_set.text!r}), {", ".join(map(repr, rest))})'
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        """Show the same in hypothesis' reports."""
+        printer.text(repr(self))
+
+
+def declaration(callbacks: list[dict[str, Any]]) -> TaskSet:
+    """Derive callbacks that each name their node; they stand in the file in this order."""
+    nodes = [{'node': callback['node'],
+              'callbacks': [{k: v for k, v in callback.items() if k != 'node'}]}
+             for callback in callbacks]
+    return loads(json.dumps({'mddag': 1, 'nodes': nodes}), 'random.yaml')
+
+
+def _ticks(draw: st.DrawFn, least: int, most: int) -> str:
+    return f'{draw(st.integers(least, most))}us'
+
+
+def _triggers(draw: st.DrawFn, callbacks: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what starts a callback: one before it, one of two (OR) or both of two (AND)."""
+    kind = draw(st.sampled_from(['one', 'one', 'and', 'or'])) if len(callbacks) > 1 else 'one'
+    if kind == 'one':
+        before = draw(st.sampled_from(callbacks))
+        before['publishes'].add(before['topic'])
+        return {'subscription': before['topic']}
+    two = draw(st.lists(st.sampled_from(callbacks), min_size=2, max_size=2,
+                        unique_by=lambda callback: callback['name']))
+    if kind == 'and':
+        for before in two:
+            before['publishes'].add(before['topic'])
+        return {'sync': [before['topic'] for before in two]}
+    topic = f"{two[0]['topic']}_or{len(callbacks)}"
+    for before in two:
+        before['publishes'].add(topic)
+    return {'subscription': topic}
+
+
+@st.composite
+def task_sets(
+    draw: st.DrawFn, max_dags: int = 3, max_callbacks: int = 5, groups: bool = True,
+    bounds: bool = True,
+) -> TaskSet:
+    """
+    Draw a task set: one to some DAGs with AND, OR, unequal deadlines, shared callbacks.
+
+    :param groups: some callbacks are in mutually exclusive groups, also across DAGs.
+    :param bounds: some DAGs abort late jobs or bound their open jobs.
+    """
+    every: list[dict[str, Any]] = []
+    n_dags = draw(st.integers(1, max_dags))
+    for dag in range(n_dags):
+        mine: list[dict[str, Any]] = []
+        for number in range(draw(st.integers(1, max_callbacks))):
+            callback: dict[str, Any] = {
+                'node': f'/n{draw(st.integers(0, 1))}', 'name': f'd{dag}c{number}',
+                'topic': f'/d{dag}/t{number}', 'publishes': set()}
+            if number:
+                callback.update(_triggers(draw, mine))
+            else:
+                callback['timer'] = _ticks(draw, 3, 15)
+                callback['dag'] = f'dag{dag}'
+                if bounds:
+                    callback['on_miss'] = draw(st.sampled_from(['continue', 'abort']))
+                    if draw(st.booleans()):
+                        callback['max_active_jobs'] = draw(st.integers(1, 3))
+            mine.append(callback)
+        every += mine
+    if n_dags > 1 and draw(st.booleans()):
+        # One callback that two DAGs trigger: a vertex in each of them.
+        before = [draw(st.sampled_from([c for c in every if c['name'].startswith(f'd{dag}')]))
+                  for dag in (0, 1)]
+        for callback in before:
+            callback['publishes'].add('/shared')
+        every.append({'node': '/n0', 'name': 'shared', 'topic': '/shared_out',
+                      'publishes': set(), 'subscription': '/shared'})
+    for callback in every:
+        if groups:
+            group = draw(st.sampled_from([None, None, 'g', 'h']))
+            if group is not None:
+                callback['group'] = group
+        if not callback['publishes']:
+            callback['deadline'] = _ticks(draw, 1, 40)
+        callback['publishes'] = sorted(callback['publishes'])
+        del callback['topic']
+        if not callback['publishes']:
+            del callback['publishes']
+    return declaration(draw(st.permutations(every)))
+
+
+@st.composite
+def cases(
+    draw: st.DrawFn, policies: tuple[str, ...] = ('rad', 'rm', 'wc', 'fifo', 'gedf'),
+    overheads: bool = False, **options: Any,
+) -> Case:
+    """Draw a task set and how to run it."""
+    task_set = draw(task_sets(**options))
+    most = draw(st.sampled_from([2, 5, 9]))  # light load to overload
+    ticks = tuple(
+        tuple(draw(st.lists(st.integers(1, most), min_size=len(dag.vertices),
+                            max_size=len(dag.vertices))))
+        for dag in task_set.dags)
+    return Case(
+        task_set, ticks, draw(st.integers(1, 4)), draw(st.sampled_from(policies)),
+        draw(st.booleans()),
+        draw(st.integers(0, 2)) if overheads else 0, draw(st.integers(0, 2)) if overheads else 0)

@@ -1,0 +1,268 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What must hold of every schedule, read from its log alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from hypothesis import given, strategies as st
+from mddag_executor.core import rad_offsets, Tables
+from mddag_executor.core.state import (
+    ABORTED,
+    COMPLETED,
+    EXPIRED,
+    JOB_END,
+    LATE,
+    SINK_ABORTED,
+    SINK_DONE,
+    SINK_EXPIRED,
+)
+from msg_graph import Dag
+
+from .task_sets import Case, cases, Event, examples, task_sets, TICK
+
+Id = tuple[int, int, int]
+"""DAG, vertex in its DAG, job."""
+
+
+def paths_to_sinks(dag: Dag, index: int) -> Iterator[int]:
+    """Yield the sink at the end of each path from a vertex."""
+    open_paths = [index]
+    while open_paths:
+        vertex = dag.vertices[open_paths.pop()]
+        if vertex.successors:
+            open_paths += vertex.successors
+        else:
+            yield vertex.index
+
+
+def rad_offset(dag: Dag, index: int) -> int:
+    """Return RAD minus release as the paper defines it, ns."""
+    deadlines = [dag.vertices[sink].deadline_ns for sink in paths_to_sinks(dag, index)]
+    return min(deadline for deadline in deadlines if deadline is not None)
+
+
+@dataclass
+class Moment:
+    """All that is ready and runs after what happened at one tick."""
+
+    now: int
+    started: list[Id]
+    preempted: list[tuple[Id, Id]]
+    running: dict[int, Id]
+    waiting: list[Id]
+    blocked: set[Id]
+
+
+class Schedule:
+    """A log of a run without bounds and aborts, taken apart tick by tick."""
+
+    def __init__(self, case: Case, log: list[Event]) -> None:
+        self.case = case
+        self.dags = case.task_set.dags
+        self.log = log
+        self.end: dict[Id, int] = {}
+        for now, kind, _, dag, vertex, job in log:
+            if kind == 'end':
+                assert (dag, vertex, job) not in self.end, 'ended twice'
+                self.end[dag, vertex, job] = now
+        self.ready = self._ready_times()
+
+    def _ready_times(self) -> dict[Id, int]:
+        """Return when each execution that the log names became ready."""
+        ready = {}
+        for _, _, _, d, v, job in self.log:
+            dag = self.dags[d]
+            before = dag.vertices[v].predecessors
+            if not before:
+                ready[d, v, job] = job * dag.period_ns // TICK
+            else:
+                assert all((d, p, job) in self.end for p in before), 'a predecessor never ended'
+                ready[d, v, job] = max(self.end[d, p, job] for p in before)
+        return ready
+
+    def group(self, each: Id) -> tuple[str, str] | None:
+        callback = self.dags[each[0]].vertices[each[1]].callback
+        return None if callback.group is None else (callback.node, callback.group)
+
+    def key(self, each: Id) -> tuple[int, ...]:
+        """Return the part of the documented key that does not depend on the order of events."""
+        d, v, job = each
+        dag = self.dags[d]
+        release = job * dag.period_ns
+        return {
+            'rad': (release + rad_offset(dag, v), v, d),
+            'gedf': (release + max(dag.vertices[s].deadline_ns or 0 for s in dag.sinks), v, d),
+            'rm': (dag.period_ns, job), 'wc': (job,), 'fifo': (self.ready[each],),
+        }[self.case.policy]
+
+    def moments(self) -> Iterator[Moment]:
+        """Yield what is the case after each tick at which something happened."""
+        running: dict[int, Id] = {}
+        begun: set[Id] = set()
+        i = 0
+        while i < len(self.log):
+            now = self.log[i][0]
+            started, preempted = [], []
+            while i < len(self.log) and self.log[i][0] == now:
+                _, kind, worker, *rest = self.log[i]
+                each: Id = (rest[0], rest[1], rest[2])
+                if kind == 'start':
+                    assert worker not in running, 'two at once on a worker'
+                    assert each not in running.values(), 'one on two workers'
+                    if preempted and preempted[-1][1] == (-1, worker, -1):
+                        preempted[-1] = (preempted[-1][0], each)
+                    running[worker] = each
+                    begun.add(each)
+                    started.append(each)
+                else:
+                    assert running.pop(worker) == each
+                    if kind == 'preempt':
+                        preempted.append((each, (-1, worker, -1)))
+                i += 1
+            alive = [e for e, ready in self.ready.items()
+                     if ready <= now and self.end.get(e, now + 1) > now]
+            waiting = [e for e in alive if e not in running.values()]
+            held = {self.group(e): e for e in alive if e in begun and self.group(e) is not None}
+            blocked = {e for e in waiting if held.get(self.group(e), e) != e}
+            yield Moment(now, started, preempted, dict(running), waiting, blocked)
+
+
+plain_cases = cases(bounds=False)
+
+
+@examples(300)
+@given(plain_cases, st.integers(5, 50))
+def test_every_moment(case: Case, horizon: int) -> None:
+    """Order, work conservation, workers, groups and preemption, at every instant of a run."""
+    schedule = Schedule(case, case.events(case.run(horizon)))
+    for moment in schedule.moments():
+        assert len(moment.running) <= case.workers
+        able = [e for e in moment.waiting if e not in moment.blocked]
+        if len(moment.running) < case.workers:
+            assert able == [], 'a worker idles while something may run'
+        for started in moment.started:
+            assert all(schedule.key(e) >= schedule.key(started) for e in able
+                       if e not in [victim for victim, _ in moment.preempted]), (
+                'a smaller key waits while a larger one starts')
+        for victim, preemptor in moment.preempted:
+            assert case.preemptive
+            assert schedule.key(preemptor)[0] < schedule.key(victim)[0], 'not strictly smaller'
+        if case.preemptive and case.policy != 'fifo':  # a preemption makes fifo's keys anew
+            assert all(schedule.key(e)[0] >= schedule.key(r)[0] for e in able
+                       for r in moment.running.values()), 'a preemption was forgotten'
+        groups = Counter(schedule.group(e) for e in moment.running.values())
+        assert all(count == 1 for group, count in groups.items() if group is not None)
+
+
+@examples(200)
+@given(plain_cases, st.integers(5, 50))
+def test_nothing_starts_before_its_predecessors_end(case: Case, horizon: int) -> None:
+    schedule = Schedule(case, case.events(case.run(horizon)))
+    for now, kind, _, dag, vertex, job in schedule.log:
+        if kind == 'start':
+            assert now >= job * case.task_set.dags[dag].period_ns // TICK
+            for before in case.task_set.dags[dag].vertices[vertex].predecessors:
+                assert schedule.end[dag, before, job] <= now
+
+
+@examples(200)
+@given(cases(bounds=False, overheads=True), st.integers(5, 50))
+def test_each_execution_gets_its_time_and_the_overheads(case: Case, horizon: int) -> None:
+    got: Counter[Id] = Counter()
+    asked: Counter[Id] = Counter()
+    since: dict[int, int] = {}
+    log = case.events(case.run(horizon))
+    for now, kind, worker, dag, vertex, job in log:
+        each = (dag, vertex, job)
+        if kind == 'start':
+            since[worker] = now
+            asked[each] += case.dispatch_overhead
+        else:
+            got[each] += now - since.pop(worker)
+            if kind == 'preempt':
+                asked[each] += case.switch_overhead
+            else:
+                assert got[each] == asked[each] + case.ticks[dag][vertex]
+    for each, time in got.items():
+        assert time <= asked[each] + case.ticks[each[0]][each[1]]
+
+
+@examples(200)
+@given(cases(), st.integers(5, 40))
+def test_every_job_ends_in_exactly_one_way(case: Case, last_release: int) -> None:
+    horizon = last_release * (1 + sum(map(sum, case.ticks)))
+    run = case.run(horizon, last_release=last_release)
+    dags = case.task_set.dags
+    released = {(dag.index, job) for dag in dags
+                for job in range(-(-last_release * TICK // dag.period_ns))}
+    ends: dict[tuple[int, int], int] = {}
+    sinks: dict[Id, tuple[int, bool]] = {}
+    for kind, dag, vertex, job, deadline, time in run.decisions:
+        if kind == JOB_END:
+            assert (dag, job) not in ends
+            ends[dag, job] = deadline
+        elif kind in (SINK_DONE, SINK_ABORTED, SINK_EXPIRED):
+            assert (dag, vertex, job) not in sinks
+            sinks[dag, vertex, job] = kind, time > deadline
+    assert set(ends) == released
+    assert len(sinks) == sum(len(dags[dag].sinks) for dag, _ in released)
+    for (dag, job), end in ends.items():
+        mine = [verdict for each, verdict in sinks.items() if (each[0], each[2]) == (dag, job)]
+        kinds = {kind for kind, _ in mine}
+        late = any(late for kind, late in mine if kind == SINK_DONE)
+        if kinds == {SINK_DONE}:
+            assert end == (LATE if late else COMPLETED)
+        else:
+            assert end == (ABORTED if SINK_ABORTED in kinds else EXPIRED)
+            assert not {SINK_ABORTED, SINK_EXPIRED} <= kinds
+    counted: Counter[str] = Counter()
+    for dag_result in run.result()['dags'].values():
+        counted.update(dag_result['ends'])
+    assert sum(counted.values()) == len(released)
+
+
+@examples(100)
+@given(cases(overheads=True), st.integers(5, 50))
+def test_the_same_input_gives_the_same_schedule(case: Case, horizon: int) -> None:
+    first, second = case.run(horizon), case.run(horizon)
+    assert first.log == second.log
+    assert first.decisions == second.decisions
+    assert first.result() == second.result()
+
+
+@examples(100)
+@given(cases(), st.integers(5, 50))
+def test_without_preemption_there_is_none(case: Case, horizon: int) -> None:
+    settings: dict[str, Any] = {**vars(case), 'preemptive': False}
+    plain = Case(**settings)
+    log = plain.events(plain.run(horizon))
+    assert all(kind != 'preempt' for _, kind, *_ in log)
+    starts = Counter(tuple(rest) for _, kind, _, *rest in log if kind == 'start')
+    assert set(starts.values()) <= {1}
+
+
+@examples(300)
+@given(task_sets(max_callbacks=8))
+def test_rad_is_the_least_deadline_of_the_sinks_it_leads_to(task_set: Any) -> None:
+    tables = Tables.build(task_set)
+    for dag in task_set.dags:
+        brute = [rad_offset(dag, vertex.index) for vertex in dag.vertices]
+        assert rad_offsets(dag) == brute
+        first = tables.first_vertex[dag.index]
+        assert tables.rad_offset[first:first + len(dag.vertices)] == brute

@@ -1,0 +1,93 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the tests of the live executor share: executors of both intakes, spinning beside the test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import contextlib
+import threading
+import time
+from typing import Any
+
+from mddag_executor import MultiDeadlineExecutor
+import pytest
+from rclpy.node import Node
+
+
+class Spinning:
+    """An executor that spins in a thread until it is left; keeps what spin raised."""
+
+    def __init__(self, executor: MultiDeadlineExecutor) -> None:
+        self.executor = executor
+        self.error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        try:
+            self.executor.spin()
+        except BaseException as error:
+            self.error = error
+
+    def __enter__(self) -> Spinning:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *args: object) -> None:
+        assert self.executor.shutdown(5.0)
+        self.join()
+
+    def join(self) -> None:
+        """Wait until spin has ended."""
+        self._thread.join(5.0)
+        assert not self._thread.is_alive(), 'spin did not end'
+
+
+def wait_for(condition: Callable[[], Any], seconds: float = 5.0) -> bool:
+    """Wait until something is true; return whether it became so."""
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.002)
+    return True
+
+
+@pytest.fixture(params=['events', 'waitset'])
+def make_executor(request: Any, ros_context: Any) -> Iterator[Callable[..., Any]]:
+    """Give a function that makes executors of one intake; they are shut down afterwards."""
+    with contextlib.ExitStack() as stack:
+        def make(*args: Any, **kwargs: Any) -> MultiDeadlineExecutor:
+            kwargs.setdefault('intake', request.param)
+            executor = MultiDeadlineExecutor(*args, context=ros_context, **kwargs)
+            stack.callback(executor.shutdown, 5.0)
+            return executor
+        yield make
+
+
+@pytest.fixture
+def make_node(ros_context: Any) -> Iterator[Callable[..., Node]]:
+    """Give a function that makes nodes; they are destroyed afterwards."""
+    nodes: list[Node] = []
+
+    def make(name: str = 'node', **kwargs: Any) -> Node:
+        kwargs.setdefault('start_parameter_services', False)
+        kwargs.setdefault('enable_rosout', False)
+        nodes.append(Node(name, context=ros_context, **kwargs))
+        return nodes[-1]
+    yield make
+    for node in nodes:
+        with contextlib.suppress(Exception):
+            node.destroy_node()

@@ -1,0 +1,208 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the tests of the intakes share: a recording receiver, and ways to wait for things."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+import itertools
+import threading
+import time
+from typing import Any
+
+from mddag_executor.live.entities import EntitySet
+from mddag_executor.live.events import EventsIntake
+from mddag_executor.live.waitset import WaitSetIntake
+from rclpy.context import Context
+from rclpy.node import Node
+import std_msgs.msg
+
+INTAKES = ('events', 'waitset', 'poll')
+
+_numbers = itertools.count()
+
+
+class Recorder:
+    """A receiver that keeps what it gets; ``react`` holds functions to call with it as well."""
+
+    def __init__(self) -> None:
+        self.timers: list[tuple[Any, int]] = []
+        self.messages: list[tuple[Any, Any, dict[str, Any]]] = []
+        self.requests: list[tuple[Any, Any, Any]] = []
+        self.responses: list[tuple[Any, int, Any, Any]] = []
+        self.guards: list[Any] = []
+        self.waitables: list[tuple[Any, Any]] = []
+        self.errors: list[BaseException] = []
+        self.react: dict[str, Callable[..., None]] = {}
+
+    def _reaction(self, kind: str, *what: Any) -> None:
+        reaction = self.react.get(kind)
+        if reaction is not None:
+            reaction(*what)
+
+    def on_timer(self, timer: Any, due_ns: int) -> None:
+        self.timers.append((timer, due_ns))
+        self._reaction('timer', timer, due_ns)
+
+    def on_message(self, subscription: Any, message: Any, info: dict[str, Any]) -> None:
+        self.messages.append((subscription, message, info))
+        self._reaction('message', subscription, message, info)
+
+    def on_request(self, service: Any, request: Any, header: Any) -> None:
+        self.requests.append((service, request, header))
+        self._reaction('request', service, request, header)
+
+    def on_response(self, client: Any, sequence: int, header: Any, response: Any) -> None:
+        self.responses.append((client, sequence, header, response))
+        self._reaction('response', client, sequence, header, response)
+
+    def on_guard(self, guard_condition: Any) -> None:
+        self.guards.append(guard_condition)
+        self._reaction('guard', guard_condition)
+
+    def on_waitable(self, waitable: Any, data: Any) -> None:
+        self.waitables.append((waitable, data))
+        self._reaction('waitable', waitable, data)
+
+    def on_intake_error(self, error: BaseException) -> None:
+        self.errors.append(error)
+
+    def dues(self, timer: Any) -> list[int]:
+        """Return the due times that this timer was handed over with."""
+        return [due for t, due in self.timers if t is timer]
+
+    def texts(self, subscription: Any) -> list[str]:
+        """Return the data of this subscription's messages."""
+        return [m.data for s, m, _ in self.messages if s is subscription]
+
+
+class PollingIntake:
+    """A ``WaitSetIntake`` that a thread polls, with the methods of the others."""
+
+    def __init__(self, context: Context, receiver: Recorder) -> None:
+        self._intake = WaitSetIntake(context, receiver)
+        self._context = context
+        self._thread: threading.Thread | None = None
+        self._stopping = False
+        self.update = self._intake.update
+        self.wake = self._intake.wake
+
+    def start(self) -> None:
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name='polling')
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stopping and self._context.ok():
+            self._intake.poll(None)
+
+    def stop(self) -> None:
+        self._stopping = True
+        self._intake.wake()
+        if self._thread is not None:
+            self._thread.join(5.0)
+            assert not self._thread.is_alive()
+            self._thread = None
+
+
+def make_intake(kind: str, context: Context, receiver: Recorder) -> Any:
+    """Return an intake of this kind of INTAKES."""
+    if kind == 'events':
+        return EventsIntake(context, receiver)
+    if kind == 'waitset':
+        return WaitSetIntake(context, receiver)
+    return PollingIntake(context, receiver)
+
+
+def make_node(context: Context, **options: Any) -> Node:
+    """Return a node with a name of its own."""
+    return Node(f'node_{next(_numbers)}', context=context, **options)
+
+
+def topic() -> str:
+    """Return a name that no other test has used."""
+    return f'/name_{next(_numbers)}'
+
+
+def text(data: str) -> std_msgs.msg.String:
+    return std_msgs.msg.String(data=data)
+
+
+def wait_for(condition: Callable[[], Any], seconds: float = 5.0) -> Any:
+    """Return the first true value of a condition, or its last one after some time."""
+    end = time.monotonic() + seconds
+    while True:
+        value = condition()
+        if value or time.monotonic() > end:
+            return value
+        time.sleep(0.002)
+
+
+def intake_threads() -> list[threading.Thread]:
+    """Return the threads of all intakes."""
+    return [t for t in threading.enumerate() if t.name.startswith('mddag-intake')]
+
+
+def cpu_ns(threads: Iterable[threading.Thread]) -> int:
+    """Return the CPU time that these threads have had."""
+    return sum(
+        time.clock_gettime_ns(time.pthread_getcpuclockid(t.ident))
+        for t in threads if t.ident is not None)
+
+
+def matched(publisher: Any, count: int = 1) -> bool:
+    """Wait until a publisher has found its subscriptions."""
+    return bool(wait_for(lambda: publisher.get_subscription_count() >= count))
+
+
+class FakeExecutor:
+    """What a node and its futures need of an executor; tasks run in a thread of their own."""
+
+    def __init__(self, intake: Any) -> None:
+        self._intake = intake
+        self.nodes: list[Node] = []
+        self.errors: list[BaseException] = []
+
+    def add_node(self, node: Node) -> None:
+        if node not in self.nodes:
+            self.nodes.append(node)
+            self.wake()
+
+    def remove_node(self, node: Node) -> None:
+        self.nodes.remove(node)
+        self.wake()
+
+    def wake(self) -> None:
+        self._intake.update(list(self.nodes))
+
+    def create_task(self, function: Callable[..., Any], *args: Any) -> None:
+        threading.Thread(target=self.run, args=(function, *args), daemon=True).start()
+
+    def run(self, function: Callable[..., Any], *args: Any) -> None:
+        """Run a function, and what it returns if that is a coroutine, to its end."""
+        try:
+            result = function(*args)
+            if hasattr(result, 'send'):
+                while True:
+                    result.send(None)
+                    time.sleep(0.001)
+        except StopIteration:
+            pass
+        except Exception as error:
+            self.errors.append(error)
+
+
+def no_entities() -> EntitySet:
+    return EntitySet([], [], [], [], [], [], [], {})

@@ -1,0 +1,361 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Declared DAGs on real rclpy nodes: which job, in which order, judged how, recorded how."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+from mddag_executor import DeadlineMiss
+from mddag_executor.live import current_job
+from msg_graph import loads, TaskSet
+import pytest
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from std_msgs.msg import Header
+
+from .conftest import Spinning, wait_for
+
+CHAIN = """
+mddag: 1
+nodes:
+  - node: /source
+    callbacks: [{name: tick, timer: 20ms, publishes: [/a], dag: chain}]
+  - node: /middle
+    callbacks:
+      - {name: relay, subscription: /a, publishes: [/b]}
+      - {name: early, subscription: /a, deadline: 10ms}
+  - node: /sink
+    callbacks: [{name: last, subscription: /b, deadline: 50ms}]
+"""
+
+
+class Chain:
+    """The nodes of CHAIN; each body may be replaced, and the jobs that it ran for are kept."""
+
+    def __init__(self, make_node: Any, bodies: dict[str, Any] | None = None) -> None:
+        bodies = bodies or {}
+        self.jobs: dict[str, list[Any]] = {n: [] for n in ('tick', 'relay', 'early', 'last')}
+        self.group = ReentrantCallbackGroup()
+        self.nodes = {n: make_node(n) for n in ('source', 'middle', 'sink')}
+        self.a = self.nodes['source'].create_publisher(Header, '/a', 10)
+        self.b = self.nodes['middle'].create_publisher(Header, '/b', 10)
+
+        def body(name: str, publisher: Any = None) -> Any:
+            def run(*message: Any) -> None:
+                self.jobs[name].append(current_job())
+                if name in bodies:
+                    bodies[name]()
+                if publisher is not None:
+                    publisher.publish(Header())
+            return run
+        self.timer = self.nodes['source'].create_timer(
+            0.02, body('tick', self.a), self.group, autostart=False)
+        for node, name, topic, publisher in (
+            ('middle', 'relay', '/a', self.b), ('middle', 'early', '/a', None),
+            ('sink', 'last', '/b', None),
+        ):
+            self.nodes[node].create_subscription(
+                Header, topic, body(name, publisher), 10, callback_group=self.group)
+
+    def start(self, executor: Any) -> None:
+        """Add the nodes; start when all are connected."""
+        for node in self.nodes.values():
+            executor.add_node(node)
+        assert wait_for(lambda: self.a.get_subscription_count() == 2
+                        and self.b.get_subscription_count() == 1)
+        self.timer.reset()
+        executor.wake()
+
+
+def sinks(executor: Any) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for dag in executor.statistics()['dags'].values():
+        found.update(dag['sinks'])
+    return found
+
+
+def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executor, make_node):
+    chain = Chain(make_node)
+    executor = make_executor(loads(CHAIN))
+    with Spinning(executor):
+        chain.start(executor)
+        assert wait_for(lambda: len(chain.jobs['last']) >= 20)
+        chain.timer.cancel()
+        assert wait_for(lambda: len(chain.jobs['last']) == len(chain.jobs['tick']))
+    count = len(chain.jobs['tick'])
+    for jobs in chain.jobs.values():
+        assert [j.job for j in jobs] == list(range(count))
+        assert {j.dag for j in jobs} == {'chain'}
+    releases = [j.release_ns for j in chain.jobs['last']]
+    assert {b - a for a, b in zip(releases, releases[1:])} == {20_000_000}
+    statistics = executor.statistics()
+    assert statistics['undeclared'] == 0
+    assert statistics['unattributed'] == {'unknown': 0, 'doubtful': 0}
+    assert statistics['dags']['chain']['jobs'] == count
+    assert sinks(executor)['/sink:last']['completed'] == count
+    assert statistics['never_ran'] == []
+
+
+def test_jobs_that_overlap_and_overtake_are_told_apart(make_executor, make_node):
+    """Odd jobs' relays take longer than a period, so messages on /b are out of order."""
+    def dawdle() -> None:
+        job = current_job()
+        assert job is not None
+        time.sleep(0.045 if job.job % 2 else 0.001)
+
+    chain = Chain(make_node, {'relay': dawdle})
+    executor = make_executor(loads(CHAIN))
+    with Spinning(executor):
+        chain.start(executor)
+        assert wait_for(lambda: len(chain.jobs['last']) >= 20)
+        chain.timer.cancel()
+        assert wait_for(lambda: len(chain.jobs['last']) == len(chain.jobs['tick']))
+    order = [j.job for j in chain.jobs['last']]
+    assert order != sorted(order) and sorted(order) == list(range(len(order)))
+    assert sinks(executor)['/sink:last']['completed'] == len(order)
+
+
+def test_unequal_deadlines_are_judged_apart_and_misses_are_told(make_executor, make_node):
+    misses: list[DeadlineMiss] = []
+    chain = Chain(make_node, {'early': lambda: time.sleep(0.015)})
+    executor = make_executor(loads(CHAIN), on_deadline_miss=misses.append)
+    with Spinning(executor):
+        chain.start(executor)
+        assert wait_for(lambda: len(misses) >= 5)
+        chain.timer.cancel()
+        assert wait_for(lambda: len(chain.jobs['last']) == len(chain.jobs['tick']))
+        time.sleep(0.05)
+    found = sinks(executor)
+    assert found['/middle:early']['late'] == found['/middle:early']['completed'] == len(misses)
+    assert found['/sink:last']['late'] == 0
+    miss = misses[0]
+    assert (miss.dag, miss.vertex, miss.job, miss.kind) == ('chain', '/middle:early', 0, 'late')
+    assert miss.deadline_ns == miss.release_ns + 10_000_000
+    assert miss.completed_ns is not None and miss.completed_ns > miss.deadline_ns
+
+
+def test_messages_of_others_run_as_undeclared_ones(make_executor, make_node):
+    chain = Chain(make_node)
+    executor = make_executor(loads(CHAIN))
+    stranger = make_node('stranger').create_publisher(Header, '/a', 10)
+    with Spinning(executor):
+        for node in chain.nodes.values():
+            executor.add_node(node)
+        assert wait_for(lambda: stranger.get_subscription_count() == 2)
+        stranger.publish(Header())
+        assert wait_for(lambda: len(chain.jobs['last']) == 1)
+    assert chain.jobs['relay'] == chain.jobs['early'] == chain.jobs['last'] == [None]
+    statistics = executor.statistics()
+    assert statistics['undeclared'] == 3
+    assert statistics['dags']['chain']['jobs'] == 0
+
+
+TWO_TO_ONE = """
+mddag: 1
+nodes:
+  - node: /left
+    callbacks: [{name: tick, timer: 20ms, publishes: [/a, /left], dag: fork}]
+  - node: /worker
+    callbacks:
+      - {name: one, subscription: /left, publishes: [/x]}
+      - {name: two, subscription: /left, publishes: [/y]}
+  - node: /join
+    callbacks:
+      - {name: both, sync: [/x, /y], deadline: 50ms}
+      - {name: any, subscription: /a, deadline: 50ms}
+  - node: /right
+    callbacks: [{name: tick, timer: 30ms, publishes: [/a], dag: other}]
+"""
+
+
+def test_sync_completes_with_the_last_leg_and_or_tells_publishers_apart(
+        make_executor, make_node):
+    group = ReentrantCallbackGroup()
+    left, worker, join, right = (make_node(n) for n in ('left', 'worker', 'join', 'right'))
+    legs: list[Any] = []
+    anys: list[Any] = []
+    a1, fork = (left.create_publisher(Header, t, 10) for t in ('/a', '/left'))
+    a2 = right.create_publisher(Header, '/a', 10)
+    x, y = (worker.create_publisher(Header, t, 10) for t in ('/x', '/y'))
+
+    def tick() -> None:
+        a1.publish(Header())
+        fork.publish(Header())
+
+    timers = [left.create_timer(0.02, tick, group, autostart=False),
+              right.create_timer(0.03, lambda: a2.publish(Header()), group, autostart=False)]
+    worker.create_subscription(
+        Header, '/left', lambda m: x.publish(Header()), 10, callback_group=group)
+    worker.create_subscription(
+        Header, '/left', lambda m: (time.sleep(0.005), y.publish(Header())), 10,
+        callback_group=group)
+    for topic in ('/x', '/y'):
+        join.create_subscription(
+            Header, topic, lambda m, t=topic: legs.append((current_job().job, t)), 10,
+            callback_group=group)
+    join.create_subscription(
+        Header, '/a', lambda m: anys.append((current_job().dag, current_job().job)), 10,
+        callback_group=group)
+    executor = make_executor(loads(TWO_TO_ONE))
+    with Spinning(executor):
+        for node in (left, worker, join, right):
+            executor.add_node(node)
+        assert wait_for(lambda: a1.get_subscription_count() == a2.get_subscription_count() == 1
+                        and fork.get_subscription_count() == 2
+                        and x.get_subscription_count() == y.get_subscription_count() == 1)
+        for timer in timers:
+            timer.reset()
+        executor.wake()
+        assert wait_for(lambda: len(legs) >= 20 and len(anys) >= 20)
+        for timer in timers:
+            timer.cancel()
+        time.sleep(0.1)
+    statistics = executor.statistics()
+    forks, others = (statistics['dags'][n]['jobs'] for n in ('fork', 'other'))
+    assert sorted(legs) == sorted((j, t) for j in range(forks) for t in ('/x', '/y'))
+    assert sorted(anys) == sorted(
+        [('fork', j) for j in range(forks)] + [('other', j) for j in range(others)])
+    found = sinks(executor)
+    assert found['/join:both']['completed'] == forks
+    assert found['/join:both']['response_ns']['min'] >= 5_000_000
+    assert found['/join:any@fork']['completed'] == forks
+    assert found['/join:any@other']['completed'] == others
+    assert statistics['undeclared'] == 0
+
+
+ORDER = """
+mddag: 1
+nodes:
+  - node: /source
+    callbacks: [{name: tick, timer: 10s, publishes: [/go], dag: race}]
+  - node: /racer
+    callbacks:
+      - {name: c, subscription: /go, deadline: 300ms}
+      - {name: a, subscription: /go, deadline: 100ms}
+      - {name: b, subscription: /go, deadline: 200ms}
+"""
+
+
+@pytest.mark.parametrize('policy, expected', [('rad', 'abc'), ('gedf', 'cab')])
+def test_ready_callbacks_run_in_the_policys_order(make_executor, make_node, policy, expected):
+    """One worker is kept busy until all three are ready; gedf knows but one deadline a DAG."""
+    source, racer = make_node('source'), make_node('racer')
+    ran: list[str] = []
+    group = ReentrantCallbackGroup()
+    publisher = source.create_publisher(Header, '/go', 10)
+
+    def tick() -> None:
+        publisher.publish(Header())
+        time.sleep(0.1)
+
+    timer = source.create_timer(10.0, tick, group, autostart=False)
+    for name in 'cab':
+        racer.create_subscription(
+            Header, '/go', lambda m, n=name: ran.append(n), 10, callback_group=group)
+    executor = make_executor(loads(ORDER), num_workers=1, policy=policy)
+    executor.add_node(source)
+    executor.add_node(racer)
+    with Spinning(executor):
+        assert wait_for(lambda: publisher.get_subscription_count() == 3)
+        timer.timer_period_ns = 10_000_000_000
+        executor.create_task(tick_as_timer, executor, timer, tick)
+        assert wait_for(lambda: len(ran) == 3)
+    assert ''.join(ran) == expected
+
+
+def tick_as_timer(executor: Any, timer: Any, tick: Any) -> None:
+    """Have the intake's receiver told that the timer is due, instead of waiting ten seconds."""
+    executor._receiver.on_timer(timer, time.monotonic_ns())
+
+
+def test_default_deadline_orders_undeclared_callbacks(make_executor, make_node):
+    """Undeclared ones go by ready time plus default_deadline: before a later declared deadline."""
+    executor = make_executor(loads(ORDER), num_workers=1, default_deadline='100ms')
+    ran: list[int] = []
+    for i in range(5):
+        executor.create_task(ran.append, i)
+    with Spinning(executor):
+        assert wait_for(lambda: len(ran) == 5)
+    assert ran == [0, 1, 2, 3, 4]
+
+
+def with_source(more: str) -> TaskSet:
+    return loads(CHAIN.replace('dag: chain', f'dag: chain, {more}'))
+
+
+def test_abort_drops_what_is_left_of_a_late_job(make_executor, make_node):
+    chain = Chain(make_node, {'relay': lambda: time.sleep(0.06)})
+    executor = make_executor(with_source('on_miss: abort'), num_workers=2)
+    with Spinning(executor):
+        chain.start(executor)
+        assert wait_for(lambda: len(chain.jobs['relay']) >= 5)
+        chain.timer.cancel()
+        time.sleep(0.3)
+    dag = executor.statistics()['dags']['chain']
+    assert dag['ends']['aborted'] > 0
+    assert sum(dag['ends'].values()) == dag['jobs']
+    assert dag['sinks']['/sink:last']['aborted'] > 0
+    assert sum(executor.statistics()['dropped'].values()) > 0
+    assert len(chain.jobs['last']) < len(chain.jobs['tick'])
+
+
+def test_a_lost_message_expires_its_job(make_executor, make_node):
+    """Nobody runs the relay: its jobs can not complete, expire, and free their places."""
+    chain = Chain(make_node)
+    chain.nodes['middle'].destroy_subscription(next(iter(chain.nodes['middle'].subscriptions)))
+    executor = make_executor(with_source('max_active_jobs: 3'))
+    with Spinning(executor):
+        for node in chain.nodes.values():
+            executor.add_node(node)
+        chain.timer.reset()
+        assert wait_for(lambda: len(chain.jobs['tick']) >= 10)
+    found = sinks(executor)['/sink:last']
+    dag = executor.statistics()['dags']['chain']
+    assert found['completed'] == 0
+    assert dag['ends']['expired'] == dag['jobs'] - 3
+    assert found['expired'] == dag['jobs'] - 3
+
+
+def test_a_timer_that_overruns_skips_and_says_so(make_executor, make_node):
+    node, calls = make_node(), []
+
+    def slow() -> None:
+        calls.append(time.monotonic())
+        time.sleep(0.035)
+
+    node.create_timer(0.01, slow, MutuallyExclusiveCallbackGroup())
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(calls) >= 10)
+    gaps = [b - a for a, b in zip(calls, calls[1:])]
+    assert min(gaps) > 0.03, 'a burst after an overrun'
+    counts = next(iter(executor.statistics()['callbacks'].values()))
+    assert counts['skipped'] > 0
+
+
+def test_current_job_is_none_elsewhere(make_executor):
+    assert current_job() is None
+    executor = make_executor()
+    seen: list[Any] = []
+    executor.create_task(lambda: seen.append(current_job()))
+    executor.spin_once(1.0)
+    assert seen == [None]
+    thread = threading.Thread(target=lambda: seen.append(current_job()))
+    thread.start()
+    thread.join()
+    assert seen == [None, None]

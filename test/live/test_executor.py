@@ -1,0 +1,554 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The executor against real rclpy: each kind of callback, tasks, exceptions, spin and its end."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.errors import MddagError
+import pytest
+import rclpy
+from rclpy.action import ActionClient, ActionServer
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.executors import ExternalShutdownException
+from rclpy.serialization import deserialize_message
+from rclpy.task import Future
+from rclpy.wait_for_message import wait_for_message
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
+
+from .conftest import Spinning, wait_for
+
+
+def publish_when_matched(publisher: Any, message: Any, count: int = 1) -> None:
+    assert wait_for(lambda: publisher.get_subscription_count() > 0)
+    for _ in range(count):
+        publisher.publish(message)
+
+
+def test_timer_runs_at_its_rate(make_executor, make_node):
+    node, calls = make_node(), []
+    node.create_timer(0.01, lambda: calls.append(time.monotonic()))
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: len(calls) >= 30)
+    assert spinning.error is None
+    assert calls[29] - calls[0] == pytest.approx(0.29, abs=0.1)
+
+
+def test_subscriptions_of_each_kind(make_executor, make_node):
+    node = make_node()
+    got: dict[str, list[Any]] = {'plain': [], 'info': [], 'raw': [], 'async': []}
+
+    async def coroutine(message: Header) -> None:
+        got['async'].append(message.frame_id)
+
+    node.create_subscription(Header, '/plain', lambda m: got['plain'].append(m.frame_id), 10)
+    node.create_subscription(Header, '/info', lambda m, i: got['info'].append((m, i)), 10)
+    node.create_subscription(Header, '/raw', got['raw'].append, 10, raw=True)
+    node.create_subscription(Header, '/async', coroutine, 10)
+    publishers = {name: node.create_publisher(Header, f'/{name}', 10) for name in got}
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        for publisher in publishers.values():
+            publish_when_matched(publisher, Header(frame_id='x'))
+        assert wait_for(lambda: all(got.values())), got
+    assert got['plain'] == got['async'] == ['x']
+    message, info = got['info'][0]
+    assert message.frame_id == 'x' and info['source_timestamp'] > 0
+    assert deserialize_message(got['raw'][0], Header).frame_id == 'x'
+
+
+def test_service_and_client_from_a_coroutine(make_executor, make_node):
+    node, answers = make_node(), []
+
+    async def answer(request: Any, response: Any) -> Any:
+        response.success, response.message = True, 'yes'
+        return response
+
+    node.create_service(Trigger, '/ask', answer)
+    client = node.create_client(Trigger, '/ask')
+    group = MutuallyExclusiveCallbackGroup()  # a coroutine keeps its group while it waits
+
+    async def ask() -> None:
+        answers.append((await client.call_async(Trigger.Request())).message)
+
+    timer = node.create_timer(0.01, ask, group)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(answers) >= 3)
+        timer.cancel()
+    assert set(answers) == {'yes'}
+
+
+def test_synchronous_calls_from_all_workers_at_once(make_executor, make_node):
+    """A worker that waits lends its place: rclpy#1211 and #1398 hang here."""
+    node = make_node()
+    group, answers, together = ReentrantCallbackGroup(), [], threading.Barrier(7)
+    node.create_service(
+        Trigger, '/ask', lambda request, response: response, callback_group=group)
+    client = node.create_client(Trigger, '/ask', callback_group=group)
+
+    def ask() -> None:
+        together.wait(5.0)
+        answers.append(client.call(Trigger.Request(), timeout_sec=5.0))
+
+    executor = make_executor()
+    executor.add_node(node)
+    assert client.wait_for_service(5.0)
+    with Spinning(executor) as spinning:
+        for _ in range(7):
+            executor.create_task(ask)
+        assert wait_for(lambda: len(answers) == 7)
+    assert spinning.error is None
+    assert None not in answers
+    assert executor.statistics()['lent'] == 7
+
+
+def test_synchronous_call_inside_spin_once(make_executor, make_node):
+    node, answers = make_node(), []
+    node.create_service(Trigger, '/ask', lambda request, response: response)
+    client = node.create_client(Trigger, '/ask', callback_group=ReentrantCallbackGroup())
+    executor = make_executor()
+    executor.add_node(node)
+    assert client.wait_for_service(5.0)
+    executor.create_task(lambda: answers.append(client.call(Trigger.Request(), timeout_sec=5.0)))
+    executor.spin_once(1.0)
+    assert len(answers) == 1 and answers[0] is not None
+
+
+def test_guard_condition(make_executor, make_node):
+    node, calls = make_node(), []
+    guard = node.create_guard_condition(lambda: calls.append(1))
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        for count in range(1, 4):
+            guard.trigger()
+            assert wait_for(lambda: len(calls) == count)
+
+
+def test_action_with_feedback_result_and_cancel(make_executor, make_node):
+    node, feedback = make_node(), []
+
+    async def execute(goal: Any) -> Any:
+        for i in range(3):
+            goal.publish_feedback(Fibonacci.Feedback(sequence=[i]))
+        if goal.request.order == 99:
+            while not goal.is_cancel_requested:
+                await asleep(executor, node)
+            goal.canceled()
+            return Fibonacci.Result()
+        goal.succeed()
+        return Fibonacci.Result(sequence=[goal.request.order])
+
+    server = ActionServer(
+        node, Fibonacci, 'fibonacci', execute, callback_group=ReentrantCallbackGroup(),
+        cancel_callback=lambda goal: rclpy.action.CancelResponse.ACCEPT)
+    client = ActionClient(node, Fibonacci, 'fibonacci', callback_group=ReentrantCallbackGroup())
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert client.wait_for_server(5.0)
+        handles = [
+            client.send_goal_async(Fibonacci.Goal(order=n), feedback_callback=feedback.append)
+            for n in (3, 4, 99)]
+        assert wait_for(lambda: all(h.done() for h in handles))
+        assert all(h.result().accepted for h in handles)
+        results = [h.result().get_result_async() for h in handles]
+        assert wait_for(lambda: results[0].done() and results[1].done())
+        assert [list(r.result().result.sequence) for r in results[:2]] == [[3], [4]]
+        handles[2].result().cancel_goal_async()
+        assert wait_for(results[2].done)
+        assert wait_for(lambda: len(feedback) == 9)
+    assert spinning.error is None
+    server.destroy()
+    client.destroy()
+
+
+async def asleep(executor: MultiDeadlineExecutor, node: Any) -> None:
+    """Await a future that a timer completes."""
+    future = Future(executor=executor)
+    timer = node.create_timer(0.005, lambda: future.set_result(None))
+    await future
+    node.destroy_timer(timer)
+
+
+def test_tasks_functions_coroutines_and_futures_across_them(make_executor):
+    executor = make_executor()
+    future = Future(executor=executor)
+    order = []
+
+    async def waits() -> str:
+        order.append('waits')
+        value = await future
+        order.append('has it')
+        return f'{value}!'
+
+    waiting = executor.create_task(waits)
+    plain = executor.create_task(lambda a, b: a + b, 1, b=2)
+    with Spinning(executor):
+        assert wait_for(plain.done) and plain.result() == 3
+        assert wait_for(lambda: order == ['waits']) and not waiting.done()
+        future.set_result('value')
+        assert wait_for(waiting.done)
+    assert waiting.result() == 'value!' and order == ['waits', 'has it']
+
+
+def test_create_task_wakes_an_idle_executor(make_executor):
+    executor = make_executor()
+    with Spinning(executor):
+        time.sleep(0.3)
+        begin = time.monotonic()
+        task = executor.create_task(lambda: None)
+        assert wait_for(task.done)
+        assert time.monotonic() - begin < 0.25
+
+
+def test_add_node_wakes_an_idle_executor(make_executor, make_node):
+    executor = make_executor()
+    calls: list[int] = []
+    with Spinning(executor):
+        time.sleep(0.2)
+        node = make_node()
+        node.create_timer(0.001, lambda: calls.append(1))
+        assert executor.add_node(node)
+        assert not executor.add_node(node)
+        assert wait_for(lambda: calls)
+        assert executor.get_nodes() == [node]
+        executor.remove_node(node)
+        assert executor.get_nodes() == []
+        assert wait_for(lambda: stays(calls))
+
+
+def stays(calls: list[Any]) -> bool:
+    before = len(calls)
+    time.sleep(0.05)
+    return len(calls) == before
+
+
+def test_entities_created_and_destroyed_while_it_spins(make_executor, make_node):
+    node, calls = make_node(), []
+    executor = make_executor()
+    executor.add_node(node)
+    publisher = node.create_publisher(Header, '/topic', 10)
+    with Spinning(executor) as spinning:
+        for _ in range(20):
+            calls.clear()
+            subscription = node.create_subscription(Header, '/topic', calls.append, 10)
+            assert wait_for(lambda: publisher.get_subscription_count() == 1)
+            assert wait_for(lambda: publisher.publish(Header()) or calls, 2.0)
+            node.destroy_subscription(subscription)
+            assert wait_for(lambda: publisher.get_subscription_count() == 0)
+    assert spinning.error is None
+
+
+@pytest.mark.parametrize('kind', ['timer', 'subscription', 'task', 'coroutine', 'service'])
+def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
+    node = make_node()
+    executor = make_executor()
+    executor.add_node(node)
+
+    def fail(*args: Any) -> None:
+        raise ZeroDivisionError(kind)
+
+    async def fail_later() -> None:
+        raise ZeroDivisionError(kind)
+
+    if kind == 'timer':
+        node.create_timer(0.01, fail)
+    elif kind == 'subscription':
+        node.create_subscription(Header, '/topic', fail, 10)
+        publisher = node.create_publisher(Header, '/topic', 10)
+        node.create_timer(0.05, lambda: publisher.publish(Header()))
+    elif kind == 'service':
+        node.create_service(Trigger, '/ask', fail)
+        client = node.create_client(Trigger, '/ask')
+        node.create_timer(0.05, lambda: client.call_async(Trigger.Request()))
+    else:
+        executor.create_task(fail if kind == 'task' else fail_later)
+    with pytest.raises(ZeroDivisionError, match=kind):
+        executor.spin_until_future_complete(Future(), 5.0)
+
+
+def test_it_spins_on_after_an_exception(make_executor):
+    executor = make_executor()
+    executor.create_task(lambda: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        executor.spin()
+    task = executor.create_task(lambda: 'fine')
+    executor.spin_until_future_complete(task, 5.0)
+    assert task.result() == 'fine'
+
+
+def test_an_exception_that_somebody_awaits_does_not_end_spin(make_executor):
+    executor = make_executor()
+
+    async def fails() -> None:
+        raise KeyError('handled')
+
+    async def handles() -> str:
+        try:
+            await inner
+        except KeyError:
+            return 'handled'
+        return 'nothing came'
+
+    outer = executor.create_task(handles)
+    inner: Any = Future(executor=executor)
+    executor.spin_once(0.1)
+    task = executor.create_task(fails)
+    task.add_done_callback(lambda t: inner.set_exception(t.exception()))
+    executor.spin_until_future_complete(outer, 5.0)
+    assert outer.result() == 'handled'
+
+
+def test_mutually_exclusive_group_is_kept(make_executor, make_node):
+    node = make_node()
+    group, running, most, ran = MutuallyExclusiveCallbackGroup(), [0], [0], []
+    lock = threading.Lock()
+
+    def exclusive(message: Header) -> None:
+        with lock:
+            running[0] += 1
+            most[0] = max(most[0], running[0])
+        time.sleep(0.005)
+        with lock:
+            running[0] -= 1
+        ran.append(message)
+
+    for _ in range(6):
+        node.create_subscription(Header, '/topic', exclusive, 10, callback_group=group)
+    publisher = node.create_publisher(Header, '/topic', 10)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: publisher.get_subscription_count() == 6)
+        for _ in range(3):
+            publisher.publish(Header())
+        assert wait_for(lambda: len(ran) == 18)
+    assert most[0] == 1
+
+
+def test_reentrant_group_fills_all_workers(make_executor):
+    executor = make_executor()
+    together = threading.Barrier(7)
+    tasks = [executor.create_task(together.wait, 5.0) for _ in range(7)]
+    with Spinning(executor):
+        assert wait_for(lambda: all(t.done() for t in tasks))
+    assert sorted(t.result() for t in tasks) == list(range(7))
+
+
+def test_never_more_than_the_workers(make_executor):
+    executor = make_executor(num_workers=3)
+    running, most = set(), [0]
+
+    def work() -> None:
+        running.add(threading.get_ident())
+        most[0] = max(most[0], len(running))
+        time.sleep(0.01)
+        running.discard(threading.get_ident())
+
+    tasks = [executor.create_task(work) for _ in range(30)]
+    with Spinning(executor):
+        assert wait_for(lambda: all(t.done() for t in tasks))
+    assert most[0] == 3
+
+
+def test_queue_depth_is_kept_and_drops_are_counted(make_executor, make_node):
+    node, got, gate = make_node(), [], threading.Event()
+    group = MutuallyExclusiveCallbackGroup()
+
+    def slow(message: Header) -> None:
+        got.append(message.stamp.sec)
+        gate.wait(5.0)
+
+    node.create_subscription(Header, '/topic', slow, 3, callback_group=group)
+    publisher = node.create_publisher(Header, '/topic', 100)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        publish_when_matched(publisher, Header(stamp=Time(sec=0)))
+        assert wait_for(lambda: got == [0])
+        for second in range(1, 11):
+            publisher.publish(Header(stamp=Time(sec=second)))
+            time.sleep(0.01)
+        gate.set()
+        assert wait_for(lambda: len(got) >= 4)
+        assert stays(got)
+    assert got == [0, 8, 9, 10]
+    assert sum(executor.statistics()['dropped'].values()) == 7
+
+
+def test_no_message_is_lost(make_executor, make_node):
+    node, got = make_node(), []
+    node.create_subscription(
+        Header, '/topic', lambda m: got.append(m.stamp.sec), 1000,
+        callback_group=ReentrantCallbackGroup())
+    publisher = node.create_publisher(Header, '/topic', 1000)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: publisher.get_subscription_count() > 0)
+        for i in range(1000):
+            publisher.publish(Header(stamp=Time(sec=i)))
+            if i % 50 == 0:
+                time.sleep(0.01)
+        assert wait_for(lambda: len(got) == 1000)
+    assert sorted(got) == list(range(1000))
+
+
+def test_spin_once_runs_one_callback_and_has_finished_it(make_executor, make_node):
+    node, calls = make_node(), []
+    for _ in range(3):
+        node.create_timer(0.001, lambda: calls.append(threading.get_ident()))
+    executor = make_executor()
+    executor.add_node(node)
+    time.sleep(0.01)
+    for count in range(1, 6):
+        executor.spin_once(1.0)
+        assert len(calls) == count
+    assert set(calls) == {threading.get_ident()}
+
+
+def test_spin_once_times_out(make_executor):
+    executor = make_executor()
+    begin = time.monotonic()
+    executor.spin_once(0.05)
+    assert time.monotonic() - begin >= 0.05
+    executor.spin_once(0)
+
+
+def test_spin_once_until_future_complete_ends_when_it_is_done(make_executor):
+    executor = make_executor()
+    future = Future()
+    threading.Timer(0.05, lambda: future.set_result(1)).start()
+    executor.spin_once_until_future_complete(future, 5.0)
+    assert future.done()
+
+
+def test_spin_until_future_complete_times_out(make_executor):
+    executor = make_executor()
+    begin = time.monotonic()
+    executor.spin_until_future_complete(Future(), 0.1)
+    assert 0.1 <= time.monotonic() - begin < 3
+
+
+def test_spinning_twice_is_an_error(make_executor):
+    executor = make_executor()
+    with Spinning(executor):
+        time.sleep(0.05)
+        with pytest.raises(RuntimeError, match='already spinning'):
+            executor.spin_once(0)
+
+
+def test_external_shutdown_raises_as_with_rclpy(make_executor, ros_context):
+    executor = make_executor()
+    threading.Timer(0.1, ros_context.shutdown).start()
+    with pytest.raises(ExternalShutdownException):
+        executor.spin()
+
+
+def test_shutdown_from_a_callback(make_executor, make_node):
+    node = make_node()
+    executor = make_executor()
+    executor.add_node(node)
+    node.create_timer(0.01, lambda: executor.shutdown(0))
+    executor.spin()
+
+
+def test_shutdown_waits_for_a_running_callback(make_executor):
+    executor = make_executor()
+    begun, done = threading.Event(), []
+
+    def work() -> None:
+        begun.set()
+        time.sleep(0.2)
+        done.append(1)
+
+    executor.create_task(work)
+    with Spinning(executor):
+        assert begun.wait(5.0)
+        assert not executor.shutdown(0.01)
+        assert executor.shutdown(5.0)
+        assert done
+
+
+def test_rclpy_spin_uses_all_workers(make_executor, make_node, ros_context):
+    node, together = make_node(), threading.Barrier(7)
+    executor = make_executor()
+    tasks = [executor.create_task(together.wait, 5.0) for _ in range(7)]
+    tasks[0].add_done_callback(lambda _: ros_context.shutdown())
+    with pytest.raises(ExternalShutdownException):
+        rclpy.spin(node, executor)
+    assert tasks[0].done()
+
+
+def test_wait_for_message_from_a_callback(make_executor, make_node, ros_context):
+    node = make_node()
+    publisher = node.create_publisher(Header, '/topic', 10)
+    node.create_timer(0.01, lambda: publisher.publish(Header(frame_id='it')))
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        found, message = wait_for_message(Header, node, '/topic', time_to_wait=5.0)
+    assert found and message.frame_id == 'it'
+
+
+def test_rate_sleeps_inside_a_callback(make_executor, make_node):
+    node = make_node()
+    executor = make_executor()
+    executor.add_node(node)
+    rate = node.create_rate(100)
+    task = executor.create_task(lambda: [rate.sleep() for _ in range(3)])
+    with Spinning(executor):
+        assert wait_for(task.done)
+
+
+def test_parameters_of_a_node(make_executor, make_node):
+    from rclpy.parameter_client import AsyncParameterClient
+    node = make_node(start_parameter_services=True)
+    node.declare_parameter('speed', 3)
+    executor = make_executor()
+    executor.add_node(node)
+    client = AsyncParameterClient(node, 'node')
+    with Spinning(executor):
+        assert client.wait_for_services(5.0)
+        future = client.get_parameters(['speed'])
+        assert wait_for(future.done)
+    assert future.result().values[0].integer_value == 3
+
+
+@pytest.mark.parametrize('kwargs, says', [
+    ({'num_workers': 0}, 'give at least 1'),
+    ({'policy': 'nonsense'}, 'choose one of'),
+    ({'intake': 'nonsense'}, 'give auto, events or waitset'),
+    ({'worker_policy': 'SCHED_NONSENSE'}, 'give one of'),
+    ({'worker_priority': 5}, 'give worker_policy'),
+    ({'worker_cpus': {4096}}, 'choose from'),
+    ({'trace': '/nowhere/at/all.mcap'}, '/nowhere/at/all.mcap'),
+])
+def test_bad_arguments_say_what_to_do(ros_context, kwargs, says):
+    with pytest.raises(MddagError, match=says):
+        MultiDeadlineExecutor(context=ros_context, **kwargs)

@@ -1,0 +1,436 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+import threading
+import time
+from typing import Any
+
+from mddag_executor.live import current_job
+from mddag_executor.live.bodies import Grid, Join, JOIN_LIMIT, no_job, Role
+from mddag_executor.live.execution import ExecutionPlan, PlanError, sleeper, spinner
+from mddag_executor.live.executor import MultiDeadlineExecutor
+from mddag_executor.live.measure import Ledger, measure, Reading
+from mddag_executor.live.session import run_synthetic, Session
+from mddag_executor.live.synthetic import build_nodes
+from mddag_executor.simulate.run import draw_execution_times
+from msg_graph import load, loads, TaskSet
+import pytest
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.node import Node
+
+TOP = Path(__file__).resolve().parents[2]
+MS = 1_000_000
+
+# AND (join), OR (/sink belongs to fast and slow), a source that is a subscription and one that is
+# a service, a group, a queue edge.
+GRAPH = """
+mddag: 1
+nodes:
+  - node: /sensor/a
+    callbacks:
+      - {name: tick, timer: 40ms, dag: fast, publishes: [/left, /right], execution_time: 2ms}
+  - node: /sensor/b
+    callbacks:
+      - {name: tick, timer: 50ms, dag: slow, publishes: [/joined], execution_time: 1ms}
+  - node: /filter/left
+    callbacks:
+      - {name: cb, subscription: /left, publishes: [/left_out], execution_time: 3ms, group: one}
+      - {name: again, subscription: /left, deadline: 400ms, execution_time: 1ms, group: one}
+  - node: /filter/right
+    callbacks:
+      - {name: cb, subscription: /right, publishes: [/right_out], reads: [/seen]}
+  - node: /join
+    callbacks:
+      - {name: cb, sync: [/left_out, /right_out], publishes: [/joined], execution_time: 2ms}
+  - node: /sink
+    callbacks:
+      - {name: cb, subscription: /joined, deadline: 400ms, execution_time: 1ms}
+  - node: /camera
+    callbacks:
+      - {name: cb, subscription: /image, period: 50ms, dag: camera, publishes: [/seen]}
+  - node: /tracker
+    callbacks:
+      - {name: cb, subscription: /seen, deadline: 400ms, execution_time: 1ms}
+  - node: /gate
+    callbacks:
+      - {name: cb, service: /gate/reset, period: 80ms, dag: gate, deadline: 400ms}
+"""
+
+
+@pytest.fixture
+def task_set() -> TaskSet:
+    return loads(GRAPH, 'graph.yaml')
+
+
+@pytest.fixture(scope='module')
+def autoware() -> TaskSet:
+    return load(TOP / 'config' / 'autoware.yaml')
+
+
+# --- the plan ------------------------------------------------------------------------------------
+
+def drawn(task_set: TaskSet, plan: ExecutionPlan) -> list[list[int]]:
+    return [[plan.execution_ns(d.index, v.index) for v in d.vertices] for d in task_set.dags]
+
+
+def test_a_seed_gives_the_draw_that_the_simulator_gives(autoware: TaskSet) -> None:
+    assert drawn(autoware, ExecutionPlan(autoware, 5)) == draw_execution_times(autoware, 5)
+    assert drawn(autoware, ExecutionPlan(autoware, 6)) != draw_execution_times(autoware, 5)
+
+
+def test_a_draw_stays_within_the_quantiles(autoware: TaskSet) -> None:
+    plan = ExecutionPlan(autoware, 3)
+    for vertex in autoware.vertices:
+        declared = vertex.callback.execution_time
+        assert declared is not None
+        time_ns = plan.execution_ns(vertex.dag, vertex.index)
+        assert declared.quantiles_ns[0] <= time_ns <= declared.quantiles_ns[-1]
+
+
+@pytest.mark.parametrize('workers', [1, 7])
+def test_scaling_gives_the_utilisation_asked_for(autoware: TaskSet, workers: int) -> None:
+    plan = ExecutionPlan(autoware, 1, 0.6, workers)
+    total = sum(plan.execution_ns(v.dag, v.index) / autoware.dags[v.dag].period_ns
+                for v in autoware.vertices)
+    assert total / workers == pytest.approx(0.6, abs=1e-6)
+    assert plan.utilisation == pytest.approx(0.6, abs=1e-6)
+    before = ExecutionPlan(autoware, 1, None, workers)
+    ratios = [a / b for x, y in zip(drawn(autoware, plan), drawn(autoware, before))
+              for a, b in zip(x, y) if b > 100_000]
+    assert max(ratios) == pytest.approx(min(ratios), rel=1e-4)  # one factor for all
+
+
+def test_the_critical_path_tells_what_is_infeasible() -> None:
+    text = """
+mddag: 1
+nodes:
+  - node: /a
+    callbacks: [{name: a, timer: 100ms, publishes: [/x], execution_time: 10ms}]
+  - node: /b
+    callbacks: [{name: b, subscription: /x, publishes: [/y], execution_time: 20ms}]
+  - node: /c
+    callbacks: [{name: c, subscription: /x, deadline: 30ms, execution_time: 20ms}]
+  - node: /d
+    callbacks: [{name: d, sync: [/x, /y], deadline: 30ms, execution_time: 1ms}]
+"""
+    plan = ExecutionPlan(loads(text), 0)
+    found, = plan.infeasible()  # /c takes exactly 30 ms, which is in time
+    assert (found.vertex, found.critical_path_ns, found.deadline_ns) == ('/d:d', 31 * MS, 30 * MS)
+
+
+def test_the_demo_draw_is_feasible(autoware: TaskSet) -> None:
+    from mddag_executor.cli.demo import DEFAULT_SEED, WORKERS
+    assert ExecutionPlan(autoware, DEFAULT_SEED, 0.6, WORKERS).infeasible() == []
+
+
+@pytest.mark.parametrize('utilisation', [0.0, -1.0, math.nan, math.inf])
+def test_an_absurd_utilisation_is_refused(autoware: TaskSet, utilisation: float) -> None:
+    with pytest.raises(PlanError, match='no number above zero'):
+        ExecutionPlan(autoware, 0, utilisation)
+
+
+def test_nothing_to_scale_is_refused() -> None:
+    text = ('mddag: 1\nnodes:\n  - node: /a\n    callbacks: '
+            '[{name: a, timer: 100ms, deadline: 1ms}]\n')
+    assert ExecutionPlan(loads(text)).utilisation == 0
+    with pytest.raises(PlanError, match='declare execution_time'):
+        ExecutionPlan(loads(text), 0, 0.6)
+
+
+# --- emulation -----------------------------------------------------------------------------------
+
+def test_sleeping_takes_the_time_and_no_cpu() -> None:
+    emulate = sleeper()
+    cpu = time.thread_time_ns()
+    taken = []
+    for _ in range(100):
+        start = time.monotonic_ns()
+        emulate(2 * MS)
+        taken.append(time.monotonic_ns() - start)
+    assert time.thread_time_ns() - cpu < 40 * MS
+    # The least disturbed half: a busy machine makes some sleeps longer.
+    undisturbed = sorted(taken)[:50]
+    assert 1.8 * MS < sum(undisturbed) / 50 < 2.2 * MS
+
+
+def test_what_is_shorter_than_a_sleep_is_waited_out() -> None:
+    emulate = sleeper(oversleep_ns=70_000)
+    taken = []
+    for _ in range(200):
+        start = time.monotonic_ns()
+        emulate(30_000)
+        taken.append(time.monotonic_ns() - start)
+    assert 30_000 <= sorted(taken)[100] < 45_000
+    start = time.monotonic_ns()
+    emulate(0)
+    assert time.monotonic_ns() - start < MS
+
+
+def test_spinning_takes_cpu_of_its_own_thread_only() -> None:
+    emulate = spinner()
+    taken = []
+
+    def spin() -> None:
+        start = time.thread_time_ns()
+        emulate(30 * MS)
+        taken.append(time.thread_time_ns() - start)
+
+    threads = [threading.Thread(target=spin) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(30 * MS <= t < 36 * MS for t in taken)
+
+
+# --- the books -----------------------------------------------------------------------------------
+
+def reading(at_ns: int, n: int = 0, cpu_ns: int = 0) -> Reading:
+    return Reading(at_ns, cpu_ns, (n,))
+
+
+SINGLE = ('mddag: 1\nnodes:\n  - node: /a\n    callbacks: '
+          '[{name: a, timer: 100ms, deadline: 150ms, execution_time: 10ms}]\n')
+
+
+def test_every_nominal_release_whose_deadline_lies_in_the_window_is_due() -> None:
+    task_set = loads(SINGLE)
+    ledger = Ledger(task_set)
+    first = 1_700_000_000 * 1000 * MS
+    ledger.first_release[0] = first
+    # Jobs 0 to 9, deadlines at first + 150, 250, … ms.  The window holds jobs 1 to 8: it begins
+    # at the deadline of job 0 and ends at that of job 8.
+    for job, response in {0: 10, 1: 150, 2: 151, 3: 20, 5: 250, 6: 30, 8: 40, 9: 50}.items():
+        release = first + job * 100 * MS
+        ledger.completions[0][0].append((release, release + response * MS))
+    result = measure(
+        ledger, ExecutionPlan(task_set), reading(first + 150 * MS), reading(first + 950 * MS))
+    sink = result['dags']['/a']['sinks']['/a:a']
+    assert {k: sink[k] for k in ('due', 'on_time', 'late', 'missing')} == {
+        'due': 8, 'on_time': 4, 'late': 2, 'missing': 2}
+    assert sink['response_ns'] == {
+        'min': 20 * MS, 'median': 40 * MS, 'p99': 250 * MS, 'max': 250 * MS}
+    assert (result['sink_jobs_due'], result['on_time_ratio']) == (8, 0.5)
+
+
+def test_a_late_or_slightly_early_noted_release_counts_for_its_own_job() -> None:
+    task_set = loads(SINGLE)
+    ledger = Ledger(task_set)
+    first = 1_700_000_000 * 1000 * MS
+    ledger.first_release[0] = first
+    for job, shift in ((1, -1000), (2, 99 * MS - 1), (3, 0), (3, 0)):
+        release = first + job * 100 * MS + shift
+        ledger.completions[0][0].append((release, first + job * 100 * MS + 60 * MS))
+    result = measure(
+        ledger, ExecutionPlan(task_set), reading(first + 150 * MS), reading(first + 450 * MS))
+    assert (result['on_time'], result['missing']) == (3, 0)
+    assert result['dags']['/a']['sinks']['/a:a']['response_ns']['max'] == 60 * MS
+
+
+def test_cpu_is_shared_among_the_callbacks_of_the_window() -> None:
+    task_set = loads(SINGLE)
+    ledger = Ledger(task_set)
+    ledger.first_release[0] = 0
+    start, end = reading(0, n=10, cpu_ns=5 * MS), reading(2000 * MS, n=30, cpu_ns=405 * MS)
+    slept = measure(ledger, ExecutionPlan(task_set, mode='sleep'), start, end)
+    spun = measure(ledger, ExecutionPlan(task_set, mode='spin'), start, end)
+    assert (slept['callbacks'], slept['callbacks_per_s']) == (20, 10.0)
+    assert slept['cpu_us_per_callback'] == 20_000
+    assert spun['cpu_us_per_callback'] == 10_000  # 10 ms of each are the bodies themselves
+
+
+def test_nothing_due_is_no_division_by_zero() -> None:
+    task_set = loads(SINGLE)
+    result = measure(Ledger(task_set), ExecutionPlan(task_set), reading(0), reading(0))
+    assert result['on_time_ratio'] is None
+    assert result['cpu_us_per_callback'] is None
+
+
+# --- joins and releases --------------------------------------------------------------------------
+
+def role(task_set: TaskSet, name: str, senders: list[str]) -> Role:
+    return Role(task_set.vertex(name), senders, '', 0, [], lambda ns: None, [], None, 0)
+
+
+def test_only_the_last_leg_of_a_job_completes_a_join(task_set: TaskSet) -> None:
+    join = Join(role(task_set, '/join:cb', ['a', 'b', 'c']))
+    assert [join.completes(1, s) for s in 'ab'] == [False, False]
+    assert not join.completes(2, 'c')
+    assert not join.completes(1, 'b')  # twice the same is no third
+    assert join.completes(1, 'c')
+    assert list(join.waiting) == [2]
+
+
+def test_incomplete_joins_are_bounded_and_counted(task_set: TaskSet) -> None:
+    join = Join(role(task_set, '/join:cb', ['a', 'b']))
+    for release in range(JOIN_LIMIT + 3):
+        join.completes(release, 'a')
+    assert (len(join.waiting), join.evicted) == (JOIN_LIMIT, 3)
+    assert not join.completes(0, 'b')  # its first leg is gone
+    assert join.completes(JOIN_LIMIT + 2, 'b')
+
+
+def test_a_late_timer_call_does_not_move_the_release(ros_context: Any) -> None:
+    period = 20 * MS
+    node = Node('grid', context=ros_context)
+    timer = node.create_timer(
+        period / 1e9, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME),
+        autostart=False)
+    before = time.monotonic_ns()
+    timer.reset()
+    after = time.monotonic_ns()
+    grid = Grid(timer, 0)
+    first = grid.first_release
+    assert before + period - 50_000 <= first <= after + period + 50_000
+
+    def call() -> int:
+        timer.handle.call_timer()
+        return grid.release()
+
+    time.sleep(max(0, first - time.monotonic_ns() + 5 * MS) / 1e9)
+    assert call() == first
+    # The next two become due; the late call stands for the first of them, the other is lost.
+    time.sleep(max(0, first + 2 * period - time.monotonic_ns() + 5 * MS) / 1e9)
+    assert call() == first + period
+    time.sleep(max(0, first + 3 * period - time.monotonic_ns() + 5 * MS) / 1e9)
+    late = call()
+    assert late >= first + 3 * period
+    assert (late - first) % period == 0
+    node.destroy_node()
+
+
+# --- nodes ---------------------------------------------------------------------------------------
+
+def test_nodes_have_exactly_what_is_declared(task_set: TaskSet, ros_context: Any) -> None:
+    workload = build_nodes(task_set, ExecutionPlan(task_set), context=ros_context)
+    nodes = {node.get_fully_qualified_name(): node for node in workload.nodes}
+    assert set(nodes) == {c.node for c in task_set.callbacks}
+    found = {}
+    for name, node in nodes.items():
+        found[name] = (
+            sorted(t.timer_period_ns for t in node.timers),
+            sorted(s.topic_name for s in node.subscriptions),
+            [s.srv_name for s in node.services],
+            sorted(p.topic_name for p in node.publishers if p.topic_name != '/parameter_events'))
+    assert found == {
+        '/sensor/a': ([40 * MS], [], [], ['/left', '/right']),
+        '/sensor/b': ([50 * MS], [], [], ['/joined']),
+        '/filter/left': ([], ['/left', '/left'], [], ['/left_out']),
+        '/filter/right': ([], ['/right'], [], ['/right_out']),
+        '/join': ([], ['/left_out', '/right_out'], [], ['/joined']),
+        '/sink': ([], ['/joined'], [], []),
+        '/camera': ([], ['/image'], [], ['/seen']),
+        '/tracker': ([], ['/seen'], [], []),
+        '/gate': ([], [], ['/gate/reset'], []),
+    }
+    assert all(t.is_canceled() for node in nodes.values() for t in node.timers)
+    first, second = nodes['/filter/left'].subscriptions
+    assert isinstance(first.callback_group, MutuallyExclusiveCallbackGroup)
+    assert first.callback_group is second.callback_group
+    assert isinstance(next(iter(nodes['/sink'].subscriptions)).callback_group,
+                      ReentrantCallbackGroup)
+    workload.destroy()
+
+
+@pytest.mark.parametrize('kind', ['ours', 'multi'])
+def test_every_release_reaches_every_sink(
+    task_set: TaskSet, ros_context: Any, kind: str
+) -> None:
+    ours = kind == 'ours'
+    executor: Any = MultiDeadlineExecutor(task_set, context=ros_context) if ours else (
+        MultiThreadedExecutor(7, context=ros_context))
+    workload = build_nodes(
+        task_set, ExecutionPlan(task_set), context=ros_context,
+        current_job=current_job if ours else no_job)
+    for node in workload.nodes:
+        executor.add_node(node)
+    with Session(executor) as session:
+        result = run_synthetic(session, workload, 1.0, warm_up_s=0.5)
+    if not ours:
+        executor._executor.shutdown(cancel_futures=True)  # rclpy leaves its pool running
+    assert session.error is None
+    assert session.clean
+    assert result is not None
+    names = {n for dag in result['dags'].values() for n in dag['sinks']}
+    assert names == {
+        '/filter/left:again', '/sink:cb@fast', '/sink:cb@slow', '/tracker:cb', '/gate:cb'}
+    for dag in task_set.dags:
+        for name, sink in result['dags'][dag.name]['sinks'].items():
+            expected = 1e9 / dag.period_ns
+            assert abs(sink['due'] - expected) <= 1, name
+            # A busy machine may make some late, but nothing may get lost.
+            assert sink['missing'] <= 1, (name, sink)
+            assert sink['response_ns']['min'] >= 0
+    # Each sink knows the release of its job exactly: the completions are on the nominal grid.
+    for dag in task_set.dags:
+        first = workload.ledger.first_release[dag.index]
+        assert first is not None
+        for index in dag.sinks:
+            for release, _ in workload.ledger.completions[dag.index][index]:
+                late = (release - first + MS) % dag.period_ns - MS
+                if dag.vertices[dag.source].callback.kind == 'timer':
+                    assert abs(late) < MS / 2
+                elif not ours:
+                    assert late == 0  # the sensor's stamp
+    assert result['attribution'] == {'wrong': 0, 'none': 0}
+    assert result['incomplete_joins_dropped'] == 0
+    workload.destroy()
+
+
+def test_groups_keep_their_callbacks_apart(task_set: TaskSet, ros_context: Any) -> None:
+    executor = MultiDeadlineExecutor(task_set, context=ros_context)
+    workload = build_nodes(
+        task_set, ExecutionPlan(task_set), context=ros_context, current_job=current_job)
+    running: list[int] = []
+    most = []
+    for subscription in next(
+            n for n in workload.nodes if n.get_name() == 'left').subscriptions:
+        inner = subscription.callback
+
+        def watched(message: Any, inner: Any = inner) -> None:
+            running.append(1)
+            most.append(len(running))
+            inner(message)
+            running.pop()
+
+        subscription.callback = watched
+    for node in workload.nodes:
+        executor.add_node(node)
+    with Session(executor) as session:
+        run_synthetic(session, workload, 0.5, warm_up_s=0.1)
+    assert len(most) > 10
+    assert max(most) == 1
+    workload.destroy()
+
+
+def test_a_session_gives_out_what_a_callback_raised(ros_context: Any) -> None:
+    node = Node('raiser', context=ros_context)
+
+    def boom() -> None:
+        raise ValueError('on purpose')
+
+    node.create_timer(0.01, boom)
+    executor = MultiDeadlineExecutor(context=ros_context)
+    executor.add_node(node)
+    with Session(executor) as session:
+        assert session.wait(5.0)
+    assert isinstance(session.error, ValueError)
+    node.destroy_node()

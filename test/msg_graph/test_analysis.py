@@ -1,0 +1,99 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Topological order, longest paths and utilisation."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+from hypothesis import given
+from hypothesis import strategies as st
+from msg_graph import analysis, Dag, loads
+
+from .helpers import graph
+
+DIAMOND = graph("""
+- node: /n
+  callbacks:
+    - {name: end, sync: [/c, /d], deadline: 9ms, execution_time: 1ms}
+    - {name: c, subscription: /a, publishes: [/c], execution_time: 5ms}
+    - {name: t, timer: 10ms, publishes: [/a], execution_time: {quantiles_us: [1000, 3000]}}
+    - {name: d, subscription: /a, publishes: [/d], execution_time: 4ms}
+    - {name: other, subscription: /a, deadline: 9ms, execution_time: 7ms}
+""").dags[0]
+
+
+def test_diamond() -> None:
+    order = analysis.topological_order(DIAMOND)
+    assert sorted(order) == [0, 1, 2, 3, 4]
+    assert all(order.index(a) < order.index(b) for a, b in DIAMOND.edges)
+    means = analysis.mean_execution_times(DIAMOND)
+    assert means == [1_000_000, 5_000_000, 2_000_000, 4_000_000, 7_000_000]
+    assert analysis.path_lengths(DIAMOND, means) == [
+        8_000_000, 7_000_000, 2_000_000, 6_000_000, 9_000_000]
+    assert analysis.longest_path(DIAMOND, means) == (2, 4)
+    assert analysis.longest_path(DIAMOND, means, end=0) == (2, 1, 0)
+    assert analysis.utilisation(DIAMOND) == 1.9
+
+
+def test_ties_go_to_the_smallest_index() -> None:
+    assert analysis.longest_path(DIAMOND, [1, 1, 1, 1, 1]) == (2, 1, 0)
+    assert analysis.longest_path(DIAMOND, [1, 1, 1, 1, 2]) == (2, 1, 0)
+
+
+def test_unknown_where_an_execution_time_is_missing() -> None:
+    dag = graph("""
+        - node: /n
+          callbacks:
+            - {name: t, timer: 10ms, publishes: [/a], execution_time: 1ms}
+            - {name: s, subscription: /a, deadline: 1ms}
+    """).dags[0]
+    assert analysis.mean_execution_times(dag) is None
+    assert analysis.utilisation(dag) is None
+
+
+@st.composite
+def weighted(draw: st.DrawFn) -> tuple[Dag, list[int]]:
+    """Draw a DAG of up to seven vertices, in a random file order, with weights."""
+    count = draw(st.integers(1, 7))
+    order = draw(st.permutations(range(count)))
+    before = {i: draw(st.sets(st.integers(0, i - 1), min_size=1)) for i in range(1, count)}
+    lines = ['mddag: 1', 'nodes:', '- node: /n', '  callbacks:']
+    for i in order:
+        start = 'timer: 10ms'
+        if i:
+            topics = [f'/t{b}' for b in sorted(before[i])]
+            start = (f'sync: [{", ".join(topics)}]' if len(topics) > 1
+                     else f'subscription: {topics[0]}')
+        sink = not any(i in each for each in before.values())
+        lines.append(
+            f'  - {{name: c{i}, {start}, publishes: [/t{i}]{", deadline: 1ms" * sink}}}')
+    weights = draw(st.lists(st.integers(0, 9), min_size=count, max_size=count))
+    return loads('\n'.join(lines)).dags[0], weights
+
+
+@given(weighted())
+def test_longest_path_is_that_of_all_paths(case: tuple[Dag, list[int]]) -> None:
+    dag, weights = case
+    best = 0
+    for length in range(len(dag.vertices)):
+        for rest in permutations(range(len(dag.vertices)), length + 1):
+            if all(step in dag.edges for step in zip(rest, rest[1:])):
+                best = max(best, sum(weights[i] for i in rest))
+    path = analysis.longest_path(dag, weights)
+    assert path[0] == dag.source
+    assert path[-1] in dag.sinks
+    assert all(step in dag.edges for step in zip(path, path[1:]))
+    assert sum(weights[i] for i in path) == max(analysis.path_lengths(dag, weights)) == best

@@ -1,0 +1,155 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The workloads that ship: the paper's, and the same with unequal deadlines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from msg_graph import analysis, Dag, load, TaskSet
+import pytest
+
+from .autoware_facts import DAGS
+
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
+SHARED = (
+    '/localization/pose_twist_fusion_filter/ekf_localizer:callback_3',
+    '/localization/pose_twist_fusion_filter/twist2accel:callback_1')
+UNEQUAL = ('control', 'imu', 'perception', 'vehicle')
+MS = 1_000_000
+
+
+@pytest.fixture(scope='module')
+def autoware() -> TaskSet:
+    return load(CONFIG / 'autoware.yaml')
+
+
+@pytest.fixture(scope='module')
+def multi() -> TaskSet:
+    return load(CONFIG / 'autoware_multi.yaml')
+
+
+@pytest.mark.parametrize('file', ['autoware.yaml', 'autoware_multi.yaml'])
+def test_the_graph_is_that_of_the_facts(file: str) -> None:
+    tasks = load(CONFIG / file)
+    assert [dag.name for dag in tasks.dags] == list(DAGS)
+    assert (len(tasks.dags), len(tasks.vertices), len(tasks.callbacks)) == (11, 86, 84)
+    assert tasks.workers == 7
+    for dag, facts in zip(tasks.dags, DAGS.values()):
+        assert dag.period_ns == facts.period * MS
+        assert [v.callback.key for v in dag.vertices] == facts.callbacks.split()
+        assert ' '.join(f'{a}-{b}' for a, b in dag.edges) == ' '.join(
+            sorted(facts.edges.split(), key=lambda edge: [int(i) for i in edge.split('-')]))
+        assert dag.sinks == tuple(facts.deadlines)
+        assert dag.source == 0
+        assert dag.vertices[0].callback.kind == 'timer'
+        for vertex in dag.vertices:
+            assert (vertex.callback.kind == 'sync') == (len(vertex.predecessors) > 1)
+        times = [v.callback.execution_time for v in dag.vertices]
+        for place, total in zip((0, 14, 23, 28), facts.times_ns):
+            assert sum(time.quantiles_ns[place] for time in times if time) == total
+        assert {len(time.percent) for time in times if time} == {29}
+
+
+def test_the_shared_callbacks_come_last(autoware: TaskSet) -> None:
+    assert tuple(callback.key for callback in autoware.callbacks[-2:]) == SHARED
+    names = [vertex.name for vertex in autoware.vertices if '@' in vertex.name]
+    assert names == [f'{key}@{dag}' for dag in ('imu', 'vehicle') for key in SHARED]
+
+
+def test_deadlines_are_those_of_the_paper(autoware: TaskSet) -> None:
+    for dag, facts in zip(autoware.dags, DAGS.values()):
+        assert {i: dag.vertices[i].deadline_ns for i in dag.sinks} == {
+            i: deadline * MS for i, deadline in facts.deadlines.items()}
+
+
+def test_load_is_that_of_the_paper(autoware: TaskSet) -> None:
+    """On seven cores the mean load is about that of the paper's most frequent runs, 0.7."""
+    shares = [analysis.utilisation(dag) for dag in autoware.dags]
+    assert sum(share for share in shares if share) / 7 == pytest.approx(0.729, abs=0.001)
+
+
+@pytest.mark.parametrize('file', ['autoware.yaml', 'autoware_multi.yaml'])
+def test_paths_run_end_to_end(file: str) -> None:
+    tasks = load(CONFIG / file)
+    assert len(tasks.queue_edges) == 32
+    paths = {path.name: path.callbacks for path in tasks.paths}
+    assert set(paths) == {
+        'lidar_to_control', 'obstacle_to_control', 'lidar_to_pose', 'imu_to_control',
+        'vehicle_to_control'}
+    assert all(path[-1] == '/pacmod_interface:callback_04' for path in paths.values())
+    dags = []
+    for key in paths['lidar_to_control']:
+        dag, = {tasks.dags[v.dag].name for v in tasks.vertices if v.callback.key == key}
+        if dag not in dags[-1:]:
+            dags.append(dag)
+    assert dags == ['top_lidar', 'perception', 'planning', 'control']
+
+
+def test_only_deadlines_differ(autoware: TaskSet, multi: TaskSet) -> None:
+    assert multi.queue_edges == autoware.queue_edges
+    assert multi.paths == autoware.paths
+    for one, other in zip(autoware.dags, multi.dags):
+        same = [v.deadline_ns for v in one.vertices] == [v.deadline_ns for v in other.vertices]
+        assert same == (one.name not in UNEQUAL)
+        for v, w in zip(one.vertices, other.vertices):
+            assert (v.name, v.predecessors, v.callback.execution_time) == (
+                w.name, w.predecessors, w.callback.execution_time)
+
+
+def deadlines_at(dag: Dag) -> list[int]:
+    """Return for each vertex the least deadline among the sinks that it leads to."""
+    least: dict[int, int] = {}
+    for index in reversed(analysis.topological_order(dag)):
+        vertex = dag.vertices[index]
+        least[index] = vertex.deadline_ns or min(least[after] for after in vertex.successors)
+    return [least[index] for index in range(len(dag.vertices))]
+
+
+def test_sinks_of_a_dag_have_deadlines_of_their_own(multi: TaskSet) -> None:
+    for name in UNEQUAL:
+        dag = multi.dag(name)
+        deadlines = [dag.vertices[i].deadline_ns for i in dag.sinks]
+        assert len(set(deadlines)) == len(deadlines) > 1
+        assert len(set(deadlines_at(dag))) == len(deadlines)
+
+
+def test_rad_orders_otherwise_than_one_deadline_for_each_dag(multi: TaskSet) -> None:
+    """For jobs released together, some pairs of ready vertices change places."""
+    rad = {v.name: at for dag in multi.dags for v, at in zip(dag.vertices, deadlines_at(dag))}
+    latest = {
+        v.name: max(dag.vertices[i].deadline_ns or 0 for i in dag.sinks)
+        for dag in multi.dags for v in dag.vertices}
+    for first, second in (
+        ('/control/vehicle_cmd_gate:callback_16',
+         '/localization/pose_twist_fusion_filter/stop_filter:callback_0'),
+        ('/perception/obstacle_segmentation/crop_box_filter:callback_0',
+         '/planning/scenario_planning/velocity_smoother:callback_4'),
+    ):
+        assert rad[first] < rad[second]
+        assert latest[first] > latest[second]
+
+
+def test_deadlines_can_be_met(multi: TaskSet) -> None:
+    """No new deadline is below the sum of the 95 % quantiles along its longest path."""
+    for name in UNEQUAL:
+        dag = multi.dag(name)
+        p95 = [
+            v.callback.execution_time.draw(0.95) for v in dag.vertices
+            if v.callback.execution_time is not None]
+        lengths = analysis.path_lengths(dag, p95)
+        for sink in dag.sinks:
+            deadline = dag.vertices[sink].deadline_ns
+            assert deadline is not None and lengths[sink] <= deadline

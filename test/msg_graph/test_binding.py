@@ -1,0 +1,140 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Matching entities with declared callbacks."""
+
+from __future__ import annotations
+
+from msg_graph.binding import Binder
+import pytest
+
+from .helpers import graph
+
+TASKS = graph("""
+- node: /a
+  callbacks:
+    - {name: t0, timer: 10ms, publishes: [/x, /y], dag: t0}
+    - {name: t1, timer: 10ms, deadline: 1ms, dag: t1}
+    - {name: t2, timer: 20ms, deadline: 1ms, dag: t2}
+    - {name: s0, subscription: /x, deadline: 1ms}
+    - {name: j0, sync: [/x, /y], deadline: 1ms}
+    - {name: s1, subscription: /x, deadline: 1ms}
+    - {name: q, service: /ask, period: 1s, deadline: 1ms, dag: q}
+- node: /b
+  callbacks:
+    - {name: s, subscription: /x, deadline: 1ms}
+    - {name: t, timer: 33.333ms, deadline: 1ms}
+""")
+
+
+def key(callback: object) -> str | None:
+    return None if callback is None else callback.key  # type: ignore[attr-defined, no-any-return]
+
+
+def test_alike_ones_are_handed_out_in_order() -> None:
+    binder = Binder(TASKS)
+    assert [key(binder.bind_subscription('/a', '/x')) for _ in range(4)] == [
+        '/a:s0', '/a:j0', '/a:s1', None]
+    assert [key(binder.bind_timer('/a', 10_000_000)) for _ in range(3)] == [
+        '/a:t0', '/a:t1', None]
+    assert key(binder.bind_timer('/a', 20_000_000)) == '/a:t2'
+    assert [key(binder.bind_service('/a', '/ask')) for _ in range(2)] == ['/a:q', None]
+    assert key(binder.bind_subscription('/b', '/x')) == '/b:s'
+
+
+def test_what_is_not_declared_is_none() -> None:
+    binder = Binder(TASKS)
+    assert binder.bind_timer('/a', 15_000_000) is None
+    assert binder.bind_timer('/c', 10_000_000) is None
+    assert binder.bind_subscription('/a', '/z') is None
+    assert binder.bind_subscription('/b', '/y') is None
+    assert binder.bind_service('/b', '/ask') is None
+    assert binder.bind_service('/a', '/x') is None
+    assert len(binder.unbound()) == len(TASKS.callbacks)
+
+
+def test_a_sync_is_bound_by_each_leg() -> None:
+    binder = Binder(TASKS)
+    assert key(binder.bind_subscription('/a', '/y')) == '/a:j0'
+    assert binder.bind_subscription('/a', '/y') is None
+    assert '/a:j0' in {callback.key for callback in binder.unbound()}
+    binder.bind_subscription('/a', '/x')
+    assert key(binder.bind_subscription('/a', '/x')) == '/a:j0'
+    assert '/a:j0' not in {callback.key for callback in binder.unbound()}
+
+
+def test_periods_may_be_rounded() -> None:
+    binder = Binder(TASKS)
+    assert key(binder.bind_timer('/b', 33_333_333)) == '/b:t'
+    binder = Binder(TASKS)
+    assert binder.bind_timer('/b', 33_400_000) is None
+    assert key(binder.bind_timer('/a', 9_999_999)) == '/a:t0'
+
+
+def test_the_nearest_period_is_meant() -> None:
+    tasks = graph("""
+        - node: /n
+          callbacks:
+            - {name: a, timer: 10ms, deadline: 1ms, dag: a}
+            - {name: b, timer: 10.005ms, deadline: 1ms, dag: b}
+    """)
+    binder = Binder(tasks)
+    assert key(binder.bind_timer('/n', 10_005_001)) == '/n:b'
+    assert key(binder.bind_timer('/n', 10_005_001)) == '/n:a'
+    assert binder.bind_timer('/n', 10_005_001) is None
+
+
+def test_unbound_is_in_file_order_and_empty_at_the_end() -> None:
+    binder = Binder(TASKS)
+    assert binder.unbound() == TASKS.callbacks
+    for callback in reversed(TASKS.callbacks):
+        for topic in callback.topics:
+            assert binder.bind_subscription(callback.node, topic) is not None
+        if callback.timer_period_ns is not None:
+            assert binder.bind_timer(callback.node, callback.timer_period_ns) is not None
+        if callback.service is not None:
+            assert binder.bind_service(callback.node, callback.service) is callback
+    assert binder.unbound() == ()
+
+
+def test_release_gives_back_in_declaration_order() -> None:
+    binder = Binder(TASKS)
+    first, join, second = (binder.bind_subscription('/a', '/x') for _ in range(3))
+    assert first is not None and join is not None and second is not None
+    binder.release(second)
+    binder.release(first)
+    assert key(binder.bind_subscription('/a', '/x')) == '/a:s0'
+    assert key(binder.bind_subscription('/a', '/x')) == '/a:s1'
+    binder.bind_subscription('/a', '/y')
+    binder.release(join, '/x')
+    assert key(binder.bind_subscription('/a', '/x')) == '/a:j0'
+    binder.release(join)
+    assert {key(binder.bind_subscription('/a', topic)) for topic in ('/x', '/y')} == {'/a:j0'}
+    timer = binder.bind_timer('/a', 20_000_000)
+    assert timer is not None
+    binder.release(timer)
+    assert binder.bind_timer('/a', 20_000_000) is timer
+
+
+def test_release_of_what_is_not_bound() -> None:
+    binder = Binder(TASKS)
+    first = binder.bind_subscription('/a', '/x')
+    assert first is not None
+    with pytest.raises(KeyError):
+        binder.release(first, '/y')
+    binder.release(first)
+    with pytest.raises(KeyError):
+        binder.release(first)
+    with pytest.raises(KeyError):
+        binder.release(TASKS.callback('/a:t0'))

@@ -1,0 +1,132 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Damaged declarations: whatever comes, it is a task set or a GraphError with one line."""
+
+from __future__ import annotations
+
+from hypothesis import example, given, HealthCheck, settings
+from hypothesis import strategies as st
+from msg_graph import GraphError, loads, TaskSet
+import pytest
+import yaml
+
+from .test_language import EVERYTHING, PATHS
+
+FRAGMENTS = [
+    '', '\n', ' ', '\t', ':', ': ', '-', '- ', '[', ']', '{', '}', ',', '#', '"', "'", '&a ',
+    '*a', '<<: ', '? ', '! ', '!!int ', '!!python/object/apply:os.system ', '---\n', '...\n',
+    '%YAML 1.1\n', '|\n', '>\n', '\x00', '\r', '\u2028', '\ufeff', '~', 'null', '0', '-1',
+    '1e999', '.nan', '.inf', '9' * 400, 'a' * 3000, '/', '//', '/a:b', 'ms', '0ms', '-1ms',
+    'timer: 1ms\n', 'sync: [/a, /b]\n', 'period: 1s\n', 'deadline: 1ms\n', 'reads: [/boxes]\n',
+    'dag: d\n', 'nodes:\n', 'mddag: 1\n',
+]
+
+
+def outcome(text: str | bytes) -> TaskSet | None:
+    """Return the task set, or None after a look at the error."""
+    try:
+        tasks = loads(text, 'f.yaml')
+    except GraphError as error:
+        line = str(error)
+        assert line.startswith('f.yaml:')
+        assert line.isprintable()
+        assert len(line) < 2_000
+        assert error.problem and error.remedy
+        assert error.line is None or 1 <= error.line
+        return None
+    assert isinstance(tasks, TaskSet)
+    return tasks
+
+
+@st.composite
+def damaged(draw: st.DrawFn) -> str:
+    """Draw a declaration with a few cuts, insertions, and lines gone or moved."""
+    text = draw(st.sampled_from([EVERYTHING, PATHS]))
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, len(text)))
+        lines = text.split('\n')
+        row = draw(st.integers(0, len(lines) - 1))
+        how = draw(st.sampled_from(['insert', 'cut', 'drop', 'double', 'move', 'shift']))
+        if how == 'insert':
+            text = text[:at] + draw(st.sampled_from(FRAGMENTS)) + text[at:]
+        elif how == 'cut':
+            text = text[:at] + text[at + draw(st.integers(1, 40)):]
+        elif how == 'shift':
+            lines[row] = draw(st.sampled_from(['  ', ' '])) + lines[row]
+            text = '\n'.join(lines)
+        else:
+            line = lines.pop(row)
+            if how == 'double':
+                lines[row:row] = [line, line]
+            elif how == 'move':
+                lines.insert(draw(st.integers(0, len(lines))), line)
+            text = '\n'.join(lines)
+    return text
+
+
+@settings(max_examples=1000, suppress_health_check=[HealthCheck.too_slow])
+@given(damaged())
+def test_damaged_declarations(text: str) -> None:
+    outcome(text)
+
+
+@settings(max_examples=300)
+@given(st.text())
+@example('mddag: 1\nnodes: {a: &b {c: *b}}')
+@example('? ? ? a')
+@example('a: !<tag:x> b')
+@example('- &a\n- *a')
+@example('&a a: *a')
+@example('\ud800')
+def test_any_text(text: str) -> None:
+    assert outcome(text) is None
+
+
+@settings(max_examples=300)
+@given(st.binary())
+def test_any_bytes(data: bytes) -> None:
+    assert outcome(data) is None
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9)
+    | st.sampled_from(['/a', '1ms', '/a:t', 't']),
+    lambda inner: st.lists(inner, max_size=3)
+    | st.dictionaries(st.sampled_from([
+        'node', 'callbacks', 'name', 'timer', 'sync', 'subscription', 'service', 'period',
+        'publishes', 'reads', 'deadline', 'execution_time', 'quantiles_us', 'percent', 'dag']),
+        inner, max_size=4),
+    max_leaves=12)
+
+
+@settings(max_examples=500, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    st.sampled_from(['workers', 'nodes', 'paths', 'mddag']), VALUES,
+    st.sampled_from(['name', 'timer', 'deadline', 'publishes', 'reads', 'execution_time', 'group',
+                     'release_from', 'on_miss', 'max_active_jobs', 'dag']), VALUES)
+def test_any_value_at_any_key(top: str, value: object, key: str, inner: object) -> None:
+    callback = {'name': 't', 'timer': '1ms', 'deadline': '1ms', key: inner}
+    data: dict[str, object] = {
+        'mddag': 1, 'nodes': [{'node': '/n', 'callbacks': [callback]}]}
+    outcome(yaml.safe_dump(data))
+    data[top] = value
+    outcome(yaml.safe_dump(data))
+
+
+@pytest.mark.parametrize('text', [EVERYTHING, PATHS])
+def test_every_truncation(text: str) -> None:
+    """A file that was cut off anywhere is never an accident."""
+    for end in range(len(text)):
+        outcome(text[:end])

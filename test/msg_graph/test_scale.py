@@ -1,0 +1,97 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Large graphs: the work grows with what is declared, not with its square."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import sys
+from typing import Any
+
+from msg_graph import loads, TaskSet
+import pytest
+
+HEAD = 'mddag: 1\nnodes:\n- node: /n\n  callbacks:\n'
+
+
+def chain(size: int) -> str:
+    """One DAG as deep as it can be."""
+    text = HEAD + '  - {name: c0, timer: 10ms, publishes: [/t0]}\n'
+    for i in range(1, size - 1):
+        text += f'  - {{name: c{i}, subscription: /t{i - 1}, publishes: [/t{i}]}}\n'
+    return text + f'  - {{name: end, subscription: /t{size - 2}, deadline: 1s}}\n'
+
+
+def star(size: int) -> str:
+    """One topic that starts everything, and a sync of everything; queue edges all over."""
+    text = HEAD + '  - {name: t, timer: 10ms, publishes: [/a]}\n'
+    for i in range(size - 2):
+        text += f'  - {{name: c{i}, subscription: /a, publishes: [/b], reads: [/a, t]}}\n'
+    return text + '  - {name: s, sync: [/a, /b], deadline: 1s}\n'
+
+
+def many(size: int) -> str:
+    """Many small DAGs that share a callback, so that it has a vertex in each."""
+    text = HEAD
+    for i in range(size // 2):
+        text += f'  - {{name: c{i}, timer: 10ms, publishes: [/a], dag: d{i}}}\n'
+    return text + '  - {name: s, subscription: /a, deadline: 1s}\n'
+
+
+def square(size: int) -> str:
+    """One topic with many publishers, beside many sinks, and queue edges from one variable."""
+    text = HEAD + '  - {name: t, timer: 10ms, publishes: [/a]}\n'
+    for i in range(size // 2):
+        text += f'  - {{name: p{i}, subscription: /a, publishes: [/b], reads: [p0]}}\n'
+    for i in range(size // 2 - 2):
+        text += f'  - {{name: r{i}, subscription: /a, deadline: 1s}}\n'
+    return text + '  - {name: s, sync: [/a, /b], deadline: 1s}\n'
+
+
+SHAPES: dict[str, Callable[[int], str]] = {
+    shape.__name__: shape for shape in (chain, star, many, square)}
+
+
+def calls(work: Callable[[], Any]) -> int:
+    """Return how many functions a piece of work calls, C functions included."""
+    count = 0
+
+    def profile(frame: object, event: str, argument: object) -> None:
+        nonlocal count
+        count += event in ('call', 'c_call')
+
+    previous = sys.getprofile()
+    sys.setprofile(profile)
+    try:
+        work()
+    finally:
+        sys.setprofile(previous)
+    return count
+
+
+@pytest.mark.parametrize('shape', SHAPES)
+def test_work_is_linear(shape: str) -> None:
+    small, large = SHAPES[shape](400), SHAPES[shape](1_600)
+    loads(small)
+    ratio = calls(lambda: loads(large)) / calls(lambda: loads(small))
+    assert 3 < ratio < 4.5
+
+
+@pytest.mark.parametrize('shape', SHAPES)
+def test_ten_thousand_vertices(shape: str) -> None:
+    tasks: TaskSet = loads(SHAPES[shape](10_000))
+    assert len(tasks.vertices) == 10_000
+    assert len({vertex.name for vertex in tasks.vertices}) == 10_000
+    assert sum(len(dag.edges) for dag in tasks.dags) >= 5_000

@@ -1,0 +1,407 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Traces for the replay tests: declarations, a live-like run in virtual time, simulated runs.
+
+`VirtualRun` drives the real scheduler core as the live executor does (intake, workers, messages
+that arrive late or never, coroutines, drops, undeclared callbacks), and records what the executor
+records, in the order in which it does: what a thread ran only when it has run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from pathlib import Path
+import random
+from typing import Any
+
+from hypothesis import strategies as st
+from mddag_executor.core import NEVER, Scheduler, Tables, Tally
+from mddag_executor.core.state import ABORTED, DROP, EXPIRED, IDLE, JOB_END, OPEN, SINK_DONE
+from mddag_executor.simulate.engine import END, Load, LogEntry, START
+from mddag_executor.trace import TraceFile
+from msg_graph import loads, TaskSet
+
+START_TIME = 1_732_166_766_000_000_000
+MS = 1_000_000
+VPID = 77
+
+SMALL = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /camera
+    callbacks:
+      - {name: grab, timer: 20ms, publishes: [/image, /info], execution_time: 1ms}
+  - node: /left
+    callbacks:
+      - {name: detect, subscription: /image, publishes: [/boxes], execution_time: 2ms}
+  - node: /right
+    callbacks:
+      - {name: rectify, subscription: /info, publishes: [/flat], execution_time: 3ms}
+      - {name: watch, subscription: /info, deadline: 12ms, execution_time: 1ms}
+  - node: /fuse
+    callbacks:
+      - {name: join, sync: [/boxes, /flat], deadline: 18ms, execution_time: 2ms}
+  - node: /imu
+    callbacks:
+      - {name: tick, timer: 10ms, publishes: [/twist], execution_time: 1ms}
+      - {name: use, subscription: /twist, deadline: 8ms, execution_time: 1ms}
+"""
+
+
+def small() -> TaskSet:
+    """Return two DAGs with a fork, a join and three sinks."""
+    return loads(SMALL, 'small.yaml')
+
+
+@st.composite
+def declarations(draw: st.DrawFn) -> str:
+    """Return the text of a declaration: random DAGs, some of which share a callback."""
+    n_dags = draw(st.integers(1, 3))
+    shared = draw(st.booleans())
+    lines = ['mddag: 1', 'nodes:']
+    for d in range(n_dags):
+        n = draw(st.integers(1, 6))
+        before = [sorted(draw(st.sets(st.integers(0, i - 1), min_size=1, max_size=3)))
+                  for i in range(1, n)]
+        publishing = {p for row in before for p in row}
+        publisher = draw(st.integers(0, n - 1)) if shared else -1
+        for i in range(n):
+            topics = [f'/d{d}t{i}'] if i in publishing else []
+            topics += ['/shared'] if i == publisher else []
+            about = []
+            if i == 0:
+                about += ['timer: 10ms', f'dag: dag{d}']
+                about += ['on_miss: abort'] if draw(st.booleans()) else []
+                about += ['max_active_jobs: 2'] if draw(st.booleans()) else []
+            elif len(before[i - 1]) == 1:
+                about.append(f'subscription: /d{d}t{before[i - 1][0]}')
+            else:
+                about.append('sync: [' + ', '.join(f'/d{d}t{p}' for p in before[i - 1]) + ']')
+            about += [f'publishes: [{", ".join(topics)}]'] if topics else [
+                f'deadline: {draw(st.integers(3, 30))}ms']
+            about.append('execution_time: 1ms')
+            lines += [f'  - node: /d{d}n{i}', '    callbacks:',
+                      f'      - {{name: cb, {", ".join(about)}}}']
+    if shared:
+        lines += ['  - node: /common', '    callbacks:',
+                  '      - {name: cb, subscription: /shared, deadline: 9ms, execution_time: 1ms}']
+    return '\n'.join(lines) + '\n'
+
+
+def legs_to(task_set: TaskSet, tables: Tables) -> dict[int, list[tuple[int, int]]]:
+    """Return for each global vertex the vertices and legs that its messages start."""
+    found: dict[int, list[tuple[int, int]]] = {}
+    for dag in task_set.dags:
+        first = tables.first_vertex[dag.index]
+        for vertex in dag.vertices:
+            found[first + vertex.index] = targets = []
+            for after in vertex.successors:
+                topics = dag.vertices[after].callback.topics
+                for leg, topic in enumerate(topics):
+                    if topic in vertex.callback.publishes:
+                        targets.append((first + after, leg if len(topics) > 1 else 0))
+    return found
+
+
+@dataclass
+class Chances:
+    """How often things go wrong in a virtual run, 0 to 1."""
+
+    lost: float = 0.05
+    dropped: float = 0.03
+    skipped: float = 0.03
+    coroutine: float = 0.1
+    undeclared: float = 0.2
+    early_message: float = 0.3
+
+
+@dataclass
+class _Execution:
+    x: int
+    vertex: int
+    leg: int
+    slot: int
+    dag: int
+    job: int
+    ready: int
+    pieces: int = 1
+
+
+@dataclass
+class VirtualRun:
+    """A run in virtual time, recorded to a file; `tally` has what the driver counted."""
+
+    path: Path
+    task_set: TaskSet
+    seed: int = 0
+    workers: int = 2
+    policy: str = 'rad'
+    duration: int = 300 * MS
+    longest: int = 8 * MS
+    max_active_jobs: int = 3
+    expire_after: int = 20 * MS
+    chances: Chances = field(default_factory=Chances)
+    shut_down: bool = True
+    finish_file: bool = True
+    flush_every: int = 40
+
+    def __post_init__(self) -> None:
+        """Run."""
+        self.random = random.Random(self.seed)
+        self.tables = Tables.build(
+            self.task_set, legs=True, groups=False, max_active_jobs=self.max_active_jobs,
+            expire_after=self.expire_after)
+        self.scheduler = Scheduler(self.tables, self.workers, self.policy, propagate=False)
+        self.tally = Tally(self.task_set, self.tables)
+        self.executions: dict[str, int] = {}
+        self.busy: dict[str, int] = {}
+        self.undeclared_runs = 0
+        self.responses: list[int] = []
+        self.drops = 0
+        self._targets = legs_to(self.task_set, self.tables)
+        self._queue: list[tuple[int, int, Callable[[int], None]]] = []
+        self._order = 0
+        self._waiting: dict[int, _Execution] = {}
+        self._aborted: set[tuple[int, int]] = set()
+        self._jobs = [0] * self.tables.n_dags
+        self._events = 0
+        self.file = TraceFile(self.path)
+        self._run()
+
+    # --- the run ---------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        self.record('task_set', START_TIME, 1, self.task_set.text, self.task_set.file, self.policy,
+                    self.workers, 100 * MS, self.max_active_jobs, False)
+        end = START_TIME + self.duration
+        for dag in self.task_set.dags:
+            for k in range(self.duration // dag.period_ns):
+                release = START_TIME + (k + 1) * dag.period_ns
+                self._at(release + self.random.randrange(MS), self._release(dag.index, release))
+        if self.random.random() < self.chances.undeclared:
+            for _ in range(20):
+                self._at(START_TIME + self.random.randrange(self.duration), self._undeclared)
+        while self._queue and self._queue[0][0] <= end:
+            now, _, action = heappop(self._queue)
+            action(now)
+            self._dispatch(now)
+        if self.shut_down:
+            self.scheduler.expire_idle(end)
+            self.decided(end)
+            self.scheduler.finish(end)
+            self.decided(end)
+            self.record('shutdown', end, 1, end)
+        if self.finish_file:
+            self.file.finish()
+        else:
+            self.file.flush()
+            self.file.abandon()
+
+    def _at(self, time: int, action: Callable[[int], None]) -> None:
+        self._order += 1
+        heappush(self._queue, (time, self._order, action))
+
+    def record(self, event: str, timestamp: int, vtid: int, *fields: Any) -> None:
+        """Record an event; now and then a chunk is written."""
+        self.file.add(event, timestamp, VPID, vtid, *fields)
+        self._events += 1
+        if self._events % self.flush_every == 0:
+            self.file.flush()
+
+    def _release(self, dag: int, release: int) -> Callable[[int], None]:
+        def action(now: int) -> None:
+            job = self._jobs[dag]
+            self._jobs[dag] += 1
+            slot = self.scheduler.release(dag, job, release, now)
+            self.decided(now)
+            self.tally.released(dag)
+            self.record('job_release', now, 2, dag, job, release)
+            if self.random.random() < self.chances.skipped:
+                self.scheduler.expire(slot, now)
+                self.decided(now)
+                return
+            self._ready(slot, dag, job, self.tables.source[dag], 0, now)
+        return action
+
+    def _ready(self, slot: int, dag: int, job: int, vertex: int, leg: int, now: int) -> None:
+        x = self.scheduler.execution(slot, vertex, leg)
+        self.scheduler.ready(x, now)
+        self._waiting[x] = _Execution(x, vertex, leg, slot, dag, job, now)
+        if self.random.random() < self.chances.dropped:
+            self.drop(x, 'qos_depth', now)
+
+    def drop(self, x: int, reason: str, now: int) -> None:
+        """Drop a waiting execution."""
+        work = self._waiting.pop(x)
+        self.scheduler.drop(x, now)
+        self.record('drop', now, 2, self._address(work.vertex), work.dag,
+                    self.tables.index_in_dag[work.vertex], work.job, reason)
+        self.drops += 1
+        self.decided(now)
+
+    def _undeclared(self, now: int) -> None:
+        self.undeclared_runs += 1
+        x = self.scheduler.undeclared(self.undeclared_runs, -1, now)
+        self._waiting[x] = _Execution(x, -1, 0, -1, -1, -1, now)
+
+    def _message(
+        self, slot: int, dag: int, job: int, vertex: int, leg: int
+    ) -> Callable[[int], None]:
+        def action(now: int) -> None:
+            state = self.scheduler.state
+            if (state.job_dag[slot] != dag or state.job_index[slot] != job
+                    or state.job_state[slot] != OPEN):
+                if (dag, job) in self._aborted:
+                    self.record('drop', now, 2, self._address(vertex), dag,
+                                self.tables.index_in_dag[vertex], job, 'aborted')
+                    self.drops += 1
+                else:
+                    self._undeclared(now)
+            elif state.x_state[self.scheduler.execution(slot, vertex, leg)] != IDLE:
+                self._undeclared(now)
+            else:
+                self._ready(slot, dag, job, vertex, leg, now)
+        return action
+
+    def _dispatch(self, now: int) -> None:
+        while True:
+            x = self.scheduler.schedule(now)
+            self.decided(now)
+            if x < 0:
+                return
+            self._start(self._waiting.pop(x), self.scheduler.state.x_worker[x], now)
+
+    def _start(self, work: _Execution, worker: int, now: int) -> None:
+        start = now + self.random.randrange(50_000)
+        end = start + self.random.randrange(1, self.longest)
+        self._at(end + self.random.choice((0, 0, 1, 30_000)),
+                 lambda locked: self._end(work, worker, start, end, locked))
+        if work.vertex >= 0:
+            for vertex, leg in self._targets[work.vertex]:
+                if self.random.random() >= self.chances.lost:
+                    early = self.random.random() < self.chances.early_message
+                    arrival = self.random.randrange(start, end + 1) if early \
+                        else end + 100_000 + self.random.randrange(2 * MS)
+                    self._at(arrival, self._message(work.slot, work.dag, work.job, vertex, leg))
+
+    def _end(self, work: _Execution, worker: int, start: int, end: int, now: int) -> None:
+        vtid = 100 + worker
+        declared = work.vertex >= 0
+        address = self._address(work.vertex)
+        vertex = self.tables.index_in_dag[work.vertex] if declared else -1
+        self.record('dispatch', start, vtid, address, work.dag, vertex, work.job, worker,
+                    work.ready, 0)
+        self.record('callback_start', start, vtid, address, False)
+        self.record('callback_end', end, vtid, address)
+        if declared:
+            key = self.task_set.vertices[work.vertex].callback.key
+            self.busy[key] = self.busy.get(key, 0) + end - start
+        if declared and self.random.random() < self.chances.coroutine:
+            self.scheduler.suspend(work.x)
+            self._at(now + self.random.randrange(MS), lambda later: self._resume(work))
+            return
+        whole = self.scheduler.complete(work.x, end)
+        if declared:
+            self.executions[key] = self.executions.get(key, 0) + 1
+            self.record('complete', now, vtid, address, work.dag, vertex, work.job, whole, end,
+                        work.leg)
+        self.decided(now)
+
+    def _resume(self, work: _Execution) -> None:
+        self.scheduler.resume(work.x)
+        self._waiting[work.x] = work
+
+    def _address(self, vertex: int) -> int:
+        return 5000 if vertex < 0 else 1000 + self.task_set.callbacks.index(
+            self.task_set.vertices[vertex].callback)
+
+    def decided(self, now: int) -> None:
+        """Count and record what the core has decided, as the live executor does."""
+        decisions = self.scheduler.decisions()
+        self.tally.add(decisions)
+        for kind, dag, vertex, job, deadline, time in decisions:
+            if kind == DROP:
+                work = self._waiting.pop(deadline, None)
+                if work is not None:
+                    self.record('drop', now, 2, self._address(work.vertex), work.dag,
+                                self.tables.index_in_dag[work.vertex], work.job, 'aborted')
+                    self.drops += 1
+            elif kind == JOB_END:
+                if deadline == ABORTED:
+                    self._aborted.add((dag, job))
+                if deadline in (ABORTED, EXPIRED):
+                    self.record('abort' if deadline == ABORTED else 'expire', now, 2, dag, job)
+            else:
+                if kind == SINK_DONE:
+                    self.responses.append(time - deadline + self.tables.sink_deadline[vertex])
+                if kind != SINK_DONE or time > deadline:
+                    self.record('deadline', now, 2, dag, self.tables.index_in_dag[vertex], job,
+                                deadline, time)
+
+
+def write_simulated(
+    path: Path, task_set: TaskSet, load: Load, log: list[LogEntry], *, policy: str = 'rad',
+    workers: int = 2, end: int,
+) -> None:
+    """Record a simulated, non-preemptive schedule as the live executor would have."""
+    legs = Tables.build(task_set, legs=True)
+    events: list[tuple[Any, ...]] = []
+    ready: dict[tuple[int, int], int] = {}
+    for i, (time, dag, job) in enumerate(zip(load.times, load.dags, load.jobs)):
+        ready[(dag, job)] = time
+        if dag < legs.n_dags:
+            release = load.releases[i] if load.releases else time
+            events.append(('job_release', time, 2, dag, job, release))
+    for start, entry in executions(log):
+        time, _, worker, dag, vertex, job = entry
+        declared = dag < legs.n_dags
+        local = legs.index_in_dag[vertex]
+        address = 1000 + vertex
+        where = (dag, local, job) if declared else (-1, -1, -1)
+        events += [
+            ('dispatch', start, 100 + worker, address, *where, worker,
+             start if declared else ready[(dag, job)], 0),
+            ('callback_start', start, 100 + worker, address, False),
+            ('callback_end', time, 100 + worker, address)]
+        for leg in range(legs.n_legs[vertex] if declared else 0):
+            last = leg == legs.n_legs[vertex] - 1
+            events.append(('complete', time, 100 + worker if last else 99, address, *where, last,
+                           time, leg))
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME - 1, VPID, 1, task_set.text, task_set.file, policy,
+                 workers, 100 * MS, 0, False)
+        for event in sorted(events, key=lambda e: e[1]):
+            file.add(event[0], event[1], VPID, *event[2:])
+        file.add('shutdown', end, VPID, 1, end)
+
+
+def executions(log: list[LogEntry]) -> Iterator[tuple[int, LogEntry]]:
+    """Yield start and end entry of each execution of a non-preemptive log, by order of end."""
+    since: dict[int, int] = {}
+    for entry in log:
+        if entry[1] == START:
+            since[entry[2]] = entry[0]
+        else:
+            assert entry[1] == END
+            yield since.pop(entry[2]), entry
+
+
+def loose(task_set: TaskSet) -> Tables:
+    """Return tables without bounds, for simulations."""
+    return Tables.build(task_set, max_active_jobs=NEVER)

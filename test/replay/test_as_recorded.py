@@ -1,0 +1,370 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""As recorded: the replayer counts what the executor counted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import tempfile
+
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from mddag_executor.replay import replay, ReplayError
+from mddag_executor.trace import TraceFile
+from msg_graph import loads
+import pytest
+
+from .helpers import Chances, declarations, MS, small, SMALL, START_TIME, VirtualRun, VPID
+
+
+@given(declarations(), st.integers(0, 2**32), st.integers(1, 4),
+       st.sampled_from(['rad', 'fifo', 'rm']), st.integers(1, 25))
+@settings(max_examples=150)
+@example(SMALL, 1, 2, 'rad', 8)
+def test_replay_counts_what_the_driver_counted(
+    text: str, seed: int, workers: int, policy: str, longest: int
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'run.mcap')
+        run = VirtualRun(path, loads(text, 'g.yaml'), seed, workers, policy,
+                         longest=longest * MS)
+        outcome = replay(path)
+    assert outcome.warnings == []
+    result = outcome.result()
+    expected = run.tally.result()
+    for dag in result['dags'].values():
+        for sink in dag['sinks'].values():
+            del sink['breakdown']
+    assert {key: result[key] for key in expected} == expected
+    assert (result['policy'], result['workers'], result['preemptive']) == (policy, workers, False)
+    for key, use in result['callbacks'].items():
+        assert use['executions'] == run.executions.get(key, 0)
+        assert use['busy_ns'] == run.busy.get(key, 0)
+    assert sum(result['dropped'].values()) == run.drops
+    assert result['worker_use']['use'] <= 1
+
+
+def test_every_kind_of_verdict_occurs(tmp_path: Path) -> None:
+    """The differential test would be worth little if nothing ever went wrong in its runs."""
+    text = SMALL.replace('timer: 20ms,', 'timer: 20ms, on_miss: abort,')
+    seen = dict.fromkeys(('completed', 'late', 'expired', 'aborted', 'overdue'), 0)
+    for seed in range(8):
+        path = tmp_path / f'{seed}.mcap'
+        run = VirtualRun(path, loads(text, 'g.yaml'), seed, duration=400 * MS,
+                         chances=Chances(undeclared=1))
+        assert run.drops > 0
+        assert run.undeclared_runs > 0
+        for dag in replay(path).tally.result()['dags'].values():
+            for sink in dag['sinks'].values():
+                for key in seen:
+                    seen[key] += sink[key]
+    assert min(seen.values()) > 0, seen
+
+
+def test_breakdowns_add_up_to_the_response_times(tmp_path: Path) -> None:
+    run = VirtualRun(tmp_path / 'a.mcap', small(), 3, duration=1000 * MS)
+    result = replay(tmp_path / 'a.mcap').result()
+    total = 0
+    for dag in result['dags'].values():
+        for sink in dag['sinks'].values():
+            parts = sink['breakdown']
+            mean = sum(parts['mean'].values())
+            total += sink['completed'] * mean
+            worst = parts['worst']
+            times = {k: v for k, v in worst.items()
+                     if k not in ('job', 'release_ns', 'completed_ns', 'chain')}
+            assert sum(times.values()) == worst['completed_ns'] - worst['release_ns']
+            assert sum(times.values()) == sink['response_ns']['max']
+            assert times['unknown_ns'] == 0
+            assert worst['chain'][-1]['end_ns'] == worst['completed_ns']
+            assert min(times[k] for k in ('waiting_ns', 'executing_ns', 'transport_ns')) >= 0
+    assert total == pytest.approx(sum(run.responses), rel=1e-6)
+
+
+def write(path: Path, *events: tuple[object, ...], text: str = SMALL, workers: int = 2,
+          policy: str = 'rad') -> Path:
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME, VPID, 1, text, 'small.yaml', policy, workers, 100 * MS,
+                 64, False)
+        for name, time, vtid, *fields in events:
+            file.add(str(name), START_TIME + int(str(time)) * MS, VPID, int(str(vtid)), *fields)
+    return path
+
+
+def one_execution(  # noqa: PLR0913
+    dag: int, vertex: int, job: int, ready: int, start: int, end: int, *, leg: int = 0,
+    whole: bool = True, vtid: int = 9,
+) -> list[tuple[object, ...]]:
+    address = 100 * dag + vertex
+    return [
+        ('dispatch', start, vtid, address, dag, vertex, job, 0, START_TIME + ready * MS, 0),
+        ('callback_start', start, vtid, address, False),
+        ('callback_end', end, vtid, address),
+        ('complete', end, vtid, address, dag, vertex, job, whole, START_TIME + end * MS, leg)]
+
+
+def job_of_the_camera(job: int, at: int) -> list[tuple[object, ...]]:
+    """Return the events of a whole job: vertices grab, detect, rectify, watch, join."""
+    return [
+        ('job_release', at + 1, 2, 0, job, START_TIME + at * MS),
+        *one_execution(0, 0, job, at + 1, at + 2, at + 4),
+        *one_execution(0, 1, job, at + 5, at + 5, at + 8),
+        *one_execution(0, 2, job, at + 5, at + 6, at + 9, vtid=10),
+        *one_execution(0, 4, job, at + 8, at + 8, at + 9, leg=0, whole=False),
+        *one_execution(0, 3, job, at + 6, at + 9, at + 11),
+        *one_execution(0, 4, job, at + 10, at + 12, at + 15, leg=1),
+    ]
+
+
+def test_a_job_to_the_millisecond(tmp_path: Path) -> None:
+    """A run written by hand: verdicts, times and chain are those that can be read off."""
+    path = write(tmp_path / 'a.mcap', *job_of_the_camera(0, 10),
+                 ('shutdown', 110, 1, START_TIME + 110 * MS))
+    outcome = replay(path)
+    assert outcome.warnings == []
+    result = outcome.result()
+    assert result['duration_ns'] == 100 * MS
+    assert result['utilisation'] == pytest.approx(14 / 200)
+    camera = result['dags']['/camera']
+    assert camera['jobs'] == 1
+    assert camera['ends'] == {'completed': 1, 'late': 0, 'aborted': 0, 'expired': 0}
+    join = camera['sinks']['/fuse:join']
+    assert (join['completed'], join['late'], join['relative_deadline_ns']) == (1, 0, 18 * MS)
+    assert join['response_ns'] == dict.fromkeys(('min', 'median', 'p99', 'max'), 15 * MS)
+    worst = join['breakdown']['worst']
+    assert [step['vertex'] for step in worst['chain']] == [
+        '/camera:grab', '/right:rectify', '/fuse:join']
+    assert {key: value // MS for key, value in worst.items() if key.endswith('_ns')} == {
+        'release_ns': START_TIME // MS + 10, 'completed_ns': START_TIME // MS + 25,
+        'release_lag_ns': 1, 'waiting_ns': 1 + 1 + 2, 'executing_ns': 2 + 3 + 3,
+        'suspended_ns': 0, 'transport_ns': 1 + 1, 'unknown_ns': 0}
+    assert result['callbacks']['/fuse:join'] == {
+        'executions': 2, 'busy_ns': 4 * MS, 'longest_ns': 3 * MS, 'waiting_ns': 2 * MS,
+        'longest_wait_ns': 2 * MS}
+    assert result['dags']['/imu']['jobs'] == 0
+
+
+def test_other_deadlines_judge_anew(tmp_path: Path) -> None:
+    path = write(tmp_path / 'a.mcap', *job_of_the_camera(0, 10), *job_of_the_camera(1, 30),
+                 ('shutdown', 110, 1, START_TIME + 110 * MS))
+    assert not replay(path).tally.missed
+    outcome = replay(path, loads(SMALL.replace('18ms', '14ms'), 'tight.yaml'))
+    assert outcome.warnings == []
+    sink = outcome.result()['dags']['/camera']['sinks']['/fuse:join']
+    assert (sink['completed'], sink['late']) == (2, 2)
+    assert outcome.tally.first_miss == {
+        'dag': '/camera', 'vertex': '/fuse:join', 'job': 0,
+        'deadline_ns': START_TIME + 24 * MS, 'completed_ns': START_TIME + 25 * MS}
+    exact = replay(path, loads(SMALL.replace('18ms', '15ms'), 'exact.yaml'))
+    assert not exact.tally.missed
+
+
+REORDERED = """\
+mddag: 1
+nodes:
+  - node: /imu
+    callbacks:
+      - {name: use, subscription: /twist, deadline: 8ms}
+      - {name: tick, timer: 10ms, publishes: [/twist]}
+  - node: /fuse
+    callbacks:
+      - {name: join, sync: [/flat, /boxes], deadline: 18ms}
+  - node: /right
+    callbacks:
+      - {name: watch, subscription: /info, deadline: 12ms}
+      - {name: rectify, subscription: /info, publishes: [/flat]}
+  - node: /left
+    callbacks:
+      - {name: detect, subscription: /image, publishes: [/boxes]}
+  - node: /camera
+    callbacks:
+      - {name: grab, timer: 20ms, publishes: [/info, /image], dag: video}
+"""
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_vertices_are_found_by_name(tmp_path: Path, seed: int) -> None:
+    """Another order of DAGs, vertices and legs changes no verdict."""
+    path = tmp_path / 'a.mcap'
+    run = VirtualRun(path, small(), seed)
+    outcome = replay(path, loads(REORDERED, 'reordered.yaml'))
+    assert outcome.warnings == []
+    expected = run.tally.result()['dags']
+    dags = outcome.result()['dags']
+    assert set(dags) == {'/imu', 'video'}
+    for ours, theirs in (('/imu', '/imu'), ('video', '/camera')):
+        assert dags[ours]['jobs'] == expected[theirs]['jobs']
+        assert dags[ours]['ends'] == expected[theirs]['ends']
+        for name, sink in dags[ours]['sinks'].items():
+            breakdown = sink.pop('breakdown')
+            assert sink == expected[theirs]['sinks'][name]
+            assert breakdown['mean']['unknown_ns'] == 0
+
+
+def test_vertices_of_shared_callbacks_are_found(tmp_path: Path) -> None:
+    """A callback of two DAGs is called ``@dag``; with other DAG names, or one DAG, it is found."""
+    text = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks: [{name: cb, timer: 10ms, dag: one, publishes: [/x]}]
+  - node: /b
+    callbacks: [{name: cb, timer: 10ms, dag: two, publishes: [/x]}]
+  - node: /c
+    callbacks: [{name: cb, subscription: /x, deadline: 5ms}]
+"""
+    path = tmp_path / 'a.mcap'
+    expected = VirtualRun(path, loads(text, 'g.yaml'), 3).tally.result()['dags']
+    renamed = replay(path, loads(text.replace('one', 'uno'), 'renamed.yaml'))
+    assert renamed.warnings == []
+    sink = renamed.result()['dags']['uno']['sinks']['/c:cb@uno']
+    assert sink['completed'] == expected['one']['sinks']['/c:cb@one']['completed'] > 0
+    alone = replay(path, loads(text.replace(
+        '[{name: cb, timer: 10ms, dag: two, publishes: [/x]}]',
+        '[{name: cb, timer: 10ms, dag: two, deadline: 9ms}]'), 'alone.yaml'))
+    assert alone.warnings == []
+    sinks = alone.result()['dags']
+    assert sinks['one']['sinks']['/c:cb']['completed'] == sink['completed']
+    assert sinks['two']['sinks']['/b:cb']['completed'] > 0
+    assert alone.result()['undeclared']['executions'] > 0  # /c:cb of DAG two
+
+
+def test_callbacks_that_the_trace_lacks(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    VirtualRun(path, small())
+    more = SMALL + """\
+  - node: /radar
+    callbacks: [{name: scan, timer: 50ms, deadline: 5ms}]
+"""
+    outcome = replay(path, loads(more, 'more.yaml'))
+    assert outcome.warnings == [
+        f'{path}: 1 of the 8 callbacks of more.yaml are not in it, so they count as never '
+        'completed: /radar:scan',
+        'more.yaml: the sources of 1 DAGs are no sources in the recording, so there are no jobs '
+        'of them: /radar']
+    assert outcome.result()['dags']['/radar']['jobs'] == 0
+    other = """\
+mddag: 1
+nodes:
+  - node: /radar
+    callbacks: [{name: scan, timer: 50ms, deadline: 5ms}]
+"""
+    with pytest.raises(ReplayError, match=(
+            r'a\.mcap: none of the callbacks of other\.yaml is in it: it has /camera:grab, .*: '
+            'give the graph')):
+        replay(path, loads(other, 'other.yaml'))
+
+
+def test_a_killed_run_is_judged_at_its_last_instant(tmp_path: Path) -> None:
+    path = write(tmp_path / 'a.mcap', *job_of_the_camera(0, 10),
+                 ('job_release', 60, 2, 0, 1, START_TIME + 60 * MS),
+                 ('job_release', 70, 2, 1, 0, START_TIME + 70 * MS),
+                 ('job_release', 80, 2, 1, 1, START_TIME + 80 * MS))
+    outcome = replay(path)
+    assert outcome.warnings == [
+        f'{path}: the end of the run is not recorded (the process was killed, or the trace is '
+        'cut): what was open is judged at the last recorded instant']
+    result = outcome.result()
+    assert result['recording']['shut_down'] is False
+    assert result['duration_ns'] == 70 * MS
+    camera, imu = result['dags']['/camera']['sinks'], result['dags']['/imu']['sinks']
+    # job 1 of the camera: 20 ms passed, deadlines of 12 and 18 ms; of the IMU: 10 and 0 ms
+    assert [s['overdue'] for s in (*camera.values(), *imu.values())] == [1, 1, 1]
+
+
+def test_misses_that_are_not_those_recorded_are_said(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / 'a.mcap', *job_of_the_camera(0, 10),
+        ('deadline', 26, 2, 0, 4, 0, START_TIME + 24 * MS, START_TIME + 25 * MS),
+        ('shutdown', 110, 1, START_TIME + 110 * MS))
+    assert replay(path).warnings == [
+        f'{path}: 1 of the 1 misses that the executor recorded are not found again, 0 that it did '
+        'not record are found: the first is job 0 at /fuse:join']
+    # under other deadlines there is nothing to compare
+    assert replay(path, loads(SMALL.replace('12ms', '13ms'), 'g.yaml')).warnings == []
+
+
+def test_events_that_make_no_sense_are_counted(tmp_path: Path) -> None:
+    good = job_of_the_camera(0, 10)
+    nonsense: list[tuple[object, ...]] = [
+        ('job_release', 20, 2, 7, 0, START_TIME), ('job_release', 20, 2, -5, 0, START_TIME),
+        ('complete', 20, 2, 1, 0, 99, 0, True, START_TIME, 0),
+        ('complete', 20, 2, 1, 1, -3, 0, True, START_TIME, 0),
+        ('expire', 20, 2, 2**31 - 1, 0), ('abort', 20, 2, -1, 0),
+        ('complete', 20, 2, 1, 0, 4, 0, True, START_TIME, 2**31 - 1),
+        ('dispatch', 20, 2, 1, 2**31 - 1, -2**31, 2**63 - 1, -5, -2**63, 0),
+        ('callback_end', 20, 2, 1), ('callback_end', 20, 3, 5),
+        ('complete', 24, 2, 1, 0, 1, 0, True, START_TIME, 0),      # a second time
+        ('complete', 25, 2, 1, 0, 1, 55, True, START_TIME, 0),     # of an unknown job
+        ('job_release', 26, 2, 0, 0, START_TIME),                  # a second time
+        ('expire', 27, 2, 0, 44),
+    ]
+    events = sorted([*good, *nonsense], key=lambda event: int(str(event[1])))
+    path = write(tmp_path / 'a.mcap', *events, ('shutdown', 110, 1, START_TIME + 110 * MS),
+                 ('shutdown', 120, 1, START_TIME + 120 * MS))
+    outcome = replay(path)
+    assert outcome.result()['dags']['/camera']['ends']['completed'] == 1
+    assert outcome.warnings == [
+        f'{path}: 6 events make no sense and are left out, most of them (2) mddag:job_release of '
+        'a DAG that is not declared',
+        f'{path}: 4 events contradict those before them and are left out']
+
+
+def test_lost_events_are_said(tmp_path: Path) -> None:
+    path = write(tmp_path / 'a.mcap', ('lost', 5, 1, 17), ('lost', 6, 1, 3),
+                 ('shutdown', 110, 1, START_TIME + 110 * MS))
+    assert replay(path).warnings == [
+        f'{path}: 20 events were lost while recording: jobs may be missing, or count as late that '
+        'were not',
+        f'{path}: no job was released in it']
+
+
+@pytest.mark.parametrize(('text', 'says'), [
+    ('', 'it was recorded without a declaration'),
+    ('nonsense', r'the declaration that it was recorded with is wrong \(small.yaml'),
+])
+def test_a_trace_without_a_usable_declaration(tmp_path: Path, text: str, says: str) -> None:
+    path = write(tmp_path / 'a.mcap', text=text)
+    with pytest.raises(ReplayError, match=f'a.mcap: {says}'):
+        replay(path)
+    with pytest.raises(ReplayError, match='<stdin>: '):
+        replay(path, name='<stdin>')
+
+
+def test_a_trace_of_another_program(tmp_path: Path) -> None:
+    path = tmp_path / 'caret.mcap'
+    with TraceFile(path) as file:
+        file.add('callback_start', START_TIME, VPID, 1, 5, False)
+        file.add('callback_end', START_TIME + 1, VPID, 1, 5)
+    with pytest.raises(ReplayError, match=(
+            'caret.mcap: no run of this executor is recorded in it: there is no event '
+            'mddag:task_set, so there are no jobs: record a run with mddag run')):
+        replay(path, small())
+
+
+def test_memory_depends_on_open_jobs(tmp_path: Path) -> None:
+    """What is kept of jobs that have ended is their response times."""
+    import tracemalloc
+    sizes = []
+    for duration in (2_000, 10_000):
+        path = tmp_path / f'{duration}.mcap'
+        run = VirtualRun(path, small(), 1, duration=duration * MS, longest=2 * MS,
+                         flush_every=10**9)
+        tracemalloc.start()
+        outcome = replay(path)
+        sizes.append(tracemalloc.get_traced_memory()[1] - 100 * len(run.responses))
+        tracemalloc.stop()
+        assert outcome.warnings == []
+    assert sizes[1] < 2 * sizes[0]
