@@ -37,12 +37,12 @@ LEVELS = {
     'mddag_executor': 3,  # its __init__.py, to those who want the version
     'mddag_executor.core': 4,
     'mddag_executor.trace': 4,
-    'mddag_executor.live': 5,
-    'mddag_executor.replay': 5,
-    'mddag_executor.simulate': 5,
-    'mddag_executor.report': 6,
-    'mddag_executor.cli': 7,
-    'mddag_executor.__main__': 8,
+    'mddag_executor.simulate': 5,  # below replay, which reschedules with its engine
+    'mddag_executor.live': 6,
+    'mddag_executor.replay': 6,
+    'mddag_executor.report': 7,
+    'mddag_executor.cli': 8,
+    'mddag_executor.__main__': 9,
 }
 # What mddag_executor/__init__.py passes on belongs to the part that it comes from.
 PASSED_ON = {'mddag_executor.DeadlineMiss', 'mddag_executor.MultiDeadlineExecutor'}
@@ -140,6 +140,7 @@ def test_every_folder_has_its_level() -> None:
     ('mddag_executor.trace.reader', 'from mddag_executor import core'),
     ('mddag_executor.trace.reader', 'import rclpy'),
     ('mddag_executor.simulate.run', 'from mddag_executor.replay.run import replay'),
+    ('mddag_executor.replay.load', 'from mddag_executor.live.verdicts import Verdicts'),
     ('mddag_executor.simulate.run', 'def f():\n    from std_msgs.msg import Header'),
     ('mddag_executor.live.executor', 'from mddag_executor.cli.common import write_json'),
     ('mddag_executor.report.html', 'import mddag_executor.cli.text'),
@@ -156,6 +157,7 @@ def test_a_wrong_import_is_found(module: str, text: str) -> None:
     ('mddag_executor.core.tables', 'from .rules import release\nfrom . import rules'),
     ('mddag_executor.live.executor', 'import rclpy\nfrom mddag_executor.core import Tables'),
     ('mddag_executor.cli.run', 'from mddag_executor.report.table import sinks'),
+    ('mddag_executor.replay.load', 'from mddag_executor.simulate.engine import Load'),
     ('mddag_executor.trace.reader', 'from mddag_executor.errors import MddagError'),
     ('mddag_executor.trace.reader', 'from mddag_executor import __version__'),
 ])

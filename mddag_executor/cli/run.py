@@ -258,6 +258,7 @@ def _run_programs(
             with session:
                 host.start(programs, arguments)
                 session.wait(seconds, progress.update)
+                host.close()
         except MddagError:
             # What a callback raised tells more than that its program failed to start.
             if session.error is None:

@@ -89,9 +89,6 @@ class State(NamedTuple):
     decisions: list[Decision]
 
 
-_BY_DAG = {'free_slot': -1, 'oldest': -1, 'newest': -1, 'n_open': 0}
-
-
 def new_state(
     tables: Tables,
     n_workers: int,
@@ -112,30 +109,49 @@ def new_state(
     :param switch_overhead: added to an execution each time it is preempted, ns.
     """
     columns: dict[str, list[int]] = {name: [] for name in State._fields}
-    for name, value in _BY_DAG.items():
-        columns[name] = [value] * (tables.n_dags + 1)
-    columns['worker_x'] = [-1] * n_workers
-    columns['scalars'] = [0] * N_SCALARS
-    columns['group_owner'] = [-1] * tables.n_groups
     state = State(**columns)  # type: ignore[arg-type]
-    state.group_heap.extend([] for _ in range(tables.n_groups))
-    state.scalars[N_IDLE] = n_workers
-    state.scalars[PREEMPTIVE] = int(preemptive)
-    state.scalars[PROPAGATE] = int(propagate)
-    state.scalars[DISPATCH_OVERHEAD] = dispatch_overhead
-    state.scalars[SWITCH_OVERHEAD] = switch_overhead
+    fill_state(
+        tables, state, n_workers, int(preemptive), int(propagate), dispatch_overhead,
+        switch_overhead)
     return state
+
+
+def fill_state(
+    t: Tables, s: State, n_workers: int, preemptive: int, propagate: int, dispatch_overhead: int,
+    switch_overhead: int,
+) -> None:
+    """Fill the columns of a state that is all empty; see ``new_state``."""
+    for _ in range(N_SCALARS):
+        s.scalars.append(0)
+    s.scalars[N_IDLE] = n_workers
+    s.scalars[PREEMPTIVE] = preemptive
+    s.scalars[PROPAGATE] = propagate
+    s.scalars[DISPATCH_OVERHEAD] = dispatch_overhead
+    s.scalars[SWITCH_OVERHEAD] = switch_overhead
+    for _ in range(t.n_groups):
+        add_group(s)
+    for _ in range(n_workers):
+        s.worker_x.append(-1)
+    for _ in range(t.n_dags + 1):
+        s.free_slot.append(-1)
+        s.oldest.append(-1)
+        s.newest.append(-1)
+        s.n_open.append(0)
 
 
 def add_slot(t: Tables, s: State, dag: int) -> None:
     """Give a DAG one more slot, with the region of executions that a job of it needs."""
     slot = len(s.job_dag)
-    for column, value in (
-        (s.job_dag, dag), (s.job_base, len(s.x_slot)), (s.job_index, -1), (s.job_release, 0),
-        (s.job_state, FREE), (s.job_sinks_left, 0), (s.job_late, 0), (s.job_active, 0),
-        (s.job_next, s.free_slot[dag]), (s.job_previous, -1),
-    ):
-        column.append(value)
+    s.job_dag.append(dag)
+    s.job_base.append(len(s.x_slot))
+    s.job_index.append(-1)
+    s.job_release.append(0)
+    s.job_state.append(FREE)
+    s.job_sinks_left.append(0)
+    s.job_late.append(0)
+    s.job_active.append(0)
+    s.job_next.append(s.free_slot[dag])
+    s.job_previous.append(-1)
     s.free_slot[dag] = slot
     last = t.n_vertices + 1 if dag == t.n_dags else t.first_vertex[dag + 1]
     for vertex in range(t.first_vertex[dag], last):
@@ -144,11 +160,13 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
             s.x_vertex.append(vertex)
             s.x_group.append(t.group[vertex])
             s.x_key.append((0, 0, 0, 0, 0))
-            for column, value in (
-                (s.x_state, IDLE), (s.x_pending, 0), (s.x_worker, -1), (s.x_ready, 0),
-                (s.x_started, -1), (s.x_left, 0), (s.x_cost, 0),
-            ):
-                column.append(value)
+            s.x_state.append(IDLE)
+            s.x_pending.append(0)
+            s.x_worker.append(-1)
+            s.x_ready.append(0)
+            s.x_started.append(-1)
+            s.x_left.append(0)
+            s.x_cost.append(0)
 
 
 def add_group(s: State) -> int:

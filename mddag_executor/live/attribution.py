@@ -47,7 +47,9 @@ KEEP = 1024
 ROUNDING_NS = 2
 """DDS stamps are multiples of 2**-32 s: they may lie this far outside of the window."""
 
-_LONG_AGO_NS = 20_000_000
+OUT_OF_ORDER_NS = 1_000_000
+"""Publications are kept in order of their begin, but for threads that overtake each other."""
+
 _STILL_PUBLISHING = 2 ** 63 - 1
 
 
@@ -85,6 +87,40 @@ class Publication:
         self.origin = origin
 
 
+class _Topic:
+    """The publications of one topic: all of the last ones, and those that have not returned."""
+
+    def __init__(self) -> None:
+        self.publications: deque[Publication] = deque(maxlen=KEEP)
+        self.open: list[Publication] = []
+        self.longest = 0
+
+    def begun(self, publication: Publication) -> None:
+        self.open.append(publication)
+        self.publications.append(publication)
+
+    def ended(self, publication: Publication, end: int) -> None:
+        self.longest = max(self.longest, end - publication.begin)
+        publication.end = end
+        self.open.remove(publication)
+
+    def holding(self, stamp: int) -> list[Publication]:
+        """Return the publications whose window holds a stamp."""
+        fits = [p for p in self.open.copy() if p.begin - ROUNDING_NS <= stamp]
+        # What began this long ago has ended before the stamp, like all before it.
+        first = stamp - self.longest - OUT_OF_ORDER_NS
+        publications = self.publications
+        for i in range(len(publications) - 1, -1, -1):
+            # By index: other threads append meanwhile, which may only show an entry twice.
+            publication = publications[i]
+            if publication.begin < first:
+                break
+            if (publication.begin - ROUNDING_NS <= stamp <= publication.end + ROUNDING_NS
+                    and publication not in fits):
+                fits.append(publication)
+        return fits
+
+
 class Attribution:
     """
     Notes publications and finds the one that a message comes from.
@@ -93,7 +129,7 @@ class Attribution:
     """
 
     def __init__(self, topics: set[str]) -> None:
-        self._by_topic: dict[str, deque[Publication]] = {t: deque(maxlen=KEEP) for t in topics}
+        self._topics = {t: _Topic() for t in topics}
         self.unknown = 0
         self.doubtful = 0
 
@@ -102,16 +138,16 @@ class Attribution:
         state: PublisherState, origin: Origin,
     ) -> None:
         """Send a message and note the publication; the caller holds the publisher's lock."""
-        publications = self._by_topic.get(state.topic)
-        if publications is None:
+        topic = self._topics.get(state.topic)
+        if topic is None:
             send(publisher, msg)
             return
         publication = Publication(time.time_ns(), state, origin)
-        publications.append(publication)
+        topic.begun(publication)
         try:
             send(publisher, msg)
         finally:
-            publication.end = time.time_ns()
+            topic.ended(publication, time.time_ns())
 
     def find(self, topic: str, stamp: int, sequence: int | None) -> Origin | None:
         """
@@ -120,11 +156,8 @@ class Attribution:
         :param stamp: its source timestamp, system time in ns.
         :param sequence: its publication sequence number, where the middleware gives one.
         """
-        publications = self._by_topic.get(topic)
-        if not publications:
-            self.unknown += 1
-            return None
-        fits = _windows_with(publications, stamp)
+        known = self._topics.get(topic)
+        fits = known.holding(stamp) if known is not None else []
         if len(fits) == 1:
             if sequence is not None:
                 fits[0].publisher.offset = sequence - fits[0].sequence
@@ -137,17 +170,3 @@ class Attribution:
             return matches[0].origin
         self.doubtful += 1
         return None
-
-
-def _windows_with(publications: deque[Publication], stamp: int) -> list[Publication]:
-    """Return the publications whose window holds a stamp, the newest first."""
-    fits: list[Publication] = []
-    for i in range(len(publications) - 1, -1, -1):
-        # By index: other threads append meanwhile, which may only show an entry twice.
-        publication = publications[i]
-        if publication.begin - ROUNDING_NS <= stamp <= publication.end + ROUNDING_NS:
-            if publication not in fits:
-                fits.append(publication)
-        elif fits and publication.end < stamp - _LONG_AGO_NS:
-            break
-    return fits

@@ -117,7 +117,7 @@ class Grid:
 
     @property
     def first_release(self) -> int:
-        """The first due time."""
+        """Return the first due time."""
         return int(self._first + self._offset)
 
     def release(self) -> int:

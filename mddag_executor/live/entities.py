@@ -60,7 +60,8 @@ class Receiver(Protocol):
         """
 
     def on_message(
-        self, subscription: Subscription, message: Any, info: dict[str, Any]) -> None:
+        self, subscription: Subscription, message: Any, info: dict[str, Any]
+    ) -> None:
         """Take in a message (bytes of a raw subscription) with its info."""
 
     def on_request(self, service: Service, request: Any, header: Any) -> None:
@@ -114,7 +115,7 @@ class EntitySet:
 
     @property
     def nodes(self) -> list[Node]:
-        """The nodes that the set was taken from."""
+        """Return the nodes that the set was taken from."""
         return list(self._nodes)
 
     def __len__(self) -> int:

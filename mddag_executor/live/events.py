@@ -31,10 +31,12 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.live.endings import stop_at_exit, wake_at_shutdown
 from mddag_executor.live.entities import EMPTY, EntitySet, Receiver, snapshot
 from mddag_executor.live.native import NodeStandIn
-from mddag_executor.live.waitset import PATIENCE, stop_at_exit, WaitSetIntake
+from mddag_executor.live.waitset import PATIENCE, WaitSetIntake
 from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
@@ -147,10 +149,14 @@ class _NativeThread:
                     failures = 0
                 except ExternalShutdownException:
                     pass
+                except InvalidHandle as error:
+                    broken = not self._node.survives(error)
+                    if broken:
+                        self._receiver.on_intake_error(error)
                 except Exception as error:
                     failures += 1
                     self._receiver.on_intake_error(error)
-                    broken = self._node.failed(error)
+                    broken = not self._node.survives(error)
                     if not broken:
                         # A take failed. What was announced with it is announced no more.
                         self._node.drain()
@@ -201,7 +207,7 @@ class EventsIntake:
         self._parts: dict[str, Any] = {}
         self._ending: list[Any] = []
         self._refused: set[str] = set()
-        context.on_shutdown(self.wake)
+        wake_at_shutdown(context, self)
 
     @classmethod
     def available(cls) -> bool:

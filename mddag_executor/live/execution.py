@@ -108,7 +108,7 @@ class ExecutionPlan:
 
     @property
     def utilisation(self) -> float:
-        """Normalised utilisation that results: sum(C / T) / workers."""
+        """Return the normalised utilisation that results: sum(C / T) / workers."""
         return _utilisation(self._task_set, self._times, self.workers)
 
     def execution_ns(self, dag: int, vertex: int) -> int:

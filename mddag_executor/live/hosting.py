@@ -79,6 +79,7 @@ class Host:
         self.guests: list[Guest] = []
         self.end_run = end_run
         self._all_started = False
+        self._closed = False
         self._ending = threading.Event()
         self._local = threading.local()
         self._lock = threading.Lock()
@@ -129,8 +130,19 @@ class Host:
                 program.spec, 'it ended and neither returned a node nor let one spin',
                 'name what makes the node, or a main() that spins it')
 
+    def close(self) -> None:
+        """Take no more nodes; to be called before the executor is shut down."""
+        self._closed = True
+
     def end(self, timeout_s: float = 0.5) -> list[Guest]:
-        """Let all spins return; return the programs that don't end in time."""
+        """
+        Shut the context down and let all spins return; ``rclpy.ok()`` is False then.
+
+        :return: the programs that don't end in time.
+        """
+        self._closed = True
+        if self.guests:
+            self.executor.context.try_shutdown()
         self._ending.set()
         end = time.monotonic() + timeout_s
         left = []
@@ -194,11 +206,12 @@ class Host:
             raise LoadingError(
                 guest.program.spec if guest else name, f'node {name} has a context of its own',
                 'let it use the default context')
-        self._local.adopting = True
-        try:
-            self.executor.add_node(node)
-        finally:
-            self._local.adopting = False
+        if not self._closed and node not in self.executor.get_nodes():
+            self._local.adopting = True
+            try:
+                self.executor.add_node(node)
+            finally:
+                self._local.adopting = False
         if guest is not None:
             with self._lock:
                 if node not in guest.nodes:

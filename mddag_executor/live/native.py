@@ -33,9 +33,11 @@ rules keep it from using what is gone, or what has come in its place:
    it was withdrawn, so an address can not be used again while events for it may be queued. It is
    withdrawn in one update of the native executor; the events queued by then are through before
    an update begins that was asked for after that one: two updates later it lets go.
-4. Adding can not fail half way, which the native executor does not survive: a destroyed entity
-   is noticed when its handle is entered, and from there to the adding no bytecode runs, so no
-   other thread can destroy it in between.
+4. Adding an entity that is destroyed fails half way, which the native executor does not survive.
+   So it is made to try the handles of new ones at the very last, when it reads ``guards``: that is
+   an iterator without elements, which enters and leaves the handles as it is read, all in C.
+   If that fails, nothing was added yet; and from there to the adding no bytecode runs, so no
+   other thread can destroy an entity in between.
 
 Before an entity is shown, everything is taken from it, and once more an update later. For the
 native executor takes as many as the middleware announces, and that does not announce everything
@@ -46,219 +48,42 @@ events.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from itertools import chain
+from operator import length_hint, methodcaller
 from typing import Any
 
 from mddag_executor.live.entities import EMPTY, EntitySet, Receiver
-from mddag_executor.live.takes import take_function
-from rclpy.client import Client
-from rclpy.event_handler import EventHandler
+from mddag_executor.live.standins import STAND_INS, StandIn
 from rclpy.exceptions import InvalidHandle
-from rclpy.service import Service
-from rclpy.subscription import Subscription
-from rclpy.waitable import NumberOfEntities
-
-DRAIN_TURNS = 16
-"""So many times ``takes.MOST_AT_ONCE`` messages are taken from a new entity at the most."""
 
 
-def _ignore(*_: Any) -> None:
-    """Stand for the callback of an entity that is no longer looked after."""
-
-
-def _keep_request(request: Any, _: Any) -> Any:
-    """Stand for a service's callback: the request itself is what is "sent" as its response."""
-    return request
-
-
-class _StandIn:
-    """What all stand-ins have; ``live`` is cleared when the entity is looked after no more."""
-
-    __slots__ = ('handle', 'live', 'take', '_on_error')
-
-    def __init__(self, kind: str, entity: Any, handle: Any, receiver: Receiver) -> None:
-        self.handle: Any = handle
-        self.live = True
-        self.take = take_function(kind, entity, receiver)
-        self._on_error = receiver.on_intake_error
-        self.handle.__enter__()
-
-    def drain(self) -> None:
-        """Take what is there."""
-        try:
-            for _ in range(DRAIN_TURNS if self.live else 0):
-                if not self.take():
-                    return
-        except InvalidHandle:
-            pass
-        except Exception as error:
-            self._on_error(error)
-
-    def withdraw(self) -> None:
-        """Hand over nothing any more."""
-        self.live = False
-
-    def let_go(self) -> None:
-        """Allow the entity to be destroyed."""
-        self.handle.__exit__(None, None, None)
-
-
-class SubscriptionStandIn(_StandIn):
-    """Stand in for a subscription."""
-
-    __slots__ = ('msg_type', 'raw', 'callback', '_callback_type', '_deliver')
-
-    CallbackType = Subscription.CallbackType
-
-    def __init__(self, subscription: Subscription, receiver: Receiver) -> None:
-        super().__init__('subscription', subscription, subscription.handle, receiver)
-        self.msg_type = subscription.msg_type
-        self.raw = subscription.raw
-        self._callback_type = Subscription.CallbackType.WithMessageInfo
-        on_message, on_error = receiver.on_message, receiver.on_intake_error
-
-        def deliver(message: Any, info: Any = None) -> None:
-            if info is None:
-                message, info = message  # rclpy 7.1 gives both as one tuple
-            try:
-                on_message(subscription, message, info)
-            except Exception as error:
-                on_error(error)
-
-        self._deliver = deliver
-        self.callback: Callable[..., None] = deliver
-
-    def withdraw(self) -> None:
-        """Hand over nothing any more."""
-        self.live = False
-        self.callback = _ignore  # the native executor may be using the old one: it stays
-
-
-class ServiceStandIn(_StandIn):
-    """Stand in for a service."""
-
-    __slots__ = ('srv_type', 'callback', '_service', '_on_request')
-
-    def __init__(self, service: Service, receiver: Receiver) -> None:
-        super().__init__('service', service, service.handle, receiver)
-        self.srv_type = service.srv_type
-        self.callback = _keep_request
-        self._service = service
-        self._on_request = receiver.on_request
-
-    def send_response(self, request: Any, header: Any) -> None:
-        """Hand over what ``callback`` kept, now that the header is known too."""
-        if self.live:
-            try:
-                self._on_request(self._service, request, header)
-            except Exception as error:
-                self._on_error(error)
-
-
-class ClientStandIn(_StandIn):
-    """Stand in for a client, and for the future of each of its requests."""
-
-    __slots__ = ('srv_type', '_client', '_on_response', '_sequence')
-
-    def __init__(self, client: Client, receiver: Receiver) -> None:
-        super().__init__('client', client, client.handle, receiver)
-        self.srv_type = client.srv_type
-        self._client = client
-        self._on_response = receiver.on_response
-        self._sequence = 0
-
-    def get_pending_request(self, sequence: int) -> ClientStandIn:
-        """Stand for the future of a request: its result comes next, in the same thread."""
-        self._sequence = sequence
-        return self
-
-    def _set_executor(self, _: Any) -> None:
-        """Do nothing: the real future gets its executor where it is completed."""
-
-    def set_result(self, response: Any) -> None:
-        """Hand over a response."""
-        if self.live:
-            try:
-                self._on_response(self._client, self._sequence, None, response)
-            except Exception as error:
-                self._on_error(error)
-
-
-class _Capture:
-    """Stand in for a wait set, to get at the handle of a QoS event, which has no other access."""
-
-    handle: Any = None
-
-    def add_event(self, handle: Any) -> int:
-        """Note the handle; return its index."""
-        self.handle = handle
-        return 0
-
-
-class EventStandIn(_StandIn):
+class _Trial:
     """
-    Stand in for a QoS event, as the waitable that the native executor takes it for.
+    The handles of new entities, to be entered and left all in C: by reading ``iterator``.
 
-    It makes a task of what ``execute`` returns; that one does nothing.
+    Both yield None, which ``filter`` leaves out: the iterator has no elements.
     """
 
-    __slots__ = ('_event', '_on_waitable')
+    def __init__(self, stand_ins: list[StandIn]) -> None:
+        self.stand_ins = stand_ins
+        handles = [stand_in.handle for stand_in in stand_ins]
+        self._in, self._out = iter(handles), iter(handles)
+        self.iterator = chain(
+            filter(methodcaller('__enter__'), self._in),
+            filter(methodcaller('__exit__', None, None, None), self._out))
 
-    _futures = ()
+    def passed(self) -> bool:
+        """Return whether the iterator was read to its end."""
+        return length_hint(self._out) == 0
 
-    def __init__(self, event: EventHandler, receiver: Receiver) -> None:
-        capture = _Capture()
-        event.add_to_wait_set(capture)
-        super().__init__('waitable', event, capture.handle, receiver)
-        self.take = self._take
-        self._event = event
-        self._on_waitable = receiver.on_waitable
-
-    def __enter__(self) -> None:
-        """Do nothing: the handle is held anyway, and this must not fail."""
-
-    def __exit__(self, *_: Any) -> None:
-        """Do nothing."""
-
-    def get_num_entities(self) -> NumberOfEntities:
-        """Return that it is one event."""
-        return NumberOfEntities(num_events=1)
-
-    def add_to_wait_set(self, wait_set: Any) -> None:
-        """Add the event (so does the native executor learn what there is to call it)."""
-        wait_set.add_event(self.handle)
-
-    def is_ready(self, _: Any) -> bool:
-        """Return True: it is asked only then."""
+    def failed(self) -> bool:
+        """Return whether a handle could not be entered; if so, leave those that were."""
+        count = len(self.stand_ins)
+        if length_hint(self._out) < count or length_hint(self._in) == count:
+            return False
+        for stand_in in self.stand_ins[:count - length_hint(self._in) - 1]:
+            stand_in.handle.__exit__(None, None, None)
         return True
-
-    def take_data(self) -> None:
-        """Take the event's status and hand it over, if it has any news."""
-        if self.live:
-            self.drain()
-
-    def _take(self) -> int:
-        with self.handle:
-            data = self.handle.take_event()
-        if data is not None and _has_news(data):
-            try:
-                self._on_waitable(self._event, data)
-            except Exception as error:
-                self._on_error(error)
-        return 0
-
-    def execute(self, _: Any) -> Callable[..., None]:
-        """Return what is run as a task."""
-        return _ignore
-
-
-def _has_news(status: Any) -> bool:
-    """
-    Return whether a QoS event's status tells of a change since it was taken last.
-
-    A status can be taken at any time; and where the middleware has announced several changes, the
-    first take gives them all.
-    """
-    return any(getattr(status, name) for name in dir(status) if name.endswith('_change'))
 
 
 class NodeStandIn:
@@ -269,7 +94,7 @@ class NodeStandIn:
     :param wake: the native executor's ``wake``.
     """
 
-    timers = clients = services = waitables = guards = ()  # type: Any
+    timers = ()
 
     def __init__(
         self, kinds: Iterable[str], receiver: Receiver, wake: Callable[[], None]
@@ -277,52 +102,86 @@ class NodeStandIn:
         self._receiver = receiver
         self._wake = wake
         self.wanted: EntitySet = EMPTY
-        self._shown: EntitySet = EMPTY
+        self._applied: EntitySet = EMPTY
         self._by_kind: dict[str, dict[int, Any]] = {kind: {} for kind in kinds}
-        self._subscriptions: list[SubscriptionStandIn] = []
+        self._subscriptions: list[Any] = []
+        self.services: list[Any] = []
+        self.clients: list[Any] = []
+        self.waitables: list[Any] = []
+        self.guards: Iterable[None] = ()
         self._updates = 0
-        # From when something new is shown until the next update: then the native executor has
-        # survived this one.
-        self.updating = False
-        self._fresh: list[_StandIn] = []
-        self._withdrawn: list[tuple[int, _StandIn]] = []
+        # What is shown for the first time: until the next update begins, the native executor may
+        # fail to add it.
+        self._trial: _Trial | None = None
+        self._withdrawn: list[tuple[int, StandIn]] = []
 
     @property
     def executor(self) -> None:
-        """Whatever is set is ignored: a node would hold the executor, and that one the node."""
+        """Ignore what is set: a node would hold the executor, and that one the node."""
 
     @executor.setter
     def executor(self, executor: Any) -> None:
         pass
 
     @property
-    def subscriptions(self) -> list[SubscriptionStandIn]:
-        """What the native executor reads first in each of its updates, in its own thread."""
+    def subscriptions(self) -> list[Any]:
+        """Give what the native executor reads first in each update, in its own thread."""
         self._updates += 1
-        fresh, self._fresh = self._fresh, []
-        for stand_in in fresh:
-            stand_in.drain()
-        self.updating = self.wanted is not self._shown
-        if self.updating:
+        trial = self._trial
+        if trial is not None and trial.passed():
+            self._trial = None
+            for stand_in in trial.stand_ins:
+                stand_in.drain()
+        if self.wanted is not self._applied:
             try:
                 self._change()
             except Exception as error:
                 self._receiver.on_intake_error(error)
         self._let_go(self._updates - 2)
-        if self.updating or self._withdrawn:
+        if self._trial is not None or self._withdrawn:
             self._wake()
         return self._subscriptions
 
-    def failed(self, error: Exception) -> bool:
-        """Return whether what came out of the native executor was its failure to update."""
-        return self.updating and (
-            type(error) in (RuntimeError, KeyError) or isinstance(error, InvalidHandle))
+    def survives(self, error: Exception) -> bool:
+        """
+        Return whether the native executor can go on after an exception that came out of it.
+
+        An entity that was destroyed before it could be added is taken back, and then it can.
+        """
+        trial = self._trial
+        if trial is None:
+            return True
+        if trial.failed():
+            self._try([s for s in trial.stand_ins if not self._took_back(s)])
+            self._show()
+            self._wake()
+            return True
+        return type(error) not in (RuntimeError, KeyError, InvalidHandle)
+
+    def _took_back(self, stand_in: StandIn) -> bool:
+        """Take back a stand-in that was never added, if its entity has been destroyed."""
+        try:
+            with stand_in.handle:
+                return False
+        except InvalidHandle:
+            for known in self._by_kind.values():
+                known.pop(stand_in.key, None)
+            stand_in.let_go()
+            return True
 
     def _change(self) -> None:
-        wanted = self._shown = self.wanted
+        wanted = self._applied = self.wanted
+        new: list[StandIn] = []
         for kind, known in self._by_kind.items():
-            self._by_kind[kind] = self._changed(known, getattr(wanted, kind), _STAND_INS[kind])
+            self._by_kind[kind] = self._changed(kind, known, getattr(wanted, kind), new)
         self._show()
+        untried = self._trial.stand_ins if self._trial is not None else []
+        self._try([stand_in for stand_in in untried if stand_in.live] + new)
+
+    def _try(self, stand_ins: list[StandIn]) -> None:
+        """Have these tried in the next update, or in the present one."""
+        self._trial = _Trial(stand_ins) if stand_ins else None
+        self.guards = self._trial.iterator if self._trial is not None else ()
 
     def _show(self) -> None:
         shown = {kind: list(known.values()) for kind, known in self._by_kind.items()}
@@ -332,22 +191,21 @@ class NodeStandIn:
         self.waitables = shown.get('events', [])
 
     def _changed(
-        self, known: dict[int, Any], entities: Iterable[Any], stand_in: Callable[..., Any]
+        self, kind: str, known: dict[int, Any], entities: Iterable[Any], new: list[StandIn]
     ) -> dict[int, Any]:
         """Return the stand-ins for these entities; withdraw those of others."""
         found: dict[int, Any] = {}
         for entity in entities:
             key = id(entity)
-            if key in known:
-                found[key] = known.pop(key)
-                continue
-            try:
-                new = stand_in(entity, self._receiver)
-            except InvalidHandle:
-                continue
-            new.drain()
-            self._fresh.append(new)
-            found[key] = new
+            stand_in = known.pop(key, None)
+            if stand_in is None:
+                try:
+                    stand_in = STAND_INS[kind](entity, self._receiver)
+                except InvalidHandle:
+                    continue
+                stand_in.drain()
+                new.append(stand_in)
+            found[key] = stand_in
         for old in known.values():
             old.withdraw()
             self._withdrawn.append((self._updates, old))
@@ -380,11 +238,3 @@ class NodeStandIn:
             self._by_kind[kind] = {}
         self._show()
         self._let_go(self._updates)
-
-
-_STAND_INS: dict[str, Callable[..., Any]] = {
-    'subscriptions': SubscriptionStandIn,
-    'services': ServiceStandIn,
-    'clients': ClientStandIn,
-    'events': EventStandIn,
-}

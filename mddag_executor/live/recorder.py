@@ -64,7 +64,7 @@ class Recorder:
         self.record(event, now, threading.get_native_id(), *fields)
 
     def entities(self, nodes: Iterable[Any], added: list[Entry]) -> None:
-        """Record new nodes, publishers and entities (CARET's initialization tracepoints)."""
+        """Record what is new among nodes, publishers and entities (CARET initialization)."""
         by_name: dict[str, int] = {}
         for node in nodes:
             address = id(node)

@@ -142,12 +142,12 @@ class SyntheticWorkload:
 
     @property
     def nodes(self) -> list[Node]:
-        """The nodes that an executor is to run."""
+        """Return the nodes that an executor is to run."""
         return list(self._nodes.values())
 
     @property
     def evicted_joins(self) -> int:
-        """How many joins were dropped incomplete."""
+        """Tell how many joins were dropped incomplete."""
         return sum(join.evicted for join in self.joins)
 
     def unmatched(self) -> list[str]:

@@ -43,19 +43,18 @@ cheaper.
 
 from __future__ import annotations
 
-import atexit
 from collections.abc import Callable, Iterable
 import threading
 import time
-from typing import Any
-import weakref
 
+from mddag_executor.live.endings import stop_at_exit, wake_at_shutdown
 from mddag_executor.live.entities import EMPTY, EntitySet, Receiver, snapshot
 from mddag_executor.live.refilled import RefilledSet
 from mddag_executor.live.timers import sharpen_wake_ups, TimerQueue
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 
 ALL_KINDS = frozenset(
@@ -76,18 +75,6 @@ PATIENCE = 3
 """So many waits in a row may bring errors before the thread slows down."""
 
 _now = time.monotonic_ns
-_started: weakref.WeakSet[Any] = weakref.WeakSet()
-
-
-def stop_at_exit(intake: Any) -> None:
-    """Have an intake that was started stopped before the interpreter and the middleware end."""
-    _started.add(intake)
-
-
-@atexit.register
-def _stop_all() -> None:
-    for intake in list(_started):
-        intake.stop()
 
 
 class WaitSetIntake:
@@ -147,7 +134,7 @@ class WaitSetIntake:
         self._polling = False
         self._events: RefilledSet | None = None  # apart from the others in a thread only
         self._events_at = 0
-        context.on_shutdown(self.wake)
+        wake_at_shutdown(context, self)
 
     # --- what to wait for ------------------------------------------------------------------------
 
@@ -239,9 +226,9 @@ class WaitSetIntake:
 
         :param timeout_sec: seconds to wait; None or negative: until something is ready.
         :return: how many things were handed over: 0 after the time, and when a guard condition
-            or ``wake`` ended the wait.
+            or ``wake`` ended the wait, or the context has been shut down.
         :raises RuntimeError: when the intake's thread runs.
-        :raises RCLError: when rcl can not wait, as in a context that has been shut down.
+        :raises RCLError: when rcl can not wait for another reason.
         """
         if self.running:
             raise RuntimeError('the intake runs in a thread of its own')
@@ -262,6 +249,10 @@ class WaitSetIntake:
                 count += more + self._timers.fire(_now())
                 if count or rang or (limit is not None and _now() >= limit):
                     return count
+        except _rclpy.RCLError:
+            if self._context.ok():
+                raise
+            return 0
         finally:
             self._polling = False
             if self._filled is not None:

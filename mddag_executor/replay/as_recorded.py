@@ -52,7 +52,7 @@ class Replay:
             self.warnings.append(
                 f'{recording.name}: {judge.contradictions} events contradict those before them '
                 'and are left out')
-        differences = judge.differences(follower.shut_down)
+        differences = judge.differences() if follower.shut_down else None
         if differences is not None:
             self.warnings.append(f'{recording.name}: {differences}')
 

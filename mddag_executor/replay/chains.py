@@ -139,10 +139,12 @@ class Chains:
         while step is not None:
             chain.append(step)
             legs = self._before[step.vertex]
-            vertices = legs[step.leg] if step.leg >= 0 and legs else [v for leg in legs for v in leg]
+            if step.leg >= 0 and legs:
+                legs = [legs[step.leg]]
             ready = step.execution.ready
-            candidates = [done[v] for v in vertices if v in done and done[v].execution.start <= ready]
-            step = max(candidates, key=lambda s: min(s.execution.end, ready), default=None)
+            candidates = [done[v] for leg in legs for v in leg
+                          if v in done and done[v].execution.start <= ready]
+            step = max(candidates, key=lambda s: s.execution.end, default=None)
         chain.reverse()
         return chain
 

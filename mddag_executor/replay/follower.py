@@ -25,7 +25,8 @@ sequence again, and whoever feeds it to a core gets the same verdicts.
 `dispatch`, `callback_start` and `callback_end` come from the thread that ran the callback; they
 belong together by thread and by the callback's address.  One such run is a *piece*.  An execution
 is one piece, or several where a coroutine was suspended in between; they have the same vertex, job
-and ready time.  `complete`, from the same thread, ends an execution of a declared callback.
+and ready time.  `complete`, from the same thread, ends an execution of a declared callback;
+several in a row end the legs of a sync callback that ran only once (a simulator's).
 
 The observers are told in terms of the declaration that judges (see ``mapping``); DAG and vertex
 are -1 for what it does not declare.  Another kind of recording needs another follower, and no
@@ -38,6 +39,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from mddag_executor.core import NEVER
 from mddag_executor.replay.mapping import Mapping
 from mddag_executor.replay.recording import Recording, TASK_SET
 
@@ -91,7 +93,8 @@ class Observer:
         Take in that an execution of a vertex has completed.
 
         :param whole: whether that completed the vertex, as the executor saw it.
-        :param execution: its times, None where they are not in the trace.
+        :param execution: its times, None where they are not in the trace; the same object again
+            for further legs that one execution completes.
         """
 
     def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
@@ -153,15 +156,17 @@ class Follower:
         #: The first release or the time at which the first execution became ready, ns.
         self.start: int | None = None
         #: The run's end, ns: as recorded, or the last thing that the executor's core saw.
-        self.end = recording.head.time
+        self.end = 0
         self.shut_down = False
         self.jobs = 0
         self.lost = 0
         self.dropped: Counter[str] = Counter()
         self._strange: Counter[str] = Counter()
+        self._newest = [-1] * len(mapping.dag)
         self._running: dict[int, _Running] = {}
-        # by thread: the execution whose piece ended last; by execution: its pieces so far
-        self._last: dict[int, Key] = {}
+        # by thread: the execution whose piece ended last; by execution that is not complete: its
+        # pieces so far
+        self._last: dict[int, tuple[Key, Execution]] = {}
         self._open: dict[Key, Execution] = {}
         self._undeclared: dict[tuple[int, int], None] = {}
 
@@ -177,11 +182,16 @@ class Follower:
             if None in event:
                 self._strange[f'{event[0]} without some of its fields'] += 1
                 continue
+            if not 0 <= event[1] < NEVER:
+                self._strange[f'{event[0]} at a time that can not be'] += 1
+                continue
             handlers[event[0]](event)
             count += 1
             if progress is not None and count % _PROGRESS_STEP == 0:
                 progress(count)
         if not self.shut_down:
+            if self.end == 0:
+                self.end = min(max(0, self._recording.head.time), NEVER - 1)
             for observer in self._observers:
                 observer.finished(self.end)
 
@@ -210,6 +220,10 @@ class Follower:
 
     def _dispatch(self, event: Event) -> None:
         _, now, _, thread, callback, dag, vertex, job, worker, ready, _ = event
+        if not 0 <= ready <= now:
+            self._strange[f'{event[0]} before it was ready'] += 1
+            self._running.pop(thread, None)
+            return
         if dag >= 0:
             dag, vertex, _ = self._mapping.look_up(dag, vertex, 0)
         self._running[thread] = _Running(callback, dag, vertex, job, worker, ready, now)
@@ -234,9 +248,10 @@ class Follower:
         if running.dag >= 0:
             key = (running.dag, running.vertex, running.job, ready)
             before = self._open.get(key)
-            self._open[key] = Execution(ready, start, now, now - start) if before is None \
+            execution = Execution(ready, start, now, now - start) if before is None \
                 else Execution(ready, before.start, now, before.busy + now - start)
-            self._last[thread] = key
+            self._open[key] = execution
+            self._last[thread] = key, execution
             first = before is None
         else:
             first = self._is_new(callback, ready)
@@ -268,6 +283,13 @@ class Follower:
         if not 0 <= dag < len(self._mapping.dag):
             self._strange[f'{event[0]} of a DAG that is not declared'] += 1
             return
+        if not 0 <= release <= now:
+            self._strange[f'{event[0]} of a release that is still to come'] += 1
+            return
+        if job <= self._newest[dag]:
+            self._strange[f'{event[0]} of a job that is not newer than the last'] += 1
+            return
+        self._newest[dag] = job
         self.jobs += 1
         if self.start is None or release < self.start:
             self.start = release
@@ -279,17 +301,21 @@ class Follower:
     def _complete(self, event: Event) -> None:
         _, now, _, thread, _, dag, vertex, job, whole, end, leg = event
         self._advance(now)
-        key = self._last.pop(thread, None)
+        last = self._last.get(thread)
         declared = self._mapping.vertex
         if not 0 <= dag < len(declared) or not 0 <= vertex < len(declared[dag]):
             self._strange[f'{event[0]} of a vertex that is not declared'] += 1
+            return
+        if not 0 <= end <= now:
+            self._strange[f'{event[0]} of an end that is still to come'] += 1
             return
         dag, vertex, leg = self._mapping.look_up(dag, vertex, leg)
         if dag < 0:
             return
         execution = None
-        if key is not None and key[:3] == (dag, vertex, job):
-            execution = self._open.pop(key, None)
+        if last is not None and last[0][:3] == (dag, vertex, job):
+            execution = last[1]
+            self._open.pop(last[0], None)
         for observer in self._observers:
             observer.completed(dag, vertex, job, leg, whole, end, execution)
 
@@ -331,6 +357,9 @@ class Follower:
 
     def _shutdown(self, event: Event) -> None:
         if self.shut_down:
+            return
+        if not self.end <= event[4] < NEVER:
+            self._strange[f'{event[0]} at a time that can not be'] += 1
             return
         self.end = event[4]
         self.shut_down = True

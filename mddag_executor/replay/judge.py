@@ -89,9 +89,6 @@ class Judge(Observer):
 
     def released(self, dag: int, job: int, release: int, now: int) -> None:
         """Open the job."""
-        if job <= self._newest.get(dag, -1):
-            self.contradictions += 1
-            return
         self._newest[dag] = job
         slot = self._scheduler.release(dag, job, release, now)
         self._slots[(dag, job)] = slot
@@ -171,15 +168,15 @@ class Judge(Observer):
         if difference:
             self._open_misses[miss] = difference
 
-    def differences(self, shut_down: bool) -> str | None:
+    def differences(self) -> str | None:
         """
         Return how the recorded misses differ from those found, None where they do not.
 
-        :param shut_down: whether the executor judged what was open at the end.
+        Only of use when the end of the run is recorded: elsewhere the trace may be cut between a
+        completion and its verdict.
         """
-        found = [m for m, n in self._open_misses.items()
-                 if n > 0 and (shut_down or m.completed >= 0)]
-        recorded = [m for m, n in self._open_misses.items() if n < 0]
+        found = [miss for miss, side in self._open_misses.items() if side > 0]
+        recorded = [miss for miss, side in self._open_misses.items() if side < 0]
         if not found and not recorded:
             return None
         example = min(found + recorded, key=lambda miss: miss.deadline)

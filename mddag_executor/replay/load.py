@@ -74,14 +74,13 @@ class LoadBuilder(Observer):
         # by DAG, flat: what each vertex of each job took, and whether it completed
         self._took: list[list[int]] = [[] for _ in task_set.dags]
         self._whole = [bytearray() for _ in task_set.dags]
-        self._undeclared: list[int] = []
+        # (time when ready, what it took)
+        self._undeclared: list[tuple[int, int]] = []
         #: By global vertex: the address of the callback that ran as it.
         self.callback_of: dict[int, int] = {}
 
     def released(self, dag: int, job: int, release: int, now: int) -> None:
         """Take in a job."""
-        if (dag, job) in self._row:
-            return
         row = len(self._jobs[dag])
         self._row[(dag, job)] = row
         self._jobs[dag].append(job)
@@ -94,9 +93,7 @@ class LoadBuilder(Observer):
         """Add to an execution time."""
         took = piece.end - piece.start
         if piece.vertex < 0:
-            ready = piece.ready if piece.first else piece.start
-            self._releases.append((ready, len(self._jobs), len(self._undeclared), ready))
-            self._undeclared.append(took)
+            self._undeclared.append((piece.ready if piece.first else piece.start, took))
             return
         self.callback_of.setdefault(piece.vertex, piece.callback)
         row = self._row.get((piece.dag, piece.job))
@@ -134,8 +131,11 @@ class LoadBuilder(Observer):
                 costs.append(max(0, took))
         demand, executions = sum(costs), len(costs)
         bases.append(len(costs))
-        costs.extend(max(0, took) for took in self._undeclared)
-        releases = sorted(self._releases)
+        undeclared = sorted(self._undeclared)
+        costs.extend(max(0, took) for _, took in undeclared)
+        releases = sorted(self._releases + [
+            (ready, len(self._jobs), place, ready)
+            for place, (ready, _) in enumerate(undeclared)])
         load = Load(
             [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases], costs,
             bases, [*self._sizes, 1], [r[3] for r in releases])

@@ -55,6 +55,7 @@ class Usage(Observer):
         self._by_vertex = [self._by_key[v.callback.key] for v in task_set.vertices]
         self.undeclared = CallbackUse()
         self.by_worker: Counter[int] = Counter()
+        self._counted: Execution | None = None
 
     def ran(self, piece: Piece) -> None:
         """Add a piece of an execution."""
@@ -77,10 +78,13 @@ class Usage(Observer):
         self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
         execution: Execution | None,
     ) -> None:
-        """Count an execution."""
+        """Count an execution, if it is in the trace and not one leg more of the last one."""
+        if execution is None or execution is self._counted:
+            return
+        self._counted = execution
         use = self._by_vertex[vertex]
         use.executions += 1
-        if execution is not None and execution.busy > use.longest:
+        if execution.busy > use.longest:
             use.longest = execution.busy
 
     @property

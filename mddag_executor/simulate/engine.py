@@ -85,6 +85,7 @@ def run(
     """
     n_workers = len(s.worker_x)
     finish_at = [NEVER] * n_workers
+    running = [-1] * n_workers
     next_release = 0
     n_releases = len(load.times)
     now = 0
@@ -106,6 +107,7 @@ def run(
                 finish_at[w] = NEVER
                 x = s.worker_x[w]
                 if log is not None:
+                    running[w] = -1
                     _note(t, s, log, now, END, w, x)
                 rules.complete(t, s, key, x, now)
         if now == horizon:
@@ -113,8 +115,8 @@ def run(
         while next_release < n_releases and load.times[next_release] == now:
             _release(t, s, key, load, next_release, now)
             next_release += 1
-        _dispatch(t, s, key, now, finish_at, log)
-        if stop_at_first_miss and _any_missed(s, seen):
+        _dispatch(t, s, key, now, finish_at, running, log)
+        if stop_at_first_miss and any_missed(s, seen):
             return now
 
 
@@ -136,10 +138,10 @@ def _release(
 
 
 def _dispatch(
-    t: Tables, s: State, key: KeyFunction, now: int, finish_at: list[int],
+    t: Tables, s: State, key: KeyFunction, now: int, finish_at: list[int], running: list[int],
     log: list[LogEntry] | None,
 ) -> None:
-    running = s.worker_x[:] if log is not None else s.worker_x
+    """Dispatch what is to run now; ``running`` is kept for the log, which wants the preempted."""
     x = rules.schedule(t, s, key, now)
     while x >= 0:
         worker = s.x_worker[x]
@@ -159,7 +161,8 @@ def _note(
     log.append((now, kind, worker, t.dag_of[vertex], vertex, s.job_index[s.x_slot[x]]))
 
 
-def _any_missed(s: State, first: int) -> bool:
+def any_missed(s: State, first: int) -> bool:
+    """Tell whether a miss is among the decisions from number ``first`` on."""
     for i in range(first, len(s.decisions)):
         kind, deadline, time = s.decisions[i][0], s.decisions[i][4], s.decisions[i][5]
         if kind == SINK_EXPIRED or kind == SINK_ABORTED or kind == SINK_DONE and time > deadline:

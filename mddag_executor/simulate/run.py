@@ -220,7 +220,7 @@ def simulate(
     :raises SimulationError: on settings that make no sense.
     :raises mddag_executor.core.PolicyError: when there is no such policy.
     """
-    _check(settings)
+    check(settings)
     policy = find_policy(settings.policy)
     preemptive = policy.preemptive if settings.preemptive is None else settings.preemptive
     tables = Tables.build(
@@ -244,7 +244,12 @@ def simulate(
     return Run(settings, tally, ended, utilisation, preemptive, entries, state.decisions)
 
 
-def _check(settings: Settings) -> None:
+def check(settings: Settings) -> None:
+    """
+    Check that settings make sense.
+
+    :raises SimulationError: when they do not.
+    """
     if settings.workers < 1:
         raise SimulationError(f'workers: {settings.workers} is too few: give at least 1')
     if settings.duration_ns < 1:

@@ -21,6 +21,7 @@ The reading itself, with its orders and what it does on damage, is in `reading`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 import os
 import stat
 from typing import Any, BinaryIO
@@ -32,6 +33,7 @@ from mddag_executor.trace.errors import TraceError, TraceWarning
 from mddag_executor.trace.reading import Reading
 
 _TASK_SET = 'mddag:task_set'
+_REMEDY = 'check its name, that you may read it, and the disk it is on'
 
 
 class TraceReader:
@@ -51,8 +53,7 @@ class TraceReader:
         self.path = os.fspath(path)
         self.warnings: list[str] = []
         self.fields: dict[str, tuple[str, ...]] = {}
-        with self._open() as stream:
-            size = os.fstat(stream.fileno()).st_size
+        with self._open() as (stream, size):
             open_data(stream, self.path, size)
             self._finished, self._summary = read_summary(stream, size)
 
@@ -72,7 +73,8 @@ class TraceReader:
         if self._summary and topic not in self._summary.topics:
             return None
         for event in self.events({_TASK_SET}):
-            return str(event[4])
+            text: str | None = event[4]
+            return text
         return None
 
     def events(self, names: Iterable[str] | None = None, *,
@@ -100,30 +102,28 @@ class TraceReader:
     def _read(self, channels: Channels, in_time_order: bool) -> Iterator[Event]:
         reading = Reading(self.path, channels)
         self.fields = channels.fields
-        try:
-            with self._open() as stream:
-                size = os.fstat(stream.fileno()).st_size
-                blocks = scan(stream, open_data(stream, self.path, size), size)
-                if in_time_order:
-                    yield from reading.by_time(stream, blocks)
-                else:
-                    yield from reading.by_file(stream, blocks)
-        except OSError as error:
-            raise TraceError(self.path, f'reading failed ({error.strerror})',
-                             'check the disk it is on') from None
+        with self._open() as (stream, size):
+            blocks = scan(stream, open_data(stream, self.path, size), size)
+            if in_time_order:
+                yield from reading.by_time(stream, blocks)
+            else:
+                yield from reading.by_file(stream, blocks)
         for text in (self._missing(reading, size), reading.undecoded()):
             if text and text not in self.warnings:
                 self.warnings.append(text)
 
-    def _open(self) -> BinaryIO:
+    @contextmanager
+    def _open(self) -> Iterator[tuple[BinaryIO, int]]:
+        """Open the file and give it with its size; errors of the system become TraceError."""
+        if '\0' in self.path:
+            raise TraceError(self.path, 'is no file name', 'give the .mcap file')
         try:
             if not stat.S_ISREG(os.stat(self.path).st_mode):    # a pipe would wait for its writer
                 raise TraceError(self.path, 'is no file', 'give the .mcap file itself')
-            return open(self.path, 'rb')
-        except (OSError, ValueError) as error:
-            reason = getattr(error, 'strerror', None) or str(error)
-            raise TraceError(self.path, f'cannot be read ({reason})',
-                             'check the name and that you may read it') from None
+            with open(self.path, 'rb') as stream:
+                yield stream, os.fstat(stream.fileno()).st_size
+        except OSError as error:
+            raise TraceError(self.path, f'cannot be read ({error.strerror})', _REMEDY) from None
 
     def _missing(self, reading: Reading, size: int) -> str | None:
         """Return the line that says what is missing, None where nothing is."""

@@ -137,7 +137,7 @@ class BruteForce:
                 if execution is not None:
                     execution.left -= 1
 
-    # --- times and keys ---------------------------------------------------------------------------
+    # --- times and keys --------------------------------------------------------------------------
 
     def _period(self, dag: Dag) -> int:
         return dag.period_ns // self.tick
@@ -174,7 +174,7 @@ class BruteForce:
             ties = ()
         return (self.priority(execution), *ties, execution.arrival)
 
-    # --- jobs -------------------------------------------------------------------------------------
+    # --- jobs ------------------------------------------------------------------------------------
 
     def _open_jobs(self, dag: Dag) -> list[Job]:
         return [job for job in self.jobs if job.dag is dag and job.outcome is None]
@@ -223,7 +223,7 @@ class BruteForce:
         for job, sink in sorted(overdue, key=lambda each: self._deadline(*each)):
             self._miss(job, sink, None)
 
-    # --- completions ------------------------------------------------------------------------------
+    # --- completions -----------------------------------------------------------------------------
 
     def _complete_all(self) -> bool:
         happened = False
@@ -260,7 +260,7 @@ class BruteForce:
         elif late and job.dag.on_miss == 'abort':
             self._give_up(job, 'aborted')
 
-    # --- workers ----------------------------------------------------------------------------------
+    # --- workers ---------------------------------------------------------------------------------
 
     def _blocked(self, execution: Execution) -> bool:
         """Tell whether another execution that has begun and not ended holds the group."""
@@ -313,7 +313,7 @@ class BruteForce:
         job, vertex = execution.job, execution.vertex
         self.events.append((self.now, kind, worker, job.dag.index, vertex.index, job.index))
 
-    # --- what came out of it ----------------------------------------------------------------------
+    # --- what came out of it ---------------------------------------------------------------------
 
     def result(self) -> dict[str, Any]:
         """Return the part of the result format that concerns jobs and sinks, times in ns."""

@@ -25,7 +25,8 @@ import json
 import os
 from typing import Any
 
-from hypothesis import HealthCheck, settings, strategies as st
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
 from mddag_executor.simulate import (
     END,
     Load,
@@ -68,7 +69,7 @@ class Case:
 
     @property
     def times_ns(self) -> list[list[int]]:
-        """Execution times as the simulator takes them."""
+        """Return the execution times as the simulator takes them."""
         return [[tick * TICK for tick in row] for row in self.ticks]
 
     def load(self, ticks: int) -> Load:
@@ -137,7 +138,7 @@ def _triggers(draw: st.DrawFn, callbacks: list[dict[str, Any]]) -> dict[str, Any
 
 @st.composite
 def task_sets(
-    draw: st.DrawFn, max_dags: int = 3, max_callbacks: int = 5, groups: bool = True,
+    draw: st.DrawFn, /, max_dags: int = 3, max_callbacks: int = 5, groups: bool = True,
     bounds: bool = True,
 ) -> TaskSet:
     """
@@ -189,7 +190,7 @@ def task_sets(
 
 @st.composite
 def cases(
-    draw: st.DrawFn, policies: tuple[str, ...] = ('rad', 'rm', 'wc', 'fifo', 'gedf'),
+    draw: st.DrawFn, /, policies: tuple[str, ...] = ('rad', 'rm', 'wc', 'fifo', 'gedf'),
     overheads: bool = False, **options: Any,
 ) -> Case:
     """Draw a task set and how to run it."""

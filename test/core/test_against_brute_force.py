@@ -15,12 +15,14 @@
 
 from __future__ import annotations
 
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 from mddag_executor.core import POLICIES
 import pytest
 
 from .brute_force import BruteForce
 from .task_sets import Case, cases, examples, TICK
+
 
 def compare(case: Case, horizon: int, judge: str = 'horizon', stop: bool = False,
             last_release: int | None = None) -> BruteForce:
@@ -44,7 +46,7 @@ def compare(case: Case, horizon: int, judge: str = 'horizon', stop: bool = False
 @examples(150)
 @given(st.data(), st.integers(5, 50))
 def test_plain(policy: str, data: st.DataObject, horizon: int) -> None:
-    """DAGs as in the paper: no groups, no bounds, no overheads."""
+    """Without groups, bounds and overheads, as in the paper."""
     compare(data.draw(cases((policy,), groups=False, bounds=False)), horizon)
 
 

@@ -20,7 +20,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 from mddag_executor.core import rad_offsets, Tables
 from mddag_executor.core.state import (
     ABORTED,
@@ -34,7 +35,7 @@ from mddag_executor.core.state import (
 )
 from msg_graph import Dag
 
-from .task_sets import Case, cases, Event, examples, task_sets, TICK
+from .task_sets import Case, cases, examples, task_sets, TICK
 
 Id = tuple[int, int, int]
 """DAG, vertex in its DAG, job."""
@@ -72,28 +73,30 @@ class Moment:
 class Schedule:
     """A log of a run without bounds and aborts, taken apart tick by tick."""
 
-    def __init__(self, case: Case, log: list[Event]) -> None:
+    def __init__(self, case: Case, horizon: int) -> None:
         self.case = case
+        self.horizon = horizon
         self.dags = case.task_set.dags
-        self.log = log
+        self.log = case.events(case.run(horizon))
         self.end: dict[Id, int] = {}
-        for now, kind, _, dag, vertex, job in log:
+        for now, kind, _, dag, vertex, job in self.log:
             if kind == 'end':
                 assert (dag, vertex, job) not in self.end, 'ended twice'
                 self.end[dag, vertex, job] = now
         self.ready = self._ready_times()
 
     def _ready_times(self) -> dict[Id, int]:
-        """Return when each execution that the log names became ready."""
+        """Return when each execution became ready that did so before the horizon."""
         ready = {}
-        for _, _, _, d, v, job in self.log:
-            dag = self.dags[d]
-            before = dag.vertices[v].predecessors
-            if not before:
-                ready[d, v, job] = job * dag.period_ns // TICK
-            else:
-                assert all((d, p, job) in self.end for p in before), 'a predecessor never ended'
-                ready[d, v, job] = max(self.end[d, p, job] for p in before)
+        for dag in self.dags:
+            for job in range(-(-self.horizon * TICK // dag.period_ns)):
+                for vertex in dag.vertices:
+                    ends = [self.end.get((dag.index, before, job), self.horizon)
+                            for before in vertex.predecessors]
+                    when = max(ends, default=job * dag.period_ns // TICK)
+                    if when < self.horizon:
+                        ready[dag.index, vertex.index, job] = when
+        assert {(d, v, job) for _, _, _, d, v, job in self.log} <= set(ready)
         return ready
 
     def group(self, each: Id) -> tuple[str, str] | None:
@@ -112,13 +115,14 @@ class Schedule:
         }[self.case.policy]
 
     def moments(self) -> Iterator[Moment]:
-        """Yield what is the case after each tick at which something happened."""
+        """Yield what is the case after each tick before the horizon at which something was."""
         running: dict[int, Id] = {}
         begun: set[Id] = set()
         i = 0
-        while i < len(self.log):
+        while i < len(self.log) and self.log[i][0] < self.horizon:
             now = self.log[i][0]
-            started, preempted = [], []
+            started: list[Id] = []
+            preempted: list[tuple[Id, Id]] = []
             while i < len(self.log) and self.log[i][0] == now:
                 _, kind, worker, *rest = self.log[i]
                 each: Id = (rest[0], rest[1], rest[2])
@@ -150,7 +154,7 @@ plain_cases = cases(bounds=False)
 @given(plain_cases, st.integers(5, 50))
 def test_every_moment(case: Case, horizon: int) -> None:
     """Order, work conservation, workers, groups and preemption, at every instant of a run."""
-    schedule = Schedule(case, case.events(case.run(horizon)))
+    schedule = Schedule(case, horizon)
     for moment in schedule.moments():
         assert len(moment.running) <= case.workers
         able = [e for e in moment.waiting if e not in moment.blocked]
@@ -173,7 +177,7 @@ def test_every_moment(case: Case, horizon: int) -> None:
 @examples(200)
 @given(plain_cases, st.integers(5, 50))
 def test_nothing_starts_before_its_predecessors_end(case: Case, horizon: int) -> None:
-    schedule = Schedule(case, case.events(case.run(horizon)))
+    schedule = Schedule(case, horizon)
     for now, kind, _, dag, vertex, job in schedule.log:
         if kind == 'start':
             assert now >= job * case.task_set.dags[dag].period_ns // TICK

@@ -15,61 +15,22 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from mddag_executor.core import NEVER, PolicyError, Scheduler, Tables
 from mddag_executor.core.rules import SWEEP_AT
 from mddag_executor.core.state import (
-    ABORTED,
     COMPLETED,
     DROP,
     EXPIRED,
     FREE,
-    IDLE,
     JOB_END,
     LATE,
     OPEN,
-    SINK_ABORTED,
     SINK_DONE,
     SINK_EXPIRED,
-    SINK_MISSED,
-    WAITING,
 )
-from msg_graph import TaskSet
 import pytest
 
-from .task_sets import declaration
-
-US = 1_000
-
-JOIN = declaration([
-    {'node': '/n', 'name': 's', 'timer': '100us', 'publishes': ['/s'], 'dag': 'd'},
-    {'node': '/n', 'name': 'x', 'subscription': '/s', 'publishes': ['/x']},
-    {'node': '/n', 'name': 'y', 'subscription': '/s', 'publishes': ['/y']},
-    {'node': '/n', 'name': 'join', 'sync': ['/x', '/y'], 'deadline': '50us'},
-])
-S, X, Y, J = range(4)
-
-
-def live(task_set: TaskSet | None = JOIN, workers: int = 2, **more: Any) -> Scheduler:
-    options = {name: more.pop(name) for name in ('max_active_jobs', 'expire_after')
-               if name in more}
-    tables = Tables.build(task_set, legs=True, groups=False, **options)
-    return Scheduler(tables, workers, propagate=False, **more)
-
-
-def run_one(scheduler: Scheduler, x: int, now: int) -> bool:
-    """Make an execution ready and run it at once."""
-    scheduler.ready(x, now)
-    assert scheduler.take(scheduler.state.worker_x.index(-1), now) == x
-    return scheduler.complete(x, now)
-
-
-def start_job(scheduler: Scheduler, job: int = 0, now: int = 0, dag: int = 0) -> int:
-    """Release a job and run its source."""
-    slot = scheduler.release(dag, job, now, now)
-    assert run_one(scheduler, scheduler.source(slot), now)
-    return slot
+from .live_helpers import J, JOIN, live, run_one, start_job, US, X, Y
 
 
 def test_an_unknown_policy_is_refused_with_the_list() -> None:
@@ -305,159 +266,3 @@ def test_queues_stay_bounded_when_what_waits_longest_is_dropped_for_ever(grouped
         scheduler.complete(order[-1], 4_000)
     assert order == waiting
     assert scheduler.take(0, 4_000) == -1
-
-
-# --- ends of jobs --------------------------------------------------------------------------------
-
-def test_at_most_so_many_jobs_are_open() -> None:
-    scheduler = live(max_active_jobs=2)
-    slots = [start_job(scheduler, job) for job in range(2)]
-    waiting = scheduler.execution(slots[0], X)
-    scheduler.ready(waiting, 5)
-    assert scheduler.decisions() == []
-    third = scheduler.release(0, 2, 10, 10)
-    assert third not in slots, 'something of job 0 still waits in its slot'
-    assert scheduler.state.n_open[0] == 2
-    assert scheduler.decisions() == [
-        (SINK_EXPIRED, 0, J, 0, 50 * US, -1), (JOB_END, 0, -1, 0, EXPIRED, 10)]
-    # The message of the expired job still gets its callback, which counts for nothing.
-    assert scheduler.take(0, 11) == waiting
-    assert scheduler.complete(waiting, 12)
-    assert scheduler.decisions() == []
-    assert scheduler.state.job_state[slots[0]] == FREE
-    assert start_job(scheduler, 3, 20) == slots[0]
-
-
-def test_what_still_runs_of_an_expired_job_does_not_touch_its_successor() -> None:
-    scheduler = live(max_active_jobs=1)
-    slot = start_job(scheduler)
-    leg = scheduler.execution(slot, J, 0)
-    scheduler.ready(leg, 1)
-    assert scheduler.take(0, 1) == leg
-    second = start_job(scheduler, 1, 2)
-    assert second != slot
-    assert scheduler.complete(leg, 3) is False
-    pending = scheduler.state.x_pending[scheduler.execution(second, J)]
-    assert pending == 2, 'the join of job 1 still lacks both'
-    scheduler.ready(scheduler.execution(second, X), 4)
-    third = scheduler.release(0, 2, 4, 4)
-    assert third == slot
-    assert scheduler.state.x_pending[scheduler.execution(third, J)] == 2
-    assert scheduler.state.x_state[leg] == IDLE
-
-
-def test_only_idle_jobs_expire_and_only_after_their_time() -> None:
-    scheduler = live(expire_after=10 * US)
-    slot = start_job(scheduler)
-    x = scheduler.execution(slot, X)
-    scheduler.ready(x, 1)
-    scheduler.expire_idle(NEVER)
-    assert scheduler.decisions() == [], 'something of it waits'
-    assert scheduler.take(0, 2) == x
-    scheduler.suspend(x)
-    scheduler.expire_idle(NEVER)
-    assert scheduler.decisions() == [], 'something of it is suspended'
-    scheduler.resume(x)
-    scheduler.take(0, 3)
-    scheduler.complete(x, 4)
-    scheduler.expire_idle(60 * US)
-    assert scheduler.decisions() == []
-    scheduler.release(0, 1, 60 * US + 1, 60 * US + 1)
-    assert scheduler.decisions() == [
-        (SINK_EXPIRED, 0, J, 0, 50 * US, -1), (JOB_END, 0, -1, 0, EXPIRED, 60 * US + 1)]
-    assert scheduler.state.n_open[0] == 1
-
-
-def test_a_job_that_is_told_to_end_ends() -> None:
-    scheduler = live()
-    slots = [start_job(scheduler, job) for job in range(2)]
-    scheduler.expire(slots[0], 7)
-    scheduler.abort(slots[1], 8)
-    assert scheduler.decisions() == [
-        (SINK_EXPIRED, 0, J, 0, 50 * US, -1), (JOB_END, 0, -1, 0, EXPIRED, 7),
-        (SINK_ABORTED, 0, J, 1, 50 * US, -1), (JOB_END, 0, -1, 1, ABORTED, 8)]
-    assert scheduler.state.n_open[0] == 0
-
-
-def aborting() -> TaskSet:
-    return declaration([
-        {'node': '/n', 'name': 's', 'timer': '100us', 'publishes': ['/s'], 'dag': 'd',
-         'on_miss': 'abort'},
-        {'node': '/n', 'name': 'x', 'subscription': '/s', 'deadline': '5us'},
-        {'node': '/n', 'name': 'y', 'subscription': '/s', 'deadline': '50us'},
-        {'node': '/n', 'name': 'z', 'subscription': '/s', 'deadline': '60us'}])
-
-
-def test_an_abort_drops_what_waits_and_spares_what_has_started() -> None:
-    scheduler = live(aborting(), workers=3)
-    slot = start_job(scheduler)
-    x, y, z = (scheduler.execution(slot, vertex) for vertex in (1, 2, 3))
-    group = scheduler.new_group()
-    scheduler.state.x_group[y] = scheduler.state.x_group[z] = group
-    for each in (x, y, z):
-        scheduler.ready(each, 1)
-    assert [scheduler.take(worker, 1) for worker in range(3)] == [x, y, -1]
-    scheduler.suspend(y)
-    scheduler.complete(x, 6 * US)            # late by 1 us
-    assert scheduler.decisions() == [
-        (SINK_DONE, 0, 1, 0, 5 * US, 6 * US), (SINK_ABORTED, 0, 2, 0, 50 * US, -1),
-        (SINK_ABORTED, 0, 3, 0, 60 * US, -1), (JOB_END, 0, -1, 0, ABORTED, 6 * US)]
-    scheduler.resume(y)
-    assert scheduler.take(0, 7 * US) == y, 'it has started, so it runs on'
-    assert scheduler.complete(y, 8 * US)
-    assert scheduler.decisions() == []
-    assert scheduler.take(0, 9 * US) == -1
-    assert scheduler.decisions() == [(DROP, 0, 3, 0, z, 9 * US)]
-    assert scheduler.state.job_state[slot] == FREE
-    assert scheduler.queue_length == 0
-    assert scheduler.state.group_owner[group] == -1
-
-
-def test_what_comes_too_late_aborts_its_job_at_its_turn() -> None:
-    scheduler = live(aborting(), workers=1)
-    slot = start_job(scheduler)
-    y = scheduler.execution(slot, 2)
-    scheduler.ready(y, 1)
-    assert scheduler.take(0, 5 * US + 1) == -1, 'x has missed its deadline: the job is over'
-    kinds = [decision[0] for decision in scheduler.decisions()]
-    assert kinds == [SINK_ABORTED, SINK_ABORTED, SINK_ABORTED, JOB_END, DROP]
-    assert scheduler.state.job_state[slot] == FREE
-
-
-def test_a_blocked_callback_does_not_abort_its_job() -> None:
-    """Only what would go next shows that a job is late; what waits for its group does not."""
-    scheduler = live(aborting(), workers=2)
-    group = scheduler.new_group()
-    busy = scheduler.undeclared(0, group, 0)
-    scheduler.take(0, 0)
-    slot = start_job(scheduler)
-    y = scheduler.execution(slot, 2)
-    scheduler.state.x_group[y] = group
-    scheduler.ready(y, 1)
-    assert scheduler.take(1, 10 * US) == -1
-    assert scheduler.state.job_state[slot] == OPEN
-    scheduler.complete(busy, 11 * US)
-    assert scheduler.take(1, 11 * US) == -1
-    assert scheduler.decisions()[-1][0] == DROP
-
-
-def test_the_end_of_the_run_judges_what_is_open() -> None:
-    scheduler = live()
-    start_job(scheduler, 0, 0)
-    start_job(scheduler, 1, 10 * US)
-    start_job(scheduler, 2, 20 * US)
-    scheduler.finish(60 * US)
-    assert scheduler.decisions() == [
-        (SINK_MISSED, 0, J, 0, 50 * US, -1), (SINK_MISSED, 0, J, 1, 60 * US, -1)]
-    assert scheduler.state.n_open[0] == 3
-
-
-def test_a_recorded_execution_goes_past_queue_and_workers() -> None:
-    scheduler = live(workers=1)
-    slot = scheduler.release(0, 0, 0, 0)
-    source = scheduler.source(slot)
-    scheduler.admit(source, 1)
-    assert scheduler.idle_workers == 1
-    assert scheduler.complete(source, 2)
-    assert scheduler.state.job_active[slot] == 0
-    assert scheduler.state.x_state[source] != WAITING

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the tests of the live executor share: executors of both intakes, spinning beside the test."""
+"""What the tests of the live executor share: executors of both intakes that spin beside them."""
 
 from __future__ import annotations
 

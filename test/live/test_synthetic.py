@@ -24,7 +24,6 @@ from mddag_executor.live import current_job
 from mddag_executor.live.bodies import Grid, Join, JOIN_LIMIT, no_job, Role
 from mddag_executor.live.execution import ExecutionPlan, PlanError, sleeper, spinner
 from mddag_executor.live.executor import MultiDeadlineExecutor
-from mddag_executor.live.measure import Ledger, measure, Reading
 from mddag_executor.live.session import run_synthetic, Session
 from mddag_executor.live.synthetic import build_nodes
 from mddag_executor.simulate.run import draw_execution_times
@@ -52,8 +51,10 @@ nodes:
       - {name: tick, timer: 50ms, dag: slow, publishes: [/joined], execution_time: 1ms}
   - node: /filter/left
     callbacks:
-      - {name: cb, subscription: /left, publishes: [/left_out], execution_time: 3ms, group: one}
-      - {name: again, subscription: /left, deadline: 400ms, execution_time: 1ms, group: one}
+      - {name: cb, subscription: /left, publishes: [/left_out, /debug], execution_time: 3ms,
+         group: one}
+      - {name: again, subscription: /left, publishes: [/debug], deadline: 400ms,
+         execution_time: 1ms, group: one}
   - node: /filter/right
     callbacks:
       - {name: cb, subscription: /right, publishes: [/right_out], reads: [/seen]}
@@ -201,69 +202,6 @@ def test_spinning_takes_cpu_of_its_own_thread_only() -> None:
     assert all(30 * MS <= t < 36 * MS for t in taken)
 
 
-# --- the books -----------------------------------------------------------------------------------
-
-def reading(at_ns: int, n: int = 0, cpu_ns: int = 0) -> Reading:
-    return Reading(at_ns, cpu_ns, (n,))
-
-
-SINGLE = ('mddag: 1\nnodes:\n  - node: /a\n    callbacks: '
-          '[{name: a, timer: 100ms, deadline: 150ms, execution_time: 10ms}]\n')
-
-
-def test_every_nominal_release_whose_deadline_lies_in_the_window_is_due() -> None:
-    task_set = loads(SINGLE)
-    ledger = Ledger(task_set)
-    first = 1_700_000_000 * 1000 * MS
-    ledger.first_release[0] = first
-    # Jobs 0 to 9, deadlines at first + 150, 250, … ms.  The window holds jobs 1 to 8: it begins
-    # at the deadline of job 0 and ends at that of job 8.
-    for job, response in {0: 10, 1: 150, 2: 151, 3: 20, 5: 250, 6: 30, 8: 40, 9: 50}.items():
-        release = first + job * 100 * MS
-        ledger.completions[0][0].append((release, release + response * MS))
-    result = measure(
-        ledger, ExecutionPlan(task_set), reading(first + 150 * MS), reading(first + 950 * MS))
-    sink = result['dags']['/a']['sinks']['/a:a']
-    assert {k: sink[k] for k in ('due', 'on_time', 'late', 'missing')} == {
-        'due': 8, 'on_time': 4, 'late': 2, 'missing': 2}
-    assert sink['response_ns'] == {
-        'min': 20 * MS, 'median': 40 * MS, 'p99': 250 * MS, 'max': 250 * MS}
-    assert (result['sink_jobs_due'], result['on_time_ratio']) == (8, 0.5)
-
-
-def test_a_late_or_slightly_early_noted_release_counts_for_its_own_job() -> None:
-    task_set = loads(SINGLE)
-    ledger = Ledger(task_set)
-    first = 1_700_000_000 * 1000 * MS
-    ledger.first_release[0] = first
-    for job, shift in ((1, -1000), (2, 99 * MS - 1), (3, 0), (3, 0)):
-        release = first + job * 100 * MS + shift
-        ledger.completions[0][0].append((release, first + job * 100 * MS + 60 * MS))
-    result = measure(
-        ledger, ExecutionPlan(task_set), reading(first + 150 * MS), reading(first + 450 * MS))
-    assert (result['on_time'], result['missing']) == (3, 0)
-    assert result['dags']['/a']['sinks']['/a:a']['response_ns']['max'] == 60 * MS
-
-
-def test_cpu_is_shared_among_the_callbacks_of_the_window() -> None:
-    task_set = loads(SINGLE)
-    ledger = Ledger(task_set)
-    ledger.first_release[0] = 0
-    start, end = reading(0, n=10, cpu_ns=5 * MS), reading(2000 * MS, n=30, cpu_ns=405 * MS)
-    slept = measure(ledger, ExecutionPlan(task_set, mode='sleep'), start, end)
-    spun = measure(ledger, ExecutionPlan(task_set, mode='spin'), start, end)
-    assert (slept['callbacks'], slept['callbacks_per_s']) == (20, 10.0)
-    assert slept['cpu_us_per_callback'] == 20_000
-    assert spun['cpu_us_per_callback'] == 10_000  # 10 ms of each are the bodies themselves
-
-
-def test_nothing_due_is_no_division_by_zero() -> None:
-    task_set = loads(SINGLE)
-    result = measure(Ledger(task_set), ExecutionPlan(task_set), reading(0), reading(0))
-    assert result['on_time_ratio'] is None
-    assert result['cpu_us_per_callback'] is None
-
-
 # --- joins and releases --------------------------------------------------------------------------
 
 def role(task_set: TaskSet, name: str, senders: list[str]) -> Role:
@@ -333,7 +271,7 @@ def test_nodes_have_exactly_what_is_declared(task_set: TaskSet, ros_context: Any
     assert found == {
         '/sensor/a': ([40 * MS], [], [], ['/left', '/right']),
         '/sensor/b': ([50 * MS], [], [], ['/joined']),
-        '/filter/left': ([], ['/left', '/left'], [], ['/left_out']),
+        '/filter/left': ([], ['/left', '/left'], [], ['/debug', '/left_out']),
         '/filter/right': ([], ['/right'], [], ['/right_out']),
         '/join': ([], ['/left_out', '/right_out'], [], ['/joined']),
         '/sink': ([], ['/joined'], [], []),
@@ -376,8 +314,8 @@ def test_every_release_reaches_every_sink(
         for name, sink in result['dags'][dag.name]['sinks'].items():
             expected = 1e9 / dag.period_ns
             assert abs(sink['due'] - expected) <= 1, name
-            # A busy machine may make some late, but nothing may get lost.
-            assert sink['missing'] <= 1, (name, sink)
+            # A busy machine may make some late, but ours loses none; rclpy's skips releases then.
+            assert sink['missing'] <= (1 if ours else sink['due'] // 2), (name, sink)
             assert sink['response_ns']['min'] >= 0
     # Each sink knows the release of its job exactly: the completions are on the nominal grid.
     for dag in task_set.dags:

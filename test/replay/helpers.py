@@ -22,7 +22,7 @@ records, in the order in which it does: what a thread ran only when it has run.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from pathlib import Path
@@ -30,9 +30,16 @@ import random
 from typing import Any
 
 from hypothesis import strategies as st
-from mddag_executor.core import NEVER, Scheduler, Tables, Tally
-from mddag_executor.core.state import ABORTED, DROP, EXPIRED, IDLE, JOB_END, OPEN, SINK_DONE
-from mddag_executor.simulate.engine import END, Load, LogEntry, START
+from mddag_executor.core import Scheduler, Tables, Tally
+from mddag_executor.core.state import (
+    ABORTED,
+    DROP,
+    EXPIRED,
+    IDLE,
+    JOB_END,
+    OPEN,
+    SINK_DONE,
+)
 from mddag_executor.trace import TraceFile
 from msg_graph import loads, TaskSet
 
@@ -171,6 +178,7 @@ class VirtualRun:
         self.tally = Tally(self.task_set, self.tables)
         self.executions: dict[str, int] = {}
         self.busy: dict[str, int] = {}
+        self.waited: dict[str, int] = {}
         self.undeclared_runs = 0
         self.responses: list[int] = []
         self.drops = 0
@@ -312,6 +320,8 @@ class VirtualRun:
         if declared:
             key = self.task_set.vertices[work.vertex].callback.key
             self.busy[key] = self.busy.get(key, 0) + end - start
+            if work.pieces == 1:
+                self.waited[key] = self.waited.get(key, 0) + start - work.ready
         if declared and self.random.random() < self.chances.coroutine:
             self.scheduler.suspend(work.x)
             self._at(now + self.random.randrange(MS), lambda later: self._resume(work))
@@ -324,6 +334,7 @@ class VirtualRun:
         self.decided(now)
 
     def _resume(self, work: _Execution) -> None:
+        work.pieces += 1
         self.scheduler.resume(work.x)
         self._waiting[work.x] = work
 
@@ -353,55 +364,3 @@ class VirtualRun:
                 if kind != SINK_DONE or time > deadline:
                     self.record('deadline', now, 2, dag, self.tables.index_in_dag[vertex], job,
                                 deadline, time)
-
-
-def write_simulated(
-    path: Path, task_set: TaskSet, load: Load, log: list[LogEntry], *, policy: str = 'rad',
-    workers: int = 2, end: int,
-) -> None:
-    """Record a simulated, non-preemptive schedule as the live executor would have."""
-    legs = Tables.build(task_set, legs=True)
-    events: list[tuple[Any, ...]] = []
-    ready: dict[tuple[int, int], int] = {}
-    for i, (time, dag, job) in enumerate(zip(load.times, load.dags, load.jobs)):
-        ready[(dag, job)] = time
-        if dag < legs.n_dags:
-            release = load.releases[i] if load.releases else time
-            events.append(('job_release', time, 2, dag, job, release))
-    for start, entry in executions(log):
-        time, _, worker, dag, vertex, job = entry
-        declared = dag < legs.n_dags
-        local = legs.index_in_dag[vertex]
-        address = 1000 + vertex
-        where = (dag, local, job) if declared else (-1, -1, -1)
-        events += [
-            ('dispatch', start, 100 + worker, address, *where, worker,
-             start if declared else ready[(dag, job)], 0),
-            ('callback_start', start, 100 + worker, address, False),
-            ('callback_end', time, 100 + worker, address)]
-        for leg in range(legs.n_legs[vertex] if declared else 0):
-            last = leg == legs.n_legs[vertex] - 1
-            events.append(('complete', time, 100 + worker if last else 99, address, *where, last,
-                           time, leg))
-    with TraceFile(path) as file:
-        file.add('task_set', START_TIME - 1, VPID, 1, task_set.text, task_set.file, policy,
-                 workers, 100 * MS, 0, False)
-        for event in sorted(events, key=lambda e: e[1]):
-            file.add(event[0], event[1], VPID, *event[2:])
-        file.add('shutdown', end, VPID, 1, end)
-
-
-def executions(log: list[LogEntry]) -> Iterator[tuple[int, LogEntry]]:
-    """Yield start and end entry of each execution of a non-preemptive log, by order of end."""
-    since: dict[int, int] = {}
-    for entry in log:
-        if entry[1] == START:
-            since[entry[2]] = entry[0]
-        else:
-            assert entry[1] == END
-            yield since.pop(entry[2]), entry
-
-
-def loose(task_set: TaskSet) -> Tables:
-    """Return tables without bounds, for simulations."""
-    return Tables.build(task_set, max_active_jobs=NEVER)

@@ -26,7 +26,7 @@ from mddag_executor.trace import TraceFile
 from msg_graph import loads
 import pytest
 
-from .helpers import Chances, declarations, MS, small, SMALL, START_TIME, VirtualRun, VPID
+from .helpers import Chances, declarations, MS, SMALL, small, START_TIME, VirtualRun, VPID
 
 
 @given(declarations(), st.integers(0, 2**32), st.integers(1, 4),
@@ -52,6 +52,7 @@ def test_replay_counts_what_the_driver_counted(
     for key, use in result['callbacks'].items():
         assert use['executions'] == run.executions.get(key, 0)
         assert use['busy_ns'] == run.busy.get(key, 0)
+        assert use['waiting_ns'] == run.waited.get(key, 0)
     assert sum(result['dropped'].values()) == run.drops
     assert result['worker_use']['use'] <= 1
 
@@ -103,7 +104,7 @@ def write(path: Path, *events: tuple[object, ...], text: str = SMALL, workers: i
     return path
 
 
-def one_execution(  # noqa: PLR0913
+def one_execution(
     dag: int, vertex: int, job: int, ready: int, start: int, end: int, *, leg: int = 0,
     whole: bool = True, vtid: int = 9,
 ) -> list[tuple[object, ...]]:
@@ -154,6 +155,39 @@ def test_a_job_to_the_millisecond(tmp_path: Path) -> None:
         'executions': 2, 'busy_ns': 4 * MS, 'longest_ns': 3 * MS, 'waiting_ns': 2 * MS,
         'longest_wait_ns': 2 * MS}
     assert result['dags']['/imu']['jobs'] == 0
+
+
+def test_the_chain_goes_through_the_leg_that_came_last(tmp_path: Path) -> None:
+    """It was waited for, also where the vertex before it ended sooner than the other's did."""
+    path = write(
+        tmp_path / 'a.mcap',
+        ('job_release', 10, 2, 0, 0, START_TIME + 10 * MS),
+        *one_execution(0, 0, 0, 10, 10, 12),
+        *one_execution(0, 1, 0, 12, 12, 14),
+        *one_execution(0, 2, 0, 12, 12, 15, vtid=10),
+        *one_execution(0, 4, 0, 15, 15, 16, leg=1, whole=False, vtid=10),
+        *one_execution(0, 4, 0, 18, 18, 20, leg=0),
+        ('shutdown', 110, 1, START_TIME + 110 * MS))
+    worst = replay(path).result()['dags']['/camera']['sinks']['/fuse:join']['breakdown']['worst']
+    assert [step['vertex'] for step in worst['chain']] == [
+        '/camera:grab', '/left:detect', '/fuse:join']
+    assert worst['transport_ns'] == 4 * MS
+    assert worst['executing_ns'] == 6 * MS
+
+
+def test_a_sink_may_complete_before_what_started_it(tmp_path: Path) -> None:
+    """A callback that publishes early still runs when its successor has completed."""
+    path = write(
+        tmp_path / 'a.mcap',
+        ('job_release', 10, 2, 1, 0, START_TIME + 10 * MS),
+        *one_execution(1, 1, 0, 13, 14, 15, vtid=10),
+        *one_execution(1, 0, 0, 10, 11, 40),
+        ('shutdown', 110, 1, START_TIME + 110 * MS))
+    sink = replay(path).result()['dags']['/imu']['sinks']['/imu:use']
+    assert (sink['completed'], sink['late'], sink['response_ns']['max']) == (1, 0, 5 * MS)
+    parts = sink['breakdown']['mean']
+    assert parts == {'release_lag_ns': 0, 'waiting_ns': 2 * MS, 'executing_ns': 3 * MS,
+                     'suspended_ns': 0, 'transport_ns': 0, 'unknown_ns': 0}
 
 
 def test_other_deadlines_judge_anew(tmp_path: Path) -> None:
@@ -317,9 +351,9 @@ def test_events_that_make_no_sense_are_counted(tmp_path: Path) -> None:
     outcome = replay(path)
     assert outcome.result()['dags']['/camera']['ends']['completed'] == 1
     assert outcome.warnings == [
-        f'{path}: 6 events make no sense and are left out, most of them (2) mddag:job_release of '
+        f'{path}: 8 events make no sense and are left out, most of them (2) mddag:job_release of '
         'a DAG that is not declared',
-        f'{path}: 4 events contradict those before them and are left out']
+        f'{path}: 3 events contradict those before them and are left out']
 
 
 def test_lost_events_are_said(tmp_path: Path) -> None:

@@ -153,7 +153,7 @@ def test_flipped_bits_without_a_summary(tmp_path: Path, sample: Any) -> None:
     """A killed writer's file: nothing says how many chunks there were."""
     data, chunks = sample
     end = next(start for opcode, start, _ in records_of(data) if opcode == records.DATA_END)
-    for _, changed in flips(data[:end], 2 * end, 2):
+    for _, changed in flips(data[:end], end, 2):
         check(tmp_path / 'a.mcap', changed, chunks)
 
 
@@ -161,7 +161,7 @@ def test_mutations(tmp_path: Path, sample: Any) -> None:
     """Whole bytes and stretches changed, put in, taken out, moved."""
     data, chunks = sample
     generator = random.Random(3)
-    for _ in range(3000):
+    for _ in range(1500):
         changed = bytearray(data)
         for _ in range(generator.choice([1, 1, 1, 3])):
             first = generator.randrange(len(changed))
@@ -245,9 +245,13 @@ def test_what_is_no_file(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / 'pipe', '/dev/zero'):
         with pytest.raises(TraceError, match='is no file: give the .mcap file itself'):
             TraceReader(path)
-    for name in ('missing', 'missing/a.mcap', 'a\0b', 'x' * 1000):
-        with pytest.raises(TraceError, match=r'cannot be read \(.*\): check the name'):
+    for name in ('missing', 'missing/a.mcap', 'x' * 1000):
+        with pytest.raises(TraceError, match=r'cannot be read \(.*\): check its name'):
             TraceReader(tmp_path / name)
+    with pytest.raises(TraceError, match='is no file name'):
+        TraceReader('a\0b')
+    with pytest.raises(TraceError, match=r'/proc/self/mem: cannot be read \(Input/output error\)'):
+        TraceReader('/proc/self/mem')
     if os.getuid() != 0:
         (tmp_path / 'secret').write_bytes(records.MAGIC)
         (tmp_path / 'secret').chmod(0)
@@ -294,6 +298,8 @@ def hostile() -> dict[str, bytes]:
     """Return data sections that claim more than there is, or hold more than they say."""
     zeros = bytes(1 << 20)
     bomb = zstandard.ZstdCompressor().compress(zeros * 300)
+    packer = zstandard.ZstdCompressor().compressobj(size=800 << 20)
+    large_bomb = b''.join(packer.compress(zeros) for _ in range(800)) + packer.flush()
     compressor = zstandard.ZstdCompressor(write_content_size=False)
     unsized = compressor.compress(zeros * 300)
     window = zstandard.ZstdCompressionParameters(window_log=27, write_content_size=False)
@@ -313,7 +319,7 @@ def hostile() -> dict[str, bytes]:
         'records length of 2**60': chunk(bomb, length=2**60),
         'compression name of 2**32-1 bytes': records.record(
             records.CHUNK, records.CHUNK_HEAD.pack(0, 0, 1, 0) + b'\xff' * 40),
-        'zstd bomb': chunk(bomb), 'zstd bomb of unknown size': chunk(unsized),
+        'zstd bomb': chunk(large_bomb), 'zstd bomb of unknown size': chunk(unsized),
         'zstd frame of 2**40 bytes': chunk(claims), 'zstd frame as it claims': chunk(
             claims, size=2**40),
         'zstd bomb with a large window': chunk(
@@ -331,6 +337,9 @@ def hostile() -> dict[str, bytes]:
             records.SCHEMA, b'\1\0' + b'\xff' * 20)),
         'channel changes': one(definitions() + records.channel(1, 1, '/other')),
         'short definition': one(records.record(records.CHANNEL, b'\1')),
+        'schemas of 70 MiB': one(b''.join(records.record(
+            records.SCHEMA, struct.pack('<H', number) + b'\1\0\0\0a\1\0\0\0b'
+            + records.block(zeros)) for number in range(1, 71))),
         'undefined channel': one(message(bytes(8))), 'message without a head': one(
             definitions() + records.record(records.MESSAGE, b'\1\0')),
         'string of 4 GiB': one(definitions('int64 timestamp\nint32 vpid\nint32 vtid\nstring s\n')

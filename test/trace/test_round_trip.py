@@ -28,7 +28,7 @@ from mddag_executor.trace.trace_file import CHUNK_LIMIT
 import pytest
 from rosbags.highlevel import AnyReader
 
-from .helpers import entries, mixture, read, read_back, records_of, VPID, write_chunks
+from .helpers import entries, mixture, read, read_back, records_of, sample, VPID, write_chunks
 
 ANY_EVENTS = st.lists(st.sampled_from(list(EVENTS.values())).flatmap(entries), max_size=30)
 
@@ -178,6 +178,21 @@ def test_chunks_keep_their_limit(tmp_path: Path) -> None:
     events, warnings = read(path)
     assert not warnings and len(events) == 20_001
     assert yaml in [event[4] for event in events if event[0] == 'mddag:task_set']
+
+
+def test_definitions_count_for_the_limit(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    size = 9 + 22 + 4 + 24      # of a callback_end
+    with TraceFile(path) as file:
+        for number in range((CHUNK_LIMIT - 400) // size):
+            file.add('callback_end', number, 1, 2, 3)
+        for event in list(EVENTS.values())[:5]:
+            file.add(*sample(event, 1)[:2], 1, *sample(event, 1)[2:])
+    with open(path, 'rb') as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and len(summary.chunk_indexes) == 2
+    first, second = (index.uncompressed_size for index in summary.chunk_indexes)
+    assert CHUNK_LIMIT - 400 < first <= CHUNK_LIMIT and second < 3000
 
 
 def test_events_beyond_the_table(tmp_path: Path) -> None:

@@ -22,16 +22,27 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.live.entities import EntitySet
 from mddag_executor.live.events import EventsIntake
 from mddag_executor.live.waitset import WaitSetIntake
 from rclpy.context import Context
 from rclpy.node import Node
+from rclpy.waitable import NumberOfEntities, Waitable
 import std_msgs.msg
 
 INTAKES = ('events', 'waitset', 'poll')
+THREADED = ('events', 'waitset')
+MS = 1_000_000
 
 _numbers = itertools.count()
+
+
+def nothing(*_: Any) -> None:
+    pass
+
+
+def start(intake: Any, *nodes: Node) -> None:
+    intake.update(nodes)
+    intake.start()
 
 
 class Recorder:
@@ -204,5 +215,43 @@ class FakeExecutor:
             self.errors.append(error)
 
 
-def no_entities() -> EntitySet:
-    return EntitySet([], [], [], [], [], [], [], {})
+def on_grid(dues: list[int], period: int) -> bool:
+    """Return whether due times are points of one exact phase grid, and never go back."""
+    steps = [b - a for a, b in zip(dues, dues[1:])]
+    return all(step > 0 and step % period == 0 for step in steps)
+
+
+class Pulse(Waitable):
+    """A waitable of one's own, made of a guard condition."""
+
+    def __init__(self, node: Node, group: Any) -> None:
+        super().__init__(group)  # type: ignore[no-untyped-call]
+        self.guard = node.create_guard_condition(lambda: None)
+        node._guards.remove(self.guard)
+        self._index: int | None = None
+        self.order: list[str] = []
+
+    def __enter__(self) -> None:
+        self.guard.handle.__enter__()
+
+    def __exit__(self, *_: Any) -> None:
+        self.guard.handle.__exit__(None, None, None)
+
+    def is_ready(self, wait_set: Any) -> bool:
+        ready = bool(wait_set.is_ready('guard_condition', self._index))
+        if ready:
+            self.order.append('ready')
+        return ready
+
+    def take_data(self) -> int:
+        self.order.append('take')
+        return len(self.order)
+
+    async def execute(self, taken_data: int) -> None:
+        pass
+
+    def get_num_entities(self) -> NumberOfEntities:
+        return NumberOfEntities(num_gcs=1)
+
+    def add_to_wait_set(self, wait_set: Any) -> None:
+        self._index = wait_set.add_guard_condition(self.guard.handle)

@@ -1,0 +1,188 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+The verb `simulate`: one run of a declaration in virtual time.
+
+Each vertex has one execution time for the whole run, as in the paper's experiment: drawn from the
+declared distribution (`--seed`) or read from a file (`--execution-times`).
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from typing import Any, TYPE_CHECKING
+
+from mddag_executor.cli import common
+from mddag_executor.cli.text import Progress
+from mddag_executor.core import POLICIES
+from mddag_executor.core import policy as find_policy
+from mddag_executor.errors import UsageError
+from mddag_executor.report.text import format_ns, printable
+
+if TYPE_CHECKING:
+    from mddag_executor.simulate import Load, Run, Settings
+    from msg_graph import TaskSet
+
+NAME = 'simulate'
+HELP = 'run a declaration in virtual time'
+EXAMPLE = """\
+mddag simulate config/autoware.yaml --policy rad --workers 7 --duration 3s --preemptive
+mddag simulate graph.yaml --execution-times times.json --json - --fail-on-miss"""
+
+DEFAULT_DURATION_NS = 3_000_000_000
+DEFAULT_WORKERS = 7
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add('graph', metavar='GRAPH', help="the declaration, a YAML file ('-': standard input)")
+    add('--policy', default='rad', metavar='P',
+        help=f'one of {", ".join(POLICIES)} (default: rad)')
+    add('--workers', type=common.positive_int, metavar='M',
+        help='size of the pool (default: what the declaration says, else '
+        f'{DEFAULT_WORKERS})')
+    add('--duration', type=common.duration, default=DEFAULT_DURATION_NS, metavar='TIME',
+        help='virtual time to simulate, as 3s (default: 3s)')
+    add('--preemptive', action='store_true',
+        help='what is more urgent takes the worker of what runs')
+    add('--execution-times', metavar='FILE',
+        help='JSON {"DAG": {"/node:callback": microseconds}}: the execution time of each vertex '
+        "('-': standard input; default: drawn from the declaration)")
+    add('--seed', type=int, default=0, metavar='N',
+        help='draw the execution times with this (default: 0)')
+    add('--utilisation', type=common.positive_float, metavar='U',
+        help='scale the execution times to this normalised utilisation, sum(C/T)/workers')
+    add('--judge', choices=('horizon', 'completions'), default='horizon',
+        help='what is overdue at the end is late (horizon, the default), or only what completed '
+        'is judged (completions, as in the paper)')
+    add('--stop-at-first-miss', action='store_true',
+        help='end the run with the first missed deadline')
+    add('--trace', metavar='OUT.mcap', help='record the run to this file')
+    add('--fail-on-miss', action='store_true', help='exit with status 1 if a deadline was missed')
+    common.add_json(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Simulate and print what came of the deadlines.
+
+    :raises msg_graph.GraphError: when the declaration is wrong
+    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    """
+    from mddag_executor.simulate import periodic_load, Settings, utilisation
+    _check_arguments(args)
+    task_set = common.load_graph(args.graph)
+    workers = args.workers or task_set.workers or DEFAULT_WORKERS
+    times = _execution_times(args, task_set, workers)
+    settings = Settings(
+        policy=args.policy, workers=workers, duration_ns=args.duration,
+        preemptive=args.preemptive, judge=args.judge,
+        stop_at_first_miss=args.stop_at_first_miss)
+    load = periodic_load(task_set, times, args.duration)
+    run = _simulate(task_set, load, settings, utilisation(task_set, times, workers),
+                    log=args.trace is not None)
+    if args.trace is not None:
+        _write_trace(args.trace, task_set, load, run)
+    result = _result(args, task_set, run)
+    if args.json is not None:
+        common.write_json(args.json, result)
+    if common.wants_tables(args):
+        from mddag_executor.report.tables import sink_table
+        print(sink_table(result['dags']))
+        for line in summary(result):
+            print(line)
+    return 1 if args.fail_on_miss and run.tally.missed else 0
+
+
+def _check_arguments(args: argparse.Namespace) -> None:
+    if args.graph == '-' and args.execution_times == '-':
+        raise UsageError(
+            '-: standard input can be only one of GRAPH and --execution-times: name the other')
+    if args.trace == '-':
+        raise UsageError('--trace -: a trace is not written to standard output: name a file')
+    find_policy(args.policy)
+    common.check_output(args.json)
+    common.check_output(args.trace)
+
+
+def _execution_times(
+    args: argparse.Namespace, task_set: TaskSet, workers: int
+) -> list[list[int]]:
+    from mddag_executor.simulate import (
+        draw_execution_times,
+        read_execution_times,
+        scale_execution_times,
+    )
+    if args.execution_times is None:
+        times = draw_execution_times(task_set, args.seed)
+    else:
+        name, text = common.read_text(args.execution_times)
+        times = read_execution_times(task_set, text, name)
+    if args.utilisation is not None:
+        times = scale_execution_times(task_set, times, workers, args.utilisation)
+    return times
+
+
+def _simulate(
+    task_set: TaskSet, load: Load, settings: Settings, utilisation: float, log: bool
+) -> Run:
+    from mddag_executor.simulate import simulate
+    with Progress('simulating', settings.duration_ns) as line:
+        return simulate(
+            task_set, load, settings, utilisation=utilisation, log=log, progress=line.update)
+
+
+def _write_trace(path: str, task_set: TaskSet, load: Load, run: Run) -> None:
+    """Write the trace as a whole or not at all."""
+    from mddag_executor.simulate.recording import write_trace
+    from mddag_executor.trace import TraceError
+    with common.output_file(path) as file:
+        try:
+            write_trace(file.name, task_set, load, run)
+        except TraceError as error:
+            raise TraceError(path, error.problem, error.remedy) from None
+
+
+def _result(args: argparse.Namespace, task_set: TaskSet, run: Run) -> dict[str, Any]:
+    drawn = args.execution_times is None
+    return {
+        **run.result(), 'file': task_set.file, 'judge': run.settings.judge,
+        'seed': args.seed if drawn else None, 'ended_ns': run.ended_ns,
+        'trace': args.trace}
+
+
+def summary(result: dict[str, Any]) -> Iterator[str]:
+    """Yield the lines that stand below the table of a run."""
+    from mddag_executor.report.tables import percent, total
+    every = total(result['dags'])
+    jobs = sum(dag['jobs'] for dag in result['dags'].values())
+    yield (f'{result["policy"]}, {result["workers"]} workers, '
+           f'{"preemptive" if result["preemptive"] else "not preemptive"}, '
+           f'{format_ns(result["duration_ns"])}, utilisation {result["utilisation"]:.3f}')
+    yield (f'{jobs} jobs, {every.due} sink jobs due, {every.in_time} in time '
+           f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
+           + (f', {every.aborted} aborted' if every.aborted else ''))
+    if result['ended_ns'] < result['duration_ns']:
+        yield f'stopped at {format_ns(result["ended_ns"], 9)}, with the first miss'
+    miss = result['first_miss']
+    if miss is not None:
+        completed = miss['completed_ns']
+        what = 'never completed' if completed is None else (
+            f'completed {format_ns(completed - miss["deadline_ns"])} late')
+        yield (f'first miss: {printable(miss["vertex"])} of job {miss["job"]} of '
+               f'{printable(miss["dag"])}, deadline at {format_ns(miss["deadline_ns"], 9)}, {what}')
+    if result['trace'] is not None:
+        yield f'trace: {printable(result["trace"])}'

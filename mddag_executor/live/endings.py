@@ -1,0 +1,71 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What ends or wakes the intakes when a context, or the interpreter, comes to its end."""
+
+from __future__ import annotations
+
+import atexit
+from functools import partial
+from typing import Protocol
+import weakref
+
+from rclpy.context import Context
+
+
+class _Intake(Protocol):
+
+    def wake(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+
+_started: weakref.WeakSet[_Intake] = weakref.WeakSet()
+_by_context: weakref.WeakKeyDictionary[Context, weakref.WeakSet[_Intake]] = (
+    weakref.WeakKeyDictionary())
+
+
+def stop_at_exit(intake: _Intake) -> None:
+    """
+    Have an intake stopped before the interpreter and the middleware end, if it still runs then.
+
+    A thread that is in the middleware meanwhile can crash the process.
+    """
+    _started.add(intake)
+
+
+@atexit.register
+def _stop_all() -> None:
+    for intake in list(_started):
+        intake.stop()
+
+
+def wake_at_shutdown(context: Context, intake: _Intake) -> None:
+    """
+    Have an intake woken when its context is shut down.
+
+    A context never forgets a callback of somebody who is alive, and executors can make an intake
+    for each spin; so it gets only one for all intakes.
+    """
+    intakes = _by_context.get(context)
+    if intakes is not None:
+        intakes.add(intake)
+        return
+    intakes = _by_context[context] = weakref.WeakSet([intake])
+    context.on_shutdown(partial(_wake_all, intakes))
+
+
+def _wake_all(intakes: weakref.WeakSet[_Intake]) -> None:
+    for intake in list(intakes):
+        intake.wake()

@@ -1,0 +1,79 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Acceptance ratios: how many runs met every deadline, by normalised utilisation.
+
+The bins are the paper's: the nearest multiple of 0.05, everything below 0.525 in 0.5 and
+everything from 0.975 up in 1.0.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+BINS = tuple(round(0.5 + 0.05 * i, 2) for i in range(11))
+_EDGES = np.array([0.525 + 0.05 * i for i in range(10)])
+
+Z_95 = 1.959963984540054
+"""Half the width of the central 95 % of the normal distribution, in standard deviations."""
+
+Bools = npt.NDArray[np.bool_]
+
+
+def bins_of(utilisation: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """Return for each utilisation the number of its bin."""
+    return np.searchsorted(_EDGES, utilisation, side='right').astype(np.int64)
+
+
+def wilson(accepted: int, runs: int) -> tuple[float, float]:
+    """
+    Return the 95 % confidence interval of a ratio by Wilson's score method.
+
+    Unlike the normal approximation it stays within 0 and 1 and is right near them.
+    """
+    z2 = Z_95 * Z_95
+    ratio = accepted / runs
+    centre = (ratio + z2 / (2 * runs)) / (1 + z2 / runs)
+    half = Z_95 / (1 + z2 / runs) * math.sqrt(
+        ratio * (1 - ratio) / runs + z2 / (4 * runs * runs))
+    # At the ends rounding must not leave the ratio outside of its own interval.
+    return min(ratio, max(0.0, centre - half)), max(ratio, min(1.0, centre + half))
+
+
+class Acceptance:
+    """
+    Acceptance of one set of runs: ratio and confidence interval of each bin and of all runs.
+
+    ``ratio`` and ``interval`` hold None where a bin is empty.
+    """
+
+    def __init__(self, bins: npt.NDArray[np.int64], accepted: Bools) -> None:
+        counts = np.bincount(bins, minlength=len(BINS)).tolist()
+        self.accepted: list[int] = np.bincount(
+            bins[accepted], minlength=len(BINS)).tolist()
+        self.ratio: list[float | None] = []
+        self.interval: list[tuple[float, float] | None] = []
+        for good, runs in zip(self.accepted, counts):
+            self.ratio.append(good / runs if runs else None)
+            self.interval.append(wilson(good, runs) if runs else None)
+        self.total = float(np.mean(accepted)) if len(accepted) else None
+
+    def result(self) -> dict[str, Any]:
+        """Return the parts for machines, apart from the ratios by bin."""
+        return {'total': self.total, 'interval_95': self.interval}

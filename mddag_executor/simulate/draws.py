@@ -1,0 +1,196 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Execution times for many runs: each vertex gets one value for the whole of a run.
+
+Theory of operation
+-------------------
+As in the paper, the execution time of a vertex is one uniform pick from its callback's values for
+each run, the same for the whole run and for every policy.  A callback that two DAGs trigger is two
+vertices, which are drawn apart.  The values are the quantile table of the declaration (ns), or
+measured ones, which the paper's program rounds up to whole microseconds, at least one.
+
+Run r of seed s takes its uniform numbers from a counter-based generator (Philox) with the key
+(s, r).  So a run is the same whatever runs before it, and in whichever process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+import zipfile
+import zlib
+
+from mddag_executor.errors import InputError, UsageError
+from msg_graph import ExecutionTime, TaskSet
+from msg_graph.analysis import topological_order
+import numpy as np
+import numpy.typing as npt
+
+Times = npt.NDArray[np.int64]
+"""Execution times, ns: a row for each run, a column for each vertex, DAG by DAG."""
+
+Floats = npt.NDArray[np.float64]
+Samples = Mapping[str, Times]
+
+_LONGEST_NS = 86_400_000_000_000
+_REMEDY = "write one array of measured ns for each 'node:callback' with numpy.savez"
+
+
+def read_samples(task_set: TaskSet, path: Path, name: str) -> dict[str, Times]:
+    """
+    Read measured execution times: an .npz file with one array (ns) for each ``node:callback``.
+
+    :param name: what to call the file in messages.
+    :return: for each callback in a DAG its values in ns, rounded up to whole us, at least 1 us.
+    :raises InputError: on anything that is not that, or a callback without values.
+    """
+    try:
+        archive = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, zipfile.BadZipFile):
+        raise InputError(name, 'this is no .npz file', _REMEDY) from None
+    if not isinstance(archive, np.lib.npyio.NpzFile):
+        raise InputError(name, 'this is a single array, not an .npz file', _REMEDY)
+    samples: dict[str, Times] = {}
+    with archive:
+        for vertex in task_set.vertices:
+            key = vertex.callback.key
+            if key not in samples:
+                samples[key] = _whole_us(_array(archive, key, name), key, name)
+    return samples
+
+
+def _array(archive: Any, key: str, name: str) -> npt.NDArray[Any]:
+    if key not in archive.files:
+        raise InputError(name, f'no values for {key}', 'add an array of that name')
+    try:
+        values: npt.NDArray[Any] = archive[key]
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error):
+        raise InputError(name, f'the values of {key} are damaged or no numbers', _REMEDY) from None
+    return values
+
+
+def _whole_us(values: npt.NDArray[Any], key: str, name: str) -> Times:
+    if values.ndim != 1 or values.size == 0 or values.dtype.kind not in 'iuf':
+        raise InputError(name, f'the values of {key} are no list of numbers', _REMEDY)
+    if not bool(np.all((values >= 0) & (values < _LONGEST_NS))):  # false for what is no number
+        raise InputError(
+            name, f'a value of {key} is negative or no number of ns below one day',
+            'take it out of the array')
+    return np.maximum(np.ceil(values / 1000).astype(np.int64), 1) * 1000
+
+
+class Draws:
+    """
+    The execution times of numbered runs.
+
+    :param seed: 0 to 2**64 - 1.
+    :param samples: measured values of each callback, ns; None draws from the quantile tables.
+    :raises InputError: when a callback declares no execution time, or none above zero.
+    """
+
+    def __init__(self, task_set: TaskSet, seed: int, samples: Samples | None = None) -> None:
+        if not 0 <= seed < 2 ** 64:
+            raise UsageError(f'seed {seed}: it is out of range: give 0 to 2**64 - 1')
+        self._seed = seed
+        self._pickers: list[Callable[[Floats], Times]] = []
+        for vertex in task_set.vertices:
+            callback = vertex.callback
+            if samples is not None:
+                self._pickers.append(_Measured(samples[callback.key]))
+            elif callback.execution_time is None:
+                raise InputError(
+                    task_set.file, f'{callback.key} declares no execution_time',
+                    'add one, or give --samples FILE.npz', line=callback.line)
+            elif callback.execution_time.quantiles_ns[-1] <= 0:
+                raise InputError(
+                    task_set.file, f'the execution_time of {callback.key} is 0',
+                    'give a time above zero', line=callback.line)
+            else:
+                self._pickers.append(_Table(callback.execution_time))
+
+    def times(self, first: int, count: int) -> Times:
+        """Return the execution times of ``count`` runs from number ``first`` on."""
+        uniform = np.empty((count, len(self._pickers)))
+        key = np.array([self._seed, 0], dtype=np.uint64)
+        for row in range(count):
+            key[1] = first + row
+            np.random.Generator(np.random.Philox(key=key)).random(out=uniform[row])
+        times = np.empty(uniform.shape, dtype=np.int64)
+        for column, pick in enumerate(self._pickers):
+            times[:, column] = pick(uniform[:, column])
+        return times
+
+
+class _Measured:
+    """One of the measured values."""
+
+    def __init__(self, values: Times) -> None:
+        self._values = values
+
+    def __call__(self, uniform: Floats) -> Times:
+        return self._values[(uniform * len(self._values)).astype(np.int64)]
+
+
+class _Table:
+    """``ExecutionTime.draw`` for many numbers at once, with the same results to the bit."""
+
+    def __init__(self, table: ExecutionTime) -> None:
+        self._percent = np.array(table.percent, dtype=np.float64)
+        self._quantiles = np.array(table.quantiles_ns, dtype=np.int64)
+
+    def __call__(self, uniform: Floats) -> Times:
+        percent, quantiles = self._percent, self._quantiles
+        if len(percent) == 1:
+            return np.full(uniform.shape, max(1, int(quantiles[0])), dtype=np.int64)
+        at = np.clip(uniform * 100.0, percent[0], percent[-1])
+        above = np.clip(np.searchsorted(percent, at, side='right'), 1, len(percent) - 1)
+        low, high = percent[above - 1], percent[above]
+        first, second = quantiles[above - 1], quantiles[above]
+        drawn = np.rint(first + (second - first) * (at - low) / (high - low)).astype(np.int64)
+        return np.maximum(drawn, 1)
+
+
+def utilisations(task_set: TaskSet, times: Times, workers: int) -> Floats:
+    """Return each run's normalised utilisation: sum of execution time over period, by workers."""
+    total = np.zeros(len(times))
+    first = 0
+    for dag in task_set.dags:
+        total += times[:, first:first + len(dag.vertices)].sum(axis=1) / dag.period_ns
+        first += len(dag.vertices)
+    return total / workers
+
+
+def feasible(task_set: TaskSet, times: Times, workers: int) -> npt.NDArray[np.bool_]:
+    """
+    Return for each run whether a scheduler could meet all deadlines, as far as is easily known.
+
+    It could not where the longest path to a sink is longer than the sink's deadline, nor, in the
+    long run, where the utilisation is above the number of workers.
+    """
+    possible = utilisations(task_set, times, workers) <= 1.0
+    first = 0
+    for dag in task_set.dags:
+        lengths = np.empty((len(dag.vertices), len(times)), dtype=np.int64)
+        for index in topological_order(dag):
+            vertex = dag.vertices[index]
+            lengths[index] = times[:, first + index]
+            if vertex.predecessors:
+                lengths[index] += lengths[list(vertex.predecessors)].max(axis=0)
+            if vertex.deadline_ns is not None:
+                possible &= lengths[index] <= vertex.deadline_ns
+        first += len(dag.vertices)
+    return possible

@@ -1,0 +1,127 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The paper's figure: acceptance ratio against normalised utilisation, number of runs below.
+
+matplotlib (the extra ``batch``) is used without its windows and global state, and is imported when
+a figure is drawn.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+import os
+from typing import Any, BinaryIO, TYPE_CHECKING
+
+from mddag_executor.errors import InputError
+from mddag_executor.simulate.acceptance import BINS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from mddag_executor.simulate.acceptance import Acceptance
+    from mddag_executor.simulate.evaluate import Evaluation
+
+FORMATS = ('.png', '.svg', '.pdf')
+
+# Colours of Okabe and Ito, which the colour-blind can tell apart too; each with its own marker.
+_STYLES = (
+    ('#0072B2', 'o'), ('#D55E00', 's'), ('#009E73', '^'), ('#CC79A7', 'D'), ('#E69F00', 'v'),
+    ('#56B4E9', 'P'), ('#000000', 'X'),
+)
+_SHIFT = 0.003
+"""How far the points of neighbouring policies stand apart, so that no bar hides another's."""
+
+
+def check_plot(path: str) -> None:
+    """
+    Find out whether a figure can be drawn into this file, before the work starts.
+
+    :raises InputError: on an ending that is not of ``FORMATS``, or without matplotlib.
+    """
+    if os.path.splitext(path)[1].lower() not in FORMATS:
+        raise InputError(
+            path, 'the ending tells no kind of picture', f'use one of {", ".join(FORMATS)}')
+    if find_spec('matplotlib') is None:
+        raise InputError(
+            path, 'matplotlib, which draws it, is not there',
+            "install 'mddag_executor[batch]' with pip")
+
+
+def draw(evaluation: Evaluation, file: BinaryIO, path: str) -> None:
+    """
+    Draw the figure of an evaluation into a file.
+
+    :param path: its name, whose ending tells the kind.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+    kind = os.path.splitext(path)[1].lower()[1:]
+    # Without these, two figures of the same data would differ.
+    metadata: dict[str, Any] = {'png': {}, 'svg': {'Date': None}, 'pdf': {'CreationDate': None}}
+    with rc_context({'svg.hashsalt': 'mddag', 'font.size': 9.0}):
+        figure = Figure(figsize=(6.4, 4.8), layout='constrained')
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
+        _ratios(above, evaluation)
+        _counts(below, evaluation.counts())
+        figure.savefig(file, format=kind, dpi=150, metadata=metadata[kind])
+
+
+def _ratios(axes: Axes, evaluation: Evaluation) -> None:
+    bound = evaluation.bound()
+    axes.plot(*_points(bound, 0.0), color='0.5', linestyle='--', linewidth=1.0,
+              label=f'no scheduler above ({_total(bound)})')
+    by_policy = evaluation.by_policy()
+    for i, (name, acceptance) in enumerate(by_policy.items()):
+        colour, marker = _STYLES[i % len(_STYLES)]
+        shift = (i - (len(by_policy) - 1) / 2) * _SHIFT
+        x, y = _points(acceptance, shift)
+        intervals = [each for each in acceptance.interval if each is not None]
+        bars = ([ratio - low for ratio, (low, _) in zip(y, intervals)],
+                [high - ratio for ratio, (_, high) in zip(y, intervals)])
+        preemptive = evaluation.experiment.settings(name).preemptive
+        label = f'{name}{"" if preemptive else ", non-preemptive"} ({_total(acceptance)})'
+        axes.errorbar(x, y, yerr=bars, color=colour, marker=marker, markersize=4.5,
+                      linewidth=1.2, elinewidth=0.8, capsize=2.0, label=label)
+    axes.set_ylabel('acceptance ratio')
+    axes.set_ylim(-0.03, 1.03)
+    axes.grid(color='0.9', linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.legend(fontsize=8, frameon=False, loc='lower left',
+                title='bars: 95 % confidence (Wilson)', title_fontsize=8, alignment='left')
+    experiment = evaluation.experiment
+    axes.set_title(
+        f'{evaluation.runs:,} runs of {experiment.duration_ns / 1e9:g} s, '
+        f'{experiment.workers} workers', fontsize=9)
+
+
+def _points(acceptance: Acceptance, shift: float) -> tuple[list[float], list[float]]:
+    """Return the bins that are not empty and their ratios."""
+    found = [(x + shift, y) for x, y in zip(BINS, acceptance.ratio) if y is not None]
+    return [x for x, _ in found], [y for _, y in found]
+
+
+def _total(acceptance: Acceptance) -> str:
+    return '-' if acceptance.total is None else f'{acceptance.total:.1%} of all'
+
+
+def _counts(axes: Axes, counts: list[int]) -> None:
+    bars = axes.bar(BINS, counts, width=0.035, color='0.75')
+    axes.bar_label(bars, labels=[f'{count:,}' if count else '' for count in counts], fontsize=7)
+    axes.set_ylim(0, max([*counts, 1]) * 1.3)
+    axes.set_ylabel('runs')
+    axes.set_xlabel('normalised utilisation')
+    axes.set_xticks(BINS, [f'{x:.2f}' for x in BINS])
+    for side in ('top', 'right'):
+        axes.spines[side].set_visible(False)

@@ -1,0 +1,354 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Growing arrays and structures of them for compiled code, used as lists and named tuples are.
+
+Theory of operation
+-------------------
+The core's functions work on named tuples of lists.  numba can compile that as it stands, but then
+each call hands over some thirty reference-counted lists, which takes as long as the interpreter.
+The types in here look the same to the source and cost what they cost in C:
+
+* a *vector* is the address of three words: address of its data, length, capacity.  An element is
+  a 64-bit integer, or a tuple of them, or a vector.  ``append`` grows the data with ``realloc``;
+* a *structure* is the address of three words for each field: those of a vector, or an integer.
+
+Nothing is counted or checked: an index must be within 0 and the length.  (What the plain core does
+on lists, where Python checks, is tested to be the same.)  Whoever makes a structure frees it, with
+``free``, or lends it memory that stays where it is while the structure is used.
+
+This module needs numba; nothing is compiled when it is imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import operator
+from typing import Any
+
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.core.imputils import lower_getattr_generic
+from numba.core.typing.templates import AttributeTemplate, infer_getattr
+from numba.extending import intrinsic, models, overload, overload_method, register_model
+
+WORDS = 3
+"""Words of a vector, and of a field."""
+
+_I64 = ir.IntType(64)
+_BYTES = 8
+
+
+class VectorType(types.Type):  # type: ignore[misc]
+    """
+    A vector.
+
+    :param width: how many integers an element's tuple has; 0 for plain integers.
+    :param nested: the elements are vectors with elements of that width.
+    """
+
+    def __init__(self, width: int = 0, nested: bool = False) -> None:
+        self.width = width
+        self.nested = nested
+        super().__init__(name=f'mddag.Vector({width}, {nested})')
+
+    @property
+    def words(self) -> int:
+        """Return how many words an element takes."""
+        return WORDS if self.nested else max(1, self.width)
+
+    @property
+    def element(self) -> types.Type:
+        """Return the type of an element."""
+        if self.nested:
+            return VectorType(self.width)
+        return types.UniTuple(types.int64, self.width) if self.width else types.int64
+
+
+class StructureType(types.Type):  # type: ignore[misc]
+    """A structure: fields by name, of which each is a ``VectorType`` or ``types.int64``."""
+
+    def __init__(self, name: str, fields: dict[str, types.Type]) -> None:
+        self.fields = fields
+        self.places = {field: i for i, field in enumerate(fields)}
+        super().__init__(name=f'mddag.Structure({name}: {fields})')
+
+
+class _AddressModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, fe_type: types.Type) -> None:
+        super().__init__(manager, fe_type, _I64)
+
+
+register_model(VectorType)(_AddressModel)
+register_model(StructureType)(_AddressModel)
+
+
+# --- in terms of LLVM -----------------------------------------------------------------------------
+
+def _pointer(builder: Any, address: Any) -> Any:
+    return builder.inttoptr(address, _I64.as_pointer())
+
+
+def _element(builder: Any, vector: VectorType, address: Any, index: Any) -> Any:
+    """Return the address of an element."""
+    data = builder.load(_pointer(builder, address))
+    return builder.add(data, builder.mul(index, _I64(_BYTES * vector.words)))
+
+
+def _word(builder: Any, address: Any, place: int) -> Any:
+    return builder.gep(_pointer(builder, address), [_I64(place)])
+
+
+@infer_getattr
+class _StructureAttribute(AttributeTemplate):  # type: ignore[misc]
+    key = StructureType
+
+    def generic_resolve(self, structure: StructureType, name: str) -> types.Type | None:
+        return structure.fields.get(name)
+
+
+def _get_field(context: Any, builder: Any, structure: Any, address: Any, name: str) -> Any:
+    field = builder.add(address, _I64(_BYTES * WORDS * structure.places[name]))
+    if isinstance(structure.fields[name], VectorType):
+        return field
+    return builder.load(_pointer(builder, field))
+
+
+lower_getattr_generic(StructureType)(_get_field)
+
+
+@intrinsic
+def _load(typing: Any, vector: Any, index: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        element = _element(builder, vector, *args)
+        if vector.nested:
+            return element
+        if not vector.width:
+            return builder.load(_pointer(builder, element))
+        words = [builder.load(_word(builder, element, i)) for i in range(vector.width)]
+        return context.make_tuple(builder, vector.element, words)
+
+    return vector.element(vector, types.int64), generate
+
+
+@intrinsic
+def _store(typing: Any, vector: Any, index: Any, value: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        element = _element(builder, vector, args[0], args[1])
+        if not vector.width:
+            builder.store(args[2], _pointer(builder, element))
+        for i in range(vector.width):
+            word = builder.extract_value(args[2], i)
+            builder.store(word, _word(builder, element, i))
+        return context.get_dummy_value()
+
+    return types.void(vector, types.int64, vector.element), generate
+
+
+@intrinsic
+def _get_word(typing: Any, vector: Any, place: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.load(builder.gep(_pointer(builder, args[0]), [args[1]]))
+
+    return types.int64(vector, types.int64), generate
+
+
+@intrinsic
+def _set_word(typing: Any, vector: Any, place: Any, value: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        builder.store(args[2], builder.gep(_pointer(builder, args[0]), [args[1]]))
+        return context.get_dummy_value()
+
+    return types.void(vector, types.int64, types.int64), generate
+
+
+@intrinsic
+def _realloc(typing: Any, address: Any, size: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        byte = ir.IntType(8).as_pointer()
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(byte, [byte, _I64]), 'realloc')
+        moved = builder.call(function, [builder.inttoptr(args[0], byte), args[1]])
+        return builder.ptrtoint(moved, _I64)
+
+    return types.int64(types.int64, types.int64), generate
+
+
+@intrinsic
+def _free(typing: Any, address: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        byte = ir.IntType(8).as_pointer()
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), [byte]), 'free')
+        builder.call(function, [builder.inttoptr(args[0], byte)])
+        return context.get_dummy_value()
+
+    return types.void(types.int64), generate
+
+
+def at(kind: types.Type) -> Callable[..., Any]:
+    """Return a function for compiled code that makes an address a vector or structure."""
+    @intrinsic
+    def convert(typing: Any, address: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return args[0]
+
+        return kind(types.int64), generate
+
+    function: Callable[..., Any] = convert
+    return function
+
+
+# --- what lists have ------------------------------------------------------------------------------
+
+@njit
+def _grow(vector, words):  # type: ignore[no-untyped-def]
+    capacity = max(8, 2 * _get_word(vector, 2))
+    data = _realloc(_get_word(vector, 0), capacity * words * 8)
+    if data == 0:
+        raise MemoryError('no memory for the simulation')
+    _set_word(vector, 0, data)
+    _set_word(vector, 2, capacity)
+
+
+@overload(operator.getitem)
+def _overload_getitem(vector: Any, index: Any) -> Any:
+    if isinstance(vector, VectorType) and isinstance(index, types.Integer):
+        return lambda vector, index: _load(vector, index)
+    return None
+
+
+@overload(operator.setitem)
+def _overload_setitem(vector: Any, index: Any, value: Any) -> Any:
+    if isinstance(vector, VectorType) and not vector.nested and isinstance(index, types.Integer):
+        return lambda vector, index, value: _store(vector, index, value)
+    return None
+
+
+@overload(operator.delitem)
+def _overload_delitem(vector: Any, index: Any) -> Any:
+    """Cut the end off: ``del vector[start:]``."""
+    if isinstance(vector, VectorType) and isinstance(index, types.SliceType):
+        return lambda vector, index: _set_word(vector, 1, index.start)
+    return None
+
+
+@overload(len)
+def _overload_len(vector: Any) -> Any:
+    if isinstance(vector, VectorType):
+        return lambda vector: _get_word(vector, 1)
+    return None
+
+
+@overload(bool)
+def _overload_bool(vector: Any) -> Any:
+    if isinstance(vector, VectorType):
+        return lambda vector: _get_word(vector, 1) != 0
+    return None
+
+
+@overload_method(VectorType, 'append')
+def _overload_append(vector: Any, value: Any) -> Any:
+    words = vector.words
+
+    def append(vector, value):  # type: ignore[no-untyped-def]
+        length = _get_word(vector, 1)
+        if length == _get_word(vector, 2):
+            _grow(vector, words)
+        _store(vector, length, value)
+        _set_word(vector, 1, length + 1)
+
+    return append
+
+
+@overload_method(VectorType, 'clear')
+def _overload_clear(vector: Any) -> Any:
+    return lambda vector: _set_word(vector, 1, 0)
+
+
+@njit
+def append_empty(vector):  # type: ignore[no-untyped-def]
+    """Append an empty vector to a vector of vectors."""
+    length = _get_word(vector, 1)
+    if length == _get_word(vector, 2):
+        _grow(vector, 3)
+    _set_word(vector, 1, length + 1)
+    for place in range(3):
+        _set_word(vector[length], place, 0)
+
+
+@njit
+def free(vector):  # type: ignore[no-untyped-def]
+    """Free what a vector holds, which must have no vectors in it any more."""
+    _free(_get_word(vector, 0))
+    for place in range(3):
+        _set_word(vector, place, 0)
+
+
+# --- what heapq has -------------------------------------------------------------------------------
+
+@njit
+def _rise(heap, place):  # type: ignore[no-untyped-def]
+    entry = heap[place]
+    while place > 0:
+        parent = (place - 1) >> 1
+        if not entry < heap[parent]:
+            break
+        heap[place] = heap[parent]
+        place = parent
+    heap[place] = entry
+
+
+@njit
+def _sink(heap, place):  # type: ignore[no-untyped-def]
+    entry = heap[place]
+    length = len(heap)
+    child = 2 * place + 1
+    while child < length:
+        if child + 1 < length and heap[child + 1] < heap[child]:
+            child += 1
+        if not heap[child] < entry:
+            break
+        heap[place] = heap[child]
+        place = child
+        child = 2 * place + 1
+    heap[place] = entry
+
+
+@njit
+def heappush(heap, entry):  # type: ignore[no-untyped-def]
+    """Do what ``heapq.heappush`` does."""
+    heap.append(entry)
+    _rise(heap, len(heap) - 1)
+
+
+@njit
+def heappop(heap):  # type: ignore[no-untyped-def]
+    """Do what ``heapq.heappop`` does, on a heap that is not empty."""
+    last = len(heap) - 1
+    top = heap[0]
+    heap[0] = heap[last]
+    _set_word(heap, 1, last)
+    if last > 0:
+        _sink(heap, 0)
+    return top
+
+
+@njit
+def heapify(heap):  # type: ignore[no-untyped-def]
+    """Do what ``heapq.heapify`` does."""
+    for place in range(len(heap) // 2 - 1, -1, -1):
+        _sink(heap, place)

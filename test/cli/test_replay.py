@@ -1,0 +1,279 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `replay`: tables, JSON, exit status, and bad input in one line."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+import sys
+from typing import Any
+
+from mddag_executor.cli import main as program
+from mddag_executor.trace import TraceFile
+import pytest
+
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /driver
+    callbacks:
+      - {name: tick, timer: 10ms, publishes: [/data]}
+  - node: /filter
+    callbacks:
+      - {name: run, subscription: /data, deadline: 8ms}
+"""
+START = 1_732_166_766_000_000_000
+MS = 1_000_000
+
+
+@pytest.fixture
+def trace(tmp_path: Path) -> Path:
+    """Give a trace of three jobs; the third is 2 ms late, its first vertex took 6 ms."""
+    path = tmp_path / 'run.mcap'
+    with TraceFile(path) as file:
+        def add(name: str, ms: int, *fields: Any) -> None:
+            file.add(name, START + ms * MS, 1, 9, *fields)
+
+        def run(vertex: int, job: int, ready: int, start: int, end: int) -> None:
+            add('dispatch', start, vertex, 0, vertex, job, 0, START + ready * MS, 0)
+            add('callback_start', start, vertex, False)
+            add('callback_end', end, vertex)
+            add('complete', end, vertex, 0, vertex, job, True, START + end * MS, 0)
+
+        add('task_set', 0, GRAPH, 'graph.yaml', 'rad', 2, 100 * MS, 64, False)
+        for job, first in enumerate((1, 2, 6)):
+            at = 10 + 10 * job
+            add('job_release', at, 0, job, START + at * MS)
+            run(0, job, at, at, at + first)
+            run(1, job, at + first, at + first + 1, at + first + 4)
+        add('deadline', 40, 0, 1, 2, START + 38 * MS, START + 40 * MS)
+        add('shutdown', 50, START + 50 * MS)
+    return path
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    status = program.main(['replay', *map(str, arguments)])
+    output = capsys.readouterr()
+    return status, output.out, output.err
+
+
+def test_the_tables(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = call(capsys, trace)
+    assert (status, err) == (0, '')
+    lines = [line.split() for line in out.splitlines()]
+    assert ['/driver', 'filter:run', '3', '2', '1', '0', '6', 'ms', '10', 'ms', '10', 'ms', '8',
+            'ms'] in lines
+    assert ('Where the response times went: means, and the worst job of each sink:'
+            in out.splitlines())
+    assert ['/driver', 'filter:run', '0', 'ns', '1', 'ms', '6', 'ms', '0', 'ns', '0', 'ns', '2',
+            '1', 'ms', '9', 'ms', '0', 'ns', '0', 'ns'] in lines
+    assert '3 sink jobs due, 2 in time (66.67 %), 1 late, 0 expired' in out
+    assert 'policy rad, 2 workers, 40 ms, utilisation 0.225 (all callbacks: 0.225)' in out
+    assert 'first miss: /filter:run, job 2, 2 ms late' in out
+    assert '/driver:tick' not in out
+
+
+def test_the_table_of_callbacks(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, out, _ = call(capsys, trace, '--callbacks')
+    lines = [line.split() for line in out.splitlines()]
+    assert ['/driver:tick', '3', '9', 'ms', '3', 'ms', '6', 'ms', '0', 'ns', '0', 'ns'] in lines
+    assert ['/filter:run', '3', '9', 'ms', '3', 'ms', '3', 'ms', '1', 'ms', '1', 'ms'] in lines
+
+
+def test_the_result_for_machines(
+    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = call(capsys, trace, '--json', '-')
+    assert (status, err) == (0, '')
+    result = json.loads(out)
+    assert result['dags']['/driver'] == {
+        'jobs': 3, 'ends': {'completed': 2, 'late': 1, 'aborted': 0, 'expired': 0},
+        'sinks': {'/filter:run': {
+            'relative_deadline_ns': 8 * MS, 'completed': 3, 'late': 1, 'overdue': 0, 'expired': 0,
+            'aborted': 0,
+            'response_ns': {'min': 5 * MS, 'median': 6 * MS, 'p99': 10 * MS, 'max': 10 * MS},
+            'breakdown': result['dags']['/driver']['sinks']['/filter:run']['breakdown']}}}
+    assert result['first_miss'] == {
+        'dag': '/driver', 'vertex': '/filter:run', 'job': 2, 'deadline_ns': START + 38 * MS,
+        'completed_ns': START + 40 * MS}
+    assert {key: result[key] for key in (
+        'policy', 'workers', 'preemptive', 'duration_ns', 'utilisation', 'deadline_missed',
+        'rescheduled', 'warnings')} == {
+            'policy': 'rad', 'workers': 2, 'preemptive': False, 'duration_ns': 40 * MS,
+            'utilisation': 0.225, 'deadline_missed': True, 'rescheduled': False, 'warnings': []}
+    path = tmp_path / 'result.json'
+    _, out, _ = call(capsys, trace, '--json', path)
+    assert json.loads(path.read_text()) == result
+    assert 'sink jobs due' in out
+
+
+def test_a_given_graph_judges(
+    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph = tmp_path / 'strict.yaml'
+    graph.write_text(GRAPH.replace('8ms', '5ms'))
+    status, out, err = call(capsys, trace, graph, '--fail-on-miss')
+    assert (status, err) == (1, '')
+    assert '3 sink jobs due, 1 in time (33.33 %), 2 late, 0 expired' in out
+    graph.write_text(GRAPH.replace('8ms', '10ms'))
+    status, out, err = call(capsys, trace, graph, '--fail-on-miss')
+    assert (status, err) == (0, '')
+    assert 'first miss' not in out
+
+
+def test_fail_on_miss(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(capsys, trace)[0] == 0
+    assert call(capsys, trace, '--fail-on-miss')[0] == 1
+    assert call(capsys, trace, '--fail-on-miss', '--reschedule')[0] == 1
+    assert call(capsys, trace, '--fail-on-miss', '--json', '-')[0] == 1
+
+
+def test_reschedule(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without the recorded waiting and transport the third job is still late: 6 and 3 ms."""
+    status, out, err = call(
+        capsys, trace, '--reschedule', '--workers', 1, '--policy', 'fifo', '--preemptive')
+    assert (status, err) == (0, '')
+    lines = [line.split() for line in out.splitlines()]
+    assert ['/driver', 'filter:run', '8', 'ms', '2', 'of', '3', '2', 'of', '3', '5', 'ms', '6',
+            'ms', '9', 'ms', '10', 'ms', '9', 'ms', '10', 'ms'] in lines
+    assert 'policy fifo, 1 workers, preemptive, 40 ms, utilisation 0.450' in out
+    assert 'first miss: /filter:run, job 2, 1 ms late' in out
+    result = json.loads(call(capsys, trace, '--reschedule', '--json', '-')[1])
+    assert (result['policy'], result['workers'], result['preemptive']) == ('rad', 2, False)
+    assert result['rescheduled'] is True
+    assert result['recorded']['dags']['/driver']['sinks']['/filter:run']['completed'] == 3
+
+
+def test_a_truncated_trace_gives_what_is_there(
+    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut = tmp_path / 'cut.mcap'
+    data = trace.read_bytes()
+    cut.write_bytes(data[:-40])
+    status, out, err = call(capsys, cut)
+    assert status == 0
+    assert '3 sink jobs due' in out
+    assert err.startswith(f'warning: {cut}: the summary at the end is damaged or missing: ')
+    assert err.count('\n') == 1
+
+
+@pytest.fixture
+def stdin(monkeypatch: pytest.MonkeyPatch):
+    """Give a function that sets what standard input holds."""
+    def put(data: bytes) -> None:
+        monkeypatch.setattr('sys.stdin', io.TextIOWrapper(io.BytesIO(data), encoding='utf-8'))
+    return put
+
+
+def test_standard_input(
+    trace: Path, tmp_path: Path, stdin, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stdin(trace.read_bytes())
+    status, out, err = call(capsys, '-')
+    assert (status, err) == (0, '')
+    assert out == call(capsys, trace)[1]
+    stdin(trace.read_bytes()[:-40])
+    status, out, err = call(capsys, '-', '--json', '-')
+    assert err.startswith('warning: <stdin>: the summary')
+    assert json.loads(out)['recording']['trace'] == '<stdin>'
+    stdin(b'nonsense')
+    assert call(capsys, '-') == (
+        2, '', 'error: <stdin>: is no MCAP file: give a trace written by this program or another '
+        'MCAP recording\n')
+    stdin(GRAPH.encode())
+    assert call(capsys, trace, '-')[::2] == (0, '')
+
+
+def nothing_recorded(path: Path) -> None:
+    with TraceFile(path) as file:
+        file.add('callback_start', START, 1, 1, 5, False)
+
+
+def no_declaration(path: Path) -> None:
+    with TraceFile(path) as file:
+        file.add('task_set', START, 1, 1, '', '', 'rad', 7, 0, 0, False)
+
+
+@pytest.mark.parametrize(('content', 'says'), [
+    (None, 'cannot be read (No such file or directory): check '),
+    (b'', 'is empty: give a trace'),
+    (b'8 bytes!', 'is no MCAP file: give a trace'),
+    (b'\x89MCAP0\r\n', 'ends or is damaged before its first event: give a trace'),
+    (b'PK\x03\x04' * 100, 'is no MCAP file: give a trace'),
+    (nothing_recorded, 'no run of this executor is recorded in it: there is no event '
+     'mddag:task_set, so there are no jobs: record a run with mddag run'),
+    (no_declaration, 'it was recorded without a declaration, so there are no jobs: record'),
+])
+@pytest.mark.parametrize('options', [[], ['--reschedule']])
+def test_what_is_no_trace_is_one_line(
+    content: Any, says: str, options: list[str], tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / 'bad.mcap'
+    if callable(content):
+        content(path)
+    elif content is not None:
+        path.write_bytes(content)
+    result = tmp_path / 'result.json'
+    status, out, err = call(capsys, path, '--json', result, *options)
+    assert (status, out) == (2, '')
+    assert err.startswith(f'error: {path}: {says}')
+    assert err.count('\n') == 1
+    assert not result.exists()
+
+
+def test_other_bad_input_is_one_line(
+    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = tmp_path / 'wrong.yaml'
+    wrong.write_text('mddag: 1\nnodes: []\nnonsense: 1\n')
+    other = tmp_path / 'other.yaml'
+    other.write_text('mddag: 1\nnodes:\n  - node: /x\n    callbacks:\n'
+                     '      - {name: y, timer: 1s, deadline: 1s}\n')
+    for arguments, says in (
+        ([trace, wrong], f'{wrong}:'),
+        ([trace, tmp_path / 'gone.yaml'], f'{tmp_path}/gone.yaml: '),
+        ([trace, other], f'{trace}: none of the callbacks of {other} is in it: it has '
+         '/driver:tick, /filter:run: give the graph of the nodes that were recorded, or none'),
+        ([tmp_path], f'{tmp_path}: is no file: give the .mcap file itself'),
+        ([trace, '--json', tmp_path / 'gone' / 'a.json'], f'{tmp_path}/gone/a.json: there is no'),
+        ([trace, '--workers', '2'], '--workers: a run is replayed as it was recorded: add '),
+        ([trace, '--policy', 'rad'], '--policy: a run is replayed as it was recorded: add '),
+        ([trace, '--preemptive'], '--preemptive: a run is replayed as it was recorded: add '),
+        ([trace, '--reschedule', '--callbacks'], '--callbacks: '),
+        ([trace, '--reschedule', '--policy', 'best'], "policy 'best': there is no such policy: "),
+        ([trace, '--reschedule', '--workers', '0'], 'mddag replay: argument --workers: '),
+        ([trace, '--reschedule', '--workers', '99999'], 'workers: 99999 can not be: give 1 to '),
+        (['-', '-'], '-: standard input can be only one of TRACE and GRAPH: name the other'),
+        ([], 'mddag replay: the following arguments are required: TRACE'),
+    ):
+        status, out, err = call(capsys, *arguments)
+        assert (status, out) == (2, ''), arguments
+        assert err.startswith(f'error: {says}'), arguments
+        assert err.count('\n') == 1, arguments
+
+
+def test_help_and_start_up_load_neither_ros_nor_numpy(mddag, trace: Path) -> None:
+    script = ('import sys; from mddag_executor.cli.main import main; main(sys.argv[1:]); '
+              "print(sorted({'rclpy', 'rosbags', 'hypothesis'} & set(sys.modules)))")
+    import subprocess
+    done = subprocess.run([sys.executable, '-c', script, 'replay', str(trace)], text=True,
+                          capture_output=True, check=True)
+    assert done.stdout.splitlines()[-1] == '[]'
+    shown = mddag('replay', '--help')
+    assert shown.returncode == 0
+    assert 'mddag replay run.mcap graph.yaml --fail-on-miss' in shown.stdout

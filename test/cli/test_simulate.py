@@ -1,0 +1,296 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""`mddag simulate`: results, tables, traces, exit status, and one line for whatever is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import json
+from pathlib import Path
+import subprocess
+import sys
+from typing import Any
+
+from mddag_executor.cli.main import main
+import pytest
+
+Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+
+AUTOWARE = Path(__file__).resolve().parents[2] / 'config' / 'autoware.yaml'
+GRAPH = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /sensing/driver
+    callbacks:
+      - {name: tick, timer: 10ms, publishes: [/points], dag: lidar, execution_time: 2ms}
+  - node: /filter
+    callbacks:
+      - {name: near, subscription: /points, deadline: 5ms, execution_time: 1ms}
+      - {name: far, subscription: /points, deadline: 12ms, execution_time: 8ms}
+"""
+TIMES = {'lidar': {'/sensing/driver:tick': 2000, '/filter:near': 3500.5, '/filter:far': 1}}
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Path:
+    path = tmp_path / 'graph.yaml'
+    path.write_text(GRAPH, encoding='utf-8')
+    return path
+
+
+@pytest.fixture
+def times(tmp_path: Path) -> Path:
+    path = tmp_path / 'times.json'
+    path.write_text(json.dumps(TIMES), encoding='utf-8')
+    return path
+
+
+def result_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
+    status = main(['simulate', *map(str, arguments), '--json', '-'])
+    captured = capsys.readouterr()
+    assert (status, captured.err) == (0, '')
+    result: dict[str, Any] = json.loads(captured.out)
+    return result
+
+
+def test_the_result_for_machines(capsys: pytest.CaptureFixture[str], graph: Path) -> None:
+    # tick 0-2, near on worker 0 2-3, far on worker 1 2-10: all in time.
+    result = result_of(capsys, graph, '--policy', 'rad', '--duration', '30ms')
+    assert result == {
+        'policy': 'rad', 'workers': 2, 'preemptive': False, 'duration_ns': 30_000_000,
+        'utilisation': 0.55, 'deadline_missed': False, 'first_miss': None,
+        'dags': {'lidar': {
+            'jobs': 3, 'ends': {'completed': 3, 'late': 0, 'aborted': 0, 'expired': 0},
+            'sinks': {
+                '/filter:near': {
+                    'relative_deadline_ns': 5_000_000, 'completed': 3, 'late': 0, 'overdue': 0,
+                    'expired': 0, 'aborted': 0,
+                    'response_ns': {'min': 3_000_000, 'median': 3_000_000, 'p99': 3_000_000,
+                                    'max': 3_000_000}},
+                '/filter:far': {
+                    'relative_deadline_ns': 12_000_000, 'completed': 3, 'late': 0, 'overdue': 0,
+                    'expired': 0, 'aborted': 0,
+                    'response_ns': {'min': 10_000_000, 'median': 10_000_000,
+                                    'p99': 10_000_000, 'max': 10_000_000}}}}},
+        'file': str(graph), 'judge': 'horizon', 'seed': 0, 'ended_ns': 30_000_000,
+        'trace': None}
+
+
+def test_execution_times_from_a_file(
+    capsys: pytest.CaptureFixture[str], graph: Path, times: Path
+) -> None:
+    result = result_of(capsys, graph, '--duration', '10ms', '--execution-times', times)
+    assert result['seed'] is None
+    assert result['utilisation'] == pytest.approx((2000 + 3500.5 + 1) / 10_000 / 2)
+    assert result['first_miss'] == {
+        'dag': 'lidar', 'vertex': '/filter:near', 'job': 0, 'deadline_ns': 5_000_000,
+        'completed_ns': 5_500_500}
+    assert result['dags']['lidar']['sinks']['/filter:far']['response_ns']['max'] == 2_001_000
+
+
+def test_utilisation_scales_either(
+    capsys: pytest.CaptureFixture[str], graph: Path, times: Path
+) -> None:
+    for source in ([], ['--execution-times', times]):
+        result = result_of(capsys, graph, '--utilisation', '0.3', *source)
+        assert result['utilisation'] == pytest.approx(0.3, rel=1e-5)
+
+
+def test_what_is_asked_for_is_done(
+    capsys: pytest.CaptureFixture[str], graph: Path
+) -> None:
+    # One worker, 11 ms of work each 10 ms. Job k: tick from 11k, near done at 11k + 3, far at
+    # 11k + 11. Late: near from job 3 on (36 ms), far from job 2 on (33 ms).
+    plain = result_of(capsys, graph, '--workers', 1, '--duration', '100ms')
+    assert (plain['workers'], plain['preemptive']) == (1, False)
+    near = plain['dags']['lidar']['sinks']['/filter:near']
+    assert (near['completed'], near['late'], near['overdue']) == (9, 7, 1)
+    judged = result_of(
+        capsys, graph, '--workers', 1, '--duration', '100ms', '--judge', 'completions')
+    near = judged['dags']['lidar']['sinks']['/filter:near']
+    assert (near['completed'], near['late'], near['overdue']) == (9, 6, 0)
+    graph.write_text(GRAPH.replace('12ms', '60ms'), encoding='utf-8')
+    for option, late in (([], 7), (['--preemptive'], 0)):
+        result = result_of(capsys, graph, '--workers', 1, '--duration', '100ms', *option)
+        assert result['preemptive'] is bool(option)
+        assert result['dags']['lidar']['sinks']['/filter:near']['late'] == late
+    graph.write_text(GRAPH, encoding='utf-8')
+    stopped = result_of(capsys, graph, '--workers', 1, '--stop-at-first-miss')
+    assert stopped['ended_ns'] == stopped['first_miss']['completed_ns'] == 33_000_000
+    assert stopped['deadline_missed'] is True
+
+
+def test_the_paper_workload(capsys: pytest.CaptureFixture[str]) -> None:
+    result = result_of(
+        capsys, AUTOWARE, '--policy', 'rad', '--workers', 7, '--duration', '3s', '--preemptive',
+        '--seed', 1, '--judge', 'completions')
+    again = result_of(
+        capsys, AUTOWARE, '--policy', 'rad', '--workers', 7, '--duration', '3s', '--preemptive',
+        '--seed', 1, '--judge', 'completions')
+    assert result == again
+    assert len(result['dags']) == 11
+    assert result['workers'] == 7
+    assert result['dags']['control']['jobs'] == 100
+    assert result != result_of(capsys, AUTOWARE, '--preemptive', '--seed', 2)
+
+
+def test_the_table_for_people(capsys: pytest.CaptureFixture[str], graph: Path) -> None:
+    assert main(['simulate', str(graph), '--workers', '1', '--duration', '100ms']) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[:6] == ['DAG', 'sink', 'due', 'in', 'time', 'late']
+    assert lines[1].split()[:4] == ['lidar', 'filter:near', '10', '3']
+    assert lines[2].split()[0] == 'filter:far'
+    assert lines[-3] == 'rad, 1 workers, not preemptive, 100 ms, utilisation 1.100'
+    assert lines[-2].startswith('10 jobs, 19 sink jobs due, ')
+    assert lines[-1] == ('first miss: /filter:far of job 2 of lidar, deadline at 32 ms, '
+                         'completed 1 ms late')
+    assert main(['simulate', str(graph), '--workers', '1', '--stop-at-first-miss']) == 0
+    assert 'stopped at 33 ms, with the first miss' in capsys.readouterr().out
+
+
+def test_the_table_and_a_file(
+    capsys: pytest.CaptureFixture[str], graph: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / 'out.json'
+    assert main(['simulate', str(graph), '--json', str(out)]) == 0
+    assert 'sink jobs due' in capsys.readouterr().out
+    assert json.loads(out.read_text())['deadline_missed'] is False
+
+
+@pytest.mark.parametrize(('workers', 'status'), [(1, 1), (2, 0)])
+def test_fail_on_miss(graph: Path, workers: int, status: int) -> None:
+    command = ['simulate', str(graph), '--workers', str(workers), '--json', '/dev/null']
+    assert main(command) == 0
+    assert main([*command, '--fail-on-miss']) == status
+
+
+def test_a_trace_that_the_replayer_reads(
+    capsys: pytest.CaptureFixture[str], graph: Path, tmp_path: Path
+) -> None:
+    trace = tmp_path / 'run.mcap'
+    simulated = result_of(
+        capsys, graph, '--workers', 1, '--duration', '100ms', '--trace', trace)
+    assert simulated['trace'] == str(trace)
+    assert main(['replay', str(trace), '--json', '-']) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ''
+    replayed = json.loads(captured.out)
+    for sink, values in simulated['dags']['lidar']['sinks'].items():
+        found = replayed['dags']['lidar']['sinks'][sink]
+        assert {key: found[key] for key in values} == values
+    assert [path.name for path in tmp_path.iterdir() if 'part' in path.name] == []
+
+
+def test_standard_input(mddag: Mddag, graph: Path, times: Path) -> None:
+    plain = mddag('simulate', graph, '--execution-times', times, '--json', '-')
+    first = mddag('simulate', '-', '--execution-times', times, '--json', '-', input=GRAPH)
+    second = mddag('simulate', graph, '--execution-times', '-', '--json', '-',
+                   input=json.dumps(TIMES))
+    assert (first.returncode, first.stderr, second.returncode) == (0, '', 0)
+    assert second.stdout == plain.stdout
+    assert json.loads(first.stdout)['dags'] == json.loads(plain.stdout)['dags']
+
+
+def test_help_shows_an_example(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as done:
+        main(['simulate', '--help'])
+    assert done.value.code == 0
+    assert 'mddag simulate config/autoware.yaml' in capsys.readouterr().out
+
+
+def changed(**times: Any) -> str:
+    return json.dumps({'lidar': {**TIMES['lidar'], **times}})
+
+
+@pytest.mark.parametrize(('arguments', 'times', 'says'), [
+    (['--workers', '0'], None, "--workers: '0' is no whole number from 1 up"),
+    (['--workers', '-2'], None, '--workers'),
+    (['--workers', 'many'], None, '--workers'),
+    (['--policy', 'edf'], None,
+     "policy 'edf': there is no such policy: choose one of rad, rm, wc, fifo, gedf"),
+    (['--duration', '-3s'], None, '--duration'),
+    (['--duration=-3s'], None, 'negative'),
+    (['--duration', '0s'], None, 'too short'),
+    (['--duration', '3'], None, 'no unit'),
+    (['--duration', '1e9s'], None, 'not a time'),
+    (['--judge', 'me'], None, '--judge'),
+    (['--seed', 'x'], None, '--seed'),
+    (['--utilisation', '0'], None, '--utilisation'),
+    (['--utilisation', 'nan'], None, '--utilisation'),
+    (['--trace', '-'], None, '--trace -'),
+    (['--trace', '/nowhere/x.mcap'], None, '/nowhere'),
+    (['--json', '/nowhere/x.json'], None, '/nowhere'),
+    (['--speed', '3'], None, 'unrecognized arguments'),
+    ([], '{', 'times.json:1: not JSON'),
+    ([], '[]', 'times.json: not an object of objects'),
+    ([], json.dumps({'lidra': TIMES['lidar']}),
+     "times.json: DAG 'lidra' is not in graph.yaml: its DAGs are lidar"),
+    ([], json.dumps({'lidar': {'/filter:near': 3}}),
+     'times.json: no execution time for /sensing/driver:tick of DAG lidar: add it'),
+    ([], changed(**{'/filter:mid': 3}), "times.json: '/filter:mid' is not a vertex of DAG lidar"),
+    ([], changed(**{'/filter:near': 0}), 'execution time of /filter:near of DAG lidar is 0'),
+    ([], changed(**{'/filter:near': -4}), 'is -4: give microseconds, above 0'),
+    ([], changed(**{'/filter:near': 'slow'}), "is 'slow'"),
+    ([], changed(**{'/filter:near': float('nan')}), 'is nan'),
+    ([], changed(**{'/filter:near': '\x1b[31m\n'}), 'execution time of /filter:near'),
+])
+def test_bad_input_is_one_line(
+    mddag: Mddag, graph: Path, arguments: list[str], times: str | None, says: str
+) -> None:
+    if times is not None:
+        (graph.parent / 'times.json').write_text(times)
+        arguments = [*arguments, '--execution-times', 'times.json']
+    before = sorted(graph.parent.iterdir())
+    done = mddag('simulate', 'graph.yaml', *arguments, cwd=graph.parent)
+    assert (done.returncode, done.stdout) == (2, '')
+    assert done.stderr.startswith('error: ')
+    assert done.stderr.count('\n') == 1
+    assert says in done.stderr
+    assert '\x1b' not in done.stderr
+    assert sorted(graph.parent.iterdir()) == before, 'nothing is left behind'
+
+
+@pytest.mark.parametrize(('graph_arguments', 'says'), [
+    (['missing.yaml'], 'missing.yaml: the file cannot be read'),
+    (['graph.yaml', '--execution-times', 'missing.json'], 'missing.json: no such file'),
+    (['graph.yaml', '--execution-times', '.'], '.: is a directory'),
+    (['-', '--execution-times', '-'], '-: standard input can be only one of'),
+    (['-'], '<stdin>: the file is empty'),
+    (['binary.yaml'], 'binary.yaml'),
+    (['bare.yaml'], 'bare.yaml:4: /a:b declares no execution_time: add one, or give '),
+    ([], 'required: GRAPH'),
+])
+def test_bad_files_are_one_line(
+    mddag: Mddag, graph: Path, graph_arguments: list[str], says: str
+) -> None:
+    (graph.parent / 'binary.yaml').write_bytes(bytes(range(256)))
+    (graph.parent / 'bare.yaml').write_text(
+        'mddag: 1\nnodes:\n  - node: /a\n    callbacks: [{name: b, timer: 1ms, deadline: 1ms}]\n')
+    done = mddag('simulate', *graph_arguments, cwd=graph.parent)
+    assert (done.returncode, done.stdout) == (2, '')
+    assert done.stderr.startswith('error: ')
+    assert done.stderr.count('\n') == 1
+    assert says in done.stderr
+
+
+def test_nothing_of_ros_is_loaded(graph: Path) -> None:
+    """It works on a machine without ROS."""
+    program = (
+        'import sys; from mddag_executor.cli.main import main; '
+        f'main(["simulate", {str(graph)!r}]); '
+        'assert not {"rclpy", "std_msgs"} & set(sys.modules), "ROS"')
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
+                          check=False)
+    assert (done.returncode, done.stderr) == (0, '')

@@ -1,0 +1,388 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Random driving of the scheduler as the live executor does it, with a model beside it.
+
+The model remembers every execution that was made ready, under an identity of its own, and what
+became of it; it knows nothing of slots, heaps and keys but what the scheduler's interface shows.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    RuleBasedStateMachine,
+)
+from mddag_executor.core import POLICIES, Scheduler, Tables
+from mddag_executor.core.state import (
+    ABORTED,
+    COMPLETED,
+    Decision,
+    DROP,
+    EXPIRED,
+    FREE,
+    IDLE,
+    JOB_END,
+    LATE,
+    OPEN,
+    SINK_ABORTED,
+    SINK_DONE,
+    SINK_EXPIRED,
+)
+
+from .task_sets import examples, task_sets, TICK
+
+WAITING, RUNNING, SUSPENDED, DONE, DROPPED = 'waiting', 'running', 'suspended', 'done', 'dropped'
+ALIVE = (WAITING, RUNNING, SUSPENDED)
+MAX_ACTIVE = 3
+EXPIRE_AFTER = 20 * TICK
+
+
+@dataclass(eq=False)
+class Run:
+    """One execution; ``job`` is (DAG, index), the undeclared DAG's for undeclared ones."""
+
+    x: int
+    job: tuple[int, int]
+    vertex: int
+    leg: int
+    group: int
+    key: int
+    began: bool = False
+    lent: bool = False
+    fate: str = WAITING
+
+
+@dataclass(eq=False)
+class Job:
+    """A declared job: its slot, what of it completed, its verdicts."""
+
+    dag: int
+    index: int
+    slot: int
+    release: int
+    end: int | None = None
+
+
+class LiveDriver(RuleBasedStateMachine):
+    """Messages arrive late or never, threads take, complete, lend and suspend in any order."""
+
+    @initialize(task_set=task_sets(max_dags=2, max_callbacks=4, groups=False),
+                workers=st.integers(1, 3), policy=st.sampled_from(sorted(POLICIES)))
+    def start(self, task_set: Any, workers: int, policy: str) -> None:
+        self.task_set = task_set
+        self.tables = Tables.build(
+            task_set, legs=True, groups=False, max_active_jobs=MAX_ACTIVE,
+            expire_after=EXPIRE_AFTER, default_deadline=10 * TICK)
+        self.scheduler = Scheduler(self.tables, workers, policy, propagate=False)
+        self.state = self.scheduler.state
+        self.workers = workers
+        self.groups = [-1, self.scheduler.new_group(), self.scheduler.new_group()]
+        self.now = 0
+        self.runs: list[Run] = []
+        self.by_x: dict[int, Run] = {}
+        self.jobs: list[Job] = []
+        self.messages: list[tuple[Job, int, int]] = []
+        self.counter = Counter[str]()
+        self.sinks: Counter[tuple[int, int, int]] = Counter()
+        self.completed_sinks: Counter[tuple[int, int]] = Counter()
+        self.legs_done: Counter[tuple[int, int, int]] = Counter()
+
+    # --- what happens ----------------------------------------------------------------------------
+
+    @rule(ticks=st.integers(0, 12))
+    def time_passes(self, ticks: int) -> None:
+        self.now += ticks * TICK
+
+    @rule(data=st.data(), age=st.integers(0, 3), group=st.integers(0, 2))
+    def release(self, data: st.DataObject, age: int, group: int) -> None:
+        dag = data.draw(st.sampled_from(self.task_set.dags)).index
+        index = self.counter[f'dag {dag}']
+        self.counter[f'dag {dag}'] += 1
+        release = max(0, self.now - age * TICK)
+        before = [job for job in self.open_jobs() if job.dag == dag]
+        slot = self.scheduler.release(dag, index, release, self.now)
+        self.settle()
+        still = [job for job in before if job.end is None]
+        assert still == before[len(before) - len(still):], 'the oldest expire first'
+        assert slot not in [job.slot for job in self.open_jobs()]
+        assert all(run.x not in self.region(dag, slot) for run in self.alive()), (
+            'the slot of a job of which something is still to run')
+        job = Job(dag, index, slot, release)
+        self.jobs.append(job)
+        self.make_ready(job, self.tables.source[dag], 0, self.groups[group])
+
+    @precondition(lambda self: self.messages)
+    @rule(data=st.data(), group=st.integers(0, 2))
+    def message_arrives(self, data: st.DataObject, group: int) -> None:
+        place = data.draw(st.integers(0, len(self.messages) - 1))
+        job, vertex, leg = self.messages.pop(place)
+        open_still = (self.state.job_state[job.slot] == OPEN
+                      and self.state.job_dag[job.slot] == job.dag
+                      and self.state.job_index[job.slot] == job.index)
+        assert open_still == (job.end is None)
+        if open_still and self.state.x_state[self.scheduler.execution(
+                job.slot, vertex, leg)] == IDLE:
+            self.make_ready(job, vertex, leg, self.groups[group])
+        else:
+            self.undeclared(group)
+
+    @rule(group=st.integers(0, 2))
+    def undeclared(self, group: int) -> None:
+        self.counter['undeclared'] += 1
+        index = self.counter['undeclared']
+        x = self.scheduler.undeclared(index, self.groups[group], self.now)
+        self.note(Run(x, (self.tables.n_dags, index), self.tables.n_vertices, 0,
+                      self.groups[group], self.state.x_key[x][0]))
+
+    def make_ready(self, job: Job, vertex: int, leg: int, group: int) -> None:
+        x = self.scheduler.execution(job.slot, vertex, leg)
+        self.state.x_group[x] = group
+        self.scheduler.ready(x, self.now)
+        self.note(Run(x, (job.dag, job.index), vertex, leg, group, self.state.x_key[x][0]))
+
+    def note(self, run: Run) -> None:
+        assert run.x not in self.by_x, 'an execution that is still alive'
+        self.by_x[run.x] = run
+        self.runs.append(run)
+
+    @rule(worker=st.integers(0, 2), schedule=st.booleans())
+    def dispatch(self, worker: int, schedule: bool) -> None:
+        idle = [w for w in range(self.workers) if self.state.worker_x[w] == -1]
+        if not idle and not schedule:
+            return
+        waiting = [run for run in self.alive() if run.fate == WAITING]
+        if schedule:
+            x = self.scheduler.schedule(self.now)
+        else:
+            x = self.scheduler.take(idle[worker % len(idle)], self.now)
+        self.settle()
+        able = [run for run in waiting if run.fate == WAITING and not self.blocked(run)]
+        if x < 0:
+            assert not (idle and able), 'a worker idles while something may run'
+            return
+        run = self.by_x[x]
+        assert run in able
+        assert run.key == min(other.key for other in able), 'a smaller key waits'
+        run.fate, run.began = RUNNING, True
+        worker = self.state.x_worker[x]
+        assert worker == min(idle) if schedule else worker in idle
+        assert self.state.worker_x[worker] == x
+
+    @precondition(lambda self: self.with_fate(RUNNING))
+    @rule(data=st.data())
+    def complete(self, data: st.DataObject) -> None:
+        self.complete_one(data.draw(st.sampled_from(self.with_fate(RUNNING))))
+
+    def complete_one(self, run: Run) -> None:
+        key = (*run.job, run.vertex)
+        self.legs_done[key] += 1
+        legs = self.tables.n_legs[run.vertex]
+        whole = self.scheduler.complete(run.x, self.now)
+        assert whole == (self.legs_done[key] == legs)
+        run.fate = DONE
+        del self.by_x[run.x]
+        job = next((job for job in self.jobs if (job.dag, job.index) == run.job), None)
+        if whole and job is not None:
+            self.publish(job, run.vertex)
+        self.settle()
+
+    def publish(self, job: Job, vertex: int) -> None:
+        first = self.tables.first_vertex[job.dag]
+        dag = self.task_set.dags[job.dag]
+        me = dag.vertices[vertex - first]
+        for after in me.successors:
+            topics = dag.vertices[after].callback.topics
+            legs = range(self.tables.n_legs[first + after])
+            self.messages += [
+                (job, first + after, leg) for leg in legs
+                if topics[leg] in me.callback.publishes]
+
+    @precondition(lambda self: self.with_fate(WAITING))
+    @rule(data=st.data())
+    def drop(self, data: st.DataObject) -> None:
+        fresh = [run for run in self.with_fate(WAITING) if not run.began]
+        if fresh:
+            self.scheduler.drop(data.draw(st.sampled_from(fresh)).x, self.now)
+            self.settle()
+
+    @precondition(lambda self: self.with_fate(RUNNING))
+    @rule(data=st.data())
+    def lend(self, data: st.DataObject) -> None:
+        run = data.draw(st.sampled_from(self.with_fate(RUNNING)))
+        self.scheduler.lend(run.x)
+        run.lent = True
+
+    @precondition(lambda self: self.with_fate(RUNNING))
+    @rule(data=st.data())
+    def suspend(self, data: st.DataObject) -> None:
+        run = data.draw(st.sampled_from(self.with_fate(RUNNING)))
+        self.scheduler.suspend(run.x)
+        run.fate, run.lent = SUSPENDED, False
+
+    @precondition(lambda self: self.with_fate(SUSPENDED))
+    @rule(data=st.data())
+    def resume(self, data: st.DataObject) -> None:
+        run = data.draw(st.sampled_from(self.with_fate(SUSPENDED)))
+        self.scheduler.resume(run.x)
+        run.fate = WAITING
+
+    @rule()
+    def expire_idle(self) -> None:
+        self.scheduler.expire_idle(self.now)
+        self.settle()
+
+    @precondition(lambda self: self.open_jobs())
+    @rule(data=st.data(), abort=st.booleans())
+    def end_job(self, data: st.DataObject, abort: bool) -> None:
+        job = data.draw(st.sampled_from(self.open_jobs()))
+        (self.scheduler.abort if abort else self.scheduler.expire)(job.slot, self.now)
+        self.settle()
+        assert job.end == (ABORTED if abort else EXPIRED)
+
+    # --- decisions -------------------------------------------------------------------------------
+
+    def settle(self) -> None:
+        """Carry out what was decided, as the live executor does, before anything else happens."""
+        for decision in self.scheduler.decisions():
+            kind = decision[0]
+            if kind == DROP:
+                self.dropped(decision)
+            elif kind == JOB_END:
+                self.ended(decision)
+            else:
+                _, dag, vertex, job, _, _ = decision
+                self.sinks[dag, vertex, job] += 1
+                assert self.sinks[dag, vertex, job] == 1, 'two verdicts'
+                self.completed_sinks[dag, job] += kind == SINK_DONE
+                assert kind in (SINK_DONE, SINK_ABORTED, SINK_EXPIRED)
+
+    def dropped(self, decision: Decision) -> None:
+        _, dag, vertex, job, x, now = decision
+        run = self.by_x.pop(x)
+        assert (run.job, run.vertex, now) == ((dag, job), vertex, self.now)
+        assert run.fate == WAITING and not run.began
+        run.fate = DROPPED
+
+    def ended(self, decision: Decision) -> None:
+        _, dag, _, index, end, now = decision
+        job = next(job for job in self.jobs if (job.dag, job.index) == (dag, index))
+        assert job.end is None, 'ended twice'
+        assert now == self.now
+        job.end = end
+        sinks = self.task_set.dags[dag].sinks
+        if end in (COMPLETED, LATE):
+            assert self.completed_sinks[dag, index] == len(sinks)
+        else:
+            assert self.completed_sinks[dag, index] < len(sinks)
+        first = self.tables.first_vertex[dag]
+        assert all(self.sinks[dag, first + sink, index] == 1 for sink in sinks)
+
+    # --- what must hold --------------------------------------------------------------------------
+
+    def alive(self) -> list[Run]:
+        return list(self.by_x.values())
+
+    def with_fate(self, fate: str) -> list[Run]:
+        return [run for run in self.alive() if run.fate == fate]
+
+    def open_jobs(self) -> list[Job]:
+        return [job for job in self.jobs if job.end is None]
+
+    def blocked(self, run: Run) -> bool:
+        return run.group >= 0 and any(
+            other is not run and other.began and other.group == run.group
+            for other in self.alive())
+
+    def region(self, dag: int, slot: int) -> range:
+        base = self.state.job_base[slot]
+        return range(base, base + self.tables.n_region[dag])
+
+    @invariant()
+    def counts_agree(self) -> None:
+        assert self.scheduler.queue_length == len(self.with_fate(WAITING))
+        placed = [run for run in self.with_fate(RUNNING) if not run.lent]
+        assert self.scheduler.idle_workers == self.workers - len(placed)
+        assert sorted(x for x in self.state.worker_x if x >= 0) == sorted(r.x for r in placed)
+
+    @invariant()
+    def groups_are_exclusive(self) -> None:
+        for group in self.groups[1:]:
+            holders = [run.x for run in self.alive() if run.began and run.group == group]
+            assert len(holders) <= 1
+            assert self.state.group_owner[group] == (holders[0] if holders else -1)
+
+    @invariant()
+    def slots_are_accounted_for(self) -> None:
+        state = self.state
+        active = Counter(state.x_slot[run.x] for run in self.alive())
+        open_slots = {job.slot for job in self.open_jobs()}
+        assert len(open_slots) == len(self.open_jobs())
+        for slot in range(len(state.job_dag)):
+            assert state.job_active[slot] == active[slot]
+            undeclared = state.job_dag[slot] == self.tables.n_dags
+            if not undeclared:
+                assert (state.job_state[slot] == OPEN) == (slot in open_slots)
+            if slot not in open_slots and not active[slot]:
+                assert state.job_state[slot] == FREE, 'a slot has leaked'
+        free = 0
+        for slot in state.free_slot:
+            while slot >= 0:
+                assert state.job_state[slot] == FREE
+                free += 1
+                slot = state.job_next[slot]
+        assert free == sum(job_state == FREE for job_state in state.job_state)
+
+    @invariant()
+    def open_jobs_are_bounded(self) -> None:
+        for dag in self.task_set.dags:
+            mine = [job for job in self.open_jobs() if job.dag == dag.index]
+            assert len(mine) == self.state.n_open[dag.index]
+            assert len(mine) <= (dag.max_active_jobs or MAX_ACTIVE)
+
+    def teardown(self) -> None:
+        """Let all that is left happen; then nothing may be left."""
+        if not hasattr(self, 'scheduler'):
+            return
+        for _ in range(10 * len(self.runs) + 10):
+            for run in self.with_fate(SUSPENDED):
+                self.scheduler.resume(run.x)
+                run.fate = WAITING
+            for run in self.with_fate(RUNNING):
+                self.complete_one(run)
+            self.dispatch(0, True)
+            if not self.alive():
+                break
+        assert self.alive() == []
+        assert {run.fate for run in self.runs} <= {DONE, DROPPED}
+        for job in self.open_jobs():
+            self.scheduler.expire(job.slot, self.now)
+        self.settle()
+        assert self.open_jobs() == []
+        assert set(self.state.job_state) <= {FREE}
+        self.counts_agree()
+        self.groups_are_exclusive()
+        self.slots_are_accounted_for()
+
+
+TestLiveDriver = LiveDriver.TestCase
+TestLiveDriver.settings = examples(150)

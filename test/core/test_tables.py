@@ -1,0 +1,125 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Task sets flattened into columns, and the keys of the policies."""
+
+from __future__ import annotations
+
+from mddag_executor.core import NEVER, POLICIES, policy, PolicyError, rad_offsets, Tables
+from msg_graph import TaskSet
+import pytest
+
+from .task_sets import declaration
+
+US = 1_000
+
+
+def two_dags() -> TaskSet:
+    return declaration([
+        {'node': '/a', 'name': 's', 'timer': '10us', 'publishes': ['/s', '/all'], 'dag': 'first',
+         'max_active_jobs': 4, 'on_miss': 'abort', 'group': 'g'},
+        {'node': '/a', 'name': 'late', 'subscription': '/s', 'deadline': '30us', 'group': 'g'},
+        {'node': '/b', 'name': 't', 'timer': '20us', 'publishes': ['/t', '/all'],
+         'dag': 'second', 'group': 'g'},
+        {'node': '/a', 'name': 'mid', 'subscription': '/s', 'publishes': ['/mid']},
+        {'node': '/a', 'name': 'both', 'sync': ['/mid', '/s'], 'deadline': '25us'},
+        {'node': '/b', 'name': 'shared', 'subscription': '/all', 'deadline': '40us',
+         'group': 'g'},
+    ])
+
+
+def test_columns_of_two_dags() -> None:
+    tables = Tables.build(two_dags(), max_active_jobs=9, expire_after=7, default_deadline=1)
+    # first: s, late, mid, both, shared; second: t, shared; then the undeclared one.
+    assert tables.n_dags == 2
+    assert tables.n_vertices == 7
+    assert tables.dag_of == [0, 0, 0, 0, 0, 1, 1, 2]
+    assert tables.index_in_dag == [0, 1, 2, 3, 4, 0, 1, 0]
+    assert tables.first_vertex == [0, 5, 7]
+    assert tables.source == [0, 5, 7]
+    assert tables.period == [10 * US, 20 * US, 1]
+    assert tables.rad_offset == [us * US for us in (25, 30, 25, 25, 40, 40, 40)] + [1]
+    assert tables.dag_deadline == [40 * US, 40 * US, 1]
+    assert tables.sink_deadline == [-1, 30 * US, -1, 25 * US, 40 * US, -1, 40 * US, -1]
+    assert tables.sinks == [1, 3, 4, 6]
+    assert tables.first_sink == [0, 3, 4, 4]
+    assert tables.on_miss == [1, 0, 0]
+    assert tables.max_active_jobs == [4, 9, NEVER]
+    assert tables.expire_after == [7, 7, NEVER]
+    assert tables.n_predecessors == [0, 1, 1, 2, 1, 0, 1, 0]
+    successors = [tables.successors[tables.first_successor[v]:tables.first_successor[v + 1]]
+                  for v in range(7)]
+    assert successors == [[1, 2, 3, 4], [], [3], [], [], [6], []]
+
+
+def test_groups_belong_to_their_node() -> None:
+    tables = Tables.build(two_dags())
+    assert tables.group == [0, 0, -1, -1, 1, 1, 1, -1]
+    assert tables.n_groups == 2
+    assert set(Tables.build(two_dags(), groups=False).group) == {-1}
+
+
+def test_a_sync_has_a_leg_for_each_topic() -> None:
+    plain, legs = Tables.build(two_dags()), Tables.build(two_dags(), legs=True)
+    assert plain.n_legs == [1] * 8
+    assert plain.n_region == [5, 2, 1]
+    assert legs.n_legs == [1, 1, 1, 2, 1, 1, 1, 1]
+    assert legs.n_region == [6, 2, 1]
+    assert legs.region_offset == [0, 1, 2, 3, 5, 0, 1, 0]
+
+
+def test_legs_are_topics_however_many_publish_them() -> None:
+    tables = Tables.build(declaration([
+        {'node': '/n', 'name': 's', 'timer': '10us', 'publishes': ['/s', '/x'], 'dag': 'd'},
+        {'node': '/n', 'name': 'x', 'subscription': '/s', 'publishes': ['/x', '/y']},
+        {'node': '/n', 'name': 'join', 'sync': ['/x', '/y'], 'deadline': '9us'}]), legs=True)
+    assert tables.n_legs[:3] == [1, 1, 2]
+    assert tables.n_predecessors[:3] == [0, 1, 2]
+
+
+def test_no_declaration_is_the_undeclared_dag_alone() -> None:
+    tables = Tables.build(None, default_deadline=5)
+    assert (tables.n_dags, tables.n_vertices, tables.rad_offset) == (0, 0, [5])
+
+
+def test_rad_of_a_long_chain_is_found_without_recursion() -> None:
+    n = 3_000
+    chain = [{'node': '/n', 'name': 'c0', 'timer': '1ms', 'publishes': ['/t0'], 'dag': 'd'}]
+    chain += [{'node': '/n', 'name': f'c{i}', 'subscription': f'/t{i - 1}',
+               'publishes': [f'/t{i}']} for i in range(1, n)]
+    chain[-1] = {**{k: v for k, v in chain[-1].items() if k != 'publishes'}, 'deadline': '5ms'}
+    assert rad_offsets(declaration(chain).dags[0]) == [5_000_000] * n
+
+
+@pytest.mark.parametrize(('name', 'key'), [
+    ('rad', (1_000 + 25 * US, 3, 0, 9)),
+    ('gedf', (1_000 + 40 * US, 3, 0, 9)),
+    ('rm', (10 * US, 6, 8, 9)),
+    ('wc', (6, 8, 9, 0)),
+    ('fifo', (8, 9, 0, 0)),
+])
+def test_keys(name: str, key: tuple[int, ...]) -> None:
+    """Vertex 3 of the first DAG, job 6, released at 1000, readiness 8, order 9."""
+    tables = Tables.build(two_dags())
+    assert policy(name).key(tables, 3, 1_000, 6, 8, 9) == key
+
+
+def test_every_policy_has_its_row() -> None:
+    assert set(POLICIES) == {'rad', 'rm', 'wc', 'fifo', 'gedf'}
+    assert {name for name, row in POLICIES.items() if row.preemptive} == {'rad', 'rm', 'gedf'}
+    for name, row in POLICIES.items():
+        assert policy(name) is row
+        assert row.name == name
+        assert row.meaning
+    with pytest.raises(PolicyError, match="policy 'x': there is no such policy: choose one of"):
+        policy('x')

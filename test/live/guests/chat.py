@@ -1,0 +1,221 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Unmodified programs of many kinds; none knows of this executor."""
+
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import String
+
+
+class Listener(Node):
+
+    def __init__(self):
+        super().__init__('listener')
+        self.create_subscription(String, 'chatter', self.heard, 10)
+        self.n = 0
+
+    def heard(self, message):
+        self.n += 1
+
+
+def main():
+    rclpy.init()
+    node = Listener()
+    rclpy.spin(node)
+    node.destroy_node()
+    rclpy.shutdown()
+    print('listener ended after its spin')
+
+
+def two():
+    return [Listener(), Node('idle')]
+
+
+def with_arguments(args):
+    assert args[1:] == [], args
+    return Listener()
+
+
+def own_executor():
+    from rclpy.executors import MultiThreadedExecutor
+    rclpy.init()
+    node = Listener()
+    executor = MultiThreadedExecutor(num_threads=4)
+    executor.add_node(node)
+    try:
+        executor.spin()
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.shutdown()
+    print('own executor ended')
+
+
+def events_executor():
+    from rclpy.experimental.events_executor import EventsExecutor
+    with rclpy.init() or __import__('contextlib').nullcontext():
+        executor = EventsExecutor()
+        executor.add_node(Listener())
+        executor.spin()
+
+
+def spins_in_thread():
+    import threading
+    rclpy.init()
+    executor = rclpy.executors.SingleThreadedExecutor()
+    node = Listener()
+    executor.add_node(node)
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    while rclpy.ok() and node.n < 5:
+        __import__('time').sleep(0.01)
+    print('heard five')
+    rclpy.shutdown()
+    thread.join()
+    print('thread joined')
+
+
+def spins_once():
+    rclpy.init()
+    node = Listener()
+    while rclpy.ok() and node.n < 5:
+        rclpy.spin_once(node, timeout_sec=0.1)
+    print('heard', 'enough' if node.n >= 5 else 'too little')
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+def spins_once_for_ever():
+    rclpy.init()
+    node = Listener()
+    while rclpy.ok():
+        rclpy.spin_once(node)
+    print('no longer ok')
+
+
+def calls_a_service():
+    from std_srvs.srv import Trigger
+    rclpy.init()
+    node = Listener()
+    node.create_service(Trigger, 'own', answer)
+    client = node.create_client(Trigger, 'own')
+    assert client.wait_for_service(5.0)
+    future = client.call_async(Trigger.Request())
+    rclpy.spin_until_future_complete(node, future, timeout_sec=5.0)
+    print('answer:', future.result().message)
+
+
+def answer(request, response):
+    response.message = 'forty-two'
+    return response
+
+
+def shuts_down_in_a_callback():
+    rclpy.init()
+    node = Listener()
+    node.create_timer(0.3, lambda: rclpy.shutdown())
+    rclpy.spin(node)
+    print('shut down')
+
+
+def leaves_early():
+    rclpy.init()
+    node = Node('short')
+    rclpy.spin_once(node, timeout_sec=0.1)
+    node.destroy_node()
+    rclpy.try_shutdown()
+    print('left early')
+
+
+def catches_signals():
+    import signal
+    rclpy.init()
+    signal.signal(signal.SIGTERM, lambda *_: None)
+    rclpy.spin(Listener())
+
+
+def leaves_a_thread():
+    import threading
+    import time
+    threading.Thread(target=time.sleep, args=(60,), name='stubborn', daemon=False).start()
+    main()
+
+
+def never_ends():
+    main()
+    __import__('time').sleep(60)
+
+
+def prints():
+    print('not JSON')
+    main()
+
+
+def blocks_in_a_callback():
+    rclpy.init()
+    node = Listener()
+    node.create_timer(0.2, lambda: __import__('time').sleep(60))
+    rclpy.spin(node)
+
+
+def fails():
+    rclpy.init()
+    raise RuntimeError('no camera\nfound')
+
+
+def exits():
+    raise SystemExit(3)
+
+
+def fails_later():
+    rclpy.init()
+    rclpy.spin_once(Listener(), timeout_sec=0.2)
+    raise RuntimeError('later')
+
+
+def raises_in_a_callback():
+    rclpy.init()
+    node = Listener()
+    node.create_timer(0.2, lambda: 1 / 0)
+    rclpy.spin(node)
+
+
+def own_context():
+    context = rclpy.context.Context()
+    rclpy.init(context=context)
+    rclpy.spin(Node('alone', context=context))
+
+
+def other_domain():
+    rclpy.init(domain_id=7)
+
+
+def returns_text():
+    return 'text'
+
+
+def returns_nothing():
+    pass
+
+
+def needs_two(one, two):
+    pass
+
+
+class NoNode:
+    pass
+
+
+NUMBER = 3

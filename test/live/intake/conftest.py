@@ -1,0 +1,54 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Fixtures of the tests of the intakes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from rclpy.context import Context
+from rclpy.node import Node
+
+from .helpers import INTAKES, make_intake, make_node, Recorder
+
+
+@pytest.fixture
+def recorder() -> Recorder:
+    return Recorder()
+
+
+@pytest.fixture(params=INTAKES)
+def intake(request: pytest.FixtureRequest, ros_context: Context, recorder: Recorder
+           ) -> Iterator[Any]:
+    made = make_intake(request.param, ros_context, recorder)
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def node(ros_context: Context) -> Iterator[Node]:
+    made = make_node(ros_context)
+    yield made
+    made.destroy_node()
+
+
+@pytest.fixture
+def other(ros_context: Context) -> Iterator[Node]:
+    """Give a node that no intake looks after."""
+    made = make_node(ros_context)
+    yield made
+    made.destroy_node()

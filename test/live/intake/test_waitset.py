@@ -1,0 +1,215 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Snapshots of entities, and polling a wait set, against real rclpy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import threading
+import time
+from typing import Any
+
+from mddag_executor.live.entities import snapshot
+from mddag_executor.live.waitset import WaitSetIntake
+import pytest
+from rclpy.context import Context
+from rclpy.guard_condition import GuardCondition
+from rclpy.node import Node
+from std_msgs.msg import String
+
+from .helpers import make_node, matched, MS, nothing, Recorder, text, topic, wait_for
+
+
+@pytest.fixture
+def node(ros_context: Context) -> Iterator[Node]:
+    made = make_node(ros_context, start_parameter_services=False, enable_rosout=False)
+    yield made
+    made.destroy_node()
+
+
+@pytest.fixture
+def intake(ros_context: Context, recorder: Recorder) -> Iterator[WaitSetIntake]:
+    """Give an intake of timers only, which is what EventsIntake has for them."""
+    made = WaitSetIntake(ros_context, recorder, kinds={'timer'})
+    yield made
+    made.stop()
+    assert not recorder.errors
+
+
+def on_grid(dues: list[int], period: int) -> bool:
+    """Return whether due times are points of one exact phase grid, and never go back."""
+    steps = [b - a for a, b in zip(dues, dues[1:])]
+    return all(step > 0 and step % period == 0 for step in steps)
+
+
+# --- snapshots -----------------------------------------------------------------------------------
+
+
+def test_a_snapshot_has_every_entity_and_its_node(ros_context: Context) -> None:
+    a, b = make_node(ros_context), make_node(ros_context)
+    timer = a.create_timer(1.0, nothing)
+    guard = b.create_guard_condition(nothing)
+    subscription = b.create_subscription(String, topic(), lambda _: None, 10)
+    seen = snapshot([a, b])
+    assert seen.timers == [timer] and seen.guards == [guard]
+    assert subscription in seen.subscriptions
+    assert seen.node_of(timer) is a and seen.node_of(guard) is b
+    assert set(seen.services) == {*a.services, *b.services}
+    assert set(seen.events) == {*a.waitables, *b.waitables} and seen.events
+    assert not seen.waitables and seen.nodes == [a, b]
+    with pytest.raises(KeyError):
+        seen.node_of(object())
+
+
+def test_a_snapshot_is_the_same_while_nothing_changes(ros_context: Context) -> None:
+    a, b = make_node(ros_context), make_node(ros_context)
+    first = snapshot([a, b])
+    assert snapshot([a, b], first) is first
+    assert snapshot([b, a], first) is first  # executors keep their nodes in a set
+    timer = a.create_timer(1.0, nothing)
+    second = snapshot([a, b], first)
+    assert second is not first and second.timers == [timer]
+    b.create_timer(1.0, nothing)
+    a.destroy_timer(timer)  # as many as before
+    third = snapshot([a, b], second)
+    assert third is not second and third.timers != second.timers
+    assert snapshot([a], third) is not third
+    assert snapshot([], first).timers == []
+
+
+def test_a_snapshot_takes_what_is_accepted(node: Node) -> None:
+    timer, other = node.create_timer(1.0, nothing), node.create_timer(2.0, nothing)
+    assert snapshot([node], accept=lambda entity: entity is not other).timers == [timer]
+
+
+def test_comparing_a_thousand_entities_is_cheap(ros_context: Context) -> None:
+    nodes = [make_node(ros_context) for _ in range(8)]
+    for made in nodes:
+        for _ in range(125):
+            made.create_guard_condition(nothing)
+    first = snapshot(nodes)
+    assert len(first) > 1000
+    best = min(_seconds(lambda: snapshot(nodes, first)) for _ in range(5))
+    assert best < 0.002  # about 0.1 ms
+
+
+def _seconds(function: Any) -> float:
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
+# --- poll ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def inline(ros_context: Context, recorder: Recorder) -> WaitSetIntake:
+    return WaitSetIntake(ros_context, recorder)
+
+
+def test_poll_returns_after_its_time_and_not_before(inline: WaitSetIntake, node: Node) -> None:
+    inline.update([node])
+    for timeout, least, most in ((0.0, 0.0, 0.1), (0.1, 0.1, 0.3)):
+        start = time.monotonic()
+        assert inline.poll(timeout) == 0
+        assert least <= time.monotonic() - start < most
+
+
+def test_poll_hands_over_what_is_ready(
+    inline: WaitSetIntake, node: Node, recorder: Recorder
+) -> None:
+    name = topic()
+    subscription = node.create_subscription(String, name, lambda _: None, 10)
+    publisher = node.create_publisher(String, name, 10)
+    guard = node.create_guard_condition(nothing)
+    timer = node.create_timer(0.010, nothing)
+    timer.cancel()
+    inline.update([node])
+    assert matched(publisher)
+    for k in range(3):
+        publisher.publish(text(str(k)))
+    assert wait_for(lambda: (inline.poll(0.0), len(recorder.messages) == 3)[1])
+    assert recorder.texts(subscription) == ['0', '1', '2']
+    guard.trigger()
+    assert inline.poll(1.0) == 1 and recorder.guards == [guard]
+    timer.reset()
+    start = time.monotonic_ns()
+    assert inline.poll(None) == 1
+    assert abs(recorder.dues(timer)[0] - start - 10 * MS) < MS
+    assert time.monotonic_ns() - start >= 9 * MS
+
+
+def test_poll_ends_early_when_a_guard_condition_or_wake_says_so(
+    ros_context: Context, node: Node, recorder: Recorder
+) -> None:
+    guard = GuardCondition(None, None, ros_context)
+    inline = WaitSetIntake(ros_context, recorder, (guard,))
+    inline.update([node])
+    for ring in (guard.trigger, inline.wake):
+        thread = threading.Timer(0.05, ring)
+        thread.start()
+        start = time.monotonic()
+        assert inline.poll(5.0) == 0
+        assert 0.04 < time.monotonic() - start < 1.0
+        thread.join()
+    assert not recorder.guards  # it is nobody's entity
+
+
+def test_poll_holds_entities_no_longer_than_it_lasts(
+    inline: WaitSetIntake, node: Node, recorder: Recorder
+) -> None:
+    name = topic()
+    subscription = node.create_subscription(String, name, lambda _: None, 10)
+    inline.update([node])
+    inline.poll(0.0)
+    assert node.count_subscribers(name) == 1
+    node.destroy_subscription(subscription)
+    assert wait_for(lambda: node.count_subscribers(name) == 0)
+    inline.poll(0.0)  # which has not been told
+    assert not recorder.errors
+
+
+def test_poll_and_start_exclude_each_other(inline: WaitSetIntake, node: Node) -> None:
+    inline.update([node])
+    inline.start()
+    with pytest.raises(RuntimeError, match='thread of its own'):
+        inline.poll(0.0)
+    with pytest.raises(RuntimeError, match='runs already'):
+        inline.start()
+    inline.stop()
+    assert inline.poll(0.0) == 0
+
+
+def test_unknown_kinds_are_refused(ros_context: Context, recorder: Recorder) -> None:
+    with pytest.raises(ValueError, match='timers'):
+        WaitSetIntake(ros_context, recorder, kinds={'timers'})
+
+
+# --- cost ----------------------------------------------------------------------------------------
+
+
+def test_one_take_empties_a_queue_up_to_its_depth(
+    inline: WaitSetIntake, node: Node, recorder: Recorder
+) -> None:
+    name = topic()
+    subscription = node.create_subscription(String, name, lambda _: None, 4)
+    publisher = node.create_publisher(String, name, 20)
+    inline.update([node])
+    assert matched(publisher)
+    for k in range(10):
+        publisher.publish(text(str(k)))
+    time.sleep(0.2)
+    assert inline.poll(1.0) == 4
+    assert recorder.texts(subscription) == ['6', '7', '8', '9']  # as the QoS says

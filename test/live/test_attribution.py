@@ -1,0 +1,156 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Attribution: which publication a message comes from, and when nobody can say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+from mddag_executor.live.attribution import (
+    Attribution,
+    KEEP,
+    Origin,
+    Publication,
+    PublisherState,
+    ROUNDING_NS,
+)
+
+TOPIC = '/topic'
+
+
+class Bench:
+    """An attribution whose publications are given, with a publisher or two."""
+
+    def __init__(self) -> None:
+        self.attribution = Attribution({TOPIC})
+        self.topic = self.attribution._topics[TOPIC]
+        self.publishers = [PublisherState(TOPIC), PublisherState(TOPIC)]
+
+    def published(self, begin: int, end: int | None, job: int, publisher: int = 0) -> None:
+        state = self.publishers[publisher]
+        state.count += 1
+        publication = Publication(begin, state, Origin(0, 0, job, publisher))
+        self.topic.begun(publication)
+        if end is not None:
+            self.topic.ended(publication, end)
+
+    def job(self, stamp: int, sequence: int | None = None) -> Any:
+        origin = self.attribution.find(TOPIC, stamp, sequence)
+        return None if origin is None else origin.job
+
+
+def test_the_window_that_holds_the_stamp():
+    bench = Bench()
+    for job in range(100):
+        bench.published(job * 1000, job * 1000 + 10, job)
+    assert [bench.job(job * 1000 + 5) for job in range(100)] == list(range(100))
+    assert bench.job(50_000 + 10 + ROUNDING_NS) == 50
+    assert bench.job(50_500) is None
+    assert bench.job(-5) is None
+    assert bench.attribution.unknown == 2
+
+
+def test_a_publication_that_has_not_returned_yet():
+    bench = Bench()
+    bench.published(1000, None, 7)
+    assert bench.job(1500) == 7
+
+
+def test_other_topics_and_empty_ones_are_unknown():
+    bench = Bench()
+    assert bench.job(5) is None
+    assert bench.attribution.find('/other', 5, None) is None
+    assert bench.attribution.unknown == 2
+
+
+def test_the_sequence_number_decides_between_publishers():
+    bench = Bench()
+    bench.published(0, 10, 1, publisher=0)
+    bench.published(1000, 1010, 2, publisher=1)
+    bench.published(2000, 2010, 3, publisher=1)
+    bench.published(3000, 3100, 4, publisher=0)
+    bench.published(3050, 3150, 5, publisher=1)
+    assert bench.job(3080) is None, 'without a number nobody knows'
+    assert bench.attribution.doubtful == 1
+    assert bench.job(3080, 2) == 4
+    assert bench.job(3080, 3) == 5
+    assert bench.job(3080, 9) is None
+    assert bench.attribution.doubtful == 2
+
+
+def test_publications_before_the_count_began_are_learnt():
+    """The middleware counts 100 more than we do for publisher 0."""
+    bench = Bench()
+    bench.published(0, 10, 1, publisher=0)
+    assert bench.job(5, 101) == 1
+    bench.published(100, 200, 2, publisher=0)
+    bench.published(110, 210, 3, publisher=1)
+    assert bench.job(150, 102) == 2
+    assert bench.job(150, 1) == 3
+
+
+def test_equal_numbers_of_two_publishers_stay_a_doubt():
+    bench = Bench()
+    bench.published(0, 10, 1, publisher=0)
+    bench.published(5, 15, 2, publisher=1)
+    assert bench.job(7, 1) is None
+
+
+def test_a_long_publication_is_found_behind_many_short_ones():
+    bench = Bench()
+    bench.published(0, 10 ** 12, 42, publisher=1)
+    for job in range(KEEP - 1):
+        bench.published(1_000_000 * job + 1, 1_000_000 * job + 2, job)
+    assert bench.job(500) == 42
+
+
+@given(st.lists(st.tuples(st.integers(1, 50), st.integers(0, 40)), min_size=1, max_size=60),
+       st.data())
+def test_it_never_guesses(steps, data):
+    """Against the definition: the answer is the only window with the stamp, or none."""
+    bench = Bench()
+    windows = []
+    now = 0
+    for job, (gap, length) in enumerate(steps):
+        now += gap
+        windows.append((now, now + length))
+        bench.published(now, now + length, job, publisher=job % 2)
+    stamp = data.draw(st.integers(0, now + 60))
+    holds = [job for job, (begin, end) in enumerate(windows)
+             if begin - ROUNDING_NS <= stamp <= end + ROUNDING_NS]
+    assert bench.job(stamp) == (holds[0] if len(holds) == 1 else None)
+
+
+def test_publish_notes_its_window_and_passes_exceptions_on():
+    bench = Bench()
+    state = bench.publishers[0]
+    state.count = 1
+    sent = []
+    bench.attribution.publish(
+        lambda publisher, msg: sent.append((publisher, msg)), 'p', 'm', state, Origin(1, 2, 3, 4))
+    publication = bench.topic.publications[0]
+    assert sent == [('p', 'm')] and publication.begin <= publication.end
+    assert publication.sequence == 1 and publication.origin.job == 3
+
+    def fail(publisher: Any, msg: Any) -> None:
+        raise TypeError('no such message')
+
+    try:
+        bench.attribution.publish(fail, 'p', 'm', state, Origin(1, 2, 3, 4))
+    except TypeError:
+        pass
+    assert bench.topic.publications[1].end < 2 ** 62

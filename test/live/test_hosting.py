@@ -1,0 +1,262 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Unmodified programs on our executor, each test a real `mddag run --node`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+from mddag_executor.live.hosting import Host
+import pytest
+import rclpy
+from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.node import Node
+
+from .workspace import GRAPH, GUESTS, make_workspace
+
+
+@pytest.fixture
+def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    return make_workspace(tmp_path, monkeypatch)
+
+
+Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+
+
+def run(mddag: Mddag, *specs: str, seconds: float = 1.5) -> tuple[dict[str, Any], str]:
+    """Run programs; return the result, and what they printed."""
+    nodes = [argument for spec in specs for argument in ('--node', spec)]
+    process = mddag(
+        'run', 'graph.yaml', *nodes, '--duration', f'{seconds}s', '--json', 'result.json')
+    assert process.returncode == 0, process.stderr
+    assert 'Traceback' not in process.stderr, process.stderr
+    result: dict[str, Any] = json.loads(Path('result.json').read_text())
+    return result, process.stdout
+
+
+def heard(result: dict[str, Any]) -> int:
+    sink = result['dags']['/talker']['sinks']['/listener:heard']
+    return int(sink['completed'])
+
+
+@pytest.mark.parametrize(('listener', 'said'), [
+    ('pip-nodes/listener', 'listener ended after its spin'),
+    ('chat:main', 'listener ended after its spin'),
+    ('chat:Listener', ''),
+    ('chat:two', ''),
+    ('chat:with_arguments', ''),
+    ('chat:own_executor', 'own executor ended'),
+    ('chat:events_executor', ''),
+    ('chat:spins_once_for_ever', 'no longer ok'),
+    ('chat:catches_signals', ''),
+])
+def test_unmodified_programs_run_on_our_executor(
+    world: Path, mddag: Mddag, listener: str, said: str
+) -> None:
+    result, output = run(mddag, 'chat_nodes/talker', listener)
+    assert heard(result) >= 15
+    assert result['never_ran'] == []
+    assert result['callbacks']['/talker:tick']['ran'] >= heard(result)
+    # Every message was attributed to a job of the talker's timer.
+    assert result['undeclared'] <= 2
+    assert said in output
+
+
+@pytest.mark.parametrize(('spec', 'lines'), [
+    ('chat:spins_in_thread', ['heard five', 'thread joined']),
+    ('chat:spins_once', ['heard enough']),
+    ('chat:calls_a_service', ['answer: forty-two']),
+])
+def test_a_program_goes_on_while_its_callbacks_run(
+    world: Path, mddag: Mddag, spec: str, lines: list[str]
+) -> None:
+    _, output = run(mddag, 'chat_nodes/talker', spec, seconds=2.0)
+    for line in lines:
+        assert line in output.splitlines()
+
+
+def test_a_program_that_leaves_early_leaves_the_others_alone(world: Path, mddag: Mddag) -> None:
+    result, output = run(mddag, 'chat_nodes/talker', 'chat:main', 'chat:leaves_early')
+    assert 'left early' in output
+    assert heard(result) >= 15
+
+
+def test_the_run_ends_when_a_callback_shuts_rclpy_down(world: Path, mddag: Mddag) -> None:
+    begin = time.monotonic()
+    _, output = run(mddag, 'chat_nodes/talker', 'chat:shuts_down_in_a_callback', seconds=30)
+    assert time.monotonic() - begin < 10
+    assert 'shut down' in output
+
+
+def test_the_run_ends_when_all_programs_have_ended(world: Path, mddag: Mddag) -> None:
+    begin = time.monotonic()
+    _, output = run(mddag, 'chat:calls_a_service', seconds=30)
+    assert time.monotonic() - begin < 10
+    assert 'answer: forty-two' in output
+
+
+@pytest.mark.parametrize(('spec', 'message'), [
+    ('chat:fails', 'it failed while starting (RuntimeError: no camera found, '),
+    ('chat:exits', 'it failed while starting (SystemExit: 3'),
+    ('chat:own_context', 'node /alone has a context of its own: let it use the default context'),
+    ('chat:other_domain', 'it asks for ROS domain 7, and this process is in another: set '),
+    ('chat:returns_text', 'it returned a str, which is no rclpy node'),
+    ('chat:returns_nothing', 'it ended and neither returned a node nor let one spin'),
+    ('chat:needs_two', 'the function requires the arguments one, two'),
+])
+def test_a_program_that_can_not_start_ends_the_run_with_one_line(
+    world: Path, mddag: Mddag, spec: str, message: str
+) -> None:
+    process = mddag('run', 'graph.yaml', '--node', spec, '--trace', 'out.mcap')
+    assert process.returncode == 2
+    assert process.stderr.startswith(f'error: --node {spec}: {message}')
+    assert process.stderr.count('\n') == 1
+    assert not Path('out.mcap').exists()
+
+
+@pytest.mark.parametrize(('spec', 'message'), [
+    ('chat:fails_later', 'RuntimeError: later'),
+    ('chat:raises_in_a_callback', 'ZeroDivisionError'),
+])
+def test_an_exception_during_the_run_comes_out_behind_the_summary(
+    world: Path, mddag: Mddag, spec: str, message: str
+) -> None:
+    process = mddag(
+        'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', spec, '--duration', '2s')
+    assert process.returncode == 70
+    assert message in process.stderr.splitlines()[-1]
+    assert 'sink jobs due' in process.stdout
+
+
+@pytest.mark.parametrize(('spec', 'warning'), [
+    ('chat:leaves_a_thread', 'threads that nodes started still run and are left behind: stubborn'),
+    ('chat:never_ends', '--node chat:never_ends: its main() has not ended in time'),
+    ('chat:blocks_in_a_callback', 'a callback has not ended in time; it is left behind'),
+])
+def test_what_does_not_end_is_left_behind(
+    world: Path, mddag: Mddag, spec: str, warning: str
+) -> None:
+    begin = time.monotonic()
+    process = mddag(
+        'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', spec, '--duration', '1s')
+    assert time.monotonic() - begin < 15
+    assert process.returncode == 0
+    assert warning in process.stderr
+    assert 'sink jobs due' in process.stdout
+
+
+def test_what_nodes_print_stays_out_of_the_json(world: Path, mddag: Mddag) -> None:
+    process = mddag('run', 'graph.yaml', '--node', 'chat:prints', '--duration', '0.2s',
+                    '--json', '-')
+    assert json.loads(process.stdout)['nodes'] == ['chat:prints']
+    assert 'not JSON' in process.stderr
+
+
+def test_ros_arguments_reach_the_nodes(world: Path, mddag: Mddag) -> None:
+    (world / 'graph.yaml').write_text(GRAPH.replace('/chatter', '/talk'))
+    process = mddag(
+        'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', 'chat:Listener',
+        '--duration', '1s', '--json', '-', '--ros-args', '-r', 'chatter:=talk')
+    assert process.returncode == 0, process.stderr
+    assert heard(json.loads(process.stdout)) >= 8
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_within_a_second(world: Path, number: int) -> None:
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'run', 'graph.yaml',
+         '--node', 'chat_nodes/talker', '--node', 'chat:main', '--json', 'result.json'],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    time.sleep(3.0)
+    begin = time.monotonic()
+    os.kill(process.pid, number)
+    out, err = process.communicate(timeout=20)
+    assert time.monotonic() - begin < 1.5  # with the interpreter's own end
+    assert process.returncode == 0
+    assert err == ''
+    assert 'sink jobs due' in out
+    assert 'listener ended after its spin' in out
+    assert heard(json.loads(Path('result.json').read_text())) > 5
+
+
+@pytest.fixture
+def host(ros_context: Any) -> Iterator[Host]:
+    """Give a host whose executor nobody spins."""
+    executor = SingleThreadedExecutor(context=ros_context)
+    with Host(executor, lambda: None) as host:
+        yield host
+    executor.shutdown()
+
+
+def test_rclpy_is_as_before_when_the_host_is_left(ros_context: Any) -> None:
+    def parts() -> list[Any]:
+        return [
+            rclpy.init, rclpy.shutdown, rclpy.spin, rclpy.spin_once, signal.signal,
+            *(vars(c).get(name) for c in (Executor, SingleThreadedExecutor, MultiThreadedExecutor)
+              for name in ('spin', 'spin_once', 'add_node', 'create_task', 'shutdown'))]
+
+    before = parts()
+    executor = SingleThreadedExecutor(context=ros_context)
+    with Host(executor, lambda: None):
+        assert parts() != before
+    assert parts() == before
+    executor.shutdown()
+
+
+def test_another_executor_gives_its_nodes_to_ours_when_it_spins(
+    host: Host, ros_context: Any
+) -> None:
+    other = MultiThreadedExecutor(2, context=ros_context)
+    first, second = Node('first', context=ros_context), Node('second', context=ros_context)
+    other.add_node(first)
+    assert host.executor.get_nodes() == []
+    other.spin_once(timeout_sec=0.01)
+    assert host.executor.get_nodes() == [first]
+    assert first.executor is host.executor
+    spinning = threading.Thread(target=other.spin)
+    spinning.start()
+    time.sleep(0.05)
+    other.add_node(second)
+    assert set(host.executor.get_nodes()) == {first, second}
+    other.remove_node(first)
+    assert host.executor.get_nodes() == [second]
+    assert spinning.is_alive()
+    other.shutdown()
+    spinning.join(2.0)
+    assert not spinning.is_alive()
+
+
+def test_another_executors_tasks_run_on_ours(host: Host, ros_context: Any) -> None:
+    other = SingleThreadedExecutor(context=ros_context)
+    task = other.create_task(lambda: 42)
+    other.spin_until_future_complete(task, timeout_sec=0.05)
+    assert not task.done()  # nobody spins ours
+    host.executor.spin_once(timeout_sec=1.0)
+    assert task.result() == 42
+    other.shutdown()
+
+
+def test_the_guests_know_nothing_of_us() -> None:
+    for path in GUESTS.glob('*.py'):
+        assert 'mddag_executor.' not in path.read_text()

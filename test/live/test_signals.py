@@ -1,0 +1,67 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a signal does to a process that spins: it ends soon, quietly, and leaves no thread."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+PROGRAM = """
+import sys, threading, time
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from mddag_executor import MultiDeadlineExecutor
+
+rclpy.init()
+node = rclpy.create_node('node')
+node.create_timer(0.01, lambda: time.sleep(0.005))
+executor = MultiDeadlineExecutor(intake=sys.argv[1])
+executor.add_node(node)
+print('ready', flush=True)
+try:
+    {spin}
+except (KeyboardInterrupt, ExternalShutdownException) as end:
+    print(type(end).__name__)
+executor.shutdown()
+print([t.name for t in threading.enumerate() if t.name.startswith('mddag')])
+"""
+
+
+@pytest.mark.parametrize('intake', ['events', 'waitset'])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('spin', ['executor.spin()', 'rclpy.spin(node, executor)'])
+def test_a_signal_ends_spin_within_a_second(intake, number, spin):
+    process = subprocess.Popen(
+        [sys.executable, '-c', PROGRAM.format(spin=spin), intake], stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == 'ready\n'
+        time.sleep(0.5)
+        begin = time.monotonic()
+        process.send_signal(number)
+        out, err = process.communicate(timeout=10)
+    finally:
+        process.kill()
+    assert time.monotonic() - begin < 5  # a second where the machine has nothing else to do
+    assert process.returncode == 0, err
+    assert out.splitlines()[0] in ('KeyboardInterrupt', 'ExternalShutdownException')
+    assert out.splitlines()[1] == '[]'
+    assert 'Traceback' not in err

@@ -1,0 +1,176 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Spinning: what ends it, what comes out of it, one callback at a time, shutdown."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.task import Future
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from .conftest import Spinning
+
+
+@pytest.mark.parametrize('kind', ['timer', 'subscription', 'task', 'coroutine', 'service'])
+def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
+    node = make_node()
+    executor = make_executor()
+    executor.add_node(node)
+
+    def fail(*args: Any) -> None:
+        raise ZeroDivisionError(kind)
+
+    async def fail_later() -> None:
+        raise ZeroDivisionError(kind)
+
+    if kind == 'timer':
+        node.create_timer(0.01, fail)
+    elif kind == 'subscription':
+        node.create_subscription(Header, '/topic', fail, 10)
+        publisher = node.create_publisher(Header, '/topic', 10)
+        node.create_timer(0.05, lambda: publisher.publish(Header()))
+    elif kind == 'service':
+        node.create_service(Trigger, '/ask', fail)
+        client = node.create_client(Trigger, '/ask')
+        node.create_timer(0.05, lambda: client.call_async(Trigger.Request()))
+    else:
+        executor.create_task(fail if kind == 'task' else fail_later)
+    with pytest.raises(ZeroDivisionError, match=kind):
+        executor.spin_until_future_complete(Future(), 5.0)
+
+
+def test_it_spins_on_after_an_exception(make_executor):
+    executor = make_executor()
+    executor.create_task(lambda: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        executor.spin()
+    task = executor.create_task(lambda: 'fine')
+    executor.spin_until_future_complete(task, 5.0)
+    assert task.result() == 'fine'
+
+
+def test_an_exception_that_somebody_awaits_does_not_end_spin(make_executor):
+    executor = make_executor()
+
+    async def fails() -> None:
+        raise KeyError('handled')
+
+    async def handles() -> str:
+        try:
+            await inner
+        except KeyError:
+            return 'handled'
+        return 'nothing came'
+
+    outer = executor.create_task(handles)
+    inner: Any = Future(executor=executor)
+    executor.spin_once(0.1)
+    task = executor.create_task(fails)
+    task.add_done_callback(lambda t: inner.set_exception(t.exception()))
+    executor.spin_until_future_complete(outer, 5.0)
+    assert outer.result() == 'handled'
+
+
+def test_spin_once_runs_one_callback_and_has_finished_it(make_executor, make_node):
+    node, calls = make_node(), []
+    for _ in range(3):
+        node.create_timer(0.001, lambda: calls.append(threading.get_ident()))
+    executor = make_executor()
+    executor.add_node(node)
+    time.sleep(0.01)
+    for count in range(1, 6):
+        executor.spin_once(1.0)
+        assert len(calls) == count
+    assert set(calls) == {threading.get_ident()}
+
+
+def test_spin_once_times_out(make_executor):
+    executor = make_executor()
+    begin = time.monotonic()
+    executor.spin_once(0.05)
+    assert time.monotonic() - begin >= 0.05
+    executor.spin_once(0)
+
+
+def test_spin_once_until_future_complete_ends_when_it_is_done(make_executor):
+    executor = make_executor()
+    future = Future()
+    threading.Timer(0.05, lambda: future.set_result(1)).start()
+    executor.spin_once_until_future_complete(future, 5.0)
+    assert future.done()
+
+
+def test_spin_until_future_complete_times_out(make_executor):
+    executor = make_executor()
+    begin = time.monotonic()
+    executor.spin_until_future_complete(Future(), 0.1)
+    assert 0.1 <= time.monotonic() - begin < 3
+
+
+def test_spinning_twice_is_an_error(make_executor):
+    executor = make_executor()
+    with Spinning(executor):
+        time.sleep(0.05)
+        with pytest.raises(RuntimeError, match='already spinning'):
+            executor.spin_once(0)
+
+
+def test_external_shutdown_raises_as_with_rclpy(make_executor, ros_context):
+    executor = make_executor()
+    threading.Timer(0.1, ros_context.shutdown).start()
+    with pytest.raises(ExternalShutdownException):
+        executor.spin()
+
+
+def test_shutdown_from_a_callback(make_executor, make_node):
+    node = make_node()
+    executor = make_executor()
+    executor.add_node(node)
+    node.create_timer(0.01, lambda: executor.shutdown(0))
+    executor.spin()
+
+
+def test_shutdown_waits_for_a_running_callback(make_executor):
+    executor = make_executor()
+    begun, done = threading.Event(), []
+
+    def work() -> None:
+        begun.set()
+        time.sleep(0.2)
+        done.append(1)
+
+    executor.create_task(work)
+    with Spinning(executor):
+        assert begun.wait(5.0)
+        assert not executor.shutdown(0.01)
+        assert executor.shutdown(5.0)
+        assert done
+
+
+def test_rclpy_spin_uses_all_workers(make_executor, make_node, ros_context):
+    node, together = make_node(), threading.Barrier(7)
+    executor = make_executor()
+    tasks = [executor.create_task(together.wait, 5.0) for _ in range(7)]
+    tasks[0].add_done_callback(lambda _: ros_context.shutdown())
+    with pytest.raises(ExternalShutdownException):
+        rclpy.spin(node, executor)
+    assert tasks[0].done()

@@ -1,0 +1,67 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A workspace with nodes that people could have written: see `guests/`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import sys
+
+import pytest
+
+GUESTS = Path(__file__).resolve().parent / 'guests'
+
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /talker
+    callbacks: [{name: tick, timer: 50ms, publishes: [/chatter]}]
+  - node: /listener
+    callbacks: [{name: heard, subscription: /chatter, deadline: 50ms}]
+"""
+
+
+def make_workspace(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Make an ament package, a distribution with console scripts and modules; go there."""
+    prefix = folder / 'ws'
+    index = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages'
+    index.mkdir(parents=True)
+    (index / 'chat_nodes').touch()
+    (index / 'empty_nodes').touch()
+    library = prefix / 'lib' / 'chat_nodes'
+    library.mkdir(parents=True)
+    for name, text in {
+        'talker': '#!/usr/bin/env python3\n' + (GUESTS / 'talker.py').read_text(),
+        'shell': '#!/bin/sh\nexit 0\n', 'broken.py': 'def (\n', 'native': '\x7fELF\x02\x01',
+    }.items():
+        (library / name).write_text(text)
+        (library / name).chmod(0o755)
+    site = folder / 'site'
+    info = site / 'pip_nodes-1.0.dist-info'
+    info.mkdir(parents=True)
+    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: pip-nodes\nVersion: 1.0\n')
+    (info / 'entry_points.txt').write_text(
+        '[console_scripts]\nlistener = chat:main\nstale = chat:gone\n[other]\nx = chat:main\n')
+    (site / 'chat.py').write_text((GUESTS / 'chat.py').read_text())
+    (site / 'half.py').write_text('import not_installed_anywhere\n')
+    (site / 'wrong.py').write_text('x = 1\nraise RuntimeError("no licence\\nhere")\n')
+    (folder / 'graph.yaml').write_text(GRAPH)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(prefix))
+    monkeypatch.setenv('PYTHONPATH', str(site))
+    monkeypatch.syspath_prepend(str(site))
+    monkeypatch.chdir(folder)
+    for name in ('chat', 'half', 'wrong'):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    return folder

@@ -1,0 +1,174 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Damaged traces: everything before the damage, one line about the rest, never a wrong figure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import random
+import tempfile
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mddag_executor.errors import MddagError
+from mddag_executor.replay import replay, reschedule
+from mddag_executor.trace import EVENTS, TraceFile
+from msg_graph import GraphError
+import pytest
+
+from .helpers import MS, SMALL, small, START_TIME, VirtualRun
+
+
+@pytest.fixture(scope='module')
+def sound(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """Give a trace of many chunks."""
+    path = tmp_path_factory.mktemp('damage') / 'sound.mcap'
+    VirtualRun(path, small(), 1, duration=400 * MS, flush_every=30)
+    return path.read_bytes()
+
+
+@pytest.fixture(scope='module')
+def whole(sound: bytes, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Give what the whole trace says."""
+    path = tmp_path_factory.mktemp('damage') / 'whole.mcap'
+    path.write_bytes(sound)
+    return replay(path).result()
+
+
+def counts(result: dict[str, Any]) -> dict[str, int]:
+    """Return what can only grow with a trace's length."""
+    found = {}
+    for name, dag in result['dags'].items():
+        found[f'{name} jobs'] = dag['jobs']
+        for sink_name, sink in dag['sinks'].items():
+            found[f'{sink_name} completed'] = sink['completed']
+            found[f'{sink_name} late'] = sink['late'] - sink['overdue']
+            found[f'{sink_name} expired'] = sink['expired']
+            found[f'{sink_name} missed'] = sink['late'] + sink['expired'] + sink['aborted']
+    for key, use in result['callbacks'].items():
+        found[f'{key} executions'] = use['executions']
+        found[f'{key} busy'] = use['busy_ns']
+    found['dropped'] = sum(result['dropped'].values())
+    return found
+
+
+def never_above(result: dict[str, Any], whole: dict[str, Any]) -> None:
+    ours, all_of_it = counts(result), counts(whole)
+    assert {key: n for key, n in ours.items() if n > all_of_it[key]} == {}
+
+
+def test_a_trace_cut_anywhere(sound: bytes, whole: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / 'cut.mcap'
+    jobs = []
+    for size in range(0, len(sound), len(sound) // 150):
+        path.write_bytes(sound[:size])
+        try:
+            outcome = replay(path)
+        except MddagError as error:
+            assert str(error).startswith(f'{path}: ')
+            assert '\n' not in str(error)
+            assert size < 4000  # before the first chunk is whole
+            continue
+        result = outcome.result()
+        never_above(result, whole)
+        # The first says what is missing of the file, the second, if any, that the end is.
+        assert outcome.warnings[0].startswith(f'{path}: ')
+        assert len(outcome.warnings) == 1 + (not result['recording']['shut_down'])
+        jobs.append(sum(dag['jobs'] for dag in result['dags'].values()))
+        assert reschedule(path, workers=1).tally.jobs
+    assert jobs == sorted(jobs)
+    assert 0 < jobs[0] < jobs[-1]
+
+
+def test_flipped_bits(sound: bytes, whole: dict[str, Any], tmp_path: Path) -> None:
+    """Whatever is hit, what remains is right, or there is an error of one line."""
+    path = tmp_path / 'flipped.mcap'
+    rng = random.Random(3)
+    replayed = 0
+    for _ in range(150):
+        data = bytearray(sound)
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        path.write_bytes(data)
+        try:
+            outcome = replay(path)
+            never_above(outcome.result(), whole)
+            replayed += 1
+            if counts(outcome.result()) != counts(whole):
+                assert outcome.warnings
+        except (MddagError, GraphError) as error:
+            assert '\n' not in str(error)
+    assert replayed > 100
+
+
+NUMBERS = st.integers(-1, 4) | st.sampled_from([2**31 - 1, -2**31])
+TIMES = st.integers(0, 40).map(lambda ms: START_TIME + ms * MS) | st.sampled_from(
+    [0, -1, 2**63 - 1, -2**63])
+ANY = {'int32': NUMBERS, 'int64': NUMBERS | TIMES, 'uint64': st.integers(0, 4),
+       'bool': st.booleans(), 'string': st.sampled_from(['', 'qos_depth', '\x1b[2J', SMALL])}
+KINDS = [event for event in EVENTS.values() if event.provider == 'mddag'
+         or event.name.startswith(('callback_', 'add_callback', 'rclcpp_timer', 'rclcpp_subs'))]
+
+
+@st.composite
+def nonsense(draw: st.DrawFn) -> tuple[Any, ...]:
+    """Return an event with any values."""
+    event = draw(st.sampled_from(KINDS))
+    return (event.key, draw(st.integers(0, 40)), draw(st.integers(1, 2)),
+            *(draw(ANY[kind]) for _, kind in event.fields))
+
+
+@given(st.lists(nonsense(), max_size=60), st.booleans())
+@settings(max_examples=200)
+def test_events_with_any_values(events: list[tuple[Any, ...]], in_order: bool) -> None:
+    """Whoever wrote it, there are counts and warnings, or one line; never a traceback."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'a.mcap')
+        with TraceFile(path) as file:
+            file.add('task_set', START_TIME, 1, 1, SMALL, 'g.yaml', 'rad', 2, MS, 3, False)
+            for name, ms, thread, *fields in sorted(
+                    events, key=lambda event: event[1] if in_order else 0):
+                file.add(name, START_TIME + ms * MS, 1, thread, *fields)
+        outcome = replay(path)
+        jobs = sum(outcome.tally.jobs)
+        assert jobs <= sum(event[0] == 'mddag:job_release' for event in events)
+        for dag in outcome.result()['dags'].values():
+            assert sum(dag['ends'].values()) <= dag['jobs']
+            for sink in dag['sinks'].values():
+                assert sink['completed'] + sink['overdue'] + sink['expired'] + sink[
+                    'aborted'] <= dag['jobs']
+        try:
+            result = reschedule(path, small()).result()
+            assert sum(dag['jobs'] for dag in result['dags'].values()) <= jobs
+        except MddagError as error:
+            assert str(error).startswith(str(path))
+
+
+def test_a_process_that_was_killed(tmp_path: Path) -> None:
+    """A trace without its last chunks and without a finish record, as kill -9 leaves it."""
+    path = tmp_path / 'killed.mcap'
+    run = VirtualRun(path, small(), 1, duration=400 * MS, shut_down=False, finish_file=False)
+    outcome = replay(path)
+    missing, end = outcome.warnings
+    assert 'the file ends without a finish record' in missing
+    assert 'the end of the run is not recorded' in end
+    ours, theirs = outcome.tally.result()['dags'], run.tally.result()['dags']
+    for name, dag in theirs.items():
+        assert ours[name]['ends'] == dag['ends']
+        for sink_name, sink in dag['sinks'].items():
+            found = ours[name]['sinks'][sink_name]
+            assert found['completed'] == sink['completed']
+            assert found['late'] - found['overdue'] == sink['late']
+            assert found['expired'] == sink['expired']

@@ -1,0 +1,226 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Live against replay: real nodes run under the executor, and their trace is replayed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+from mddag_executor.replay import replay, reschedule
+from mddag_executor.trace import read_events
+from msg_graph import loads
+import pytest
+
+GRAPH = """\
+mddag: 1
+workers: 3
+nodes:
+  - node: /camera
+    callbacks:
+      - {name: grab, timer: 20ms, publishes: [/image, /info]}
+  - node: /left
+    callbacks:
+      - {name: detect, subscription: /image, publishes: [/boxes]}
+  - node: /right
+    callbacks:
+      - {name: rectify, subscription: /info, publishes: [/flat]}
+      - {name: watch, subscription: /info, deadline: 200ms}
+  - node: /fuse
+    callbacks:
+      - {name: join, sync: [/boxes, /flat], deadline: 12ms}
+  - node: /imu
+    callbacks:
+      - {name: tick, timer: 10ms, publishes: [/twist], on_miss: abort}
+  - node: /filter
+    callbacks:
+      - {name: use, subscription: /twist, publishes: [/odometry]}
+      - {name: show, subscription: /odometry, deadline: 6ms}
+"""
+
+
+def build_nodes(context: Any) -> list[Any]:
+    """Make the declared nodes, and a timer that nobody declares; some callbacks are slow."""
+    from rclpy.callback_groups import ReentrantCallbackGroup
+    from rclpy.node import Node
+    from rclpy.task import Future
+    from std_msgs.msg import Header
+    nodes: dict[str, Node] = {}
+
+    def node(name: str) -> Node:
+        return nodes.setdefault(name, Node(
+            name, context=context, start_parameter_services=False, enable_rosout=False))
+
+    def publisher(name: str, topic: str) -> Any:
+        return node(name).create_publisher(Header, topic, 10)
+
+    def subscribe(name: str, topic: str, callback: Any) -> None:
+        node(name).create_subscription(
+            Header, topic, callback, 10, callback_group=ReentrantCallbackGroup())
+
+    count = 0
+    image, info = publisher('camera', '/image'), publisher('camera', '/info')
+    boxes, flat = publisher('left', '/boxes'), publisher('right', '/flat')
+    twist, odometry = publisher('imu', '/twist'), publisher('filter', '/odometry')
+
+    def grab() -> None:
+        nonlocal count
+        count += 1
+        message = Header(frame_id=str(count))
+        image.publish(message)
+        info.publish(message)
+
+    def detect(message: Any) -> None:
+        time.sleep(0.002)
+        boxes.publish(message)
+
+    async def rectify(message: Any) -> None:
+        """Wait for something once in a while, without a worker."""
+        if int(message.frame_id) % 5 == 0:
+            future: Any = Future()
+            threading.Timer(0.004, future.set_result, (None,)).start()
+            await future
+        flat.publish(message)
+
+    def join(message: Any) -> None:
+        if int(message.frame_id) % 7 == 0:
+            time.sleep(0.015)
+
+    def use(message: Any) -> None:
+        if int(message.frame_id) % 9 == 0:
+            time.sleep(0.007)
+        odometry.publish(message)
+
+    ticks = iter(range(10**9))
+    node('camera').create_timer(0.02, grab)
+    node('imu').create_timer(0.01, lambda: twist.publish(Header(frame_id=str(next(ticks)))))
+    subscribe('left', '/image', detect)
+    subscribe('right', '/info', rectify)
+    subscribe('right', '/info', lambda message: None)
+    subscribe('fuse', '/boxes', join)
+    subscribe('fuse', '/flat', join)
+    subscribe('filter', '/twist', use)
+    subscribe('filter', '/odometry', lambda message: None)
+    node('filter').create_timer(0.03, lambda: time.sleep(0.001))  # undeclared
+    return list(nodes.values())
+
+
+@contextmanager
+def spinning(executor: Any) -> Iterator[None]:
+    """Spin in a thread, as programs do."""
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    try:
+        yield
+    finally:
+        executor.shutdown(2.0)
+        thread.join(5.0)
+        assert not thread.is_alive()
+
+
+@pytest.mark.parametrize('intake', ['events', 'waitset'])
+def test_replay_counts_what_the_executor_counted(
+    ros_context: Any, tmp_path: Path, intake: str
+) -> None:
+    from mddag_executor import MultiDeadlineExecutor
+    path = tmp_path / 'live.mcap'
+    executor = MultiDeadlineExecutor(
+        loads(GRAPH, 'live.yaml'), context=ros_context, trace=str(path), intake=intake)
+    nodes = build_nodes(ros_context)
+    for node in nodes:
+        executor.add_node(node)
+    with spinning(executor):
+        time.sleep(2.5)
+    live = executor.statistics()
+    for node in nodes:
+        node.destroy_node()
+
+    outcome = replay(path)
+    assert outcome.warnings == []
+    result = outcome.result()
+    breakdowns = []
+    for dag in result['dags'].values():
+        for sink in dag['sinks'].values():
+            breakdowns.append((sink.pop('breakdown'), sink['response_ns']))
+    for key in ('policy', 'workers', 'deadline_missed', 'first_miss', 'dags'):
+        assert result[key] == live[key], key
+    for key, use in result['callbacks'].items():
+        assert use['executions'] == live['callbacks'][key]['ran'], key
+        assert use['busy_ns'] == live['callbacks'][key]['busy_ns'], key
+    assert 10 < result['undeclared']['executions'] <= live['undeclared']
+    assert sum(result['dropped'].values()) >= sum(live['dropped'].values())
+
+    # something happened in each of the ways that there are
+    sinks = {name: sink for dag in live['dags'].values() for name, sink in dag['sinks'].items()}
+    assert min(dag['jobs'] for dag in live['dags'].values()) > 50
+    assert sinks['/fuse:join']['late'] > 3
+    assert sinks['/right:watch']['completed'] > 50
+    assert sinks['/filter:show']['aborted'] + sinks['/filter:show']['late'] > 3
+    for breakdown, response in breakdowns:
+        worst = breakdown['worst']
+        assert worst['completed_ns'] - worst['release_ns'] == response['max']
+        assert worst['executing_ns'] > 0
+        assert abs(sum(breakdown['mean'].values())) < response['max']
+
+    # and the core, given the same load and as many workers, does no worse than the run itself
+    rescheduled = reschedule(path).result()
+    assert rescheduled['warnings'] == []
+    for name, dag in rescheduled['dags'].items():
+        assert dag['jobs'] == live['dags'][name]['jobs']
+
+
+KILLED = """
+import os, signal, sys, threading, time
+import rclpy
+from mddag_executor import MultiDeadlineExecutor
+from msg_graph import loads
+from rclpy.node import Node
+rclpy.init()
+text = '''mddag: 1
+nodes:
+  - node: /n
+    callbacks: [{name: cb, timer: 5ms, deadline: 5ms}]
+'''
+executor = MultiDeadlineExecutor(loads(text), trace=sys.argv[1])
+node = Node('n', start_parameter_services=False, enable_rosout=False)
+node.create_timer(0.005, lambda: None)
+executor.add_node(node)
+threading.Thread(target=executor.spin, daemon=True).start()
+time.sleep(2.5)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_process_that_was_killed_loses_the_last_second_at_most(tmp_path: Path) -> None:
+    path = tmp_path / 'killed.mcap'
+    done = subprocess.run([sys.executable, '-c', KILLED, str(path)], timeout=60, check=False)
+    assert done.returncode == -9
+    outcome = replay(path)
+    assert len(outcome.warnings) == 2
+    assert 'without a finish record' in outcome.warnings[0]
+    assert 'the end of the run is not recorded' in outcome.warnings[1]
+    result = outcome.result()
+    assert result['dags']['/n']['jobs'] > 250
+    sink = result['dags']['/n']['sinks']['/n:cb']
+    assert sink['completed'] >= result['dags']['/n']['jobs'] - 3
+    with pytest.warns(UserWarning, match='without a finish record'):
+        first, *_, last = [event['_timestamp'] for event in read_events(path)]
+    assert last - first > 1.2e9

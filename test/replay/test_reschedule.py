@@ -1,0 +1,404 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Rescheduled: the recorded load through the core, with the same and with other settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import random
+import tempfile
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mddag_executor.core import policy as find_policy
+from mddag_executor.core import PolicyError, Tables, Tally
+from mddag_executor.core.state import Decision, new_state
+from mddag_executor.errors import UsageError
+from mddag_executor.replay import replay, ReplayError, reschedule
+from mddag_executor.simulate.engine import END, Load, LogEntry, PREEMPT, run, START
+from mddag_executor.trace import TraceFile
+from msg_graph import loads, TaskSet
+import pytest
+
+from .helpers import declarations, MS, small, START_TIME, VirtualRun, VPID
+from .simulated import executions, loose, write_simulated
+
+JOBS = 12
+
+
+def random_load(task_set: TaskSet, seed: int, longest: int, undeclared: int) -> Load:
+    """Return a load with its own execution times in each job, and undeclared executions."""
+    rng = random.Random(seed)
+    releases = []
+    costs: list[int] = []
+    bases = []
+    for dag in task_set.dags:
+        bases.append(len(costs))
+        for job in range(JOBS):
+            time = START_TIME + job * dag.period_ns + rng.choice((0, 0, rng.randrange(MS)))
+            releases.append((time, dag.index, job))
+            costs.extend(rng.randrange(1, longest) for _ in dag.vertices)
+    bases.append(len(costs))
+    for number in range(undeclared):
+        releases.append((START_TIME + rng.randrange(100 * MS), len(task_set.dags), number))
+    releases.sort()
+    renumbered = 0
+    load = []
+    for time, dag_index, job in releases:
+        if dag_index == len(task_set.dags):
+            job, renumbered = renumbered, renumbered + 1
+            costs.append(rng.randrange(1, longest))
+        load.append((time, dag_index, job))
+    strides = [*(len(dag.vertices) for dag in task_set.dags), 1]
+    return Load([e[0] for e in load], [e[1] for e in load], [e[2] for e in load], costs, bases,
+                strides)
+
+
+def schedule(
+    task_set: TaskSet, load: Load, policy: str, workers: int, end: int
+) -> tuple[list[LogEntry], Tally, list[Decision]]:
+    """Simulate a load, non-preemptively."""
+    tables = loose(task_set)
+    state = new_state(tables, workers)
+    log: list[LogEntry] = []
+    run(tables, state, find_policy(policy).key, load, end, False, log)
+    tally = Tally(task_set, tables)
+    for dag in load.dags:
+        tally.released(dag)
+    tally.add(state.decisions)
+    return log, tally, state.decisions
+
+
+@given(declarations(), st.integers(0, 2**32), st.integers(1, 4),
+       st.sampled_from(['rad', 'rm', 'wc', 'gedf']), st.integers(2, 9), st.integers(0, 10))
+@settings(max_examples=100)
+def test_the_same_settings_give_the_same_schedule(
+    text: str, seed: int, workers: int, policy: str, longest: int, undeclared: int
+) -> None:
+    """A schedule of the core, recorded and rescheduled, is the same: starts, ends, verdicts."""
+    text = text.replace('on_miss: abort, ', '').replace('max_active_jobs: 2, ', '')
+    task_set = loads(text, 'g.yaml')
+    load = random_load(task_set, seed, longest * MS, undeclared)
+    end = START_TIME + 10_000 * MS
+    log, tally, decisions = schedule(task_set, load, policy, workers, end)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'run.mcap')
+        write_simulated(path, task_set, load, log, decisions, policy=policy, workers=workers,
+                        end=end)
+        outcome = reschedule(path)
+        recorded = replay(path)
+    assert outcome.warnings == []
+    assert outcome.log == log
+    expected = tally.result()
+    result = outcome.result()
+    assert {key: result[key] for key in expected} == expected
+    assert (result['policy'], result['workers'], result['preemptive']) == (policy, workers, False)
+    assert result['estimated_executions'] == 0
+    # and as recorded it has the verdicts of the simulation, too
+    assert recorded.tally.result() == expected
+    assert result['recorded']['dags'] == expected['dags']
+    use = result['worker_use']['busy_ns']
+    assert sum(use['executions'] for use in recorded.result()['callbacks'].values()) == sum(
+        entry[1] == END and entry[3] < len(task_set.dags) for entry in log)
+    busy = [0] * workers
+    for start, entry in executions(log):
+        busy[entry[2]] += entry[0] - start
+    assert use == {str(worker): took for worker, took in enumerate(busy)}
+
+
+def starts(log: list[LogEntry]) -> list[tuple[int, int, int, int]]:
+    """Return time in ms, worker, vertex and job of each start in a log."""
+    return [((time - START_TIME) // MS, worker, vertex, job)
+            for time, kind, worker, _, vertex, job in log if kind == START]
+
+
+def test_fewer_workers_miss_what_more_keep(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    task_set = small()
+    load = random_load(task_set, 1, 4 * MS, 0)
+    log, _, decisions = schedule(task_set, load, 'rad', 4, START_TIME + 1000 * MS)
+    write_simulated(path, task_set, load, log, decisions, workers=4, end=START_TIME + 1000 * MS)
+    assert reschedule(path).workers == 4
+    assert not reschedule(path).tally.missed
+    alone = reschedule(path, workers=1)
+    assert alone.tally.missed
+    assert {entry[2] for entry in alone.log} == {0}
+    assert sum(sink.late for sink in alone.tally.sinks.values()) > 5
+
+
+TWO = """\
+mddag: 1
+nodes:
+  - node: /slow
+    callbacks: [{name: cb, timer: 100ms, deadline: 90ms}]
+  - node: /fast
+    callbacks: [{name: cb, timer: 10ms, deadline: 4ms}]
+"""
+
+
+def write_two(path: Path) -> None:
+    """Record a run of 20 ms with a slow job from 0 to 12 and fast ones at 5 and 15 ms."""
+    slow = Load([START_TIME, START_TIME + 5 * MS, START_TIME + 15 * MS], [0, 1, 1], [0, 0, 1],
+                [12 * MS, 2 * MS, 2 * MS], [0, 1], [1, 1])
+    task_set = loads(TWO, 'two.yaml')
+    log, _, decisions = schedule(task_set, slow, 'rad', 2, START_TIME + 20 * MS)
+    write_simulated(path, task_set, slow, log, decisions, end=START_TIME + 20 * MS)
+
+
+def test_policy_workers_and_preemption_are_those_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    write_two(path)
+    same = reschedule(path)
+    assert starts(same.log) == [(0, 0, 0, 0), (5, 1, 1, 0), (15, 0, 1, 1)]
+    alone = reschedule(path, workers=1)
+    assert starts(alone.log) == [(0, 0, 0, 0), (12, 0, 1, 0), (15, 0, 1, 1)]
+    assert alone.tally.first_miss is not None
+    assert alone.tally.first_miss['completed_ns'] == START_TIME + 14 * MS
+    preemptive = reschedule(path, workers=1, preemptive=True)
+    assert starts(preemptive.log) == [(0, 0, 0, 0), (5, 0, 1, 0), (7, 0, 0, 0), (15, 0, 1, 1)]
+    assert [e[0] - START_TIME for e in preemptive.log if e[1] == PREEMPT] == [5 * MS]
+    assert preemptive.worker_busy() == [16 * MS]
+    assert not preemptive.tally.missed
+    fifo = reschedule(path, workers=1, policy='fifo', preemptive=True).result()
+    assert (fifo['policy'], fifo['workers'], fifo['preemptive']) == ('fifo', 1, True)
+    assert fifo['deadline_missed']
+    assert fifo['utilisation'] == pytest.approx(16 / 20)
+
+
+def test_another_declaration_schedules_anew(tmp_path: Path) -> None:
+    """Deadlines, order of DAGs and callback groups are those of the declaration given."""
+    path = tmp_path / 'a.mcap'
+    write_two(path)
+    relaxed = TWO.replace('deadline: 4ms', 'deadline: 9ms')
+    assert not reschedule(path, loads(relaxed, 'relaxed.yaml'), workers=1).tally.missed
+    one_group = """\
+mddag: 1
+nodes:
+  - node: /fast
+    callbacks: [{name: cb, timer: 10ms, deadline: 4ms, group: g}]
+  - node: /slow
+    callbacks: [{name: cb, timer: 100ms, deadline: 90ms}]
+"""
+    outcome = reschedule(path, loads(one_group, 'g.yaml'))
+    assert outcome.warnings == []
+    assert starts(outcome.log) == [(0, 0, 1, 0), (5, 1, 0, 0), (15, 0, 0, 1)]
+    assert outcome.tables.group[:2] == [0, -1]
+
+
+def write_with_groups(path: Path, text: str, *shared: str) -> None:
+    """Record two overlapping jobs of two callbacks, and the callback groups that they had."""
+    kind = 'mutually_exclusive' if shared else 'reentrant'
+    with TraceFile(path) as file:
+        def add(name: str, ms: int, *fields: object, vtid: int = 5) -> None:
+            file.add(name, START_TIME + ms * MS, VPID, vtid, *fields)
+
+        add('task_set', -1, text, 'g.yaml', 'rad', 2, 100 * MS, 64, False)
+        add('add_callback_group', -1, 1, 70, kind)
+        add('rcl_timer_init', -1, 11, 100 * MS)
+        add('rclcpp_timer_callback_added', -1, 11, 1000)
+        add('callback_group_add_timer', -1, 70, 11)
+        add('rcl_subscription_init', -1, 12, 2, 12, '/x', 1)
+        add('rclcpp_subscription_init', -1, 12, 120)
+        add('rclcpp_subscription_callback_added', -1, 120, 1001)
+        add('callback_group_add_subscription', -1, 70, 12)
+        for vertex, address in ((0, 1000), (1, 1001)):
+            add('job_release', 0, vertex, 0, START_TIME)
+            add('dispatch', 0, address, vertex, 0, 0, vertex, START_TIME, 0, vtid=vertex)
+            add('callback_start', 0, address, False, vtid=vertex)
+        for vertex, address in ((0, 1000), (1, 1001)):
+            add('callback_end', 5, address, vtid=vertex)
+            add('complete', 5, address, vertex, 0, 0, True, START_TIME + 5 * MS, 0, vtid=vertex)
+        add('shutdown', 20, START_TIME + 20 * MS)
+
+
+TIMER_AND_MESSAGE = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: a, timer: 100ms, deadline: 90ms, dag: a}
+      - {name: b, service: /s, period: 100ms, deadline: 80ms, dag: b}
+"""
+
+
+def test_recorded_callback_groups_are_kept(tmp_path: Path) -> None:
+    write_with_groups(tmp_path / 'a.mcap', TIMER_AND_MESSAGE, 'shared')
+    apart = reschedule(tmp_path / 'a.mcap')
+    assert starts(apart.log) == [(0, 0, 1, 0), (5, 0, 0, 0)]
+    write_with_groups(tmp_path / 'b.mcap', TIMER_AND_MESSAGE)
+    together = reschedule(tmp_path / 'b.mcap')
+    assert starts(together.log) == [(0, 0, 1, 0), (0, 1, 0, 0)]
+    # a group of another declaration goes before the recorded one
+    declared = TIMER_AND_MESSAGE.replace('dag: a', 'dag: a, group: own').replace('90ms', '91ms')
+    parted = reschedule(tmp_path / 'a.mcap', loads(declared, 'd.yaml'))
+    assert starts(parted.log) == [(0, 0, 1, 0), (0, 1, 0, 0)]
+
+
+def test_a_message_counts_from_its_stamp_and_is_ready_when_it_came(tmp_path: Path) -> None:
+    """Of a source that is no timer the release may be long before it can run."""
+    text = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: a, timer: 100ms, deadline: 50ms, dag: a}
+      - {name: b, service: /s, period: 100ms, deadline: 50ms, dag: b}
+"""
+    path = tmp_path / 'a.mcap'
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME, VPID, 1, text, 'g.yaml', 'rad', 2, 100 * MS, 64, False)
+        for dag in (0, 1):
+            file.add('job_release', START_TIME + 30 * MS, VPID, 1, dag, 0, START_TIME)
+        for dag in (0, 1):
+            start, end = START_TIME + 30 * MS, START_TIME + 33 * MS
+            file.add('dispatch', start, VPID, dag, 9, dag, 0, 0, dag, start, 0)
+            file.add('callback_start', start, VPID, dag, 9, False)
+            file.add('callback_end', end, VPID, dag, 9)
+            file.add('complete', end, VPID, dag, 9, dag, 0, 0, True, end, 0)
+        file.add('shutdown', START_TIME + 90 * MS, VPID, 1, START_TIME + 90 * MS)
+    outcome = reschedule(path)
+    assert starts(outcome.log) == [(0, 0, 0, 0), (30, 0, 1, 0)]
+    sinks = outcome.result()['dags']
+    assert sinks['a']['sinks']['/n:a']['response_ns']['max'] == 3 * MS
+    assert sinks['b']['sinks']['/n:b']['response_ns']['max'] == 33 * MS
+
+
+def test_what_was_not_recorded_takes_the_median_then_the_declared_mean(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    text = TWO.replace('timer: 100ms,', 'timer: 100ms, execution_time: 7ms,')
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME, VPID, 1, text, 'g.yaml', 'rad', 2, 100 * MS, 64, False)
+        for job, took in enumerate((1, 3, 2, 0)):
+            release = START_TIME + job * 10 * MS
+            file.add('job_release', release, VPID, 1, 1, job, release)
+            if took:
+                end = release + took * MS
+                file.add('dispatch', release, VPID, 8, 9, 1, 0, job, 0, release, 0)
+                file.add('callback_start', release, VPID, 8, 9, False)
+                file.add('callback_end', end, VPID, 8, 9)
+                file.add('complete', end, VPID, 8, 9, 1, 0, job, True, end, 0)
+        file.add('job_release', START_TIME + 40 * MS, VPID, 1, 0, 0, START_TIME + 40 * MS)
+        file.add('shutdown', START_TIME + 60 * MS, VPID, 1, START_TIME + 60 * MS)
+    outcome = reschedule(path)
+    took = {(vertex, job): time - start for start, (time, _, _, _, vertex, job)
+            in executions(outcome.log)}
+    assert took == {(1, 0): MS, (1, 1): 3 * MS, (1, 2): 2 * MS, (1, 3): 2 * MS, (0, 0): 7 * MS}
+    result = outcome.result()
+    assert (result['executions'], result['estimated_executions']) == (5, 2)
+    with pytest.raises(ReplayError, match=(
+            'a.mcap: 1 callbacks neither completed in it nor declare an execution_time: /slow:cb: '
+            'give a GRAPH')):
+        reschedule(path, loads(TWO, 'g.yaml'))
+
+
+def test_pieces_and_legs_are_added_up(tmp_path: Path) -> None:
+    """A coroutine's pauses are no execution; the legs of a sync vertex are one execution."""
+    text = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: a, timer: 100ms, publishes: [/x, /y], dag: a}
+      - {name: b, sync: [/x, /y], deadline: 90ms}
+"""
+    path = tmp_path / 'a.mcap'
+    with TraceFile(path) as file:
+        def piece(vertex: int, ready: int, start: int, end: int) -> None:
+            file.add('dispatch', START_TIME + start * MS, VPID, 8, 9, 0, vertex, 0, 0,
+                     START_TIME + ready * MS, 0)
+            file.add('callback_start', START_TIME + start * MS, VPID, 8, 9, False)
+            file.add('callback_end', START_TIME + end * MS, VPID, 8, 9)
+
+        def complete(vertex: int, end: int, whole: bool, leg: int) -> None:
+            file.add('complete', START_TIME + end * MS, VPID, 8, 9, 0, vertex, 0, whole,
+                     START_TIME + end * MS, leg)
+
+        file.add('task_set', START_TIME, VPID, 1, text, 'g.yaml', 'rad', 2, 100 * MS, 64, False)
+        file.add('job_release', START_TIME, VPID, 1, 0, 0, START_TIME)
+        piece(0, 0, 0, 2)
+        piece(0, 0, 20, 23)
+        complete(0, 23, True, 0)
+        piece(1, 25, 25, 26)
+        complete(1, 26, False, 1)
+        piece(1, 30, 30, 36)
+        complete(1, 36, True, 0)
+        file.add('shutdown', START_TIME + 90 * MS, VPID, 1, START_TIME + 90 * MS)
+    outcome = reschedule(path)
+    assert [(start - START_TIME, entry[0] - START_TIME) for start, entry
+            in executions(outcome.log)] == [(0, 5 * MS), (5 * MS, 12 * MS)]
+    callbacks = replay(path).result()['callbacks']
+    assert callbacks['/n:a'] == {'executions': 1, 'busy_ns': 5 * MS, 'longest_ns': 5 * MS,
+                                 'waiting_ns': 0, 'longest_wait_ns': 0}
+    breakdown = replay(path).result()['dags']['a']['sinks']['/n:b']['breakdown']['worst']
+    assert (breakdown['suspended_ns'], breakdown['executing_ns']) == (18 * MS, 5 * MS + 6 * MS)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_run_with_losses_is_rescheduled_whole(tmp_path: Path, seed: int) -> None:
+    """Messages that were lost and jobs that expired do not matter: only releases and times do."""
+    path = tmp_path / 'a.mcap'
+    driven = VirtualRun(path, small(), seed, longest=2 * MS)
+    outcome = reschedule(path, workers=8)
+    assert outcome.warnings == []
+    released = sum(driven.tally.jobs)
+    assert sum(outcome.tally.jobs) == released
+    assert all(sink.expired == sink.aborted == 0 for sink in outcome.tally.sinks.values())
+    ends = [sum(kinds.values()) for kinds in outcome.tally.ends]
+    assert sum(ends) >= released - 3  # but for those that were open at the end
+
+
+def test_jobs_are_called_as_in_the_recording(tmp_path: Path) -> None:
+    """Inside the engine jobs are counted from 0; a trace may begin with any."""
+    path = tmp_path / 'a.mcap'
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME, VPID, 1, TWO, 'g.yaml', 'rad', 2, 100 * MS, 64, False)
+        for job in (2**40, 2**40 + 7):
+            file.add('job_release', START_TIME + job % 8 * MS, VPID, 1, 1, job,
+                     START_TIME + job % 8 * MS)
+        start, end = START_TIME + 8 * MS, START_TIME + 14 * MS
+        file.add('dispatch', start, VPID, 8, 9, 1, 0, 2**40 + 7, 0, start, 0)
+        file.add('callback_start', start, VPID, 8, 9, False)
+        file.add('callback_end', end, VPID, 8, 9)
+        file.add('complete', end, VPID, 8, 9, 1, 0, 2**40 + 7, True, end, 0)
+        file.add('shutdown', START_TIME + 60 * MS, VPID, 1, START_TIME + 60 * MS)
+    outcome = reschedule(path)
+    assert outcome.result()['first_miss']['job'] == 2**40
+    assert [outcome.recorded_job(e[3], e[5]) for e in outcome.log if e[1] == END] == [
+        2**40, 2**40 + 7]
+
+
+def test_settings_that_can_not_be(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    write_two(path)
+    with pytest.raises(PolicyError, match="policy 'best'"):
+        reschedule(path, policy='best')
+    for workers in (0, -1, 10**9):
+        with pytest.raises(UsageError, match='give 1 to'):
+            reschedule(path, workers=workers)
+    for policy, workers, says in (('newest', 2, "policy 'newest'.*give --policy"),
+                                  ('rad', 2**31 - 1, '2147483647 workers: give --workers'),
+                                  ('rad', -3, '-3 workers')):
+        with TraceFile(path) as file:
+            file.add('task_set', START_TIME, VPID, 1, TWO, 'g.yaml', policy, workers, 100 * MS,
+                     64, False)
+        with pytest.raises(ReplayError, match=says):
+            reschedule(path)
+        replay(path).result()
+
+
+def test_tables_without_groups_stay_as_they_are() -> None:
+    from mddag_executor.replay.load import with_groups
+    tables = Tables.build(loads(TIMER_AND_MESSAGE.replace('dag: b', 'dag: b, group: g'), 'g.yaml'))
+    assert with_groups(tables, {}, {}, declared_first=False) == tables

@@ -1,0 +1,210 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Loads, execution times and settings of a simulated run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+import json
+from typing import Any
+
+from mddag_executor.core import NEVER
+from mddag_executor.simulate import (
+    draw_execution_times,
+    Load,
+    periodic_load,
+    read_execution_times,
+    scale_execution_times,
+    Settings,
+    simulate,
+    SimulationError,
+    utilisation,
+)
+from msg_graph import TaskSet
+import pytest
+
+from ..core.task_sets import declaration
+
+US = 1_000
+FILE = 'times.json'
+
+
+def two_dags(**more: Any) -> TaskSet:
+    return declaration([
+        {'node': '/n', 'name': 's', 'timer': '10us', 'publishes': ['/s'], 'dag': 'a',
+         'execution_time': '2us', **more},
+        {'node': '/n', 'name': 'x', 'subscription': '/s', 'deadline': '9us',
+         'execution_time': {'quantiles_us': [1, 3]}},
+        {'node': '/n', 'name': 't', 'timer': '4us', 'publishes': ['/s'], 'dag': 'b',
+         'execution_time': '1us'}])
+
+
+# --- loads ---------------------------------------------------------------------------------------
+
+def test_a_periodic_load_is_in_order_of_time_and_dag() -> None:
+    load = periodic_load(two_dags(), [[2, 3], [4, 5]], 12 * US)
+    assert list(zip(load.times, load.dags, load.jobs)) == [
+        (0, 0, 0), (0, 1, 0), (4 * US, 1, 1), (8 * US, 1, 2), (10 * US, 0, 1)]
+    assert (load.costs, load.cost_base, load.cost_stride) == ([2, 3, 4, 5], [0, 2], [0, 0])
+    assert load.releases == []
+
+
+def test_each_job_may_have_execution_times_of_its_own() -> None:
+    load = Load([0, 20 * US], [0, 0], [0, 1], [1, 2, 3, 5], [0], [2])
+    run = simulate(two_dags(), load, Settings(workers=1, duration_ns=100 * US))
+    sink = run.result()['dags']['a']['sinks']['/n:x@a']
+    assert (sink['response_ns']['min'], sink['response_ns']['max']) == (3, 8)
+
+
+def test_a_source_may_get_ready_after_its_release() -> None:
+    """As with a header stamp: the deadline counts from the release."""
+    load = Load([5 * US], [0], [0], [2 * US, 2 * US], [0], [0], releases=[1])
+    run = simulate(two_dags(), load, Settings(workers=1, duration_ns=100 * US))
+    sink = run.result()['dags']['a']['sinks']['/n:x@a']
+    assert (sink['completed'], sink['late']) == (1, 0)
+    assert sink['response_ns']['max'] == 9 * US - 1
+    late = simulate(two_dags(), load._replace(times=[5 * US + 2]),
+                    Settings(workers=1, duration_ns=100 * US))
+    assert late.result()['first_miss'] == {
+        'dag': 'a', 'vertex': '/n:x@a', 'job': 0, 'deadline_ns': 9 * US + 1,
+        'completed_ns': 9 * US + 2}
+
+
+def test_a_vertex_without_time_makes_its_successors_ready_at_once() -> None:
+    run = simulate(two_dags(), periodic_load(two_dags(), [[0, 0], [0, 1]], 8 * US),
+                   Settings(workers=1, duration_ns=8 * US), log=True)
+    assert [entry[0] for entry in run.log if entry[3] == 0] == [0, 0, 0, 0]
+    assert run.result()['dags']['a']['sinks']['/n:x@a']['response_ns']['max'] == 0
+    assert run.result()['dags']['b']['ends']['completed'] == 2
+
+
+def test_a_bound_for_all_dags_and_one_of_its_own() -> None:
+    task_set = two_dags(max_active_jobs=3)
+    load = periodic_load(task_set, [[1, 900 * US], [900 * US, 1]], 100 * US)
+    settings = Settings(workers=2, duration_ns=100 * US)
+    ends = {name: dag['ends']['expired'] for name, dag in simulate(
+        task_set, load, settings, max_active_jobs=2).result()['dags'].items()}
+    assert ends == {'a': 10 - 3, 'b': 25 - 2}
+    ends = {name: dag['ends']['expired']
+            for name, dag in simulate(task_set, load, settings).result()['dags'].items()}
+    assert ends == {'a': 10 - 3, 'b': 0}
+
+
+def test_progress_is_told_the_virtual_time() -> None:
+    told: list[int] = []
+    simulate(two_dags(), periodic_load(two_dags(), [[1, 1], [1, 1]], 9 * US),
+             Settings(workers=4, duration_ns=9 * US), progress=told.append)
+    assert told == sorted(told)
+    assert told[0] == 0
+    assert told[-1] == 8 * US + 2
+
+
+# --- settings ------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('setting', 'says'), [
+    ({'workers': 0}, 'workers: 0 is too few'), ({'workers': -1}, 'workers: -1 is too few'),
+    ({'duration_ns': 0}, 'duration: 0 ns is too short'),
+    ({'judge': 'me'}, "judge 'me': .*: choose one of horizon, completions"),
+    ({'policy': 'edf'}, "policy 'edf': .*: choose one of rad, rm"),
+    ({'dispatch_overhead_ns': -1}, 'overhead'), ({'switch_overhead_ns': -1}, 'overhead'),
+])
+def test_settings_that_make_no_sense(setting: dict[str, Any], says: str) -> None:
+    from mddag_executor.errors import MddagError
+    load = periodic_load(two_dags(), [[1, 1], [1, 1]], US)
+    with pytest.raises(MddagError, match=says) as error:
+        simulate(two_dags(), load, replace(Settings(), **setting))
+    assert '\n' not in str(error.value)
+
+
+@pytest.mark.parametrize(('policy', 'own'), [
+    ('rad', True), ('rm', True), ('gedf', True), ('wc', False), ('fifo', False)])
+def test_a_policy_has_its_own_mode(policy: str, own: bool) -> None:
+    load = periodic_load(two_dags(), [[1, 1], [1, 1]], US)
+    assert Settings(policy=policy).preemptive is False
+    for asked, got in ((None, own), (True, True), (False, False)):
+        run = simulate(two_dags(), load, Settings(policy=policy, preemptive=asked))
+        assert run.preemptive is run.result()['preemptive'] is got
+
+
+# --- execution times -----------------------------------------------------------------------------
+
+def test_a_seed_draws_the_same_for_ever() -> None:
+    """The draw is part of results that people publish: it must not change."""
+    assert draw_execution_times(two_dags(), 1) == [[2_000, 2_695], [2_528, 1_000]]
+    assert draw_execution_times(two_dags(), 2) == [[2_000, 2_896], [1_113, 1_000]]
+
+
+def test_utilisation_and_its_scaling() -> None:
+    times = [[2_000, 3_000], [1_000, 1_000]]
+    assert utilisation(two_dags(), times, 2) == pytest.approx(0.5)
+    scaled = scale_execution_times(two_dags(), times, 2, 0.25)
+    assert scaled == [[1_000, 1_500], [500, 500]]
+    assert times == [[2_000, 3_000], [1_000, 1_000]]
+    for target in (0.0, -1.0, float('nan'), float('inf')):
+        with pytest.raises(SimulationError, match='utilisation'):
+            scale_execution_times(two_dags(), times, 2, target)
+    with pytest.raises(SimulationError, match='nothing|0'):
+        scale_execution_times(two_dags(), [[0, 0], [0, 0]], 2, 0.5)
+
+
+def test_times_can_not_be_drawn_where_none_is_declared() -> None:
+    bare = declaration([{'node': '/n', 'name': 's', 'timer': '10us', 'deadline': '9us'}])
+    with pytest.raises(SimulationError, match=r'random.yaml:1: /n:s declares no execution_time: '):
+        draw_execution_times(bare, 0)
+
+
+GOOD = {'a': {'/n:s': 2, '/n:x@a': 3.5}, 'b': {'/n:t': 0.0001, '/n:x': 86_399_999_999}}
+
+
+def test_times_from_a_file_are_microseconds() -> None:
+    times = read_execution_times(two_dags(), json.dumps(GOOD), FILE)
+    assert times == [[2_000, 3_500], [86_399_999_999_000, 1]]  # x stands before t
+
+
+def changed(change: Callable[[dict[str, Any]], Any]) -> str:
+    data = json.loads(json.dumps(GOOD))
+    change(data)
+    return json.dumps(data)
+
+
+@pytest.mark.parametrize(('text', 'says'), [
+    ('', 'times.json:1: not JSON'),
+    ('{"a": {\n"x" 1}}', 'times.json:2: not JSON'),
+    ('[' * 100_000, 'not usable JSON'),
+    ('{"a": {"/n:s": ' + '9' * 5_000 + '}}', 'JSON|below one day'),
+    ('[]', 'not an object of objects'), ('null', 'not an object of objects'),
+    ('{"a": 3}', 'not an object of objects'),
+    ('{}', 'no execution time for /n:s of DAG a: add it'),
+    (changed(lambda d: d.pop('b')), 'no execution time for /n:t of DAG b|/n:x of DAG b'),
+    (changed(lambda d: d['a'].update({'/n:s': None})), 'no execution time for /n:s of DAG a'),
+    (changed(lambda d: d['a'].pop('/n:x@a')), 'no execution time for /n:x of DAG a: add it'),
+    (changed(lambda d: d.update(c={})), "DAG 'c' is not in random.yaml: its DAGs are a, b"),
+    (changed(lambda d: d['a'].update({'/n:t': 1})), "'/n:t' is not a vertex of DAG a"),
+    *((changed(lambda d, v=value: d['a'].update({'/n:s': v})), 'execution time of /n:s of DAG a')
+      for value in (0, -1, -0.5, 86_400_000_000, '3', True, [1], {}, float('nan'),
+                    float('inf'), 10 ** 400)),
+])
+def test_a_wrong_file_of_times_is_one_line(text: str, says: str) -> None:
+    with pytest.raises(SimulationError, match=says) as error:
+        read_execution_times(two_dags(), text, FILE)
+    line = str(error.value)
+    assert '\n' not in line
+    assert line.startswith(FILE)
+    assert len(line) < 300
+
+
+def test_never_is_later_than_any_clock() -> None:
+    assert NEVER > 2 * 1_800_000_000 * 10 ** 9
+    assert NEVER + 86_400 * 10 ** 9 < 2 ** 63, 'deadlines can be added to it in 64 bits'
