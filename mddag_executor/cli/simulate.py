@@ -182,7 +182,8 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
         completed = miss['completed_ns']
         what = 'never completed' if completed is None else (
             f'completed {format_ns(completed - miss["deadline_ns"])} late')
+        deadline = format_ns(miss['deadline_ns'], 9)
         yield (f'first miss: {printable(miss["vertex"])} of job {miss["job"]} of '
-               f'{printable(miss["dag"])}, deadline at {format_ns(miss["deadline_ns"], 9)}, {what}')
+               f'{printable(miss["dag"])}, deadline at {deadline}, {what}')
     if result['trace'] is not None:
         yield f'trace: {printable(result["trace"])}'

@@ -82,6 +82,7 @@ class Dispatcher:
         self._work: dict[int, Work] = {}
         self._next_job = [0] * (self.tables.n_dags + 1)
         self._last = 0
+        self._finished = False
 
     # --- time ------------------------------------------------------------------------------------
 
@@ -268,6 +269,9 @@ class Dispatcher:
         """Carry out what the core has decided since the last call."""
         if not self.scheduler.state.decisions:
             return
+        if self._finished:  # it was judged already, and the trace is closed
+            self.scheduler.decisions()
+            return
         for x in self.verdicts.add(self.scheduler.decisions(), now):
             work = self._work.pop(x, None)
             if work is not None:  # the core dropped it: what is left of an aborted job
@@ -296,5 +300,6 @@ class Dispatcher:
             self.decided(now)
             self.scheduler.finish(now)
             self.decided(now)
+            self._finished = True
         self.verdicts.tell()
         return now

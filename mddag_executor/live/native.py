@@ -153,6 +153,10 @@ class NodeStandIn:
             return True
         if trial.failed():
             self._try([s for s in trial.stand_ins if not self._took_back(s)])
+            # What was to be removed in this update stays until the next one.
+            self._withdrawn = [
+                (self._updates + 1 if update == self._updates else update, stand_in)
+                for update, stand_in in self._withdrawn]
             self._show()
             self._wake()
             return True

@@ -22,8 +22,9 @@ import time
 from typing import Any
 
 from mddag_executor.live.entries import Entry, SERVICE, SUBSCRIPTION, TIMER
-from mddag_executor.trace import TraceWriter
+from mddag_executor.trace import TraceError, TraceWriter
 from msg_graph import TaskSet
+from rclpy.logging import get_logger
 from rclpy.utilities import get_rmw_implementation_identifier
 
 
@@ -111,6 +112,13 @@ class Recorder:
         self._say('rmw_take', id(entry.entity), id(message), source_timestamp, True)
 
     def close(self, end: int) -> None:
-        """Record the run's end (trace's clock) and complete the file."""
+        """
+        Record the run's end (trace's clock) and complete the file.
+
+        Where it could not be written, the run has gone on without it; this says so in the log.
+        """
         self.record('shutdown', end, threading.get_native_id(), end)
-        self.writer.close()
+        try:
+            self.writer.close()
+        except TraceError as error:
+            get_logger('mddag_executor').error(f'the trace is incomplete: {error}')

@@ -61,5 +61,6 @@ def statistics(
             'doubtful': dispatcher.attribution.doubtful},
         'never_ran': [c.key for c in registry.unbound()],
         'trace': None if recorder is None else {
-            'path': recorder.path, 'lost': recorder.writer.dropped},
+            'path': recorder.path, 'lost': recorder.writer.dropped,
+            'error': None if recorder.writer.error is None else str(recorder.writer.error)},
     }

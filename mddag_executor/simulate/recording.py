@@ -29,7 +29,7 @@ order; this module merges them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 import os
 from typing import Any
 
@@ -48,7 +48,7 @@ from mddag_executor.core.state import (
 from mddag_executor.simulate.engine import END, Load, LogEntry, START
 from mddag_executor.simulate.run import Run
 from mddag_executor.trace import TraceFile
-from msg_graph import TaskSet, Vertex
+from msg_graph import TaskSet
 
 PROCESS = 1
 _MOST = 2 ** 31 - 1

@@ -224,21 +224,21 @@ def _grow(vector, words):  # type: ignore[no-untyped-def]
     _set_word(vector, 2, capacity)
 
 
-@overload(operator.getitem)
+@overload(operator.getitem, strict=False)
 def _overload_getitem(vector: Any, index: Any) -> Any:
     if isinstance(vector, VectorType) and isinstance(index, types.Integer):
         return lambda vector, index: _load(vector, index)
     return None
 
 
-@overload(operator.setitem)
+@overload(operator.setitem, strict=False)
 def _overload_setitem(vector: Any, index: Any, value: Any) -> Any:
     if isinstance(vector, VectorType) and not vector.nested and isinstance(index, types.Integer):
         return lambda vector, index, value: _store(vector, index, value)
     return None
 
 
-@overload(operator.delitem)
+@overload(operator.delitem, strict=False)
 def _overload_delitem(vector: Any, index: Any) -> Any:
     """Cut the end off: ``del vector[start:]``."""
     if isinstance(vector, VectorType) and isinstance(index, types.SliceType):
@@ -246,21 +246,21 @@ def _overload_delitem(vector: Any, index: Any) -> Any:
     return None
 
 
-@overload(len)
+@overload(len, strict=False)
 def _overload_len(vector: Any) -> Any:
     if isinstance(vector, VectorType):
         return lambda vector: _get_word(vector, 1)
     return None
 
 
-@overload(bool)
+@overload(bool, strict=False)
 def _overload_bool(vector: Any) -> Any:
     if isinstance(vector, VectorType):
         return lambda vector: _get_word(vector, 1) != 0
     return None
 
 
-@overload_method(VectorType, 'append')
+@overload_method(VectorType, 'append', strict=False)
 def _overload_append(vector: Any, value: Any) -> Any:
     words = vector.words
 
@@ -274,7 +274,7 @@ def _overload_append(vector: Any, value: Any) -> Any:
     return append
 
 
-@overload_method(VectorType, 'clear')
+@overload_method(VectorType, 'clear', strict=False)
 def _overload_clear(vector: Any) -> Any:
     return lambda vector: _set_word(vector, 1, 0)
 
@@ -352,3 +352,19 @@ def heapify(heap):  # type: ignore[no-untyped-def]
     """Do what ``heapq.heapify`` does."""
     for place in range(len(heap) // 2 - 1, -1, -1):
         _sink(heap, place)
+
+
+# --- what the compiled core needs besides ---------------------------------------------------------
+
+@njit
+def add_group(s):  # type: ignore[no-untyped-def]
+    """Do what ``core.state.add_group`` does."""
+    s.group_owner.append(-1)
+    append_empty(s.group_heap)
+    return len(s.group_owner) - 1
+
+
+@njit
+def set_address(vector, address):  # type: ignore[no-untyped-def]
+    """Let a vector that is lent its data stand for other data of the same length."""
+    _set_word(vector, 0, address)

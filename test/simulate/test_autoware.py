@@ -88,12 +88,11 @@ class Auditor:
 
     def audit(self, run: Run, first: list[int]) -> None:
         instants: dict[int, list[tuple[int, int, Id]]] = {}
-        for now, kind, worker, dag, vertex, job in run.log:
-            each = (dag, vertex - first[dag], job)
-            instants.setdefault(now, []).append((kind, worker, each))
+        for now, kind, worker, d, v, job in run.log:
+            instants.setdefault(now, []).append((kind, worker, (d, v - first[d], job)))
         releases = {k * dag.period_ns for dag in self.dags
                     for k in range(DURATION_NS // dag.period_ns + 1)}
-        for now in sorted(releases | set(instants)):
+        for now in sorted({*releases, *instants}):
             log = instants.get(now, [])
             ends = [entry for entry in log if entry[0] == END]
             assert log[:len(ends)] == ends, 'completions come first'

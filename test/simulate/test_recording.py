@@ -40,8 +40,8 @@ from msg_graph import load
 import pytest
 
 from ..core.task_sets import Case, cases, declaration, examples
-from .test_autoware import AUTOWARE
 
+AUTOWARE = Path(__file__).resolve().parents[2] / 'config' / 'autoware.yaml'
 US = 1_000
 
 

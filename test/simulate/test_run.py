@@ -179,6 +179,14 @@ def changed(change: Callable[[dict[str, Any]], Any]) -> str:
     return json.dumps(data)
 
 
+NO_TIMES: tuple[Any, ...] = (
+    0, -1, -0.5, 86_400_000_000, '3', True, [1], {}, float('nan'), float('inf'), 10 ** 400)
+
+
+def with_time(value: Any) -> str:
+    return changed(lambda data: data['a'].update({'/n:s': value}))
+
+
 @pytest.mark.parametrize(('text', 'says'), [
     ('', 'times.json:1: not JSON'),
     ('{"a": {\n"x" 1}}', 'times.json:2: not JSON'),
@@ -192,9 +200,7 @@ def changed(change: Callable[[dict[str, Any]], Any]) -> str:
     (changed(lambda d: d['a'].pop('/n:x@a')), 'no execution time for /n:x of DAG a: add it'),
     (changed(lambda d: d.update(c={})), "DAG 'c' is not in random.yaml: its DAGs are a, b"),
     (changed(lambda d: d['a'].update({'/n:t': 1})), "'/n:t' is not a vertex of DAG a"),
-    *((changed(lambda d, v=value: d['a'].update({'/n:s': v})), 'execution time of /n:s of DAG a')
-      for value in (0, -1, -0.5, 86_400_000_000, '3', True, [1], {}, float('nan'),
-                    float('inf'), 10 ** 400)),
+    *((with_time(value), 'execution time of /n:s of DAG a') for value in NO_TIMES),
 ])
 def test_a_wrong_file_of_times_is_one_line(text: str, says: str) -> None:
     with pytest.raises(SimulationError, match=says) as error:

@@ -1,0 +1,302 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The core compiled to machine code: the same source, with structures of vectors for named tuples.
+
+Theory of operation
+-------------------
+The functions of ``core.state``, ``core.jobs``, ``core.rules``, ``core.policies`` and ``engine``
+are taken as they are and bound to a namespace of their own, in which each other's names stand for
+the compiled functions, and ``heapq``'s for those of ``vectors``.  There is no second copy of a
+rule.  Only ``add_group`` is replaced, as an empty list has no type.  The policy is a field that
+is added to the tables, and the key function one that looks at it, so that all policies need one
+compilation.
+
+What numba makes of an entry point (with everything that it calls inside) is kept on disk, in
+``$XDG_CACHE_HOME/mddag_executor`` (``~/.cache``), under a hash of all sources and versions that it
+was made from; numba itself adds the processor.  Where that folder can not be written, each process
+compiles anew.  Nothing is compiled, and numba is not imported, before the first use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import ctypes
+from functools import cache
+import hashlib
+from importlib.util import find_spec
+import os
+from pathlib import Path
+import platform
+import tempfile
+from types import FunctionType, ModuleType
+from typing import Any, NamedTuple
+
+from mddag_executor.core import jobs, policies, rules, state, tables
+from mddag_executor.core.policies import POLICIES
+from mddag_executor.core.state import Decision, State
+from mddag_executor.core.tables import Tables
+from mddag_executor.simulate import engine, kernel
+from mddag_executor.simulate.draws import Times
+from mddag_executor.simulate.engine import Load, LogEntry
+from mddag_executor.simulate.run import periodic_load, Settings
+from msg_graph import TaskSet
+import numpy as np
+import numpy.typing as npt
+
+_MODULES = (tables, state, jobs, policies, rules, engine)
+_NOT_COMPILED = frozenset({
+    'new_state', 'add_group', 'rad_offsets', 'policy'})  # they build the plain lists
+_ENTRIES = ('accept_runs', 'run_once', 'free_run')
+_WORD = 8
+_FIELD = 3 * _WORD
+
+
+def available() -> bool:
+    """Tell whether numba is there and allowed to compile."""
+    return find_spec('numba') is not None and os.environ.get('NUMBA_DISABLE_JIT', '0') == '0'
+
+
+def cached() -> bool:
+    """Tell whether what ``evaluate`` needs has been compiled before (for any processor)."""
+    folder = _folder()
+    return folder is not None and any(folder.glob('**/*accept_runs*.nbc'))
+
+
+@cache
+def _fingerprint() -> str:
+    """Return a hash of all that the compiled code depends on."""
+    import llvmlite
+    import numba
+    digest = hashlib.sha256()
+    for version in (numba.__version__, llvmlite.__version__, np.__version__,
+                    platform.python_version(), platform.machine()):
+        digest.update(version.encode() + b'\0')
+    names = {module.__name__ for module in _MODULES} | {__name__, kernel.__name__}
+    names |= {row.key.__module__ for row in POLICIES.values()}
+    files = {__file__, str(Path(__file__).with_name('vectors.py'))}
+    for name in sorted(names):
+        spec = find_spec(name)
+        if spec is not None and spec.origin is not None:
+            files.add(spec.origin)
+    for file in sorted(files, key=os.path.basename):
+        digest.update(Path(file).read_bytes() + b'\0')
+    digest.update(','.join(POLICIES).encode())
+    return digest.hexdigest()[:24]
+
+
+def _folder() -> Path | None:
+    """Return the folder for the compiled code, whether it is there or not; None without a home."""
+    base = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
+    if not os.path.isabs(base):
+        return None
+    return Path(base, 'mddag_executor', _fingerprint())
+
+
+def _stamp() -> Path | None:
+    """
+    Return a file beside which numba may keep what it compiles; None where there can be none.
+
+    numba keeps the code with the source file of a function, and compiles anew when that file is
+    changed.  This file is never changed: its folder's name tells the sources.
+    """
+    folder = _folder()
+    if folder is None:
+        return None
+    file = folder / 'kernel.py'
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not file.exists():
+            with tempfile.NamedTemporaryFile('w', dir=folder, delete=False) as part:
+                part.write('# Compiled code of mddag_executor; this folder can be deleted.\n')
+            os.replace(part.name, file)
+    except OSError:
+        return None
+    return file
+
+
+@cache
+def _entries() -> dict[str, Callable[..., Any]]:
+    """Return the compiled entry points, which compile, or load what was compiled, when called."""
+    from mddag_executor.simulate import vectors
+    from numba import njit, types
+    space: dict[str, Any] = {}
+    for module in _MODULES:
+        space.update((k, v) for k, v in vars(module).items() if not k.startswith('__'))
+    space.update(
+        heappush=vectors.heappush, heappop=vectors.heappop, heapify=vectors.heapify,
+        add_group=vectors.add_group, free=vectors.free, set_address=vectors.set_address,
+        STATE_FIELDS=len(State._fields))
+    integers = vectors.VectorType()
+    kinds = {
+        'int': types.int64, 'list[int]': integers, 'list[Entry]': vectors.VectorType(5),
+        'list[list[Entry]]': vectors.VectorType(5, nested=True),
+        'list[Decision]': vectors.VectorType(6)}
+    for name, row in (('as_tables', Tables), ('as_state', State), ('as_load', Load)):
+        fields = {
+            field: kinds[getattr(kind, '__forward_arg__', kind)]
+            for field, kind in row.__annotations__.items()}
+        if row is Tables:
+            fields['policy'] = types.int64
+        space[name] = vectors.at(vectors.StructureType(row.__name__, fields))
+    space['as_vector'] = vectors.at(integers)
+    space['as_log'] = vectors.at(vectors.VectorType(6))
+    for module in (*_MODULES, kernel):
+        inner = ModuleType(module.__name__)  # for names such as `rules.complete`
+        for name, function in _functions(module):
+            space[name] = njit(error_model='numpy')(_bound(function, space))
+            setattr(inner, name, space[name])
+        if module in (jobs, rules):
+            space[module.__name__.rsplit('.', 1)[1]] = inner
+    space['key_of_policy'] = _key_of_policy(space)
+    stamp = _stamp()
+    return {
+        name: njit(error_model='numpy', nogil=True, cache=stamp is not None)(
+            _bound(getattr(kernel, name), space, None if stamp is None else str(stamp)))
+        for name in _ENTRIES}
+
+
+def _functions(module: ModuleType) -> list[tuple[str, FunctionType]]:
+    """Return the functions that a module itself defines and that are to be compiled."""
+    return [
+        (name, value) for name, value in vars(module).items()
+        if isinstance(value, FunctionType) and value.__module__ == module.__name__
+        and name not in _NOT_COMPILED]
+
+
+def _bound(function: Any, space: dict[str, Any], file: str | None = None) -> FunctionType:
+    """Return a function with the same code whose globals are those of a namespace."""
+    code = function.__code__ if file is None else function.__code__.replace(co_filename=file)
+    return FunctionType(code, space, function.__name__, function.__defaults__)
+
+
+def _key_of_policy(space: dict[str, Any]) -> Any:
+    """
+    Make the key function that asks the tables for the policy.
+
+    It is no compiled function but one that numba is told how to compile, because only these can be
+    handed from function to function in code that is kept on disk.
+    """
+    from numba.extending import overload
+    arguments = 't, v, release, job, readiness, order'
+    lines = [f'def key_of_policy({arguments}):']
+    for number, row in enumerate(POLICIES.values()):
+        lines += [f'    if t.policy == {number}:',
+                  f'        return {row.key.__name__}({arguments})']
+    lines.append(f'    return {row.key.__name__}({arguments})')
+    exec('\n'.join(lines), space)
+    implementation = space['key_of_policy']
+
+    def key_of_policy(
+        t: Any, v: int, release: int, job: int, readiness: int, order: int
+    ) -> None:
+        """Stand for the implementation."""
+
+    overload(key_of_policy, strict=False)(lambda t, v, release, job, readiness, order:
+                                          implementation)
+    return key_of_policy
+
+
+# --- handing over ---------------------------------------------------------------------------------
+
+class _Lent:
+    """A named tuple of integers and lists, as a structure in numpy's memory."""
+
+    def __init__(self, row: NamedTuple, *more: int) -> None:
+        self._columns: list[npt.NDArray[np.int64]] = []  # keeps the memory
+        words = []
+        for value in (*row, *more):
+            if isinstance(value, int):
+                words += [value, 0, 0]
+                continue
+            column = np.array(value, dtype=np.int64)
+            self._columns.append(column)
+            words += [column.ctypes.data, len(column), len(column)]
+        self._words = np.array(words, dtype=np.int64)
+        self.address = self._words.ctypes.data
+
+
+class _Empty:
+    """Memory for a structure or a vector that is all empty."""
+
+    def __init__(self, fields: int = 1) -> None:
+        self._words = np.zeros(3 * fields, dtype=np.int64)
+        self.address = self._words.ctypes.data
+
+    def rows(self, field: int, width: int) -> list[tuple[int, ...]]:
+        """Return a copy of a field, which is a vector of tuples."""
+        address, length = self._words[3 * field:3 * field + 2].tolist()
+        if length == 0:
+            return []
+        data = (ctypes.c_int64 * (length * width)).from_address(address)
+        rows = np.ctypeslib.as_array(data).reshape(length, width).tolist()
+        return [tuple(row) for row in rows]
+
+
+class CompiledJudge:
+    """Simulates runs in compiled code (see ``evaluate.Judge``); safe for several threads."""
+
+    def __init__(self, task_set: TaskSet) -> None:
+        self._task_set = task_set
+        self._tables = Tables.build(task_set)
+        self._lent: dict[str, _Lent] = {}
+
+    def warm_up(self) -> None:
+        """Compile, or load what was compiled before."""
+        times = np.ones((0, self._tables.n_vertices), dtype=np.int64)
+        self(Settings(duration_ns=1, preemptive=False, judge='completions'), times)
+
+    def __call__(self, settings: Settings, times: Times) -> npt.NDArray[np.bool_]:
+        """Tell which of the runs met every deadline."""
+        tables, dags = self._tables, self._task_set.dags
+        policy = _Lent(tables, list(POLICIES).index(settings.policy))
+        load = periodic_load(
+            self._task_set, [[0] * len(dag.vertices) for dag in dags], settings.duration_ns)
+        lent_load = _Lent(load._replace(
+            cost_base=[tables.first_vertex[dag.index] for dag in dags]))
+        working = _Empty(len(State._fields))
+        times = np.ascontiguousarray(times, dtype=np.int64)
+        accepted = np.zeros(len(times), dtype=np.bool_)
+        _entries()['accept_runs'](
+            policy.address, lent_load.address, working.address, times.ctypes.data,
+            times.shape[1] * _WORD, settings.workers, int(bool(settings.preemptive)),
+            settings.dispatch_overhead_ns, settings.switch_overhead_ns, settings.duration_ns,
+            settings.judge == 'horizon', accepted)
+        return accepted
+
+
+def run_compiled(
+    built: Tables, load: Load, settings: Settings
+) -> tuple[int, list[LogEntry], list[Decision]]:
+    """
+    Run the compiled core over a load, as ``engine.run`` does with the plain one.
+
+    :return: when the run ended (ns), the log of every worker, and the core's decisions.
+    """
+    lent = _Lent(built, list(POLICIES).index(settings.policy))
+    lent_load = _Lent(load)
+    working = _Empty(len(State._fields))
+    log = _Empty()
+    entries = _entries()
+    ended = entries['run_once'](
+        lent.address, lent_load.address, working.address, settings.workers,
+        int(bool(settings.preemptive)), settings.dispatch_overhead_ns,
+        settings.switch_overhead_ns, settings.duration_ns, settings.stop_at_first_miss,
+        settings.judge == 'horizon', log.address)
+    try:
+        place = State._fields.index('decisions')
+        return int(ended), log.rows(0, 6), working.rows(place, 6)  # type: ignore[return-value]
+    finally:
+        entries['free_run'](working.address, log.address)

@@ -1,0 +1,108 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Entry points of the compiled core: whole runs, over memory that ``compiled`` lends them.
+
+They are compiled and never called as they stand here: the names of the core that they use are
+bound to its compiled functions, and those imported for type checkers only, to functions of
+``vectors`` (see ``compiled``).  Structures are handed over as addresses.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
+from mddag_executor.core.jobs import finish
+from mddag_executor.core.state import fill_state
+from mddag_executor.simulate.engine import any_missed, run
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    as_load: Callable[[int], Any]
+    as_log: Callable[[int], Any]
+    as_nested: Callable[[int], Any]
+    as_state: Callable[[int], Any]
+    as_tables: Callable[[int], Any]
+    as_vector: Callable[[int], Any]
+    free: Callable[[Any], None]
+    set_address: Callable[[Any, int], None]
+    key_of_policy: Any
+    STATE_FIELDS: int
+
+
+def clear_state(state: int) -> None:
+    """Empty all columns of a state and keep their memory, but for that of the groups' heaps."""
+    heaps = as_state(state).group_heap
+    for group in range(len(heaps)):
+        free(heaps[group])
+    for field in range(STATE_FIELDS):
+        as_vector(state + 24 * field).clear()
+
+
+def free_state(state: int) -> None:
+    """Free the memory of a state."""
+    clear_state(state)
+    for field in range(STATE_FIELDS):
+        free(as_vector(state + 24 * field))
+
+
+def accept_runs(
+    tables: int, load: int, state: int, costs: int, row: int, n_workers: int, preemptive: int,
+    dispatch_overhead: int, switch_overhead: int, horizon: int, judge_open: bool, accepted: Any,
+) -> None:
+    """
+    Simulate runs up to the first miss; tell which of them had none.
+
+    :param costs: address of the first run's execution times, from where run after run stands.
+    :param row: bytes from one run's to the next.
+    :param accepted: array of bool, one for each run.
+    """
+    t = as_tables(tables)
+    s = as_state(state)
+    arrivals = as_load(load)
+    for i in range(len(accepted)):
+        set_address(arrivals.costs, costs + i * row)
+        fill_state(t, s, n_workers, preemptive, 1, dispatch_overhead, switch_overhead)
+        ended = run(t, s, key_of_policy, arrivals, horizon, True, None, None)
+        if judge_open:
+            finish(t, s, ended)
+        accepted[i] = not any_missed(s, 0)
+        clear_state(state)
+    free_state(state)
+
+
+def run_once(
+    tables: int, load: int, state: int, n_workers: int, preemptive: int, dispatch_overhead: int,
+    switch_overhead: int, horizon: int, stop_at_first_miss: bool, judge_open: bool, log: int,
+) -> int:
+    """
+    Simulate one run and return when it ended; log and state are the caller's to free.
+
+    As in ``simulate``, what is open is judged unless the run stopped before its horizon.
+    """
+    t = as_tables(tables)
+    s = as_state(state)
+    fill_state(t, s, n_workers, preemptive, 1, dispatch_overhead, switch_overhead)
+    ended = run(
+        t, s, key_of_policy, as_load(load), horizon, stop_at_first_miss, as_log(log), None)
+    if judge_open and not (stop_at_first_miss and ended < horizon):
+        finish(t, s, ended)
+    return ended
+
+
+def free_run(state: int, log: int) -> None:
+    """Free what ``run_once`` left."""
+    free_state(state)
+    free(as_log(log))
