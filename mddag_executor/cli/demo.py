@@ -36,7 +36,7 @@ import time
 from typing import Any
 
 from mddag_executor.cli import common
-from mddag_executor.cli.run import measured_lines
+from mddag_executor.cli.run import summary
 from mddag_executor.cli.text import Cell, format_ns, printable, Progress, table
 from mddag_executor.errors import MddagError
 from mddag_executor.report.tables import (
@@ -92,14 +92,12 @@ def main(args: argparse.Namespace) -> int:
         say(line)
     live = run_live(args, graph, output)
     say(sink_table(live['dags']))
-    for line in measured_lines(live['measured']):
+    for line in summary(live):
         say(line)
-    say(f'{sum(live["dropped"].values())} dropped, {live["undeclared"]} undeclared')
     recorded, rescheduled = run_replays(graph, output)
     say('\n== The recording, replayed ==')
     say(replay_table(live, recorded, rescheduled))
     say(agreement(live, recorded))
-    say(f'trace: {printable(str((output / "demo.mcap").absolute()))}')
     say(f"\n== The same nodes on rclpy's MultiThreadedExecutor({WORKERS}), "
         f'{args.baseline_seconds:g} s ==')
     baseline = run_baseline(args, graph)

@@ -343,6 +343,6 @@ def _complete_vertex(
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
         elif now > deadline and t.on_miss[dag] == ABORT:
             abort_job(t, s, slot, now)
-    if s.scalars[PROPAGATE] != 0 and s.job_state[slot] == OPEN:
+    if s.scalars[PROPAGATE] != 0:  # a sink, which may have ended the job, has no successors
         for i in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
             edge(t, s, key, slot, t.successors[i], now)

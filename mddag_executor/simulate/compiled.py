@@ -132,7 +132,7 @@ def _entries() -> dict[str, Callable[..., Any]]:
     """Return the compiled entry points, which compile, or load what was compiled, when called."""
     from mddag_executor.simulate import vectors
     from numba import njit, types
-    space: dict[str, Any] = {}
+    space: dict[str, Any] = {'__name__': kernel.__name__}  # a loaded code's module must be there
     for module in _MODULES:
         space.update((k, v) for k, v in vars(module).items() if not k.startswith('__'))
     space.update(
