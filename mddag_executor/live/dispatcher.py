@@ -75,6 +75,7 @@ class Dispatcher:
         self.clock_offset = clock_offset
         self.n_workers = n_workers
         self.undeclared = 0
+        self.held = 0
         self.record = record
         self.fail = fail
         # told, under the lock, that something may be ready to be dispatched
@@ -98,6 +99,21 @@ class Dispatcher:
         return now
 
     # --- what became ready -----------------------------------------------------------------------
+
+    def hold(self) -> None:
+        """
+        Wake no idle worker until ``let_go``: more is going to become ready at this instant.
+
+        Else the first of several would start though a more urgent one follows.
+        """
+        with self.lock:
+            self.held += 1
+
+    def let_go(self) -> None:
+        """End one ``hold``."""
+        with self.lock:
+            self.held -= 1
+            self.dispatch(self.core_time(self.now()))
 
     def timer_due(self, entry: Entry, work: Work, due: int) -> None:
         """Take in a timer that became due at ``due`` (trace's clock)."""

@@ -49,6 +49,12 @@ class Receiver(Protocol):
     raises does no harm to the intake: its exception is passed on to ``on_intake_error``.
     """
 
+    def hold(self) -> None:
+        """Take note that several timers are handed over that were due at one wake-up."""
+
+    def let_go(self) -> None:
+        """Take note that all of them have been; one call for each ``hold``."""
+
     def on_timer(self, timer: Timer, due_ns: int) -> None:
         """
         Take in a timer that became due (``call_timer`` has been done).

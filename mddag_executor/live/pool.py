@@ -179,6 +179,8 @@ class Pool:
     def _dispatch(self, now: int) -> None:
         """Wake idle workers for what is ready; the caller holds the lock."""
         state = self._scheduler.state
+        if self.dispatcher.held:
+            return
         while self.running and state.ready and state.scalars[N_IDLE] > 0:
             x = self._scheduler.schedule(now)
             self.dispatcher.decided(now)

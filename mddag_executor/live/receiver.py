@@ -50,6 +50,14 @@ class Receiver:
         self._fail = fail
         self._recorder = recorder
 
+    def hold(self) -> None:
+        """Take note that several things are handed over that became ready at one instant."""
+        self._dispatcher.hold()
+
+    def let_go(self) -> None:
+        """Take note that all of them have been."""
+        self._dispatcher.let_go()
+
     def on_timer(self, timer: Any, due_ns: int) -> None:
         """Take in a timer; ``due_ns`` is its nominal due time on the monotonic clock."""
         entry = self._registry[timer]

@@ -161,13 +161,16 @@ class TimerQueue:
     """
     The timers of an intake, by due time. All methods belong to one thread at a time.
 
-    :param receiver: gets ``on_timer`` and ``on_intake_error``.
+    :param receiver: gets ``on_timer`` and ``on_intake_error``, and ``hold`` and ``let_go`` around
+        several timers at once, so that it can choose among them.
     :param wake: called, from any thread, when a clock jumped: ``fire`` is to be called soon.
     """
 
     def __init__(self, receiver: Receiver, wake: Callable[[], None]) -> None:
         self._on_timer = receiver.on_timer
         self._on_error = receiver.on_intake_error
+        self._hold = receiver.hold
+        self._let_go = receiver.let_go
         self._wake = wake
         self._slots: dict[int, _Slot] = {}
         self._heap: list[tuple[int, int, _Slot]] = []
@@ -252,6 +255,17 @@ class TimerQueue:
         """Hand over the timers that are due; return how many."""
         if self._jumped or (now >= self._scan_early and self._slots):
             self.scan()
+        heap = self._heap
+        # The root's children are the next two: with neither due, there is at most one.
+        if not any(entry[0] <= now for entry in heap[1:3]):
+            return self._fire_due(now)
+        self._hold()
+        try:
+            return self._fire_due(now)
+        finally:
+            self._let_go()
+
+    def _fire_due(self, now: int) -> int:
         count = 0
         heap = self._heap
         # An entry made meanwhile is of the next call, so this ends.

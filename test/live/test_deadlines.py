@@ -282,6 +282,37 @@ def tick_as_timer(executor: Any, timer: Any, tick: Any) -> None:
     executor._receiver.on_timer(timer, time.monotonic_ns())
 
 
+SAME_INSTANT = """
+mddag: 1
+nodes:
+  - node: /calm
+    callbacks: [{name: tick, timer: 20ms, deadline: 1s}]
+  - node: /urgent
+    callbacks: [{name: tick, timer: 20ms, deadline: 5ms}]
+"""
+
+
+def test_of_timers_due_at_one_instant_the_most_urgent_starts_first(make_executor, make_node):
+    """Timers are handed over one by one; no worker may start the first before the last is in."""
+    ran: list[str] = []
+    timers = {}
+    executor = make_executor(loads(SAME_INSTANT), num_workers=1)
+    for name in ('calm', 'urgent'):
+        node = make_node(name)
+        timers[name] = node.create_timer(
+            0.02, lambda n=name: (ran.append(n), time.sleep(0.002)), ReentrantCallbackGroup(),
+            autostart=False)
+        executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: not executor.statistics()['never_ran'])
+        for timer in timers.values():
+            timer.reset()
+        executor.wake()
+        assert wait_for(lambda: len(ran) >= 40)
+    pairs = [tuple(ran[i:i + 2]) for i in range(0, 40, 2)]
+    assert pairs.count(('urgent', 'calm')) >= 15, pairs
+
+
 def test_default_deadline_orders_undeclared_callbacks(make_executor, make_node):
     """Undeclared ones go by ready time plus default_deadline: before a later declared deadline."""
     executor = make_executor(loads(ORDER), num_workers=1, default_deadline='100ms')

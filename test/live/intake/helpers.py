@@ -49,6 +49,7 @@ class Recorder:
     """A receiver that keeps what it gets; ``react`` holds functions to call with it as well."""
 
     def __init__(self) -> None:
+        self.held = 0
         self.timers: list[tuple[Any, int]] = []
         self.messages: list[tuple[Any, Any, dict[str, Any]]] = []
         self.requests: list[tuple[Any, Any, Any]] = []
@@ -62,6 +63,12 @@ class Recorder:
         reaction = self.react.get(kind)
         if reaction is not None:
             reaction(*what)
+
+    def hold(self) -> None:
+        self.held += 1
+
+    def let_go(self) -> None:
+        self.held -= 1
 
     def on_timer(self, timer: Any, due_ns: int) -> None:
         self.timers.append((timer, due_ns))
