@@ -20,6 +20,7 @@ import re
 from setuptools import find_packages, setup
 
 NAME = 'mddag_executor'
+BATCH = ['matplotlib>=3.7', 'numba>=0.60']
 HERE = Path(__file__).resolve().parent
 
 
@@ -70,12 +71,15 @@ setup(
         'zstandard>=0.18',
     ],
     extras_require={
+        # many simulated runs at compiled speed, and their figures
+        'batch': BATCH,
         'ros': [
             'ros-jazzy-common-interfaces',
             'ros-jazzy-rclpy[fastrtps]',
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
         'test': [
+            *BATCH,
             'flake8',
             'flake8-blind-except',
             # later ones also object to modules inside a package; Ubuntu 24.04 has 2.1

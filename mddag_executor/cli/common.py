@@ -217,6 +217,12 @@ def _plain(value: Any) -> Any:
     raise TypeError(f'{type(value).__name__} has no JSON form')
 
 
+def add_graph(parser: argparse.ArgumentParser) -> None:
+    """Declare the argument `GRAPH`."""
+    parser.add_argument(
+        'graph', metavar='GRAPH', help="the declaration, a YAML file ('-': standard input)")
+
+
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Declare `--json`."""
     parser.add_argument('--json', metavar='FILE',

@@ -37,7 +37,7 @@ from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
     from mddag_executor.simulate.draws import Samples
-    from mddag_executor.simulate.evaluate import Evaluation, Experiment
+    from mddag_executor.simulate.evaluate import Evaluation
     from msg_graph import TaskSet
 
 NAME = 'evaluate'
@@ -77,7 +77,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'those that passed before the end (default: %(default)s)')
     add('--jobs', type=common.positive_int, metavar='N',
         help='runs to simulate at a time (default: the number of processors)')
-    add('--plain', action='store_true', help='do without the compiled core')
+    add('--core', choices=('auto', 'compiled', 'plain'), default='auto',
+        help="the scheduler core, compiled (by numba, the extra 'batch') or in plain Python: the "
+        'results are the same (default: the one that is sooner done)')
     add('--plot', metavar='OUT', help="draw the paper's figure (.png, .svg or .pdf)")
     add('--csv', metavar='FILE', help="write the table as CSV ('-': to standard output)")
     common.add_json(parser)
@@ -141,19 +143,26 @@ def _evaluate(
     args: argparse.Namespace, task_set: TaskSet, policies: tuple[str, ...]
 ) -> Evaluation:
     from mddag_executor.simulate.evaluate import evaluate, Experiment
-    experiment: Experiment = Experiment(
+    experiment = Experiment(
         task_set, policies, workers=args.workers or task_set.workers or 7,
         duration_ns=args.duration, seed=args.seed, samples=_samples(args.samples, task_set),
         preemptive=False if args.non_preemptive else None, overhead_ns=args.overhead,
         judge=args.judge)
-    begin = time.monotonic()
     with Progress('evaluating', args.runs) as line:
+        begin = 0.0
+
         def progress(done: int) -> None:
-            left = (time.monotonic() - begin) / done * (args.runs - done)
+            nonlocal begin
+            if done < 0:
+                line.update(0, 'the core is being compiled, once')
+                return
+            begin = begin or time.monotonic()
+            left = (time.monotonic() - begin) / max(1, done) * (args.runs - done)
             line.update(done, f'of {args.runs} runs, {_clock(left)} left')
 
-        return evaluate(experiment, args.runs, jobs=args.jobs or _processors(),
-                        progress=progress)
+        return evaluate(
+            experiment, args.runs, jobs=args.jobs or _processors(), core=args.core,
+            progress=progress)
 
 
 def _samples(path: str | None, task_set: TaskSet) -> Samples | None:

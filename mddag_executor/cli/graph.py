@@ -13,48 +13,38 @@
 # limitations under the License.
 
 """
-The verb `graph`: what a declaration means.
+The verb `graph`: what a declaration means; each of its own verbs is a module `graph_…`.
 
-`graph check` validates a declaration and shows the DAG tasks that it gives. Critical path and
-utilisation are those of the mean execution times, so that both tell of the same load; where an
-execution time is not declared they are not known (`-`, in JSON null).
+Those modules import nothing heavy before they run: `mddag graph --help` stays quick.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from typing import Any, TYPE_CHECKING
-
-from mddag_executor.cli import common
-from mddag_executor.cli.text import Cell, format_ns, table
-
-if TYPE_CHECKING:
-    from msg_graph import Dag, TaskSet
+from importlib import import_module
 
 NAME = 'graph'
 HELP = 'check, draw, derive and analyse declarations'
 EXAMPLE = """\
 mddag graph check config/autoware.yaml
-mddag graph check config/autoware.yaml --json -
+mddag graph draw config/autoware.yaml -o autoware.svg
+mddag graph check --help
 """
 
-_HEADER = ('DAG', 'period', 'vertices', 'critical path', 'utilisation', 'sink', 'deadline')
+VERBS = ('check', 'draw')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the verbs of this verb, with their arguments."""
     verbs = parser.add_subparsers(dest='graph_verb', metavar='VERB', required=True, title='verbs')
-    check = verbs.add_parser(
-        'check', help='validate a declaration and show its DAGs', allow_abbrev=False,
-        description='Validate a declaration and show the DAG tasks that it gives: period, number '
-        'of vertices, sinks with deadlines, critical path and utilisation, the last two with '
-        'the mean execution times (- where one is not declared).',
-        epilog='example: mddag graph check config/autoware.yaml --json -')
-    check.add_argument(
-        'graph', metavar='GRAPH', help="the declaration, a YAML file ('-': standard input)")
-    common.add_json(check)
-    check.set_defaults(graph_main=_check)
+    for name in VERBS:
+        module = import_module(f'mddag_executor.cli.graph_{name.replace("-", "_")}')
+        examples = ''.join(f'\n  {line}' for line in module.EXAMPLE.strip().splitlines())
+        own = verbs.add_parser(
+            name, help=module.HELP, allow_abbrev=False, description=module.DESCRIPTION,
+            epilog=f'example:{examples}', formatter_class=argparse.RawDescriptionHelpFormatter)
+        module.add_arguments(own)
+        own.set_defaults(graph_main=module.main)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -64,83 +54,3 @@ def main(args: argparse.Namespace) -> int:
     :raises msg_graph.GraphError: when the declaration is wrong
     """
     return int(args.graph_main(args))
-
-
-def _check(args: argparse.Namespace) -> int:
-    common.check_output(args.json)
-    task_set = common.load_graph(args.graph)
-    result = check_result(task_set)
-    if args.json is not None:
-        common.write_json(args.json, result)
-    if common.wants_tables(args):
-        print(table(_HEADER, _rows(result)) + '\n' + _summary(task_set, result))
-    return 0
-
-
-def check_result(task_set: TaskSet) -> dict[str, Any]:
-    """
-    Return the result of `graph check` for machines.
-
-    Times are in ns; `rad_offset_ns` is the reference absolute deadline (RAD) minus the release of
-    each vertex, in the order of `vertices`. `critical_path_ns` and `utilisation` are None where
-    an execution time is not declared.
-    """
-    from mddag_executor.core import Tables
-    tables = Tables.build(task_set)
-    dags = {}
-    for dag in task_set.dags:
-        first = tables.first_vertex[dag.index]
-        offsets = tables.rad_offset[first:first + len(dag.vertices)]
-        dags[dag.name] = _dag_result(dag, offsets)
-    shares = [dag['utilisation'] for dag in dags.values()]
-    return {
-        'dags': dags,
-        'vertices': len(task_set.vertices),
-        'callbacks': len(task_set.callbacks),
-        'workers': task_set.workers,
-        'utilisation': None if None in shares else sum(shares),
-        'queue_edges': [
-            {'reader': edge.reader, 'topic': edge.topic, 'writers': list(edge.writers)}
-            for edge in task_set.queue_edges],
-        'paths': {path.name: list(path.callbacks) for path in task_set.paths},
-    }
-
-
-def _dag_result(dag: Dag, rad_offsets: list[int]) -> dict[str, Any]:
-    from msg_graph.analysis import mean_execution_times, path_lengths, utilisation
-    means = mean_execution_times(dag)
-    return {
-        'period_ns': dag.period_ns,
-        'vertices': [vertex.name for vertex in dag.vertices],
-        'edges': [list(edge) for edge in dag.edges],
-        'sinks': {dag.vertices[i].name: dag.vertices[i].deadline_ns for i in dag.sinks},
-        'rad_offset_ns': rad_offsets,
-        'critical_path_ns': None if means is None else max(path_lengths(dag, means)),
-        'utilisation': utilisation(dag),
-    }
-
-
-def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
-    """Yield a row for each sink; what concerns the whole DAG stands at its first one."""
-    for name, dag in result['dags'].items():
-        path, share = dag['critical_path_ns'], dag['utilisation']
-        row: list[Cell] = [
-            name, format_ns(dag['period_ns']), len(dag['vertices']),
-            None if path is None else format_ns(path),
-            None if share is None else f'{share:.4f}']
-        for sink, deadline in dag['sinks'].items():
-            yield [*row, sink, format_ns(deadline)]
-            row = [''] * len(row)
-
-
-def _summary(task_set: TaskSet, result: dict[str, Any]) -> str:
-    text = (
-        f'{len(task_set.dags)} DAGs, {result["vertices"]} vertices, '
-        f'{result["callbacks"]} callbacks, {len(task_set.queue_edges)} queue edges, '
-        f'{len(task_set.paths)} paths')
-    if result['utilisation'] is not None:
-        text += f', utilisation {result["utilisation"]:.3f}'
-        if task_set.workers is not None:
-            share = result['utilisation'] / task_set.workers
-            text += f' ({share:.3f} of {task_set.workers} workers)'
-    return text

@@ -33,7 +33,7 @@ from mddag_executor.core.state import (
     SINK_MISSED,
     State,
 )
-from mddag_executor.core.tables import Tables
+from mddag_executor.core.tables import NEVER, Tables
 
 
 def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int) -> int:
@@ -105,13 +105,16 @@ def _free(s: State, slot: int) -> None:
 
 
 def expire_idle(t: Tables, s: State, dag: int, now: int) -> None:
-    """Expire the oldest jobs of a DAG that can no longer complete (rule 1)."""
-    while s.oldest[dag] >= 0:
-        slot = s.oldest[dag]
-        patience = t.dag_deadline[dag] + t.expire_after[dag]
-        if s.job_active[slot] > 0 or now - s.job_release[slot] <= patience:
-            return
-        expire_job(t, s, slot, now)
+    """Expire the jobs of a DAG that can no longer complete (rule 1), the oldest first."""
+    if t.expire_after[dag] >= NEVER:
+        return
+    patience = t.dag_deadline[dag] + t.expire_after[dag]
+    slot = s.oldest[dag]
+    while slot >= 0:  # all of them: releases that messages carry may come out of order
+        after = s.job_next[slot]
+        if s.job_active[slot] == 0 and now - s.job_release[slot] > patience:
+            expire_job(t, s, slot, now)
+        slot = after
 
 
 def expire_job(t: Tables, s: State, slot: int, now: int) -> None:
@@ -121,7 +124,6 @@ def expire_job(t: Tables, s: State, slot: int, now: int) -> None:
 
 
 def abort_job(t: Tables, s: State, slot: int, now: int) -> None:
-    """Abort an open job (rule 7): each sink that has not completed is missed and aborted."""
     """Abort an open job (rule 7): each sink that has not completed is missed and aborted."""
     _give_up_sinks(t, s, slot, SINK_ABORTED)
     close_job(s, slot, ABORTED, now)

@@ -28,6 +28,9 @@ TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
     'timer', 'subscription', 'service', 'client', 'guard', 'waitable', 'task')
 
 
+_COUNTS = ('ready', 'ran', 'dropped', 'skipped', 'unattributed', 'busy_ns')
+
+
 class Entry:
     """
     An rclpy entity as the executor sees it.
@@ -68,6 +71,22 @@ class Entry:
         self.unattributed = 0
         self.removed = False
         self.address = id(self)
+
+    def count_into(self, counts: dict[str, dict[str, Any]]) -> None:
+        """
+        Add what there is to count to the counts of this entry's callback.
+
+        What nobody uses (the many services and events of every node) is left out.
+        """
+        if self.callback is None and not self.ready + self.skipped + self.dropped:
+            return
+        name = f'{self.node}:{self.label}' if self.callback is None else self.callback.key
+        total = counts.setdefault(name, {
+            'kind': self.kind, 'declared': self.callback is not None, 'waiting': 0,
+            **dict.fromkeys(_COUNTS, 0)})
+        for key in _COUNTS:
+            total[key] += getattr(self, key)
+        total['waiting'] += len(self.waiting)
 
 
 def link(entry: Entry, task_set: TaskSet, tables: Tables, topic: str) -> None:

@@ -72,16 +72,20 @@ class Registry:
         self._binder = Binder(task_set) if task_set is not None else None
         self._groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
         self._entries: dict[int, Entry] = {}
-        # every entry there has been, those of destroyed entities included: for the counts
-        self.known: list[Entry] = []
+        # entries of destroyed entities whose last executions are not done yet, and the counts
+        # of those before
+        self._retired: list[Entry] = []
+        self._past: dict[str, dict[str, Any]] = {}
+        self._names: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
 
     def __getitem__(self, entity: Any) -> Entry | None:
         """Return the entry of an entity, None for one that is not (or no longer) known."""
         return self._entries.get(id(entity))
 
-    def unbound(self) -> list[Callback]:
-        """Return the declared callbacks that no entity has been found for."""
-        return list(self._binder.unbound()) if self._binder is not None else []
+    @property
+    def declared(self) -> tuple[Callback, ...]:
+        """Return the declared callbacks."""
+        return self._task_set.callbacks if self._task_set is not None else ()
 
     def refresh(self, nodes: Iterable[Any]) -> tuple[list[Entry], list[Entry]]:
         """
@@ -92,7 +96,7 @@ class Registry:
         present: dict[int, Entry] = {}
         added: list[Entry] = []
         for node in nodes:
-            name = node.get_fully_qualified_name()
+            name = self._name(node)
             for attribute, kind in KINDS:
                 for entity in getattr(node, attribute):
                     entry = self._entries.get(id(entity))
@@ -101,13 +105,35 @@ class Registry:
                         if entry is None:
                             continue
                         added.append(entry)
-                        self.known.append(entry)
                     present[id(entity)] = entry
         gone = [e for key, e in self._entries.items() if present.get(key) is not e]
         for entry in gone:
             self._unbind(entry)
         self._entries = present
+        self._retired.extend(gone)
+        self._fold()
         return added, gone
+
+    def _name(self, node: Any) -> str:
+        """Return a node's name, also when it has been destroyed and not removed."""
+        name: str | None = self._names.get(node)
+        if name is None:
+            name = self._names[node] = node.get_fully_qualified_name()
+        return name
+
+    def _fold(self) -> None:
+        """Keep of retired entries that are through only their counts: memory is bounded."""
+        through = [e for e in self._retired if e.ready <= e.ran + e.dropped]
+        self._retired = [e for e in self._retired if e not in through]
+        for entry in through:
+            entry.count_into(self._past)
+
+    def counts(self) -> dict[str, dict[str, Any]]:
+        """Return the counts of all entities there have been, by callback (see ``Entry``)."""
+        counts = {name: dict(past) for name, past in self._past.items()}
+        for entry in (*self._retired, *self._entries.values()):
+            entry.count_into(counts)
+        return counts
 
     def _new_entry(self, kind: str, entity: Any, node: str) -> Entry | None:
         callback, topic, depth, label = None, '', 0, kind

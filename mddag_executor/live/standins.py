@@ -180,9 +180,13 @@ class EventStandIn(StandIn):
     Stand in for a QoS event, as the waitable that the native executor takes it for.
 
     It makes a task of what ``execute`` returns; that one does nothing.
+
+    A status can be taken at any time, and it has news when it tells of a change since it was taken
+    last, or when its counts are others than then: registering a callback with the middleware can
+    use up the change. So ``drain`` comes before that.
     """
 
-    __slots__ = ('_event', '_on_waitable')
+    __slots__ = ('_event', '_on_waitable', '_counts')
 
     _futures = ()
 
@@ -192,6 +196,7 @@ class EventStandIn(StandIn):
         super().__init__('waitable', event, capture.handle, receiver)
         self.take = self._take
         self._event = event
+        self._counts: list[int] | None = None
         self._on_waitable = receiver.on_waitable
 
     def __enter__(self) -> None:
@@ -220,7 +225,12 @@ class EventStandIn(StandIn):
     def _take(self) -> int:
         with self.handle:
             data = self.handle.take_event()
-        if data is not None and _has_news(data):
+        if data is None:
+            return 0
+        counts = [getattr(data, name) for name in dir(data) if name.endswith('_count')]
+        changes = [getattr(data, name) for name in dir(data) if name.endswith('_change')]
+        known, self._counts = self._counts, counts
+        if any(changes) or (known is not None and counts != known):
             try:
                 self._on_waitable(self._event, data)
             except Exception as error:
@@ -230,16 +240,6 @@ class EventStandIn(StandIn):
     def execute(self, _: Any) -> Callable[..., None]:
         """Return what is run as a task."""
         return _ignore
-
-
-def _has_news(status: Any) -> bool:
-    """
-    Return whether a QoS event's status tells of a change since it was taken last.
-
-    A status can be taken at any time; and where the middleware has announced several changes, the
-    first take gives them all.
-    """
-    return any(getattr(status, name) for name in dir(status) if name.endswith('_change'))
 
 
 STAND_INS: dict[str, Callable[..., Any]] = {

@@ -40,17 +40,9 @@ def statistics(
         waiting = dispatcher.scheduler.queue_length
         idle = dispatcher.scheduler.idle_workers
         undeclared = dispatcher.undeclared
-    callbacks: dict[str, dict[str, Any]] = {}
-    for entry in registry.known:
-        if entry.callback is None and not entry.ready + entry.skipped + entry.dropped:
-            continue  # the many services and events of every node that nobody uses
-        name = entry.callback.key if entry.callback is not None else f'{entry.node}:{entry.label}'
-        counts = callbacks.setdefault(name, {
-            'kind': entry.kind, 'declared': entry.callback is not None, 'ready': 0, 'ran': 0,
-            'waiting': 0, 'dropped': 0, 'skipped': 0, 'unattributed': 0, 'busy_ns': 0})
-        for key in ('ready', 'ran', 'dropped', 'skipped', 'unattributed', 'busy_ns'):
-            counts[key] += getattr(entry, key)
-        counts['waiting'] += len(entry.waiting)
+    callbacks = registry.counts()
+    never_ran = [c.key for c in registry.declared
+                 if c.key not in callbacks or not callbacks[c.key]['ran']]
     return {
         'policy': dispatcher.scheduler.policy.name, 'workers': dispatcher.n_workers,
         **result, 'callbacks': callbacks, 'undeclared': undeclared,
@@ -59,7 +51,7 @@ def statistics(
         'unattributed': {
             'unknown': dispatcher.attribution.unknown,
             'doubtful': dispatcher.attribution.doubtful},
-        'never_ran': [c.key for c in registry.unbound()],
+        'never_ran': never_ran,
         'trace': None if recorder is None else {
             'path': recorder.path, 'lost': recorder.writer.dropped,
             'error': None if recorder.writer.error is None else str(recorder.writer.error)},

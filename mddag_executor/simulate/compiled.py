@@ -33,6 +33,7 @@ compiles anew.  Nothing is compiled, and numba is not imported, before the first
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 import ctypes
 from functools import cache
 import hashlib
@@ -40,7 +41,9 @@ from importlib.util import find_spec
 import os
 from pathlib import Path
 import platform
+import shutil
 import tempfile
+import time
 from types import FunctionType, ModuleType
 from typing import Any, NamedTuple
 
@@ -48,7 +51,7 @@ from mddag_executor.core import jobs, policies, rules, state, tables
 from mddag_executor.core.policies import POLICIES
 from mddag_executor.core.state import Decision, State
 from mddag_executor.core.tables import Tables
-from mddag_executor.simulate import engine, kernel
+from mddag_executor.simulate import engine
 from mddag_executor.simulate.draws import Times
 from mddag_executor.simulate.engine import Load, LogEntry
 from mddag_executor.simulate.run import periodic_load, Settings
@@ -59,9 +62,11 @@ import numpy.typing as npt
 _MODULES = (tables, state, jobs, policies, rules, engine)
 _NOT_COMPILED = frozenset({
     'new_state', 'add_group', 'rad_offsets', 'policy'})  # they build the plain lists
+_OWN = ('compiled', 'kernel', 'structures', 'vectors')
+_REPLACED = ('add_group', 'heapify', 'heappop', 'heappush')
 _ENTRIES = ('accept_runs', 'run_once', 'free_run')
+_KEEP_S = 90 * 86400
 _WORD = 8
-_FIELD = 3 * _WORD
 
 
 def available() -> bool:
@@ -84,14 +89,15 @@ def _fingerprint() -> str:
     for version in (numba.__version__, llvmlite.__version__, np.__version__,
                     platform.python_version(), platform.machine()):
         digest.update(version.encode() + b'\0')
-    names = {module.__name__ for module in _MODULES} | {__name__, kernel.__name__}
+    names = {module.__name__ for module in _MODULES}
     names |= {row.key.__module__ for row in POLICIES.values()}
-    files = {__file__, str(Path(__file__).with_name('vectors.py'))}
+    names |= {f'{__package__}.{name}' for name in _OWN}
+    files = set()
     for name in sorted(names):
         spec = find_spec(name)
         if spec is not None and spec.origin is not None:
             files.add(spec.origin)
-    for file in sorted(files, key=os.path.basename):
+    for file in sorted(files):
         digest.update(Path(file).read_bytes() + b'\0')
     digest.update(','.join(POLICIES).encode())
     return digest.hexdigest()[:24]
@@ -117,8 +123,9 @@ def _stamp() -> Path | None:
         return None
     file = folder / 'kernel.py'
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not file.exists():
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            _forget_old(folder.parent)
             with tempfile.NamedTemporaryFile('w', dir=folder, delete=False) as part:
                 part.write('# Compiled code of mddag_executor; this folder can be deleted.\n')
             os.replace(part.name, file)
@@ -127,32 +134,23 @@ def _stamp() -> Path | None:
     return file
 
 
+def _forget_old(folder: Path) -> None:
+    """Remove what was compiled from sources of long ago."""
+    for old in folder.iterdir():
+        stamp = old / 'kernel.py'
+        if stamp.is_file() and stamp.stat().st_mtime < time.time() - _KEEP_S:
+            shutil.rmtree(old, ignore_errors=True)
+
+
 @cache
 def _entries() -> dict[str, Callable[..., Any]]:
     """Return the compiled entry points, which compile, or load what was compiled, when called."""
-    from mddag_executor.simulate import vectors
-    from numba import njit, types
-    space: dict[str, Any] = {'__name__': kernel.__name__}  # a loaded code's module must be there
+    from mddag_executor.simulate import kernel, structures, vectors
+    from numba import njit
+    space = dict(vars(kernel))  # with its name: what is loaded from disk looks its module up
     for module in _MODULES:
         space.update((k, v) for k, v in vars(module).items() if not k.startswith('__'))
-    space.update(
-        heappush=vectors.heappush, heappop=vectors.heappop, heapify=vectors.heapify,
-        add_group=vectors.add_group, free=vectors.free, set_address=vectors.set_address,
-        STATE_FIELDS=len(State._fields))
-    integers = vectors.VectorType()
-    kinds = {
-        'int': types.int64, 'list[int]': integers, 'list[Entry]': vectors.VectorType(5),
-        'list[list[Entry]]': vectors.VectorType(5, nested=True),
-        'list[Decision]': vectors.VectorType(6)}
-    for name, row in (('as_tables', Tables), ('as_state', State), ('as_load', Load)):
-        fields = {
-            field: kinds[getattr(kind, '__forward_arg__', kind)]
-            for field, kind in row.__annotations__.items()}
-        if row is Tables:
-            fields['policy'] = types.int64
-        space[name] = vectors.at(vectors.StructureType(row.__name__, fields))
-    space['as_vector'] = vectors.at(integers)
-    space['as_log'] = vectors.at(vectors.VectorType(6))
+    space.update((name, getattr(vectors, name)) for name in _REPLACED)
     for module in (*_MODULES, kernel):
         inner = ModuleType(module.__name__)  # for names such as `rules.complete`
         for name, function in _functions(module):
@@ -160,7 +158,7 @@ def _entries() -> dict[str, Callable[..., Any]]:
             setattr(inner, name, space[name])
         if module in (jobs, rules):
             space[module.__name__.rsplit('.', 1)[1]] = inner
-    space['key_of_policy'] = _key_of_policy(space)
+    structures.bind_policies(space)
     stamp = _stamp()
     return {
         name: njit(error_model='numpy', nogil=True, cache=stamp is not None)(
@@ -182,34 +180,7 @@ def _bound(function: Any, space: dict[str, Any], file: str | None = None) -> Fun
     return FunctionType(code, space, function.__name__, function.__defaults__)
 
 
-def _key_of_policy(space: dict[str, Any]) -> Any:
-    """
-    Make the key function that asks the tables for the policy.
-
-    It is no compiled function but one that numba is told how to compile, because only these can be
-    handed from function to function in code that is kept on disk.
-    """
-    from numba.extending import overload
-    arguments = 't, v, release, job, readiness, order'
-    lines = [f'def key_of_policy({arguments}):']
-    for number, row in enumerate(POLICIES.values()):
-        lines += [f'    if t.policy == {number}:',
-                  f'        return {row.key.__name__}({arguments})']
-    lines.append(f'    return {row.key.__name__}({arguments})')
-    exec('\n'.join(lines), space)
-    implementation = space['key_of_policy']
-
-    def key_of_policy(
-        t: Any, v: int, release: int, job: int, readiness: int, order: int
-    ) -> None:
-        """Stand for the implementation."""
-
-    overload(key_of_policy, strict=False)(lambda t, v, release, job, readiness, order:
-                                          implementation)
-    return key_of_policy
-
-
-# --- handing over ---------------------------------------------------------------------------------
+# --- handing over --------------------------------------------------------------------------------
 
 class _Lent:
     """A named tuple of integers and lists, as a structure in numpy's memory."""
@@ -225,7 +196,17 @@ class _Lent:
             self._columns.append(column)
             words += [column.ctypes.data, len(column), len(column)]
         self._words = np.array(words, dtype=np.int64)
-        self.address = self._words.ctypes.data
+
+    @property
+    def address(self) -> int:
+        """Return where the structure is, as long as this object lives."""
+        return int(self._words.ctypes.data)
+
+    def copy(self) -> _Lent:
+        """Return a structure of its own over the same columns."""
+        copied = copy(self)
+        copied._words = self._words.copy()
+        return copied
 
 
 class _Empty:
@@ -233,7 +214,11 @@ class _Empty:
 
     def __init__(self, fields: int = 1) -> None:
         self._words = np.zeros(3 * fields, dtype=np.int64)
-        self.address = self._words.ctypes.data
+
+    @property
+    def address(self) -> int:
+        """Return where it is, as long as this object lives."""
+        return int(self._words.ctypes.data)
 
     def rows(self, field: int, width: int) -> list[tuple[int, ...]]:
         """Return a copy of a field, which is a vector of tuples."""
@@ -246,34 +231,38 @@ class _Empty:
 
 
 class CompiledJudge:
-    """Simulates runs in compiled code (see ``evaluate.Judge``); safe for several threads."""
+    """
+    Simulates runs in compiled code (see ``evaluate.Judge``); several threads may call it.
 
-    def __init__(self, task_set: TaskSet) -> None:
-        self._task_set = task_set
-        self._tables = Tables.build(task_set)
-        self._lent: dict[str, _Lent] = {}
+    :param duration_ns: of each run.
+    """
+
+    def __init__(self, task_set: TaskSet, duration_ns: int) -> None:
+        built = Tables.build(task_set)
+        load = periodic_load(
+            task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
+        self._columns = built.n_vertices
+        self._duration_ns = duration_ns
+        self._tables = [_Lent(built, number) for number in range(len(POLICIES))]
+        self._load = _Lent(load._replace(
+            cost_base=[built.first_vertex[dag.index] for dag in task_set.dags]))
 
     def warm_up(self) -> None:
         """Compile, or load what was compiled before."""
-        times = np.ones((0, self._tables.n_vertices), dtype=np.int64)
-        self(Settings(duration_ns=1, preemptive=False, judge='completions'), times)
+        none = np.ones((0, self._columns), dtype=np.int64)
+        self(Settings(preemptive=False, judge='completions'), none)
 
     def __call__(self, settings: Settings, times: Times) -> npt.NDArray[np.bool_]:
         """Tell which of the runs met every deadline."""
-        tables, dags = self._tables, self._task_set.dags
-        policy = _Lent(tables, list(POLICIES).index(settings.policy))
-        load = periodic_load(
-            self._task_set, [[0] * len(dag.vertices) for dag in dags], settings.duration_ns)
-        lent_load = _Lent(load._replace(
-            cost_base=[tables.first_vertex[dag.index] for dag in dags]))
+        load = self._load.copy()  # whose costs become each run's
         working = _Empty(len(State._fields))
         times = np.ascontiguousarray(times, dtype=np.int64)
         accepted = np.zeros(len(times), dtype=np.bool_)
         _entries()['accept_runs'](
-            policy.address, lent_load.address, working.address, times.ctypes.data,
-            times.shape[1] * _WORD, settings.workers, int(bool(settings.preemptive)),
-            settings.dispatch_overhead_ns, settings.switch_overhead_ns, settings.duration_ns,
-            settings.judge == 'horizon', accepted)
+            self._tables[list(POLICIES).index(settings.policy)].address, load.address,
+            working.address, times.ctypes.data, self._columns * _WORD, settings.workers,
+            int(bool(settings.preemptive)), settings.dispatch_overhead_ns,
+            settings.switch_overhead_ns, self._duration_ns, settings.judge == 'horizon', accepted)
         return accepted
 
 

@@ -44,7 +44,7 @@ from dataclasses import dataclass, field
 import multiprocessing
 import signal
 import time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Tables
@@ -58,8 +58,15 @@ from msg_graph import TaskSet
 import numpy as np
 
 DEFAULT_POLICIES = ('rad', 'rm', 'wc', 'fifo')
+CORES = ('auto', 'compiled', 'plain')
 CHUNK_S = 0.25
 """About how long a worker should take for a chunk: short enough for Ctrl-C and progress."""
+
+_MOST_RUNS = 10 ** 8
+
+# Roughly, to choose the core that is sooner done: plain Python's time for each vertex job, and the
+# compiled core's to be loaded and to be compiled.
+_PLAIN_S, _LOAD_S, _COMPILE_S = 6e-6, 1.0, 15.0
 
 
 @dataclass(frozen=True)
@@ -111,20 +118,37 @@ class Chunk(NamedTuple):
 
 
 Task = Callable[[int, int], Chunk]
-Judge = Callable[[Settings, Times], Bools]
-"""Simulates runs with these execution times; tells which of them met every deadline."""
+
+
+class Judge(Protocol):
+    """Simulates runs of a task set."""
+
+    def warm_up(self) -> None:
+        """Do what has to be done once."""
+
+    def __call__(self, settings: Settings, times: Times) -> Bools:
+        """Tell which of the runs with these execution times met every deadline."""
 
 
 class Evaluator:
     """Evaluates chunks of an experiment; each worker has one."""
 
-    def __init__(self, experiment: Experiment, judge: Judge | None = None) -> None:
+    def __init__(self, experiment: Experiment, compiled: bool = False) -> None:
         self._experiment = experiment
         self._settings = [experiment.settings(name) for name in experiment.policies]
         for settings in self._settings:
             check(settings)
         self._draws = Draws(experiment.task_set, experiment.seed, experiment.samples)
-        self._judge = PlainJudge(experiment.task_set) if judge is None else judge
+        self._judge: Judge
+        if compiled:
+            from mddag_executor.simulate.compiled import CompiledJudge
+            self._judge = CompiledJudge(experiment.task_set, experiment.duration_ns)
+        else:
+            self._judge = PlainJudge(experiment.task_set, experiment.duration_ns)
+
+    def prepare(self) -> None:
+        """Do what has to be done once, before the first run."""
+        self._judge.warm_up()
 
     def __call__(self, first: int, count: int) -> Chunk:
         """Evaluate ``count`` runs from number ``first`` on."""
@@ -140,25 +164,28 @@ class Evaluator:
 class PlainJudge:
     """Simulates runs in plain Python."""
 
-    def __init__(self, task_set: TaskSet) -> None:
-        self._task_set = task_set
+    def __init__(self, task_set: TaskSet, duration_ns: int) -> None:
         self._tables = Tables.build(task_set)
+        load = periodic_load(
+            task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
+        self._load = load._replace(
+            cost_base=[self._tables.first_vertex[dag.index] for dag in task_set.dags])
+
+    def warm_up(self) -> None:
+        """Do nothing."""
 
     def __call__(self, settings: Settings, times: Times) -> Bools:
         """Tell which of the runs met every deadline."""
         tables, policy = self._tables, find_policy(settings.policy)
-        bases = [tables.first_vertex[dag.index] for dag in self._task_set.dags]
-        zeros = [[0] * len(dag.vertices) for dag in self._task_set.dags]
-        load = periodic_load(self._task_set, zeros, settings.duration_ns)
         accepted = np.zeros(len(times), dtype=np.bool_)
         for row in range(len(times)):
             state = new_state(
                 tables, settings.workers, preemptive=bool(settings.preemptive),
                 dispatch_overhead=settings.dispatch_overhead_ns,
                 switch_overhead=settings.switch_overhead_ns)
-            run_load = load._replace(costs=times[row].tolist(), cost_base=bases)
+            load = self._load._replace(costs=times[row].tolist())
             ended = run(
-                tables, state, policy.key, run_load, settings.duration_ns,
+                tables, state, policy.key, load, settings.duration_ns,
                 settings.stop_at_first_miss)
             if settings.judge == 'horizon':
                 finish(tables, state, ended)
@@ -245,6 +272,7 @@ def evaluate(
     runs: int,
     *,
     jobs: int = 1,
+    core: str = 'auto',
     progress: Callable[[int], None] | None = None,
 ) -> Evaluation:
     """
@@ -252,7 +280,8 @@ def evaluate(
 
     :param runs: how many runs, each with a draw of its own.
     :param jobs: how many of them to simulate at a time.
-    :param progress: told now and then how many runs are done.
+    :param core: ``compiled``, ``plain``, or ``auto`` for the one that is sooner done.
+    :param progress: told now and then how many runs are done, -1 while the core is compiled.
     :return: the outcome; after a KeyboardInterrupt that of the runs that were done.
     :raises SimulationError: on settings that make no sense.
     :raises mddag_executor.core.PolicyError: when there is no such policy.
@@ -260,27 +289,63 @@ def evaluate(
     """
     if runs < 1:
         raise SimulationError(f'runs: {runs} is too few: give at least 1')
+    if runs > _MOST_RUNS:
+        raise SimulationError(f'runs: {runs} is too many: give at most {_MOST_RUNS}')
     if jobs < 1:
         raise SimulationError(f'jobs: {jobs} is too few: give at least 1')
-    evaluator = Evaluator(experiment)  # finds what is wrong with the experiment
-    outcome = Evaluation(experiment, runs, False, jobs)
+    compiled = _compiled(core, experiment, runs, jobs)
+    evaluator = Evaluator(experiment, compiled)  # finds what is wrong with the experiment
+    outcome = Evaluation(experiment, runs, compiled, jobs)
     begin = time.monotonic()
     pool: Executor
-    task: Task
-    if jobs == 1:
-        pool, task = ThreadPoolExecutor(1), evaluator
+    task: Task = evaluator
+    if compiled or jobs == 1:
+        pool = ThreadPoolExecutor(jobs)
     else:
-        pool, task = ProcessPoolExecutor(
-            jobs, multiprocessing.get_context('spawn'), _start_worker, (experiment,)), _work
+        task = _work
+        pool = ProcessPoolExecutor(
+            jobs, multiprocessing.get_context('spawn'), _start_worker, (experiment,))
     with pool:
         try:
+            if compiled:
+                _wait(pool.submit(evaluator.prepare), progress)
             _collect(pool, task, outcome, progress)
         except BrokenProcessPool:
             raise SimulationError(
                 'jobs: a worker process was killed: free some memory, or give fewer --jobs'
             ) from None
+        except KeyboardInterrupt:
+            outcome.interrupted = True
     outcome.elapsed_s = time.monotonic() - begin
     return outcome
+
+
+def _compiled(core: str, experiment: Experiment, runs: int, jobs: int) -> bool:
+    """Tell whether to use the compiled core."""
+    if core not in CORES:
+        raise SimulationError(
+            f"core '{core}': there is no such core: choose one of {', '.join(CORES)}")
+    if core == 'plain':
+        return False
+    from mddag_executor.simulate.compiled import available, cached
+    if core == 'compiled' and not available():
+        raise SimulationError(
+            "core: numba, which compiles it, is not there: install 'mddag_executor[batch]' "
+            'with pip, or use the plain core')
+    if core == 'compiled' or not available():
+        return core == 'compiled'
+    vertex_jobs = sum(
+        -(-experiment.duration_ns // dag.period_ns) * len(dag.vertices)
+        for dag in experiment.task_set.dags)
+    plain_s = vertex_jobs * len(experiment.policies) * runs * _PLAIN_S / jobs
+    return plain_s > _LOAD_S and (plain_s > _COMPILE_S or cached())
+
+
+def _wait(future: Future[None], progress: Callable[[int], None] | None) -> None:
+    while not wait((future,), timeout=0.2).done:
+        if progress is not None:
+            progress(-1)
+    future.result()
 
 
 _evaluator: Evaluator | None = None  # of this process, if it is a worker
@@ -314,16 +379,15 @@ def _collect(
                 chunk = future.result()
                 outcome.add(chunk)
                 # Towards the end smaller ones, so that all workers end at about the same time.
-                size = min(
-                    chunk.size_for(CHUNK_S),
-                    1 + (outcome.asked - started) // (4 * outcome.jobs))
+                left = (outcome.asked - started) // (4 * outcome.jobs)
+                size = min(chunk.size_for(CHUNK_S), max(chunk.size_for(CHUNK_S / 10), left))
             if progress is not None:
                 progress(outcome.runs)
     except KeyboardInterrupt:
-        outcome.interrupted = True
         for future in pending:
             if not future.cancel():
                 outcome.add(future.result())
+        raise
     except BaseException:
         for future in pending:
             future.cancel()

@@ -15,31 +15,28 @@
 """
 Entry points of the compiled core: whole runs, over memory that ``compiled`` lends them.
 
-They are compiled and never called as they stand here: the names of the core that they use are
-bound to its compiled functions, and those imported for type checkers only, to functions of
-``vectors`` (see ``compiled``).  Structures are handed over as addresses.
+They are compiled and never called as they stand here: the names of the core that they use are then
+bound to its compiled functions (see ``compiled``).  Structures are handed over as addresses.
 """
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import fill_state
+from mddag_executor.core.state import fill_state, State
 from mddag_executor.simulate.engine import any_missed, run
+from mddag_executor.simulate.structures import (
+    as_load,
+    as_log,
+    as_state,
+    as_tables,
+    as_vector,
+    key_of_policy,
+)
+from mddag_executor.simulate.vectors import free, set_address
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    as_load: Callable[[int], Any]
-    as_log: Callable[[int], Any]
-    as_nested: Callable[[int], Any]
-    as_state: Callable[[int], Any]
-    as_tables: Callable[[int], Any]
-    as_vector: Callable[[int], Any]
-    free: Callable[[Any], None]
-    set_address: Callable[[Any, int], None]
-    key_of_policy: Any
-    STATE_FIELDS: int
+STATE_FIELDS = len(State._fields)
 
 
 def clear_state(state: int) -> None:

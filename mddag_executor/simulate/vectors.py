@@ -52,7 +52,7 @@ _I64 = ir.IntType(64)
 _BYTES = 8
 
 
-class VectorType(types.Type):  # type: ignore[misc]
+class VectorType(types.Type):
     """
     A vector.
 
@@ -78,7 +78,7 @@ class VectorType(types.Type):  # type: ignore[misc]
         return types.UniTuple(types.int64, self.width) if self.width else types.int64
 
 
-class StructureType(types.Type):  # type: ignore[misc]
+class StructureType(types.Type):
     """A structure: fields by name, of which each is a ``VectorType`` or ``types.int64``."""
 
     def __init__(self, name: str, fields: dict[str, types.Type]) -> None:
@@ -87,7 +87,8 @@ class StructureType(types.Type):  # type: ignore[misc]
         super().__init__(name=f'mddag.Structure({name}: {fields})')
 
 
-class _AddressModel(models.PrimitiveModel):  # type: ignore[misc]
+class _AddressModel(models.PrimitiveModel):
+
     def __init__(self, manager: Any, fe_type: types.Type) -> None:
         super().__init__(manager, fe_type, _I64)
 
@@ -96,7 +97,7 @@ register_model(VectorType)(_AddressModel)
 register_model(StructureType)(_AddressModel)
 
 
-# --- in terms of LLVM -----------------------------------------------------------------------------
+# --- in terms of LLVM ----------------------------------------------------------------------------
 
 def _pointer(builder: Any, address: Any) -> Any:
     return builder.inttoptr(address, _I64.as_pointer())
@@ -113,7 +114,7 @@ def _word(builder: Any, address: Any, place: int) -> Any:
 
 
 @infer_getattr
-class _StructureAttribute(AttributeTemplate):  # type: ignore[misc]
+class _StructureAttribute(AttributeTemplate):
     key = StructureType
 
     def generic_resolve(self, structure: StructureType, name: str) -> types.Type | None:
@@ -212,10 +213,10 @@ def at(kind: types.Type) -> Callable[..., Any]:
     return function
 
 
-# --- what lists have ------------------------------------------------------------------------------
+# --- what lists have -----------------------------------------------------------------------------
 
 @njit
-def _grow(vector, words):  # type: ignore[no-untyped-def]
+def _grow(vector, words):
     capacity = max(8, 2 * _get_word(vector, 2))
     data = _realloc(_get_word(vector, 0), capacity * words * 8)
     if data == 0:
@@ -264,7 +265,7 @@ def _overload_bool(vector: Any) -> Any:
 def _overload_append(vector: Any, value: Any) -> Any:
     words = vector.words
 
-    def append(vector, value):  # type: ignore[no-untyped-def]
+    def append(vector, value):
         length = _get_word(vector, 1)
         if length == _get_word(vector, 2):
             _grow(vector, words)
@@ -280,7 +281,7 @@ def _overload_clear(vector: Any) -> Any:
 
 
 @njit
-def append_empty(vector):  # type: ignore[no-untyped-def]
+def append_empty(vector):
     """Append an empty vector to a vector of vectors."""
     length = _get_word(vector, 1)
     if length == _get_word(vector, 2):
@@ -291,17 +292,17 @@ def append_empty(vector):  # type: ignore[no-untyped-def]
 
 
 @njit
-def free(vector):  # type: ignore[no-untyped-def]
+def free(vector):
     """Free what a vector holds, which must have no vectors in it any more."""
     _free(_get_word(vector, 0))
     for place in range(3):
         _set_word(vector, place, 0)
 
 
-# --- what heapq has -------------------------------------------------------------------------------
+# --- what heapq has ------------------------------------------------------------------------------
 
 @njit
-def _rise(heap, place):  # type: ignore[no-untyped-def]
+def _rise(heap, place):
     entry = heap[place]
     while place > 0:
         parent = (place - 1) >> 1
@@ -313,7 +314,7 @@ def _rise(heap, place):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _sink(heap, place):  # type: ignore[no-untyped-def]
+def _sink(heap, place):
     entry = heap[place]
     length = len(heap)
     child = 2 * place + 1
@@ -329,14 +330,14 @@ def _sink(heap, place):  # type: ignore[no-untyped-def]
 
 
 @njit
-def heappush(heap, entry):  # type: ignore[no-untyped-def]
+def heappush(heap, entry):
     """Do what ``heapq.heappush`` does."""
     heap.append(entry)
     _rise(heap, len(heap) - 1)
 
 
 @njit
-def heappop(heap):  # type: ignore[no-untyped-def]
+def heappop(heap):
     """Do what ``heapq.heappop`` does, on a heap that is not empty."""
     last = len(heap) - 1
     top = heap[0]
@@ -348,16 +349,16 @@ def heappop(heap):  # type: ignore[no-untyped-def]
 
 
 @njit
-def heapify(heap):  # type: ignore[no-untyped-def]
+def heapify(heap):
     """Do what ``heapq.heapify`` does."""
     for place in range(len(heap) // 2 - 1, -1, -1):
         _sink(heap, place)
 
 
-# --- what the compiled core needs besides ---------------------------------------------------------
+# --- what the compiled core needs besides --------------------------------------------------------
 
 @njit
-def add_group(s):  # type: ignore[no-untyped-def]
+def add_group(s):
     """Do what ``core.state.add_group`` does."""
     s.group_owner.append(-1)
     append_empty(s.group_heap)
@@ -365,6 +366,6 @@ def add_group(s):  # type: ignore[no-untyped-def]
 
 
 @njit
-def set_address(vector, address):  # type: ignore[no-untyped-def]
+def set_address(vector, address):
     """Let a vector that is lent its data stand for other data of the same length."""
     _set_word(vector, 0, address)

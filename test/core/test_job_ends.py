@@ -95,6 +95,30 @@ def test_only_idle_jobs_expire_and_only_after_their_time() -> None:
     assert scheduler.state.n_open[0] == 1
 
 
+def test_a_stuck_job_does_not_keep_younger_ones_from_expiring() -> None:
+    scheduler = live(expire_after=10 * US)
+    stuck = scheduler.release(0, 0, 0, 0)
+    scheduler.ready(scheduler.source(stuck), 0)
+    assert scheduler.take(0, 0) == scheduler.source(stuck)
+    scheduler.suspend(scheduler.source(stuck))     # it waits for what never comes
+    lost = [start_job(scheduler, job, job) for job in (1, 2)]
+    scheduler.expire_idle(60 * US + 2)
+    assert [decision[3] for decision in scheduler.decisions() if decision[0] == JOB_END] == [1]
+    scheduler.expire_idle(60 * US + 3)
+    assert [decision[3] for decision in scheduler.decisions() if decision[0] == JOB_END] == [2]
+    states = [scheduler.state.job_state[slot] for slot in (stuck, *lost)]
+    assert states == [OPEN, FREE, FREE]
+
+
+def test_releases_may_come_out_of_order() -> None:
+    """As header stamps do; each job expires by its own release."""
+    scheduler = live(expire_after=10 * US)
+    scheduler.release(0, 0, 5 * US, 5 * US)
+    scheduler.release(0, 1, 1 * US, 6 * US)
+    scheduler.expire_idle(61 * US + 1)
+    assert [decision[3] for decision in scheduler.decisions() if decision[0] == JOB_END] == [1]
+
+
 def test_a_job_that_is_told_to_end_ends() -> None:
     scheduler = live()
     slots = [start_job(scheduler, job) for job in range(2)]
@@ -179,12 +203,17 @@ def test_the_end_of_the_run_judges_what_is_open() -> None:
     assert scheduler.state.n_open[0] == 3
 
 
-def test_a_recorded_execution_goes_past_queue_and_workers() -> None:
+def test_a_recorded_execution_goes_past_queue_workers_and_groups() -> None:
     scheduler = live(workers=1)
+    group = scheduler.new_group()
+    busy = scheduler.undeclared(0, group, 0)
+    assert scheduler.take(0, 0) == busy
     slot = scheduler.release(0, 0, 0, 0)
     source = scheduler.source(slot)
+    scheduler.state.x_group[source] = group
     scheduler.admit(source, 1)
-    assert scheduler.idle_workers == 1
+    assert scheduler.idle_workers == 0
     assert scheduler.complete(source, 2)
+    assert scheduler.state.group_owner[group] == busy
     assert scheduler.state.job_active[slot] == 0
     assert scheduler.state.x_state[source] != WAITING

@@ -263,6 +263,25 @@ def test_entities_created_and_destroyed_while_it_spins(make_executor, make_node)
     assert spinning.error is None
 
 
+def test_a_node_destroyed_while_it_spins_and_one_made_instead(make_executor, make_node):
+    executor = make_executor()
+    total = 0
+    with Spinning(executor) as spinning:
+        for _ in range(20):
+            calls: list[int] = []
+            node = make_node()
+            node.create_timer(0.001, lambda some=calls: some.append(1))
+            executor.add_node(node)
+            assert wait_for(lambda some=calls: len(some) >= 3)
+            node.destroy_node()
+            assert wait_for(lambda some=calls: stays(some))
+            total += len(calls)
+    assert spinning.error is None
+    counts = executor.statistics()['callbacks']
+    assert counts['/node:timer 1000000 ns']['ran'] == total
+    assert len(executor._registry._retired) <= 1
+
+
 def test_mutually_exclusive_group_is_kept(make_executor, make_node):
     node = make_node()
     group, running, most, ran = MutuallyExclusiveCallbackGroup(), [0], [0], []

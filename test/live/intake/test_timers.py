@@ -173,6 +173,24 @@ def test_a_cancelled_timer_does_not_fire_until_it_is_reset(
     assert seen - due < 20 * MS  # nobody told the intake, and it is in time all the same
 
 
+def test_a_timer_cancelled_for_a_moment_is_in_time_again(
+    intake: WaitSetIntake, node: Node, recorder: Recorder
+) -> None:
+    timer = node.create_timer(0.030, nothing)
+    intake.update([node])
+    intake.start()
+    for _ in range(5):
+        count = len(recorder.timers)
+        assert wait_for(lambda count=count: len(recorder.timers) > count)
+        timer.cancel()
+        time.sleep(0.035)  # it was due, and has been found to be cancelled
+        timer.reset()
+        due = time.monotonic_ns() + 30 * MS
+        count = len(recorder.timers)
+        assert wait_for(lambda count=count: len(recorder.timers) > count)
+        assert time.monotonic_ns() - due < 15 * MS
+
+
 def test_a_timer_that_is_reset_again_and_again_does_not_fire(
     intake: WaitSetIntake, node: Node, recorder: Recorder
 ) -> None:
@@ -269,6 +287,21 @@ def test_destroyed_timers_do_not_fire_and_new_ones_do(
     intake.update([node])
     assert wait_for(lambda: len(recorder.dues(new)) >= 3)
     assert len(recorder.dues(old)) == count
+
+
+def test_a_destroyed_timer_that_somebody_still_holds_does_not_fire(
+    intake: WaitSetIntake, node: Node, recorder: Recorder
+) -> None:
+    timer = node.create_timer(0.010, nothing)
+    intake.update([node])
+    intake.start()
+    assert wait_for(lambda: len(recorder.timers) >= 3)
+    with timer.handle:
+        node.destroy_timer(timer)
+        time.sleep(0.020)
+        count = len(recorder.timers)
+        time.sleep(0.100)
+        assert len(recorder.timers) == count
 
 
 def test_the_grid_survives_other_timers_coming_and_going(

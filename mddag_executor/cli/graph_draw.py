@@ -1,0 +1,118 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `graph draw`: the DAGs of a declaration as a picture."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import shutil
+import subprocess
+
+from mddag_executor.cli import common
+from mddag_executor.cli.text import one_line, Progress
+from mddag_executor.errors import InputError, UsageError
+
+HELP = 'draw the DAGs of a declaration (SVG, PNG, PDF, DOT, Mermaid)'
+EXAMPLE = """\
+mddag graph draw config/autoware.yaml -o autoware.svg
+mddag graph draw config/autoware.yaml -o autoware.mmd
+"""
+DESCRIPTION = """\
+Draw the DAGs of a declaration. Each DAG is a frame, and in it each node. Timers are ellipses,
+subscriptions rounded boxes, sync callbacks hexagons, services arrows; sinks have a double border
+and their deadline. Solid arrows are trigger edges, dotted ones queue edges. The colour is the RAD
+offset (reference absolute deadline minus release): red is most urgent.
+
+The ending of OUT says what it becomes: .svg, .png and .pdf need Graphviz (Debian, Ubuntu:
+'sudo apt install graphviz'); .dot (Graphviz's language) and .mmd (Mermaid) need nothing.
+Viewers of Mermaid limit its size: raise maxEdges and maxTextSize there for large graphs."""
+
+_BY_GRAPHVIZ = ('.svg', '.png', '.pdf')
+_ENDINGS = (*_BY_GRAPHVIZ, '.dot', '.mmd')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    common.add_graph(parser)
+    parser.add_argument(
+        '-o', '--output', metavar='OUT', required=True,
+        help=f'the picture; its name ends in {", ".join(_ENDINGS)}')
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Draw.
+
+    :raises mddag_executor.errors.UsageError: OUT has no ending that is known
+    :raises mddag_executor.errors.InputError: Graphviz is needed and not there, or it failed
+    :raises msg_graph.GraphError: when the declaration is wrong
+    """
+    ending = Path(args.output).suffix.lower()
+    if ending not in _ENDINGS:
+        raise UsageError(
+            f'{args.output}: no ending that says what to draw: use one of {", ".join(_ENDINGS)}')
+    common.check_output(args.output)
+    program = _find_dot(args.output) if ending in _BY_GRAPHVIZ else ''
+    task_set = common.load_graph(args.graph)
+    from mddag_executor.report.picture import picture
+    drawn = picture(task_set)
+    if ending == '.mmd':
+        from mddag_executor.report.mermaid import to_mermaid
+        common.write_text(args.output, to_mermaid(drawn))
+        return 0
+    from mddag_executor.report.dot import to_dot
+    text = to_dot(drawn)
+    if ending == '.dot':
+        common.write_text(args.output, text)
+    else:
+        data = _render(program, text, ending[1:], args.output)
+        with common.output_file(args.output) as file:
+            file.write(data)
+    return 0
+
+
+def _find_dot(output: str) -> str:
+    program = shutil.which('dot')
+    if program is None:
+        raise InputError(
+            output, "this needs Graphviz, and its program 'dot' is not there",
+            "install it with 'sudo apt install graphviz', or name an OUT.dot or OUT.mmd")
+    return program
+
+
+def _render(program: str, text: str, kind: str, output: str) -> bytes:
+    """Let Graphviz lay a picture out."""
+    with Progress('drawing') as progress, subprocess.Popen(
+            [program, f'-T{kind}'], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE) as process:
+        given: bytes | None = text.encode()
+        begin_s = 0.0
+        try:
+            while True:
+                try:
+                    data, errors = process.communicate(given, timeout=0.5)
+                    break
+                except subprocess.TimeoutExpired:
+                    given, begin_s = None, begin_s + 0.5
+                    progress.update(begin_s, 's')
+        except BaseException:
+            process.kill()
+            raise
+    if process.returncode != 0:
+        said = one_line(errors.decode('utf-8', 'replace')) or f'status {process.returncode}'
+        raise InputError(output, f'Graphviz failed ({said})',
+                         "write OUT.dot and try other programs on it, for instance 'sfdp'")
+    return data

@@ -1,0 +1,81 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Make one measurement in this process and print it as JSON.
+
+    python -m mddag_executor.live.bench '{"load": "topics", "executor": "multi", "topics": 20}'
+
+The process ends without destroying anything: rclpy's executors can't be stopped in an orderly way
+while callbacks wait for their pool.  With ``--tied`` it also ends when its standard input does, so
+that it can not outlive the process that started it, even when that was killed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import threading
+import traceback
+from typing import Any
+
+from mddag_executor.errors import MddagError
+from mddag_executor.live.bench.declared import run_declared
+from mddag_executor.live.bench.messages import run_messages
+from mddag_executor.live.bench.spec import DECLARED, Spec
+from msg_graph import GraphError
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+
+
+def run(spec: Spec) -> dict[str, Any]:
+    """Make a measurement; see ``run_declared`` and ``run_messages``."""
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    return run_declared(spec) if spec.load in DECLARED else run_messages(spec)
+
+
+def _end_with_stdin() -> None:
+    sys.stdin.buffer.read()
+    os._exit(1)
+
+
+def main() -> int:
+    """Run the program; return its exit status."""
+    parser = argparse.ArgumentParser(
+        prog='python -m mddag_executor.live.bench', description=(__doc__ or '').split('\n')[1])
+    parser.add_argument('spec')
+    parser.add_argument('--tied', action='store_true')
+    args = parser.parse_args()
+    if args.tied:
+        threading.Thread(target=_end_with_stdin, daemon=True).start()
+    try:
+        result = run(Spec.from_json(args.spec))
+    except (MddagError, GraphError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    except BaseException:
+        traceback.print_exc()
+        return 70
+    json.dump(result, sys.stdout)
+    print(flush=True)
+    return 0
+
+
+if __name__ == '__main__':
+    # Not even an exception may end in the interpreter's exit, which joins the executor's threads.
+    status = main()
+    sys.stderr.flush()
+    os._exit(status)

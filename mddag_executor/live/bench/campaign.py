@@ -1,0 +1,183 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Make measurements one after the other, each in a process of its own, and sum them up.
+
+With repetitions all measurements are made in turn, and then all of them again: what disturbs the
+machine for a while hits every executor alike.  Of the repetitions the median of each figure is
+taken; messages are counted over all of them, so that no loss is hidden.
+
+A process that does not end in time is killed: rclpy's EventsExecutor holds off SIGTERM.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any
+
+from mddag_executor.live.bench.spec import BenchError, DECLARED, Spec
+
+PATIENCE_S = 90.0
+"""What a process may take besides its window and warm-up: discovery and the end."""
+_KILLED = -9
+
+Tick = Callable[[float], None]
+"""Told now and then for how many seconds a measurement has been going on."""
+
+
+class CrashError(BenchError):
+    """A measurement whose executor crashed or hung."""
+
+
+def measure(spec: Spec, tick: Tick | None = None, patience_s: float = PATIENCE_S) -> dict[str, Any]:
+    """
+    Make one measurement in a new process; return its figures.
+
+    :raises CrashError: when the process crashed, or did not end and was killed.
+    :raises BenchError: when the measurement can not be made.
+    """
+    # Of this machine only: it must not find another one's nodes, nor be found by them.
+    environment = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ}
+    command = [sys.executable, '-m', 'mddag_executor.live.bench', spec.to_json(), '--tied']
+    limit = spec.seconds + spec.warm_up_s + patience_s + spec.idle * 0.05
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        # Not communicate(), which would close standard input: that ends the process.
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=out, stderr=err, env=environment)
+        try:
+            _wait(process, limit, tick)
+        finally:
+            process.kill()
+            process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
+        out.seek(0)
+        err.seek(0)
+        lines = err.read().decode(errors='replace').strip().splitlines()
+        if process.returncode == 2 and lines:
+            raise BenchError(lines[-1])
+        if process.returncode != 0:
+            raise CrashError(f'{spec.name}: {_reason(process.returncode, limit, lines)}')
+        result: dict[str, Any] = json.loads(out.read())
+        return result
+
+
+def _wait(process: subprocess.Popen[bytes], limit: float, tick: Tick | None) -> None:
+    begin = time.monotonic()
+    while (passed := time.monotonic() - begin) < limit:
+        if tick is not None:
+            tick(passed)
+        try:
+            process.wait(0.5)
+            return
+        except subprocess.TimeoutExpired:
+            continue
+
+
+def _reason(status: int, limit: float, lines: Sequence[str]) -> str:
+    if status == _KILLED:
+        return f'it did not end within {limit:.0f} s and was killed'
+    if status < 0:
+        return f'it crashed with signal {-status}'
+    return lines[-1] if lines else f'it ended with status {status}'
+
+
+def run_all(
+    specs: Sequence[Spec], repeat: int, tick: Callable[[Spec, int, float], None],
+    warn: Callable[[str], None],
+) -> list[dict[str, Any]]:
+    """
+    Make all measurements in turn, ``repeat`` times; return a result for each of them.
+
+    :param tick: told now and then which one goes on, how many were made, and for how many s.
+    :param warn: told of each that crashed; its figures are None when it never succeeded.
+    :raises BenchError: when a measurement can not be made, or when all of them crashed.
+    """
+    runs: list[list[dict[str, Any]]] = [[] for _ in specs]
+    made = 0
+    for _ in range(repeat):
+        for spec, results in zip(specs, runs):
+            def tell(passed: float, spec: Spec = spec, made: int = made) -> None:
+                tick(spec, made, passed)
+
+            try:
+                results.append(measure(spec, tell))
+            except CrashError as error:
+                warn(str(error))
+            made += 1
+    if not any(runs):
+        raise BenchError('no measurement succeeded: see the warnings')
+    return [combine(spec, results, repeat) for spec, results in zip(specs, runs)]
+
+
+_COUNTS = ('published', 'received', 'lost')
+_VERDICTS = ('sink_jobs_due', 'on_time', 'late', 'missing')
+_FIGURES = ('callbacks_per_s', 'cpu_us_per_callback', 'utilisation_taken')
+_QUANTILES = ('dispatch_latency_us', 'hot_path_us')
+
+
+def combine(spec: Spec, runs: Sequence[dict[str, Any]], repeat: int = 1) -> dict[str, Any]:
+    """
+    Return the result of a measurement from its repetitions.
+
+    :return: an object of ``bench live --json``; ``runs`` in it has the repetitions' figures.
+    """
+    result: dict[str, Any] = {
+        'load': spec.load, 'executor': spec.name, 'workers': spec.workers,
+        'seconds': spec.seconds, 'seed': spec.seed, 'repeat': repeat, 'crashed': repeat - len(runs)}
+    declared = spec.load in DECLARED
+    if declared:
+        result['graph'] = spec.graph
+        result['bodies'] = spec.bodies
+    else:
+        result.update(topics=spec.topics, rate_hz=spec.rate_hz, idle=spec.idle)
+    result['utilisation'] = _median(run.get('utilisation') for run in runs)
+    for name in _VERDICTS:
+        result[name] = _median(run.get(name) for run in runs)
+    due = result['sink_jobs_due']
+    result['on_time_ratio'] = result['on_time'] / due if due else None
+    for name in _FIGURES:
+        result[name] = _median(run.get(name) for run in runs)
+    for name in _QUANTILES:
+        result[name] = _medians([run.get(name) for run in runs])
+    for name in () if declared else _COUNTS:
+        result[name] = sum(run[name] for run in runs)
+    kept = {*_VERDICTS, *_FIGURES, *_QUANTILES, *_COUNTS, 'on_time_ratio', 'callbacks',
+            'window_ns', 'attribution', 'infeasible_sinks'}
+    result['runs'] = [{k: v for k, v in run.items() if k in kept} for run in runs]
+    return result
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    """Return the median of what is not None; an actual value where the values are whole."""
+    found = [value for value in values if value is not None]
+    if not found:
+        return None
+    whole = all(isinstance(value, int) for value in found)
+    return statistics.median_low(found) if whole else statistics.median(found)
+
+
+def _medians(values: Sequence[dict[str, Any] | None]) -> dict[str, Any] | None:
+    found = [value for value in values if value is not None]
+    if not found:
+        return None
+    return {name: _median(value[name] for value in found) for name in found[0]}

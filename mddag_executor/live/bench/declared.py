@@ -1,0 +1,111 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Measure an executor with the synthetic nodes of a declaration."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+from mddag_executor.live import current_job
+from mddag_executor.live.bench.executors import make_executor, UnfinishedSession
+from mddag_executor.live.bench.latency import quantiles_us, Starts
+from mddag_executor.live.bench.spec import BenchError, OURS, Spec
+from mddag_executor.live.bodies import no_job
+from mddag_executor.live.execution import ExecutionPlan, Mode
+from mddag_executor.live.session import run_synthetic
+from mddag_executor.live.synthetic import build_nodes, SyntheticWorkload
+from msg_graph import load, TaskSet
+from rclpy.timer import Timer
+
+HOT_PATH = 'hot_path'
+"""Name of the path in a declaration whose latency is reported."""
+
+
+def run_declared(spec: Spec) -> dict[str, Any]:
+    """
+    Run the nodes of a declaration under an executor.
+
+    :return: the figures of ``measure``, ``dispatch_latency_us`` and ``hot_path_us``.
+    :raises BenchError: when the run was over before anything was measured.
+    :raises mddag_executor.errors.MddagError: when declaration and execution times do not fit.
+    :raises msg_graph.GraphError: when the declaration is wrong.
+    """
+    if spec.graph is None:
+        raise BenchError(f'--load {spec.load}: it needs a declaration: give --graph')
+    task_set = load(spec.graph)
+    plan = ExecutionPlan(
+        task_set, spec.seed, spec.utilisation, spec.workers, cast(Mode, spec.bodies))
+    executor = make_executor(spec, task_set)
+    job_of_thread = current_job if spec.executor in OURS else no_job
+    workload = build_nodes(task_set, plan, current_job=job_of_thread)
+    starts = Starts()
+    _watch(starts, workload)
+    for node in workload.nodes:
+        executor.add_node(node)
+    session = UnfinishedSession(executor, spec)
+    with session:
+        result = run_synthetic(session, workload, spec.seconds, warm_up_s=spec.warm_up_s)
+    if session.error is not None:
+        raise session.error
+    if result is None:
+        raise BenchError('the run was ended before anything was measured: run it again')
+    begin = result['window_start_ns']
+    latencies = starts.within(begin, begin + result['window_ns'])
+    return {
+        **result, 'infeasible_sinks': len(plan.infeasible()),
+        'dispatch_latency_us': quantiles_us(latencies), 'hot_path_us': hot_path(task_set, result)}
+
+
+def _watch(starts: Starts, workload: SyntheticWorkload) -> None:
+    """Note the starts of everything, before an executor learns of it."""
+    delays: dict[Timer, list[int]] = {}
+    nodes = {node.get_fully_qualified_name(): node for node in workload.nodes}
+    timers = {name: iter(node.timers) for name, node in nodes.items()}
+    # The timers of a node were made in the order of the declaration.
+    for callback in workload.task_set.callbacks:
+        if callback.kind == 'timer':
+            timer = next(timers[callback.node])
+            delays[timer] = workload.ledger.delays[_dag_of(workload.task_set, callback.key)]
+    starts.watch(workload.nodes, delays.__getitem__)
+
+
+def _dag_of(task_set: TaskSet, key: str) -> int:
+    return next(v.dag for v in task_set.vertices if v.callback.key == key)
+
+
+def hot_path(task_set: TaskSet, result: dict[str, Any]) -> dict[str, Any] | None:
+    """
+    Return the latency of the path ``hot_path``, from its source's release to its sink's end.
+
+    :param result: what ``measure`` made of the run.
+    :return: p50, p99 and max of the jobs that were due and completed, how many were due, and how
+        many of these are missing; None when the declaration has no such path within one DAG.
+    """
+    path = next((path for path in task_set.paths if path.name == HOT_PATH), None)
+    if path is None:
+        return None
+    for dag in task_set.dags:
+        keys = {vertex.callback.key for vertex in dag.vertices}
+        ends = [dag.vertices[i] for i in dag.sinks
+                if dag.vertices[i].callback.key == path.callbacks[-1]]
+        if ends and keys.issuperset(path.callbacks):
+            sink = result['dags'][dag.name]['sinks'][ends[0].name]
+            response = sink['response_ns'] or dict.fromkeys(('median', 'p99', 'max'))
+            shown = {'p50': 'median', 'p99': 'p99', 'max': 'max'}
+            return {
+                **{name: None if response[key] is None else response[key] / 1000
+                   for name, key in shown.items()},
+                'due': sink['due'], 'missing': sink['missing']}
+    return None

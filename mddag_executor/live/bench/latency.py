@@ -1,0 +1,111 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Note when callbacks start, and how long after they could have.
+
+Theory of operation: the callback of a subscription or timer is replaced by one that reads the
+clock first.  That is the same small cost (about 1 us) under every executor.  A list takes one
+tuple for each start; appending is one indivisible step in CPython, so there is no lock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+import time
+from typing import Any
+
+from mddag_executor.core.tally import quantile
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+
+Start = tuple[int, int]
+"""When a callback started, ns since the epoch, and its dispatch latency, ns."""
+
+
+class Starts:
+    """
+    What is noted about the starts of callbacks.
+
+    ``messages`` has a ``Start`` for each message that a callback was called with.
+    """
+
+    def __init__(self) -> None:
+        self.messages: list[Start] = []
+        self._timers: list[tuple[list[int], list[int]]] = []
+
+    def empty_callback(self) -> Callable[[Any, Any], None]:
+        """Return a subscription's callback that does nothing else."""
+        append, time_ns = self.messages.append, time.time_ns
+
+        def on_message(message: Any, info: Any) -> None:
+            now = time_ns()
+            append((now, now - info['source_timestamp']))
+
+        return on_message
+
+    def watch_subscription(self, subscription: Subscription) -> None:
+        """Note the starts of a subscription whose callback takes the message only."""
+        append, time_ns, callback = self.messages.append, time.time_ns, subscription.callback
+
+        def on_message(message: Any, info: Any) -> None:
+            now = time_ns()
+            append((now, now - info['source_timestamp']))
+            callback(message)
+
+        subscription.callback = on_message
+
+    def watch_timer(self, timer: Timer, delays: list[int]) -> None:
+        """
+        Note the starts of a timer.
+
+        :param delays: where its callback itself appends by how much it started late, ns.
+        """
+        starts: list[int] = []
+        append, time_ns, callback = starts.append, time.time_ns, timer.callback
+
+        def on_timer() -> None:
+            append(time_ns())
+            callback()
+
+        timer.callback = on_timer
+        self._timers.append((starts, delays))
+
+    def watch(self, nodes: Iterable[Node], delays: Callable[[Timer], list[int]]) -> None:
+        """Note the starts of all subscriptions and timers of nodes."""
+        for node in nodes:
+            for subscription in node.subscriptions:
+                self.watch_subscription(subscription)
+            for timer in node.timers:
+                self.watch_timer(timer, delays(timer))
+
+    def within(self, begin: int, end: int) -> list[int]:
+        """Return the latencies of what started in a window, ns; its ends in ns of the epoch."""
+        found = [latency for at, latency in list(self.messages) if begin <= at <= end]
+        for starts, delays in self._timers:
+            # One of each for every call.  Calls of one timer that overlap may come in another
+            # order here than there, which can matter only at the edges of the window.
+            found += [late for at, late in zip(list(starts), delays) if begin <= at <= end]
+        return found
+
+
+def quantiles_us(values: list[int]) -> dict[str, float] | None:
+    """Return p50, p99 and max in us of values in ns; None when there are none."""
+    if not values:
+        return None
+    ordered = sorted(values)
+    return {
+        'p50': quantile(ordered, 0.5) / 1000, 'p99': quantile(ordered, 0.99) / 1000,
+        'max': ordered[-1] / 1000}

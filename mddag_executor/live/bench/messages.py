@@ -1,0 +1,114 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Measure an executor with subscriptions whose callbacks are empty.
+
+Every message is counted: what was published and has not been run when nothing comes any more is
+lost.  The publishers are in another process, so the CPU time is that of receiving only: executor,
+middleware, interpreter, and reading the clock.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any
+
+from mddag_executor.live.bench.executors import make_executor, UnfinishedSession
+from mddag_executor.live.bench.latency import quantiles_us, Starts
+from mddag_executor.live.bench.publisher import make_node, PublisherProcess
+from mddag_executor.live.bench.spec import BenchError, Spec
+from mddag_executor.live.session import MATCH_TIMEOUT_S
+from mddag_executor.live.synthetic import QOS
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+from std_msgs.msg import Header
+
+QUIET_S = 0.5
+"""When no callback has run for so long after the last publication, nothing comes any more."""
+DRAIN_S = 10.0
+
+
+def run_messages(spec: Spec) -> dict[str, Any]:
+    """
+    Run subscriptions under an executor while another process publishes.
+
+    :return: callbacks, CPU time and dispatch latency within the window; ``published``,
+        ``received`` and ``lost`` of the whole run.
+    :raises BenchError: when publishers and subscriptions do not find each other.
+    """
+    executor = make_executor(spec, None)
+    # Topics of this process only, whoever else is in this domain.
+    prefix = f'/mddag_bench_{os.getpid()}'
+    topics = [f'{prefix}/topic_{i}' for i in range(spec.topics)]
+    node = make_node('mddag_bench')
+    starts = Starts()
+    active = [_subscribe(node, topic, starts) for topic in topics]
+    for i in range(spec.idle):
+        _subscribe(node, f'{prefix}/idle_{i}', starts)
+    executor.add_node(node)
+    session = UnfinishedSession(executor, spec)
+    with session, PublisherProcess(topics, spec.rate_hz, spec.seed) as publisher:
+        publisher.wait_until_ready()
+        _wait_until_matched(session, active)
+        publisher.begin()
+        session.wait(spec.warm_up_s)
+        begin, cpu_begin = time.time_ns(), time.process_time_ns()
+        session.wait(spec.seconds)
+        end, cpu_end = time.time_ns(), time.process_time_ns()
+        published = sum(publisher.finish())
+        _drain(session, starts, published)
+        received = len(starts.messages)
+    if session.error is not None:
+        raise session.error
+    latencies = starts.within(begin, end)
+    callbacks = len(latencies)
+    return {
+        'window_ns': end - begin, 'callbacks': callbacks,
+        'callbacks_per_s': callbacks / ((end - begin) / 1e9),
+        'cpu_us_per_callback': (cpu_end - cpu_begin) / 1000 / callbacks if callbacks else None,
+        'dispatch_latency_us': quantiles_us(latencies), 'published': published,
+        'received': received, 'lost': published - received}
+
+
+def _subscribe(node: Node, topic: str, starts: Starts) -> Subscription:
+    # Reentrant groups, as the synthetic nodes have them: no executor has to wait for itself.
+    return node.create_subscription(
+        Header, topic, starts.empty_callback(), QOS, callback_group=ReentrantCallbackGroup())
+
+
+def _wait_until_matched(session: UnfinishedSession, active: list[Subscription]) -> None:
+    end = time.monotonic() + MATCH_TIMEOUT_S
+    while not all(subscription.get_publisher_count() for subscription in active):
+        if session.wait(0.01):
+            return
+        if time.monotonic() > end:
+            raise BenchError(
+                'the publishing process was not found: check ROS_DOMAIN_ID and the network')
+
+
+def _drain(session: UnfinishedSession, starts: Starts, published: int) -> None:
+    """Wait until all messages were received, or none has come for a while."""
+    last, quiet_since = -1, time.monotonic()
+    end = time.monotonic() + DRAIN_S
+    while len(starts.messages) < published and time.monotonic() < end:
+        count = len(starts.messages)
+        if count != last:
+            last, quiet_since = count, time.monotonic()
+        elif time.monotonic() - quiet_since > QUIET_S:
+            return
+        if session.wait(0.02):
+            return

@@ -1,0 +1,132 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+r"""
+A picture in DOT, Graphviz's language.
+
+Every name stands in a quoted string. In those Graphviz gives a meaning to the quotation mark and
+to the backslash (`\n`, `\N`, `\G`, …), to nothing else, and an HTML-like label only begins with
+`<` outside of quotes; control characters are written as escapes, so that no name can break a line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+import re
+
+from mddag_executor.report.picture import Arrow, Box, DagFrame, Picture
+from mddag_executor.report.text import printable
+
+_SHAPES = {
+    'timer': 'shape=ellipse, style="filled"',
+    'subscription': 'shape=box, style="filled,rounded"',
+    'sync': 'shape=hexagon, style="filled"',
+    'service': 'shape=cds, style="filled"',
+}
+_CENTRED = '\\n'
+_LEFT = '\\l'
+_WIDTH = 22
+_PIECES = re.compile(r'[^/_]*[/_]?')
+_MANY = 2_000
+"""With more boxes than this Graphviz takes short cuts, which cost some beauty and save minutes."""
+
+
+def to_dot(picture: Picture) -> str:
+    """Return the DOT text of a picture."""
+    return '\n'.join(_lines(picture)) + '\n'
+
+
+def quoted(text: str) -> str:
+    """Return a text as a quoted string of DOT that stands for just this text."""
+    return '"' + printable(text).replace('\\', '\\\\').replace('"', '\\"') + '"'
+
+
+def _label(lines: Iterable[str], end: str = _CENTRED) -> str:
+    r"""Return lines as one label; they are centred with ``\n``, and start at the left with ``\l``."""
+    return '"' + end.join(quoted(line)[1:-1] for line in lines) + (end if end == _LEFT else '') + '"'
+
+
+def _wrapped(name: str) -> list[str]:
+    """Return a long name in lines, broken at its slashes and underscores."""
+    lines = ['']
+    for piece in _PIECES.findall(name):
+        if lines[-1] and len(lines[-1]) + len(piece) > _WIDTH:
+            lines.append('')
+        lines[-1] += piece
+    return lines
+
+
+def _lines(picture: Picture) -> Iterator[str]:
+    boxes = sum(len(node.boxes) for dag in picture.dags for node in dag.nodes)
+    yield 'digraph mddag {'
+    yield '  graph [rankdir=LR, compound=true, newrank=false, ranksep=0.35, nodesep=0.1,'
+    yield f'    fontname="Helvetica", labelloc=t, labeljust=l, fontsize=20, label={quoted(picture.title)}]'
+    if boxes > _MANY:
+        yield '  graph [splines=line, nslimit=1, nslimit1=1, mclimit=0.1, searchsize=5]'
+    yield '  node [fontname="Helvetica", fontsize=12, margin="0.08,0.04", height=0.3]'
+    yield '  edge [arrowsize=0.7]'
+    yield from _legend(picture)
+    for dag in picture.dags:
+        yield from _dag(dag)
+    for arrow in picture.arrows:
+        yield _arrow(arrow)
+    yield '}'
+
+
+def _dag(dag: DagFrame) -> Iterator[str]:
+    yield f'  subgraph {quoted("cluster_" + dag.id)} {{'
+    yield (f'    label={quoted(dag.title)} labeljust=l fontsize=16 style="rounded,bold" '
+           'color="#444444"')
+    for node in dag.nodes:
+        yield f'    subgraph {quoted("cluster_" + node.id)} {{'
+        yield (f'      label={_label(_wrapped(node.title), _LEFT)} labeljust=l fontsize=10 '
+               'style="filled" color="#bbbbbb" fillcolor="#f6f6f6" penwidth=1')
+        for box in node.boxes:
+            yield f'      {_box(box)}'
+        yield '    }'
+    yield '  }'
+
+
+def _box(box: Box) -> str:
+    sink = ', peripheries=2' if box.sink else ''
+    return (f'{quoted(box.id)} [label={_label(box.lines)}, {_SHAPES[box.kind]}, '
+            f'fillcolor={quoted(box.colour)}{sink}, tooltip={quoted(box.note)}]')
+
+
+def _arrow(arrow: Arrow) -> str:
+    ends = f'  {quoted(arrow.start)} -> {quoted(arrow.end)}'
+    note = f'tooltip={quoted(arrow.note)}'
+    if not arrow.queue:
+        return f'{ends} [{note}]'
+    # A queue edge often leads back; it must not pull the boxes out of their order.
+    return (f'{ends} [style=dotted, color="#2244bb", penwidth=1.6, constraint=false, '
+            f'arrowhead=open, {note}]')
+
+
+def _legend(picture: Picture) -> Iterator[str]:
+    yield '  subgraph "cluster_legend" {'
+    yield '    label="RAD offset" labeljust=l fontsize=12 style="dashed" color="#888888"'
+    shapes = (
+        ('timer', 'timer', False), ('subscription', 'subscription', False),
+        ('sync', 'sync (joins topics)', False), ('service', 'service', False),
+        ('subscription', 'sink, with deadline', True))
+    names = [f'k{place}' for place in range(len(picture.legend) + len(shapes))]
+    for name, (colour, text) in zip(names, picture.legend):
+        yield (f'    {quoted(name)} [label={quoted(text)}, shape=box, style="filled", '
+               f'color={quoted(colour)}, fillcolor={quoted(colour)}]')
+    for name, (kind, text, sink) in zip(names[len(picture.legend):], shapes):
+        double = ', peripheries=2' if sink else ''
+        yield (f'    {quoted(name)} [label={quoted(text)}, {_SHAPES[kind]}, '
+               f'fillcolor=white{double}]')
+    yield '  }'

@@ -1,0 +1,79 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A picture in Mermaid, which many web pages and editors show as a drawing.
+
+Names stand in quoted labels. Mermaid reads those as HTML, so everything in them but plain letters,
+digits and a few harmless signs is written by its number (`#35;`), and nothing in a name can end
+the label, open a tag or start a comment. Identifiers are numbers of our own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import re
+
+from mddag_executor.report.picture import Box, Picture
+from mddag_executor.report.text import printable
+
+_BRACKETS = {
+    'timer': ('([', '])'),
+    'subscription': ('[', ']'),
+    'sync': ('{{', '}}'),
+    'service': ('[/', '/]'),
+}
+_NOT_PLAIN = re.compile(r'[^A-Za-z0-9_/:,. -]')
+
+
+def to_mermaid(picture: Picture) -> str:
+    """Return the Mermaid text of a picture."""
+    return '\n'.join(_lines(picture)) + '\n'
+
+
+def quoted(text: str) -> str:
+    """Return a text as a quoted label that stands for just this text."""
+    return '"' + _NOT_PLAIN.sub(lambda found: f'#{ord(found[0])};', printable(text)) + '"'
+
+
+def _lines(picture: Picture) -> Iterator[str]:
+    yield 'flowchart LR'
+    classes: dict[str, str] = {}
+    members: dict[str, list[str]] = {}
+    sinks = []
+    for dag in picture.dags:
+        yield f'  subgraph {dag.id}[{quoted(dag.title)}]'
+        for node in dag.nodes:
+            yield f'    subgraph {node.id}[{quoted(node.title)}]'
+            for box in node.boxes:
+                yield f'      {_box(box)}'
+                name = classes.setdefault(box.colour, f'c{len(classes)}')
+                members.setdefault(name, []).append(box.id)
+                if box.sink:
+                    sinks.append(box.id)
+            yield '    end'
+        yield '  end'
+    for arrow in picture.arrows:
+        yield f'  {arrow.start} {"-.->" if arrow.queue else "-->"} {arrow.end}'
+    for colour, name in classes.items():
+        yield f'  classDef {name} fill:{colour},stroke:#444444,color:#000000'
+        yield f'  class {",".join(members[name])} {name}'
+    yield '  classDef sink stroke-width:3px'
+    yield f'  class {",".join(sinks)} sink'
+
+
+def _box(box: Box) -> str:
+    opening, closing = _BRACKETS[box.kind]
+    label = '<br>'.join(quoted(line)[1:-1] for line in box.lines)
+    return f'{box.id}{opening}"{label}"{closing}'

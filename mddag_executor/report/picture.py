@@ -1,0 +1,196 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A task set as a picture: what is drawn, in words of boxes, frames and arrows.
+
+Theory of operation
+-------------------
+1. A DAG is a frame; in it each node that has vertices of the DAG is a frame; in that each vertex
+   is a box. Trigger edges are solid arrows.
+2. Queue edges are dotted arrows from the vertices that write to the vertices that read. Where
+   reader and writer have vertices in the same DAG, those are joined. A reader without a writer in
+   its own DAG gets one arrow from the writer's first vertex, as more would say nothing new.
+3. The colour of a box is its RAD offset (reference absolute deadline minus release): red what is
+   most urgent, blue what has most time, on a logarithmic scale over the whole task set.
+4. Names are kept as they are; each language of pictures escapes them in its own way.
+"""
+
+from __future__ import annotations
+
+from colorsys import hls_to_rgb
+from dataclasses import dataclass
+import math
+
+from mddag_executor.core import Tables
+from mddag_executor.report.text import format_ns
+from msg_graph import Dag, TaskSet, Vertex
+
+_RED, _BLUE = 0.0, 0.62
+_MOST_IN_LEGEND = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """
+    A vertex.
+
+    :ivar lines: its text: name, what starts it if that is not a topic, a sink's deadline.
+    :ivar kind: ``timer``, ``subscription``, ``sync`` or ``service``.
+    :ivar note: all about it, for a tool tip.
+    """
+
+    id: str
+    lines: tuple[str, ...]
+    kind: str
+    colour: str
+    sink: bool
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class NodeFrame:
+    """The vertices that a node has in a DAG."""
+
+    id: str
+    title: str
+    boxes: tuple[Box, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class DagFrame:
+    """A DAG; ``title`` has its name and period."""
+
+    id: str
+    title: str
+    nodes: tuple[NodeFrame, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Arrow:
+    """An edge; ``queue`` for a queue edge, else a trigger edge. ``note`` names the topic."""
+
+    start: str
+    end: str
+    queue: bool
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """All that is drawn; ``legend`` has colours and what they mean, the most urgent first."""
+
+    title: str
+    dags: tuple[DagFrame, ...]
+    arrows: tuple[Arrow, ...]
+    legend: tuple[tuple[str, str], ...]
+
+
+def picture(task_set: TaskSet) -> Picture:
+    """Return the picture of a task set."""
+    tables = Tables.build(task_set)
+    offsets = tables.rad_offset[:len(task_set.vertices)]
+    colours = _colours(offsets)
+    dags = []
+    for dag in task_set.dags:
+        first = tables.first_vertex[dag.index]
+        dags.append(_dag_frame(dag, offsets[first:first + len(dag.vertices)], colours))
+    return Picture(
+        title=task_set.file, dags=tuple(dags),
+        arrows=(*_trigger_arrows(task_set), *_queue_arrows(task_set)),
+        legend=_legend(colours))
+
+
+def _id(vertex: Vertex) -> str:
+    return f'd{vertex.dag}v{vertex.index}'
+
+
+def _dag_frame(dag: Dag, offsets: list[int], colours: dict[int, str]) -> DagFrame:
+    by_node: dict[str, list[Box]] = {}
+    for vertex, offset in zip(dag.vertices, offsets):
+        by_node.setdefault(vertex.callback.node, []).append(_box(vertex, offset, colours[offset]))
+    nodes = tuple(
+        NodeFrame(f'd{dag.index}n{place}', node, tuple(boxes))
+        for place, (node, boxes) in enumerate(by_node.items()))
+    return DagFrame(f'd{dag.index}', f'{dag.name}, every {format_ns(dag.period_ns)}', nodes)
+
+
+def _box(vertex: Vertex, offset: int, colour: str) -> Box:
+    callback = vertex.callback
+    _, several, number = vertex.name[len(callback.key):].partition('#')
+    lines = [callback.name + several + number]
+    if callback.kind == 'timer' and callback.timer_period_ns is not None:
+        lines.append(f'timer {format_ns(callback.timer_period_ns)}')
+    elif callback.kind == 'sync':
+        lines.append(f'sync of {len(callback.topics)}')
+    elif callback.kind == 'service':
+        lines.append(f'service {callback.service}')
+    if vertex.deadline_ns is not None:
+        lines.append(f'deadline {format_ns(vertex.deadline_ns)}')
+    note = [vertex.name, f'RAD offset {format_ns(offset)}']
+    if callback.execution_time is not None:
+        note.append(f'mean execution time {format_ns(callback.execution_time.mean_ns)}')
+    if callback.topics:
+        note.append('started by ' + ', '.join(callback.topics))
+    if callback.group is not None:
+        note.append(f'group {callback.group}')
+    return Box(_id(vertex), tuple(lines), callback.kind, colour,
+               vertex.deadline_ns is not None, ', '.join(note))
+
+
+def _colours(offsets: list[int]) -> dict[int, str]:
+    """Return a light colour for each RAD offset."""
+    known = sorted(set(offsets))
+    low, high = math.log(known[0]), math.log(known[-1])
+    colours = {}
+    for offset in known:
+        share = (math.log(offset) - low) / (high - low) if high > low else 0.5
+        rgb = hls_to_rgb(_RED + (_BLUE - _RED) * share, 0.80, 0.85)
+        colours[offset] = '#' + ''.join(f'{round(255 * part):02x}' for part in rgb)
+    return colours
+
+
+def _legend(colours: dict[int, str]) -> tuple[tuple[str, str], ...]:
+    known = list(colours)
+    if len(known) > _MOST_IN_LEGEND:
+        step = (len(known) - 1) / (_MOST_IN_LEGEND - 1)
+        known = [known[round(i * step)] for i in range(_MOST_IN_LEGEND)]
+    return tuple((colours[offset], format_ns(offset)) for offset in known)
+
+
+def _trigger_arrows(task_set: TaskSet) -> list[Arrow]:
+    arrows = []
+    for dag in task_set.dags:
+        for start, end in dag.edges:
+            before, after = dag.vertices[start], dag.vertices[end]
+            topics = [topic for topic in after.callback.topics
+                      if topic in before.callback.publishes]
+            arrows.append(Arrow(_id(before), _id(after), False, ', '.join(topics)))
+    return arrows
+
+
+def _queue_arrows(task_set: TaskSet) -> list[Arrow]:
+    vertices: dict[str, dict[int, list[Vertex]]] = {}
+    for vertex in task_set.vertices:
+        vertices.setdefault(vertex.callback.key, {}).setdefault(vertex.dag, []).append(vertex)
+    arrows: list[Arrow] = []
+    for edge in task_set.queue_edges:
+        note = edge.topic or 'member variable'
+        for writer in edge.writers:
+            written = vertices[writer]
+            first = next(iter(written.values()))[0]
+            for dag, readers in vertices[edge.reader].items():
+                start = written[dag][0] if dag in written else first
+                arrows.extend(Arrow(_id(start), _id(reader), True, note) for reader in readers)
+    return arrows

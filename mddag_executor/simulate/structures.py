@@ -1,0 +1,82 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The core's named tuples as structures for compiled code (see ``vectors``), and its policies.
+
+This module needs numba; nothing is compiled when it is imported.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mddag_executor.core.policies import Key, POLICIES
+from mddag_executor.core.state import State
+from mddag_executor.core.tables import Tables
+from mddag_executor.simulate.engine import Load
+from mddag_executor.simulate.vectors import at, StructureType, VectorType
+from numba import types
+from numba.extending import overload
+
+_KINDS = {
+    'int': types.int64,
+    'list[int]': VectorType(),
+    'list[Entry]': VectorType(5),
+    'list[list[Entry]]': VectorType(5, nested=True),
+    'list[Decision]': VectorType(6),
+}
+
+
+def _structure(row: Any, **more: Any) -> Any:
+    """Return the structure type that stands for a class of named tuples, with more fields."""
+    fields = {
+        name: _KINDS[str(getattr(kind, '__forward_arg__', kind))]
+        for name, kind in row.__annotations__.items()}
+    return StructureType(row.__name__, {**fields, **more})
+
+
+# What makes an address a structure or vector.
+as_tables = at(_structure(Tables, policy=types.int64))
+as_state = at(_structure(State))
+as_load = at(_structure(Load))
+as_log = at(VectorType(6))
+as_vector = at(VectorType())
+
+
+def key_of_policy(
+    t: Any, v: int, release: int, job: int, readiness: int, order: int
+) -> Key:
+    """
+    Return the key of the policy whose number the tables have in one more field, ``policy``.
+
+    This is no compiled function but one that numba is told how to compile, because only these can
+    be handed from function to function in code that is kept on disk.
+    """
+    key: Key = list(POLICIES.values())[t.policy].key(t, v, release, job, readiness, order)
+    return key
+
+
+def bind_policies(space: dict[str, Any]) -> None:
+    """Tell numba how to compile ``key_of_policy``, with the key functions in a namespace."""
+    arguments = 't, v, release, job, readiness, order'
+    *others, last = (row.key.__name__ for row in POLICIES.values())
+    lines = [f'def choose({arguments}):']
+    for number, key in enumerate(others):
+        lines += [f'    if t.policy == {number}:', f'        return {key}({arguments})']
+    lines.append(f'    return {last}({arguments})')
+    exec('\n'.join(lines), space)
+    chosen = space['choose']
+    overload(key_of_policy, strict=False)(
+        lambda t, v, release, job, readiness, order: chosen)

@@ -1,0 +1,201 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `evaluate`: table, JSON, CSV, figure, Ctrl-C, and bad input in one line."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+from mddag_executor.cli import main as program
+import numpy as np
+import pytest
+
+GRAPH = """\
+mddag: 1
+workers: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: a, timer: 10ms, dag: a, deadline: 10ms, execution_time: 2500us}
+      - name: b
+        timer: 20ms
+        dag: b
+        deadline: 20ms
+        execution_time: {quantiles_us: [10000, 10000, 14000, 14000], percent: [0, 50, 50.01, 100]}
+"""
+BATCH = pytest.importorskip('matplotlib', reason='the extra batch is not there')
+
+
+@pytest.fixture
+def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give a declaration in the working directory: runs of utilisation 0.75 and 0.95."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / 'graph.yaml'
+    path.write_text(GRAPH)
+    return path
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    status = program.main(['evaluate', *map(str, arguments)])
+    output = capsys.readouterr()
+    return status, output.out, output.err
+
+
+def test_table(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = call(
+        capsys, graph, '--runs', 40, '--policies', 'rad,fifo', '--non-preemptive')
+    assert (status, err) == (0, '')
+    lines = [line.split() for line in out.splitlines()]
+    assert lines[0] == ['utilisation', 'runs', 'rad', 'fifo', 'bound']
+    assert lines[1] == ['0.50', '0', '-', '-', '-']
+    # Run without preemption, 14 ms after one of 2.5 ms leave the next of these no time.
+    rows = {line[0]: line[2:] for line in lines[1:13]}
+    assert rows['0.75'] == ['0.0', '%', '0.0', '%', '100.0', '%'] or rows['0.75'][0] == '100.0'
+    assert rows['0.95'][:2] == ['0.0', '%']
+    assert lines[12][:2] == ['all', '40']
+    assert '40 runs in' in out and 'plain core' in out
+
+
+def test_json(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = call(
+        capsys, graph, '--runs', 20, '--seed', 4, '--json', '-', '--duration', '1s',
+        '--overhead', '10us', '--jobs', 1)
+    assert (status, err) == (0, '')
+    result = json.loads(out)
+    assert result['runs'] == 20 and result['elapsed_s'] >= 0
+    assert result['bins'] == [0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0]
+    assert list(result['acceptance']) == ['rad', 'rm', 'wc', 'fifo']
+    assert (result['seed'], result['workers'], result['overhead_ns']) == (4, 1, 10_000)
+    assert result['duration_ns'] == 10 ** 9
+    again = json.loads(call(
+        capsys, graph, '--runs', 20, '--seed', 4, '--json', '-', '--duration', '1s',
+        '--overhead', '10us', '--jobs', 2)[1])
+    assert {**again, 'elapsed_s': 0, 'jobs': 0} == {**result, 'elapsed_s': 0, 'jobs': 0}
+
+
+def test_csv(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = call(capsys, graph, '--runs', 20, '--policies', 'rad', '--csv', '-')
+    assert status == 0
+    rows = list(csv.DictReader(io.StringIO(out)))
+    assert [row['utilisation'] for row in rows][:3] == ['0.5', '0.55', '0.6']
+    assert list(rows[0]) == ['utilisation', 'runs', 'rad', 'rad_low', 'rad_high', 'bound']
+    assert rows[0]['rad'] == '' and rows[0]['runs'] == '0'
+    assert float(rows[5]['rad_low']) < float(rows[5]['rad']) == float(rows[5]['rad_high']) == 1.0
+
+
+@pytest.mark.parametrize(('ending', 'start'), [
+    ('png', b'\x89PNG'), ('svg', b'<?xml'), ('pdf', b'%PDF')])
+def test_figure(
+    graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], ending: str, start: bytes
+) -> None:
+    """It is a picture of that kind, and the same for the same runs."""
+    pictures = []
+    for name in ('one', 'two'):
+        path = tmp_path / f'{name}.{ending.upper() if name == "two" else ending}'
+        assert call(capsys, graph, '--runs', 20, '--plot', path, '--jobs', 1)[0] == 0
+        pictures.append(path.read_bytes())
+    assert pictures[0].startswith(start) and len(pictures[0]) > 5000
+    assert pictures[0] == pictures[1]
+    if ending == 'svg':
+        for text in (b'normalised utilisation', b'acceptance ratio'):
+            assert b'<!-- ' + text in pictures[0]
+
+
+def test_samples(graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.savez(tmp_path / 's.npz', **{'/n:a': [9_000_000], '/n:b': [1, 2]})
+    status, out, _ = call(capsys, graph, '--runs', 5, '--samples', 's.npz', '--json', '-')
+    assert status == 0
+    result = json.loads(out)
+    assert result['samples'] is True
+    assert result['counts'][8] == 5  # 0.9 + 1 us / 20 ms
+    assert result['acceptance']['rad'][8] == 1.0
+
+
+@pytest.mark.parametrize(('arguments', 'line'), [
+    (['--policies', 'rad,edf'], "policy 'edf': there is no such policy: choose one of rad, "),
+    (['--policies', ''], "policy '': there is no such policy: "),
+    (['--policies', 'rad,rad'], "--policies: 'rad' stands there twice: name each once"),
+    (['--runs', '0'], "mddag evaluate: argument --runs: '0' is no whole number from 1 up: "),
+    (['--runs', '99999999999'], 'runs: 99999999999 is too many: '),
+    (['--workers', '0'], "mddag evaluate: argument --workers: '0' is no whole number from 1"),
+    (['--jobs', '-1'], "mddag evaluate: argument --jobs: '-1' is no whole number from 1 up: "),
+    (['--seed', '-1'], "mddag evaluate: argument --seed: '-1' is no whole number from 0"),
+    (['--duration', '3'], 'mddag evaluate: argument --duration: '),
+    (['--overhead', 'x'], 'mddag evaluate: argument --overhead: '),
+    (['--samples', 'none.npz'], 'none.npz: no such file or directory: check the path'),
+    (['--samples', 'graph.yaml'], 'graph.yaml: this is no .npz file: '),
+    (['--samples', 'few.npz'], 'few.npz: no values for /n:b: add an array of that name'),
+    (['--samples', '.'], '.: is a directory: name a file'),
+    (['--plot', 'a.gif'], 'a.gif: the ending tells no kind of picture: use one of .png, '),
+    (['--plot', 'picture'], 'picture: the ending tells no kind of picture: '),
+    (['--plot', 'nowhere/a.png'], 'nowhere/a.png: there is no directory nowhere: make it first'),
+    (['--json', 'nowhere/a.json'], 'nowhere/a.json: there is no directory nowhere: '),
+    (['--csv', '.'], '.: this is a directory: name a file'),
+    (['--csv', '-', '--json', '-'], '-: standard output can take only one of --json and --csv: '),
+])
+def test_bad_input(
+    graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str],
+    line: str,
+) -> None:
+    """One line, exit status 2, nothing written, and before any run is done."""
+    np.savez(tmp_path / 'few.npz', **{'/n:a': [1]})
+    before = sorted(tmp_path.iterdir())
+    status, out, err = call(capsys, 'graph.yaml', '--runs', '5000000', *arguments)
+    assert (status, out) == (2, '')
+    assert err.startswith(f'error: {line}') and err.count('\n') == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_without_matplotlib(
+    graph: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mddag_executor.simulate import plot
+    monkeypatch.setattr(plot, 'find_spec', lambda name: None)
+    status, _, err = call(capsys, graph, '--runs', 5, '--plot', 'a.png')
+    assert status == 2
+    assert err == ('error: a.png: matplotlib, which draws it, is not there: '
+                   "install 'mddag_executor[batch]' with pip\n")
+
+
+def test_interrupted(graph: Path, tmp_path: Path) -> None:
+    """Ctrl-C: the exit status is 130, and what is done is written as a whole."""
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'evaluate', str(graph), '--runs', '5000000',
+         '--core', 'plain', '--jobs', '2', '--json', 'out.json', '--plot', 'out.png'],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    time.sleep(5)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    result = json.loads((tmp_path / 'out.json').read_text())
+    assert process.returncode == 130
+    assert err == f"warning: interrupted: {result['runs']} of 5000000 runs are done\n"
+    assert 0 < result['runs'] < 5000000 and result['interrupted'] is True
+    assert (tmp_path / 'out.png').stat().st_size > 5000
+    assert f"{result['runs']} runs in" in out
+
+
+def test_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        program.main(['evaluate', '--help'])
+    out = capsys.readouterr().out
+    assert caught.value.code == 0
+    assert 'mddag evaluate config/autoware.yaml --runs 5000 --plot acceptance.png' in out

@@ -1,0 +1,87 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `graph draw`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
+
+
+@pytest.mark.parametrize(('ending', 'begin'), [('dot', 'digraph '), ('mmd', 'flowchart LR\n')])
+def test_text(mddag: Mddag, tmp_path: Path, ending: str, begin: str) -> None:
+    done = mddag('graph', 'draw', CONFIG / 'autoware.yaml', '-o', f'o.{ending}', cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+    text = (tmp_path / f'o.{ending}').read_text()
+    assert text.startswith(begin)
+    assert 'callback_16' in text
+
+
+@pytest.mark.skipif(shutil.which('dot') is None, reason='Graphviz is not installed')
+@pytest.mark.parametrize(('ending', 'begin'), [
+    ('svg', b'<?xml'), ('png', b'\x89PNG'), ('pdf', b'%PDF')])
+def test_graphviz(mddag: Mddag, tmp_path: Path, ending: str, begin: bytes) -> None:
+    text = (CONFIG / 'autoware_multi.yaml').read_text()
+    done = mddag('graph', 'draw', '-', '-o', f'o.{ending}', cwd=tmp_path, input=text)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+    assert (tmp_path / f'o.{ending}').read_bytes().startswith(begin)
+
+
+def test_without_graphviz(
+        mddag: Mddag, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('PATH', str(Path(sys.executable).parent))
+    if shutil.which('dot') is not None:
+        pytest.skip('Graphviz lies beside Python')
+    done = mddag('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "error: o.svg: this needs Graphviz, and its program 'dot' is not there: install it with "
+        "'sudo apt install graphviz', or name an OUT.dot or OUT.mmd\n")
+
+
+def test_graphviz_that_fails(
+        mddag: Mddag, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / 'dot'
+    program.write_text('#!/bin/sh\ncat >/dev/null\necho no fonts >&2\nexit 3\n')
+    program.chmod(0o755)
+    monkeypatch.setenv('PATH', f'{tmp_path}:/usr/bin:/bin')
+    done = mddag('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith('error: o.svg: Graphviz failed (no fonts): ')
+    assert not (tmp_path / 'o.svg').exists()
+
+
+def test_bad_usage(mddag: Mddag, tmp_path: Path) -> None:
+    for name in ('o.jpeg', 'o', '-'):
+        done = mddag('graph', 'draw', CONFIG / 'autoware.yaml', '-o', name, cwd=tmp_path)
+        assert done.returncode == 2
+        assert done.stderr == (
+            f'error: {name}: no ending that says what to draw: use one of .svg, .png, .pdf, '
+            '.dot, .mmd\n')
+
+
+def test_help_has_an_example(mddag: Mddag) -> None:
+    done = mddag('graph', 'draw', '--help')
+    assert done.returncode == 0
+    assert 'mddag graph draw config/autoware.yaml -o autoware.svg' in done.stdout

@@ -1,0 +1,198 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The compiled core against the plain one: the same starts, ends and decisions.
+
+Both are the same source; what this finds is where compiled arithmetic, lists or heaps differ.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+from hypothesis import given
+from hypothesis import strategies as st
+from mddag_executor.core import POLICIES, Tables
+from mddag_executor.simulate import compiled
+from mddag_executor.simulate.draws import Draws
+from mddag_executor.simulate.evaluate import PlainJudge
+from mddag_executor.simulate.run import Settings, simulate
+from msg_graph import load, loads
+import numpy as np
+import pytest
+
+from ..core.task_sets import Case, cases, examples, TICK
+
+pytestmark = [
+    pytest.mark.skipif(not compiled.available(), reason='numba is not there'),
+    pytest.mark.timeout(400),  # a first run compiles
+]
+CONFIG = Path(__file__).parents[2] / 'config'
+
+
+def settings_of(case: Case, horizon: int, judge: str, stop: bool) -> Settings:
+    return Settings(
+        policy=case.policy, workers=case.workers, duration_ns=horizon * TICK,
+        preemptive=case.preemptive, judge=judge, stop_at_first_miss=stop,
+        dispatch_overhead_ns=case.dispatch_overhead * TICK,
+        switch_overhead_ns=case.switch_overhead * TICK)
+
+
+def compare(case: Case, horizon: int, judge: str = 'horizon', stop: bool = False) -> int:
+    """Run a case both ways; return how many decisions there were."""
+    settings = settings_of(case, horizon, judge, stop)
+    load_ = case.load(horizon)
+    plain = simulate(case.task_set, load_, settings, log=True)
+    ended, log, decisions = compiled.run_compiled(Tables.build(case.task_set), load_, settings)
+    assert log == plain.log
+    assert decisions == plain.decisions
+    assert ended == plain.ended_ns
+    return len(decisions)
+
+
+@pytest.mark.parametrize('policy', POLICIES)
+@examples(300)
+@given(st.data(), st.integers(5, 60))
+def test_the_paper_s_model(policy: str, data: st.DataObject, horizon: int) -> None:
+    compare(data.draw(cases((policy,), groups=False, bounds=False)), horizon)
+
+
+@examples(1000)
+@given(cases(overheads=True), st.integers(5, 60), st.sampled_from(['horizon', 'completions']),
+       st.booleans())
+def test_everything_at_once(case: Case, horizon: int, judge: str, stop: bool) -> None:
+    """Groups, bounds, aborts and overheads too."""
+    compare(case, horizon, judge, stop)
+
+
+@examples(15)
+@given(cases(overheads=True, max_callbacks=12))
+def test_long_runs(case: Case) -> None:
+    """Overload for long: slots, queues and stale entries grow and are swept."""
+    compare(case, 1500)
+
+
+@examples(150)
+@given(st.lists(cases(overheads=True), min_size=1, max_size=1), st.integers(5, 60),
+       st.sampled_from(['horizon', 'completions']), st.data())
+def test_runs_do_not_disturb_one_another(
+    one: list[Case], horizon: int, judge: str, data: st.DataObject
+) -> None:
+    """Several runs in one memory give the verdicts that each gives alone."""
+    case = one[0]
+    settings = settings_of(case, horizon, judge, True)
+    columns = len(case.task_set.vertices)
+    times = np.array(data.draw(st.lists(
+        st.lists(st.integers(1, 9), min_size=columns, max_size=columns), min_size=1,
+        max_size=6)), dtype=np.int64) * TICK
+    found = compiled.CompiledJudge(case.task_set, settings.duration_ns)(settings, times)
+    assert found.tolist() == PlainJudge(
+        case.task_set, settings.duration_ns)(settings, times).tolist()
+
+
+@pytest.mark.parametrize('name', ['autoware.yaml', 'autoware_multi.yaml'])
+@pytest.mark.parametrize('policy', POLICIES)
+def test_autoware(name: str, policy: str) -> None:
+    task_set = load(CONFIG / name)
+    times = Draws(task_set, 11).times(0, 3).tolist()
+    row = times[2]
+    split, place = [], 0
+    for dag in task_set.dags:
+        split.append(tuple(time // TICK + 1 for time in row[place:place + len(dag.vertices)]))
+        place += len(dag.vertices)
+    case = Case(task_set, tuple(split), 5, policy, POLICIES[policy].preemptive)
+    assert compare(case, 400_000) > 200
+
+
+def test_times_of_a_day() -> None:
+    """Keys and times do not overflow: a day at the nanosecond, and what never expires."""
+    task_set = loads(
+        'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, timer: 3600s, deadline: 86400s, '
+        'on_miss: abort}]}]', 'day.yaml')
+    case = Case(task_set, ((7_200_000_000,),), 1, 'rad', True)
+    assert compare(case, 86_400_000_000) > 10
+
+
+def test_memory_is_given_back() -> None:
+    """Thousands of runs need no more memory than some."""
+    task_set = load(CONFIG / 'autoware.yaml')
+    judge = compiled.CompiledJudge(task_set, 300_000_000)
+    times = Draws(task_set, 1).times(0, 50)
+    settings = Settings(workers=3, preemptive=True, judge='completions')
+
+    def resident() -> int:
+        return int(Path('/proc/self/statm').read_text().split()[1]) * os.sysconf('SC_PAGE_SIZE')
+
+    for _ in range(5):
+        judge(settings, times)
+    before = resident()
+    for _ in range(60):
+        judge(settings, times)
+    assert resident() - before < 4_000_000
+
+
+def python(*lines: str, **environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, '-c', '\n'.join(lines)], env={**os.environ, **environment},
+        capture_output=True, text=True, check=True, timeout=300)
+    return done.stdout.strip()
+
+
+def test_nothing_is_compiled_at_import() -> None:
+    assert python(
+        'import sys',
+        'import mddag_executor.simulate.compiled, mddag_executor.simulate.evaluate',
+        'print([m for m in ("numba", "matplotlib") if m in sys.modules])') == '[]'
+
+
+WARM_UP = (
+    'from mddag_executor.simulate import compiled',
+    'from msg_graph import load',
+    f'judge = compiled.CompiledJudge(load({str(CONFIG / "autoware.yaml")!r}), 10 ** 9)',
+    'judge.warm_up()',
+    'statistics = compiled._entries()["accept_runs"].stats',
+    'print(sum(statistics.cache_hits.values()), sum(statistics.cache_misses.values()))')
+
+
+@pytest.mark.slow
+def test_a_second_process_does_not_compile(tmp_path: Path) -> None:
+    """The code is kept under the hash of its sources; old ones are forgotten."""
+    old = tmp_path / 'mddag_executor' / 'old'
+    old.mkdir(parents=True)
+    (old / 'kernel.py').touch()
+    os.utime(old / 'kernel.py', (0, 0))
+    assert python(*WARM_UP, XDG_CACHE_HOME=str(tmp_path)) == '0 1'
+    assert python(*WARM_UP, XDG_CACHE_HOME=str(tmp_path)) == '1 0'
+    assert python(
+        'from mddag_executor.simulate import compiled', 'print(compiled.cached())',
+        XDG_CACHE_HOME=str(tmp_path)) == 'True'
+    assert [path.name for path in (tmp_path / 'mddag_executor').iterdir()] == [
+        compiled._fingerprint()]
+
+
+def test_without_a_place_for_the_cache(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for place in ('relative', '/proc/nowhere'):
+        monkeypatch.setenv('XDG_CACHE_HOME', place)
+        assert compiled._stamp() is None
+        assert not compiled.cached()
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    stamp = compiled._stamp()
+    assert stamp is not None and stamp.is_file()
+    assert stamp.parent.stat().st_mode & 0o077 == 0
