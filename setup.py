@@ -68,6 +68,7 @@ setup(
         'mcap>=1.0',
         'numpy>=1.21',
         'rosbags>=0.10',
+        'ruamel.yaml>=0.17',
         'zstandard>=0.18',
     ],
     extras_require={
@@ -91,6 +92,7 @@ setup(
             'flake8-import-order',
             'flake8-quotes',
             'hypothesis',
+            'jsonschema',
             'mypy',
             'pydocstyle',
             'pytest>=7.4',

@@ -29,7 +29,7 @@ from os import fspath, PathLike
 from msg_graph.declaration import parse_declaration
 from msg_graph.derive import derive_task_set
 from msg_graph.duration import DurationError, format_duration, parse_duration
-from msg_graph.errors import GraphError
+from msg_graph.errors import GraphError, GraphErrors
 from msg_graph.model import (
     Callback,
     Dag,
@@ -42,8 +42,8 @@ from msg_graph.model import (
 from msg_graph.yamltext import decode, MAX_BYTES
 
 __all__ = [
-    'Callback', 'Dag', 'DurationError', 'ExecutionTime', 'GraphError', 'Path', 'QueueEdge',
-    'TaskSet', 'Vertex', 'format_duration', 'load', 'loads', 'parse_duration',
+    'Callback', 'Dag', 'DurationError', 'ExecutionTime', 'GraphError', 'GraphErrors',
+    'Path', 'QueueEdge', 'TaskSet', 'Vertex', 'format_duration', 'load', 'loads', 'parse_duration',
 ]
 
 

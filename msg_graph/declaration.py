@@ -15,7 +15,9 @@
 """
 The declaration language: YAML to callbacks, each entry checked by itself.
 
-What needs more than one entry to judge (publishers, cycles, sinks, sources, …) is ``derive``'s.
+Entries do not depend on each other, so the first error of each is collected and all are raised
+together. What needs more than one entry to judge (publishers, cycles, sinks, sources, …) is
+``derive``'s.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from dataclasses import dataclass
 from typing import cast
 
 from msg_graph.duration import DAY, format_duration
-from msg_graph.errors import GraphError, shown
+from msg_graph.errors import Collector, GraphError, shown
 from msg_graph.fields import (
     check_callback,
     check_dag,
@@ -40,20 +42,20 @@ from msg_graph.fields import (
 from msg_graph.model import Callback, ExecutionTime, Kind, OnMiss, Path, ReleaseFrom
 from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Tree
 
-_FORMAT = '1'
-_MOST_WORKERS = 1024
-_MOST_ACTIVE_JOBS = 1_000_000
+FORMAT = '1'
+MOST_WORKERS = 1024
+MOST_ACTIVE_JOBS = 1_000_000
 
-_FILE_KEYS = ('mddag', 'workers', 'nodes', 'paths')
-_NODE_KEYS = ('node', 'callbacks')
-_TRIGGERS = ('timer', 'subscription', 'sync', 'service')
-_CALLBACK_KEYS = (
-    'name', *_TRIGGERS, 'period', 'publishes', 'reads', 'deadline', 'release_from',
+FILE_KEYS = ('mddag', 'workers', 'nodes', 'paths')
+NODE_KEYS = ('node', 'callbacks')
+TRIGGERS = ('timer', 'subscription', 'sync', 'service')
+CALLBACK_KEYS = (
+    'name', *TRIGGERS, 'period', 'publishes', 'reads', 'deadline', 'release_from',
     'execution_time', 'group', 'dag', 'on_miss', 'max_active_jobs')
-_PATH_KEYS = ('name', 'callbacks')
-_TIME_KEYS = ('quantiles_us', 'percent')
-_RELEASE_FROM = ('arrival', 'source_timestamp', 'header_stamp')
-_ON_MISS = ('continue', 'abort')
+PATH_KEYS = ('name', 'callbacks')
+TIME_KEYS = ('quantiles_us', 'percent')
+RELEASE_FROM = ('arrival', 'source_timestamp', 'header_stamp')
+ON_MISS = ('continue', 'abort')
 
 # The quantiles that the published figures of the Autoware workload come with.
 _PERCENT_29 = (
@@ -100,44 +102,61 @@ def parse_declaration(text: str, file: str) -> Declaration:
     if not isinstance(tree, Mapping):
         raise GraphError(
             file, tree.line, 'this is not a declaration', "write one that starts with 'mddag: 1'")
-    fields = Fields(tree, file, 'the declaration', _FILE_KEYS)
+    fields = Fields(tree, file, 'the declaration', FILE_KEYS)
     fields.text('mddag', _check_format)
-    workers = fields.integer_or_none('workers', 1, _MOST_WORKERS)
-    entries = _entries(fields.sequence('nodes'), file)
-    paths = _paths(fields.sequence('paths'), file) if fields.has('paths') else ()
+    found = Collector()
+    workers: int | None = None
+    entries: tuple[Entry, ...] = ()
+    paths: tuple[PathEntry, ...] = ()
+    with found:
+        workers = fields.integer_or_none('workers', 1, MOST_WORKERS)
+    with found:
+        entries = _entries(fields.sequence('nodes'), file)
+    with found:
+        paths = _paths(fields.sequence('paths'), file) if fields.has('paths') else ()
+    found.check()
     return Declaration(file, workers, entries, paths)
 
 
 def _check_format(text: str) -> tuple[str, str] | None:
-    if text == _FORMAT:
+    if text == FORMAT:
         return None
-    return f'{shown(text)} is no known version of the format', f"write 'mddag: {_FORMAT}'"
+    return f'{shown(text)} is no known version of the format', f"write 'mddag: {FORMAT}'"
 
 
 def _entries(nodes: list[Tree], file: str) -> tuple[Entry, ...]:
     entries: dict[str, Entry] = {}
-    for place, node_tree in enumerate(nodes, 1):
-        fields = Fields(node_tree, file, f'node {place}', _NODE_KEYS)
-        node = fields.text('node', check_node)
-        fields.entry = f'node {shown(node)}'
-        for number, tree in enumerate(fields.sequence('callbacks'), 1):
-            entry = _callback(
-                Fields(tree, file, f'callback {number} of node {shown(node)}', _CALLBACK_KEYS),
-                node)
-            key = entry.callback.key
-            if key in entries:
-                raise entry.fields.error(
-                    'name', f'this name is taken in line {entries[key].callback.line}',
-                    'give each callback of a node a name of its own')
-            entries[key] = entry
+    found = Collector()
+    for place, tree in enumerate(nodes, 1):
+        with found:
+            fields = Fields(tree, file, f'node {place}', NODE_KEYS)
+            node = fields.text('node', check_node)
+            fields.entry = f'node {shown(node)}'
+            for number, callback_tree in enumerate(fields.sequence('callbacks'), 1):
+                with found:
+                    _add_entry(entries, callback_tree, file, node, number)
+    found.check()
     return tuple(entries.values())
+
+
+def _add_entry(
+    entries: dict[str, Entry], tree: Tree, file: str, node: str, number: int
+) -> None:
+    entry = _callback(
+        Fields(tree, file, f'callback {number} of node {shown(node)}', CALLBACK_KEYS), node)
+    key = entry.callback.key
+    if key in entries:
+        raise entry.fields.error(
+            'name', f'this name is taken in line {entries[key].callback.line}',
+            'give each callback of a node a name of its own')
+    entries[key] = entry
 
 
 def _callback(fields: Fields, node: str) -> Entry:
     name = fields.text('name', check_callback)
     key = f'{node}:{name}'
     fields.entry = f'callback {shown(key)}'
-    kind = fields.one_of(_TRIGGERS, 'what starts the callback')
+    kind = fields.one_of(TRIGGERS, 'what starts the callback')
     timer_period = fields.duration_or_none('timer')
     topics: tuple[str, ...] = ()
     if kind == 'subscription':
@@ -160,13 +179,13 @@ def _callback(fields: Fields, node: str) -> Entry:
         publishes=fields.texts('publishes', check_topic),
         reads=fields.texts('reads', check_read),
         deadline_ns=fields.duration_or_none('deadline'),
-        release_from=cast(ReleaseFrom, fields.choice('release_from', _RELEASE_FROM)),
+        release_from=cast(ReleaseFrom, fields.choice('release_from', RELEASE_FROM)),
         group=fields.text_or_none('group', check_group),
         dag=fields.text_or_none('dag', check_dag),
         execution_time=_execution_time(fields),
         line=fields.line,
-        on_miss=cast(OnMiss, fields.choice('on_miss', _ON_MISS)),
-        max_active_jobs=fields.integer_or_none('max_active_jobs', 1, _MOST_ACTIVE_JOBS),
+        on_miss=cast(OnMiss, fields.choice('on_miss', ON_MISS)),
+        max_active_jobs=fields.integer_or_none('max_active_jobs', 1, MOST_ACTIVE_JOBS),
     )
     return Entry(callback, fields)
 
@@ -193,7 +212,7 @@ def _execution_time(fields: Fields) -> ExecutionTime | None:
         constant = fields.duration_or_none('execution_time', minimum_ns=1)
         assert constant is not None
         return ExecutionTime((constant,), (50.0,))
-    inner = Fields(value, fields.file, f'execution time of {fields.entry}', _TIME_KEYS)
+    inner = Fields(value, fields.file, f'execution time of {fields.entry}', TIME_KEYS)
     quantiles_us = inner.numbers('quantiles_us')
     _check_quantiles(inner, quantiles_us)
     percent = _percent(inner, len(quantiles_us))
@@ -233,15 +252,24 @@ def _percent(fields: Fields, count: int) -> tuple[float, ...]:
 
 def _paths(trees: list[Tree], file: str) -> tuple[PathEntry, ...]:
     paths: dict[str, PathEntry] = {}
+    found = Collector()
     for place, tree in enumerate(trees, 1):
-        fields = Fields(tree, file, f'path {place}', _PATH_KEYS)
-        name = fields.text('name', check_path)
-        fields.entry = f'path {shown(name)}'
-        if name in paths:
-            raise fields.error('name', 'this name is taken', 'give each path a name of its own')
-        fields.sequence('callbacks')
-        callbacks = fields.texts('callbacks', check_key)
-        if len(callbacks) < 2:
-            raise fields.error('callbacks', 'a path of one callback', 'give at least 2')
-        paths[name] = PathEntry(Path(name, callbacks), fields)
+        with found:
+            entry = _path(Fields(tree, file, f'path {place}', PATH_KEYS))
+            name = entry.path.name
+            if name in paths:
+                raise entry.fields.error(
+                    'name', 'this name is taken', 'give each path a name of its own')
+            paths[name] = entry
+    found.check()
     return tuple(paths.values())
+
+
+def _path(fields: Fields) -> PathEntry:
+    name = fields.text('name', check_path)
+    fields.entry = f'path {shown(name)}'
+    fields.sequence('callbacks')
+    callbacks = fields.texts('callbacks', check_key)
+    if len(callbacks) < 2:
+        raise fields.error('callbacks', 'a path of one callback', 'give at least 2')
+    return PathEntry(Path(name, callbacks), fields)

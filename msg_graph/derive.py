@@ -43,7 +43,9 @@ Rules 1, 2, 3 and 6 concern callbacks and are in ``links``, the others, which ma
 7. DAGs are numbered by their sources' places in the file. The vertices of a DAG are numbered by
    their callbacks' places in the file, several of one callback in the order of the vertices that
    start them, that is of the publishers.
-8. The number of vertices and edges is bounded before they are made, as rule 4 multiplies.
+8. Errors are collected in stages, as far as none is a consequence of another: who starts whom and
+   who reads what; then cycles, deadlines and paths; then what the vertices show.
+9. The number of vertices and edges is bounded before they are made, as rule 4 multiplies.
 """
 
 from __future__ import annotations
@@ -52,9 +54,9 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from msg_graph.declaration import Declaration
-from msg_graph.errors import GraphError, shown
+from msg_graph.errors import Collector, GraphError, shown
 from msg_graph.links import Links
-from msg_graph.model import Dag, TaskSet, Vertex
+from msg_graph.model import Dag, Path, QueueEdge, TaskSet, Vertex
 
 MAX_VERTICES = 100_000
 MAX_EDGES = 1_000_000
@@ -67,17 +69,30 @@ def derive_task_set(declaration: Declaration, text: str) -> TaskSet:
     :raises GraphError: the graph breaks a rule of the model.
     """
     links = Links(declaration)
-    links.check_triggers()
-    order = links.order()
-    links.check_deadlines()
+    found = Collector()
+    order: list[int] = []
+    queue_edges: tuple[QueueEdge, ...] = ()
+    paths: tuple[Path, ...] = ()
+    with found:
+        links.check_triggers()
+    with found:
+        queue_edges = links.queue_edges()
+    found.check()
+    with found:
+        order = links.order()
+    with found:
+        links.check_deadlines()
+    with found:
+        paths = links.paths(declaration)
+    found.check()
     expansion = _Expansion(links)
     for callback in order:
         expansion.expand(callback)
     return TaskSet(
         dags=_dags(links, expansion),
         callbacks=tuple(entry.callback for entry in declaration.entries),
-        queue_edges=links.queue_edges(),
-        paths=links.paths(declaration),
+        queue_edges=queue_edges,
+        paths=paths,
         workers=declaration.workers,
         file=declaration.file,
         text=text,

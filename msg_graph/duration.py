@@ -26,7 +26,7 @@ MILLISECOND = 1_000_000
 SECOND = 1_000_000_000
 DAY = 86_400 * SECOND
 
-_UNITS = {
+UNITS = {
     'ns': 1,
     'us': MICROSECOND,
     'µs': MICROSECOND,  # micro sign
@@ -79,12 +79,12 @@ def parse_duration(
         raise DurationError(
             f'{shown(text)} has no unit',
             f"add one, as '{match['number']}ms' (ns, us, ms, s, min)")
-    if unit not in _UNITS:
+    if unit not in UNITS:
         raise DurationError(
             f'{shown(text)} has the unknown unit {shown(unit)}', 'use ns, us, ms, s or min')
     if match['sign'] == '-':
         raise DurationError(f'{shown(text)} is negative', 'write a time above zero')
-    exact = Decimal(match['number']) * _UNITS[unit]
+    exact = Decimal(match['number']) * UNITS[unit]
     value = int(exact.to_integral_value(ROUND_HALF_EVEN))
     if value < minimum_ns:
         raise DurationError(

@@ -12,12 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The one error of the package, and how text from a file is shown in it."""
+"""The error of the package, alone or several together, and how text from a file is shown."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 import difflib
+from types import TracebackType
+
+MOST_ERRORS = 50
+"""So many errors of a declaration are collected at most."""
 
 _LONGEST_SHOWN = 120
 
@@ -32,6 +36,7 @@ class GraphError(Exception):
     :ivar line: line of the offending entry, counted from 1; None where no line can be blamed.
     :ivar problem: what is wrong, naming the entry.
     :ivar remedy: what to do about it.
+    :ivar errors: all errors that were found together, this one first.
     """
 
     def __init__(self, file: str, line: int | None, problem: str, remedy: str) -> None:
@@ -45,6 +50,72 @@ class GraphError(Exception):
         """Return the error as one line."""
         place = self.file if self.line is None else f'{self.file}:{self.line}'
         return printable(f'{place}: {self.problem}: {self.remedy}')
+
+    @property
+    def errors(self) -> tuple[GraphError, ...]:
+        """Return this error, and those that were found with it."""
+        return (self,)
+
+
+class GraphErrors(GraphError):
+    """
+    Several independent errors of one declaration.
+
+    To those who know of one error only it is the first; ``str()`` is still one line.
+    """
+
+    def __init__(self, errors: tuple[GraphError, ...]) -> None:
+        first = errors[0]
+        super().__init__(first.file, first.line, first.problem, first.remedy)
+        self.args = (errors,)
+
+    @property
+    def errors(self) -> tuple[GraphError, ...]:
+        """Return the errors, in the order in which they were found."""
+        errors: tuple[GraphError, ...] = self.args[0]
+        return errors
+
+    def __str__(self) -> str:
+        """Return the first error as one line, and how many follow it."""
+        return f'{self.errors[0]} (and {len(self.errors) - 1} more)'
+
+
+class Collector:
+    """
+    Collects errors that do not depend on each other.
+
+    As a context manager it holds an error back, as often as it is entered; ``check`` raises what
+    was held back. With ``MOST_ERRORS`` it raises at once: nobody reads more, and to look for the
+    word that was meant takes its time.
+    """
+
+    def __init__(self) -> None:
+        self.errors: list[GraphError] = []
+        self._full: GraphErrors | None = None
+
+    def __enter__(self) -> Collector:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> bool:
+        if not isinstance(error, GraphError) or error is self._full:
+            return False
+        self.errors.extend(error.errors)
+        if len(self.errors) >= MOST_ERRORS:
+            self._full = GraphErrors(tuple(self.errors[:MOST_ERRORS]))
+            raise self._full from None
+        return True
+
+    def check(self) -> None:
+        """
+        End a stage: what comes next would only stumble over the errors of this one.
+
+        :raises GraphError: the error that was held back, or all of them.
+        """
+        if len(self.errors) == 1:
+            raise self.errors[0]
+        if self.errors:
+            raise GraphErrors(tuple(self.errors))
 
 
 def printable(text: str) -> str:

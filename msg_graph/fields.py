@@ -24,12 +24,12 @@ from msg_graph.duration import DAY, DurationError, MICROSECOND, parse_duration
 from msg_graph.errors import did_you_mean, GraphError, listed, shown
 from msg_graph.yamltext import Mapping, Scalar, Sequence, Tree
 
-_LONGEST_TOPIC = 247  # RMW_TOPIC_MAX_NAME_LENGTH of rmw
-_LONGEST_NODE = 255  # RMW_NODE_NAME_MAX_NAME_LENGTH of rmw
-_LONGEST_WORD = 255
-_ROS_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
-_WORD = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_.-]*')
-_DAG_NAME = re.compile(r'/?[A-Za-z0-9_.-]+(?:/[A-Za-z0-9_.-]+)*')
+LONGEST_TOPIC = 247  # RMW_TOPIC_MAX_NAME_LENGTH of rmw
+LONGEST_NODE = 255  # RMW_NODE_NAME_MAX_NAME_LENGTH of rmw
+LONGEST_WORD = 255
+ROS_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
+WORD = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_.-]*')
+DAG_NAME = re.compile(r'/?[A-Za-z0-9_.-]+(?:/[A-Za-z0-9_.-]+)*')
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
 _INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
 
@@ -42,7 +42,7 @@ def _check_ros_name(text: str, what: str, longest: int) -> tuple[str, str] | Non
         return (
             f'{shown(text)} is not an absolute {what} name',
             f'write it in full, as {shown("/" + text.lstrip("~/"))}')
-    if not _ROS_NAME.fullmatch(text):
+    if not ROS_NAME.fullmatch(text):
         return (
             f'{shown(text)} is not a valid {what} name',
             "use '/' and words of letters, digits and '_' that start with no digit")
@@ -53,45 +53,45 @@ def _check_ros_name(text: str, what: str, longest: int) -> tuple[str, str] | Non
 
 def check_node(text: str) -> tuple[str, str] | None:
     """Check a fully qualified node name (as rmw_validate_node_name and namespaces ask)."""
-    return _check_ros_name(text, 'node', _LONGEST_NODE)
+    return _check_ros_name(text, 'node', LONGEST_NODE)
 
 
 def check_topic(text: str) -> tuple[str, str] | None:
     """Check a fully qualified topic name (as rmw_validate_full_topic_name asks)."""
-    return _check_ros_name(text, 'topic', _LONGEST_TOPIC)
+    return _check_ros_name(text, 'topic', LONGEST_TOPIC)
 
 
 def check_service(text: str) -> tuple[str, str] | None:
     """Check a fully qualified service name."""
-    return _check_ros_name(text, 'service', _LONGEST_TOPIC)
+    return _check_ros_name(text, 'service', LONGEST_TOPIC)
 
 
 def _check_word(text: str, what: str, pattern: re.Pattern[str]) -> tuple[str, str] | None:
     if not pattern.fullmatch(text):
         return (f'{shown(text)} is no name for a {what}', "use letters, digits, '_', '-' and '.'")
-    if len(text) > _LONGEST_WORD:
-        return (f'the name {shown(text)} is too long', f'use at most {_LONGEST_WORD} characters')
+    if len(text) > LONGEST_WORD:
+        return (f'the name {shown(text)} is too long', f'use at most {LONGEST_WORD} characters')
     return None
 
 
 def check_callback(text: str) -> tuple[str, str] | None:
     """Check the name of a callback within its node."""
-    return _check_word(text, 'callback', _WORD)
+    return _check_word(text, 'callback', WORD)
 
 
 def check_group(text: str) -> tuple[str, str] | None:
     """Check the name of a callback group within its node."""
-    return _check_word(text, 'callback group', _WORD)
+    return _check_word(text, 'callback group', WORD)
 
 
 def check_dag(text: str) -> tuple[str, str] | None:
     """Check the name of a DAG; like a node's it may have '/'."""
-    return _check_word(text, 'DAG', _DAG_NAME)
+    return _check_word(text, 'DAG', DAG_NAME)
 
 
 def check_path(text: str) -> tuple[str, str] | None:
     """Check the name of an end-to-end path."""
-    return _check_word(text, 'path', _WORD)
+    return _check_word(text, 'path', WORD)
 
 
 def check_read(text: str) -> tuple[str, str] | None:

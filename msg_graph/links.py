@@ -23,8 +23,8 @@ from __future__ import annotations
 
 from collections import deque
 
-from msg_graph.declaration import Declaration, Entry
-from msg_graph.errors import did_you_mean, GraphError, listed, shown
+from msg_graph.declaration import Declaration, Entry, PathEntry
+from msg_graph.errors import Collector, did_you_mean, GraphError, listed, shown
 from msg_graph.model import Callback, Path, QueueEdge
 
 
@@ -51,20 +51,26 @@ class Links:
 
     def check_triggers(self) -> None:
         """Check sources, and that the topics of all other callbacks are published (rule 2)."""
+        found = Collector()
         for entry in self.entries:
-            callback = entry.callback
-            if callback.kind == 'service' and callback.period_ns is None:
-                raise entry.fields.error(
-                    'service', 'a service is a source, and it has no period',
-                    "add 'period:' with the time between two requests")
-            if callback.kind == 'timer' and callback.release_from != 'arrival':
-                raise entry.fields.error(
-                    'release_from', 'a timer is released when it is due',
-                    "remove 'release_from:', or start the callback by a subscription")
-            if self.is_source(callback):
-                self._check_source(entry)
-            else:
-                self._check_started(entry)
+            with found:
+                self._check_trigger(entry)
+        found.check()
+
+    def _check_trigger(self, entry: Entry) -> None:
+        callback = entry.callback
+        if callback.kind == 'service' and callback.period_ns is None:
+            raise entry.fields.error(
+                'service', 'a service is a source, and it has no period',
+                "add 'period:' with the time between two requests")
+        if callback.kind == 'timer' and callback.release_from != 'arrival':
+            raise entry.fields.error(
+                'release_from', 'a timer is released when it is due',
+                "remove 'release_from:', or start the callback by a subscription")
+        if self.is_source(callback):
+            self._check_source(entry)
+        else:
+            self._check_started(entry)
 
     def _check_source(self, entry: Entry) -> None:
         callback = entry.callback
@@ -163,38 +169,50 @@ class Links:
 
     def check_deadlines(self) -> None:
         """Check that sinks, and nothing else, have deadlines (rule 6)."""
+        found = Collector()
         for entry in self.entries:
-            callback = entry.callback
-            topic = next((t for t in callback.publishes if t in self.started), None)
-            if topic is None:
-                if callback.deadline_ns is None:
-                    raise entry.fields.error(
-                        None, 'it is a sink (it starts no other callback) and has no deadline',
-                        "add 'deadline:'")
-            elif callback.deadline_ns is not None:
-                after = self.callbacks[self.started[topic][0]].key
+            with found:
+                self._check_deadline(entry)
+        found.check()
+
+    def _check_deadline(self, entry: Entry) -> None:
+        callback = entry.callback
+        topic = next((t for t in callback.publishes if t in self.started), None)
+        if topic is None:
+            if callback.deadline_ns is None:
                 raise entry.fields.error(
-                    'deadline', f'it has a deadline but is no sink: it starts {shown(after)} by '
-                    f'{shown(topic)}',
-                    'move the deadline to the sinks after it, or read that topic by a queue edge '
-                    "('reads:')")
+                    None, 'it is a sink (it starts no other callback) and has no deadline',
+                    "add 'deadline:'")
+        elif callback.deadline_ns is not None:
+            after = self.callbacks[self.started[topic][0]].key
+            raise entry.fields.error(
+                'deadline', f'it has a deadline but is no sink: it starts {shown(after)} by '
+                f'{shown(topic)}',
+                'move the deadline to the sinks after it, or read that topic by a queue edge '
+                "('reads:')")
 
     def queue_edges(self) -> tuple[QueueEdge, ...]:
         """Return the queue edges, each with its writers (rule 1)."""
+        found = Collector()
         edges = []
         for entry in self.entries:
-            callback = entry.callback
-            for read in callback.reads:
-                if read.startswith('/'):
-                    writers = tuple(self.callbacks[p].key for p in self.publishers.get(read, ()))
-                    edges.append(QueueEdge(callback.key, read, writers))
-                else:
-                    writer = f'{callback.node}:{read}'
-                    writers = (writer,) if writer in self.by_key else ()
-                    edges.append(QueueEdge(callback.key, None, writers))
-                if not writers:
-                    raise self._read_error(entry, read)
+            for read in entry.callback.reads:
+                with found:
+                    edges.append(self._queue_edge(entry, read))
+        found.check()
         return tuple(edges)
+
+    def _queue_edge(self, entry: Entry, read: str) -> QueueEdge:
+        callback = entry.callback
+        topic = read if read.startswith('/') else None
+        if topic is not None:
+            writers = tuple(self.callbacks[p].key for p in self.publishers.get(topic, ()))
+        else:
+            writer = f'{callback.node}:{read}'
+            writers = (writer,) if writer in self.by_key else ()
+        if not writers:
+            raise self._read_error(entry, read)
+        return QueueEdge(callback.key, topic, writers)
 
     def _read_error(self, entry: Entry, read: str) -> GraphError:
         line = entry.fields.line_of('reads', read)
@@ -209,22 +227,28 @@ class Links:
 
     def paths(self, declaration: Declaration) -> tuple[Path, ...]:
         """Return the declared paths; each step must be a trigger or queue edge (rule 1)."""
+        found = Collector()
         for entry in declaration.paths:
-            keys = entry.path.callbacks
-            for key in keys:
-                if key not in self.by_key:
-                    raise GraphError(
-                        self.file, entry.fields.line_of('callbacks', key),
-                        f'{entry.fields.entry}: unknown callback {shown(key)}',
-                        did_you_mean(key, self.by_key, 'name a declared callback'))
-            for before, after in zip(keys, keys[1:]):
-                if not self._linked(self.by_key[before], self.by_key[after]):
-                    raise GraphError(
-                        self.file, entry.fields.line_of('callbacks', after),
-                        f'{entry.fields.entry}: no trigger or queue edge leads from '
-                        f'{shown(before)} to {shown(after)}',
-                        "name the callbacks between them, or add what is missing to 'reads:'")
+            with found:
+                self._check_path(entry)
+        found.check()
         return tuple(entry.path for entry in declaration.paths)
+
+    def _check_path(self, entry: PathEntry) -> None:
+        keys = entry.path.callbacks
+        for key in keys:
+            if key not in self.by_key:
+                raise GraphError(
+                    self.file, entry.fields.line_of('callbacks', key),
+                    f'{entry.fields.entry}: unknown callback {shown(key)}',
+                    did_you_mean(key, self.by_key, 'name a declared callback'))
+        for before, after in zip(keys, keys[1:]):
+            if not self._linked(self.by_key[before], self.by_key[after]):
+                raise GraphError(
+                    self.file, entry.fields.line_of('callbacks', after),
+                    f'{entry.fields.entry}: no trigger or queue edge leads from '
+                    f'{shown(before)} to {shown(after)}',
+                    "name the callbacks between them, or add what is missing to 'reads:'")
 
     def _linked(self, before: Callback, after: Callback) -> bool:
         if before.node == after.node and before.name in after.reads:

@@ -40,8 +40,8 @@ import pytest
 HERE = Path(__file__).resolve().parent
 
 # Fast and basic ones first, so that a mistake shows early; whatever starts ROS comes last.
-ORDER = ('msg_graph', 'core', 'trace', 'simulate', 'replay', 'report', 'cli', 'launch', '',
-         'live', 'integration', 'bench')
+ORDER = ('msg_graph', 'core', 'trace', 'simulate', 'analysis', 'replay', 'report', 'cli', 'launch',
+         '', 'live', 'integration', 'bench')
 # Domains above 101 collide with the ephemeral ports of Linux; low ones are what people use.
 DOMAINS = range(40, 102)
 

@@ -39,6 +39,7 @@ from mddag_executor.cli import common
 from mddag_executor.cli.run import summary
 from mddag_executor.cli.text import Cell, format_ns, printable, Progress, table
 from mddag_executor.errors import MddagError
+from mddag_executor.live.bench.spec import Spec
 from mddag_executor.report.tables import (
     counts,
     percent,
@@ -162,11 +163,12 @@ def run_replays(graph: Path, output: Path) -> tuple[dict[str, Any], dict[str, An
 
 def run_baseline(args: argparse.Namespace, graph: Path) -> dict[str, Any]:
     """Run the same nodes on rclpy's MultiThreadedExecutor; return what they measured."""
-    command = [
-        sys.executable, '-m', 'mddag_executor.live.baseline', str(graph), '--executor', 'multi',
-        '--utilisation', str(args.utilisation), '--seed', str(args.seed),
-        '--workers', str(WORKERS), '--seconds', str(args.baseline_seconds)]
-    return _json_of(command, 'running the baseline', args.baseline_seconds + 3)
+    from mddag_executor.live.bench.campaign import measure
+    spec = Spec(
+        load='autoware', executor='multi', workers=WORKERS, seconds=args.baseline_seconds,
+        seed=args.seed, graph=str(graph), utilisation=args.utilisation)
+    with Progress('running the baseline', args.baseline_seconds + 3) as progress:
+        return measure(spec, progress.update)
 
 
 def _mddag(*arguments: str) -> list[str]:

@@ -68,8 +68,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="measured execution times, an array of ns for each 'node:callback' (default: the "
         'quantile tables of the declaration)')
     add('--non-preemptive', action='store_true',
-        help='run all policies as an executor of callbacks can; else rad, rm and gedf preempt, as '
-        'in the paper')
+        help='run all policies as an executor of callbacks can; else all but wc and fifo preempt, '
+        'as in the paper')
     add('--overhead', type=_overhead, default=0, metavar='TIME',
         help='what each dispatch of a callback takes more (default: 0)')
     add('--judge', choices=('completions', 'horizon'), default='completions',

@@ -31,7 +31,7 @@ mddag graph draw config/autoware.yaml -o autoware.svg
 mddag graph check --help
 """
 
-VERBS = ('check', 'draw')
+VERBS = ('check', 'draw', 'schema', 'fmt', 'from-caret', 'analyse')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -18,7 +18,8 @@ Entry point of `mddag`: find the verb, run it, turn errors into one line and an 
 Theory of operation: the table of verbs below holds the one-line helps, so that `mddag --help`
 imports nothing but argparse; the module of a verb is imported when that verb is named first on the
 command line, and only then. Whatever the user can cause comes up as an exception of a known tree
-and leaves as one line `error: PLACE: what is wrong: what to do`. The exit status is
+and leaves as one line `error: PLACE: what is wrong: what to do`, several errors of a declaration
+as one line each. The exit status is
 
 | status | meaning |
 | --- | --- |
@@ -42,7 +43,7 @@ import io
 import os
 import sys
 from types import ModuleType
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from mddag_executor import __version__
 from mddag_executor.cli.text import one_line
@@ -162,8 +163,21 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exception(type(error), error, error.__traceback__)
         if line is None:
             return EXIT_DEFECT
-        print(f'error: {line}', file=sys.stderr)
+        for each in _user_lines(error, line):
+            print(f'error: {each}', file=sys.stderr)
         return EXIT_BAD_INPUT
+
+
+def _user_lines(error: BaseException, line: str) -> list[str]:
+    """Return a line for each error that was found: a declaration may have several."""
+    every: Sequence[Any] = getattr(error, 'errors', ())
+    if len(every) < 2:
+        return [line]
+    from msg_graph.errors import MOST_ERRORS
+    lines = [one_line(str(each)) for each in every]
+    if len(every) >= MOST_ERRORS:
+        lines.append(one_line(f'{every[0].file}: there may be more errors: correct these first'))
+    return lines
 
 
 def user_line(error: BaseException) -> str | None:

@@ -114,7 +114,7 @@ def main(args: argparse.Namespace) -> int:
         from mddag_executor.live.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
-            intake=args.intake)
+            intake=args.intake, freeze_gc=True)
         # With `--json -` what nodes print must not get into the JSON.
         output = sys.stdout if common.wants_tables(args) else sys.stderr
         try:

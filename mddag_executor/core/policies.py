@@ -63,6 +63,16 @@ def key_gedf(t: Tables, v: int, release: int, job: int, readiness: int, order: i
     return (release + t.dag_deadline[t.dag_of[v]], t.index_in_dag[v], t.dag_of[v], order)
 
 
+def key_dm(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+    """Return the key of deadline monotonic: relative reference deadline, then as ``rm``."""
+    return (t.rad_offset[v], job, readiness, order)
+
+
+def key_llf(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+    """Return the key of least laxity first by the remaining critical path: latest start."""
+    return (release + t.latest_start[v], t.index_in_dag[v], t.dag_of[v], order)
+
+
 class Policy(NamedTuple):
     """
     A row of the policy table.
@@ -83,6 +93,8 @@ POLICIES: dict[str, Policy] = {p.name: p for p in (
     Policy('wc', key_wc, False, 'work-conserving baseline of the paper: job index, readiness'),
     Policy('fifo', key_fifo, False, 'order of becoming ready'),
     Policy('gedf', key_gedf, True, 'one deadline for each DAG: its latest'),
+    Policy('dm', key_dm, True, 'deadline monotonic: the shortest relative deadline first'),
+    Policy('llf', key_llf, True, 'least laxity first: deadline less the critical path to it'),
 )}
 
 

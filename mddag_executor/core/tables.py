@@ -33,6 +33,9 @@ The offsets are relative to a job's release:
   deadline, of any other vertex the least among the sinks that it leads to (Yano and Azumi, RTSS
   2024 WiP, extended GEDF).
 * ``dag_deadline``: the latest deadline of the DAG (GEDF with one deadline for each DAG).
+* ``latest_start``: the latest time at which the vertex can start with every sink that it leads to
+  in time, if each vertex takes its mean execution time (0 where none is declared) and never waits:
+  the least of these sinks' deadlines minus the longest path to them (least laxity first).
 """
 
 from __future__ import annotations
@@ -72,6 +75,7 @@ class Tables(NamedTuple):
     dag_of: list[int]
     index_in_dag: list[int]
     rad_offset: list[int]
+    latest_start: list[int]
     sink_deadline: list[int]
     region_offset: list[int]
     n_legs: list[int]
@@ -126,15 +130,16 @@ class _Columns:
     def add_dag(self, dag: Dag) -> None:
         lists = self.lists
         first = len(lists['dag_of'])
-        offsets = rad_offsets(dag)
+        offsets, starts = rad_offsets(dag), latest_starts(dag)
         region = 0
-        for vertex, offset in zip(dag.vertices, offsets):
+        for vertex, offset, start in zip(dag.vertices, offsets, starts):
             countdown, legs = len(vertex.predecessors), 1
             if self._legs and countdown > 0:
                 countdown = legs = max(1, len(vertex.callback.topics))
             lists['dag_of'].append(dag.index)
             lists['index_in_dag'].append(vertex.index)
             lists['rad_offset'].append(offset)
+            lists['latest_start'].append(start)
             lists['sink_deadline'].append(-1 if vertex.deadline_ns is None else vertex.deadline_ns)
             lists['region_offset'].append(region)
             lists['n_legs'].append(legs)
@@ -166,8 +171,9 @@ class _Columns:
         n_vertices = len(lists['dag_of'])
         undeclared = {
             'dag_of': n_dags, 'index_in_dag': 0, 'rad_offset': default_deadline,
-            'sink_deadline': -1, 'region_offset': 0, 'n_legs': 1, 'n_predecessors': 0,
-            'first_successor': len(lists['successors']), 'group': -1,
+            'latest_start': default_deadline, 'sink_deadline': -1, 'region_offset': 0,
+            'n_legs': 1, 'n_predecessors': 0, 'first_successor': len(lists['successors']),
+            'group': -1,
             'period': default_deadline, 'dag_deadline': default_deadline, 'on_miss': CONTINUE,
             'max_active_jobs': NEVER, 'expire_after': NEVER, 'first_vertex': n_vertices,
             'n_region': 1, 'source': n_vertices, 'first_sink': len(lists['sinks']),
@@ -185,6 +191,21 @@ def rad_offsets(dag: Dag) -> list[int]:
     The rule of the paper's extended GEDF: a sink has its own deadline, every other vertex the
     least of its successors', hence the least among the sinks that it leads to.
     """
+    return _least_backwards(dag, [0] * len(dag.vertices))
+
+
+def latest_starts(dag: Dag) -> list[int]:
+    """
+    Latest start minus release for each vertex of a DAG, ns, by local index; may be negative.
+
+    See ``latest_start`` in the theory of operation.
+    """
+    times = (vertex.callback.execution_time for vertex in dag.vertices)
+    return _least_backwards(dag, [0 if each is None else each.mean_ns for each in times])
+
+
+def _least_backwards(dag: Dag, costs: list[int]) -> list[int]:
+    """Return the least of the sinks' deadlines minus the costs on the way to them and there."""
     offsets = [NEVER] * len(dag.vertices)
     open_successors = [len(v.successors) for v in dag.vertices]
     done = [v.index for v in dag.vertices if not v.successors]
@@ -192,6 +213,7 @@ def rad_offsets(dag: Dag) -> list[int]:
         vertex = dag.vertices[index]
         if vertex.deadline_ns is not None:
             offsets[index] = vertex.deadline_ns
+        offsets[index] -= costs[index]
         for before in vertex.predecessors:
             offsets[before] = min(offsets[before], offsets[index])
             open_successors[before] -= 1

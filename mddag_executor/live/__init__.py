@@ -49,7 +49,8 @@ def current_job() -> Job | None:
         return None
     origin = running.work.origin
     return Job(
-        running.pool.dispatcher.dag_names[origin.dag], origin.job, running.work.release_ns)
+        running.pool.dispatcher.dag_names[origin.dag], origin.job,
+        running.pool.dispatcher.release_of(running.work))
 
 
 def __getattr__(name: str) -> Any:

@@ -41,7 +41,7 @@ import threading
 import time
 from typing import Any, NamedTuple
 
-KEEP = 1024
+KEEP = 256
 """How many publications of a topic are remembered."""
 
 ROUNDING_NS = 2
@@ -93,20 +93,32 @@ class _Topic:
     def __init__(self) -> None:
         self.publications: deque[Publication] = deque(maxlen=KEEP)
         self.open: list[Publication] = []
+        # The longest window of those kept; a maximum of two generations, so that it is forgotten.
         self.longest = 0
+        self._longest_lately = 0
+        self._count = 0
 
     def begun(self, publication: Publication) -> None:
         self.open.append(publication)
         self.publications.append(publication)
 
     def ended(self, publication: Publication, end: int) -> None:
-        self.longest = max(self.longest, end - publication.begin)
+        length = end - publication.begin
+        if length > self._longest_lately:
+            self._longest_lately = length
+            self.longest = max(self.longest, length)
         publication.end = end
         self.open.remove(publication)
+        self._count += 1
+        if self._count >= KEEP:
+            self._count = 0
+            self.longest, self._longest_lately = self._longest_lately, 0
 
     def holding(self, stamp: int) -> list[Publication]:
         """Return the publications whose window holds a stamp."""
-        fits = [p for p in self.open.copy() if p.begin - ROUNDING_NS <= stamp]
+        fits: list[Publication] = []
+        if self.open:
+            fits.extend(p for p in self.open.copy() if p.begin - ROUNDING_NS <= stamp)
         # What began this long ago has ended before the stamp, like all before it.
         first = stamp - self.longest - OUT_OF_ORDER_NS
         publications = self.publications

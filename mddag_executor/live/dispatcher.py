@@ -33,6 +33,7 @@ from time import monotonic_ns
 from typing import Any
 
 from mddag_executor.core import Scheduler, Tables
+from mddag_executor.core.rules import complete, make_ready
 from mddag_executor.core.state import IDLE, OPEN, SUSPENDED
 from mddag_executor.live.attribution import Attribution, Origin, PublisherState
 from mddag_executor.live.entries import Entry, Work
@@ -80,6 +81,7 @@ class Dispatcher:
         self.fail = fail
         # told, under the lock, that something may be ready to be dispatched
         self.dispatch: Callable[[int], None] = lambda now: None
+        self._key = self.scheduler.policy.key
         self._work: dict[int, Work] = {}
         self._next_job = [0] * (self.tables.n_dags + 1)
         self._last = 0
@@ -90,6 +92,14 @@ class Dispatcher:
     def now(self) -> int:
         """Return the time on the trace's clock: ns since the epoch, steady during the run."""
         return monotonic_ns() + self.clock_offset
+
+    def _tick(self) -> int:
+        """Return the core's time now."""
+        now = monotonic_ns() + self.clock_offset
+        if now < self._last:
+            return self._last
+        self._last = now
+        return now
 
     def core_time(self, now: int) -> int:
         """Return ``now``, or the time of the core's last event where that is later."""
@@ -113,14 +123,14 @@ class Dispatcher:
         """End one ``hold``."""
         with self.lock:
             self.held -= 1
-            self.dispatch(self.core_time(self.now()))
+            self.dispatch(self._tick())
 
     def timer_due(self, entry: Entry, work: Work, due: int) -> None:
         """Take in a timer that became due at ``due`` (trace's clock)."""
         with self.lock:
             if entry.removed:
                 return
-            now = self.core_time(self.now())
+            now = self._tick()
             if entry.depth and len(entry.waiting) >= entry.depth:
                 entry.skipped += 1
                 if entry.source >= 0:
@@ -144,7 +154,7 @@ class Dispatcher:
         with self.lock:
             if entry.removed:
                 return
-            now = self.core_time(self.now())
+            now = self._tick()
             if entry.depth and len(entry.waiting) >= entry.depth:
                 self._drop_oldest(entry, now)
             if entry.source >= 0 and release is not None:
@@ -160,7 +170,7 @@ class Dispatcher:
         with self.lock:
             if entry.removed:
                 return
-            now = self.core_time(self.now())
+            now = self._tick()
             self._start_undeclared(entry, work, now)
             self.dispatch(now)
 
@@ -180,7 +190,8 @@ class Dispatcher:
         job = self._next_job[dag]
         self._next_job[dag] = job + 1
         slot = self.scheduler.release(dag, job, release, now)
-        self.decided(now)
+        if self.scheduler.state.decisions:
+            self.decided(now)
         self.verdicts.released(dag, job, release, now)
         return slot
 
@@ -197,7 +208,7 @@ class Dispatcher:
                 return False
             self.verdicts.note_drop(entry, Origin(slot, dag, job, target[0]), 'aborted', now)
             return True
-        x = self.scheduler.execution(slot, *target)
+        x = state.job_base[slot] + self.tables.region_offset[target[0]] + target[1]
         if state.x_state[x] != IDLE:
             return False  # a second message for the same vertex of the same job
         self._enqueue(entry, work, x, Origin(slot, dag, job, target[0]), now)
@@ -212,9 +223,7 @@ class Dispatcher:
         state = self.scheduler.state
         state.x_group[x] = entry.group
         work.origin = origin
-        work.release_ns = state.job_release[origin.slot]
-        work.reference_deadline = work.release_ns + self.tables.rad_offset[origin.vertex]
-        self.scheduler.ready(x, now)
+        make_ready(self.tables, state, self._key, x, now)
         self._note_ready(entry, work, x, now)
 
     def _note_ready(self, entry: Entry, work: Work, x: int, now: int) -> None:
@@ -229,7 +238,7 @@ class Dispatcher:
         with self.lock:
             if work.x >= 0 and self.scheduler.state.x_state[work.x] == SUSPENDED:
                 self.scheduler.resume(work.x)
-                self.dispatch(self.core_time(self.now()))
+                self.dispatch(self._tick())
 
     # --- what does not run -----------------------------------------------------------------------
 
@@ -249,10 +258,15 @@ class Dispatcher:
         """Forget a destroyed entity: what waits of it never runs."""
         with self.lock:
             entry.removed = True
-            now = self.core_time(self.now())
+            now = self._tick()
             for x in list(entry.waiting):
                 self._drop(entry, x, 'destroyed', now)
             self.decided(now)
+
+    def release_of(self, work: Work) -> int:
+        """Return the release of the job that a declared execution belongs to; it is not over."""
+        assert work.origin is not None
+        return self.scheduler.state.job_release[work.origin.slot]
 
     # --- for the pool: all under the lock --------------------------------------------------------
 
@@ -272,14 +286,16 @@ class Dispatcher:
         x = work.x
         work.x = -1
         work.entry.ran += 1
-        whole = self.scheduler.complete(x, end)
+        state = self.scheduler.state
+        whole = complete(self.tables, state, self._key, x, end)
         origin = work.origin
         if origin is not None and self.record is not None:
             leg = x - self.scheduler.execution(origin.slot, origin.vertex)
             self.record(
                 'complete', now, vtid, work.entry.address, origin.dag,
                 self.tables.index_in_dag[origin.vertex], origin.job, whole, end, leg)
-        self.decided(now)
+        if state.decisions:
+            self.decided(now)
 
     def decided(self, now: int) -> None:
         """Carry out what the core has decided since the last call."""
@@ -311,7 +327,7 @@ class Dispatcher:
     def finish(self) -> int:
         """Judge what is open, once, when the run ends; return the time on the trace's clock."""
         with self.lock:
-            now = self.core_time(self.now())
+            now = self._tick()
             self.scheduler.expire_idle(now)
             self.decided(now)
             self.scheduler.finish(now)

@@ -18,10 +18,15 @@ from __future__ import annotations
 
 import atexit
 from functools import partial
+import time
 from typing import Protocol
 import weakref
 
 from rclpy.context import Context
+
+FIRST_LOOK_NS = 5_000_000
+LAST_LOOK_NS = 500_000_000
+_now = time.monotonic_ns
 
 
 class _Intake(Protocol):
@@ -69,3 +74,33 @@ def wake_at_shutdown(context: Context, intake: _Intake) -> None:
 def _wake_all(intakes: weakref.WeakSet[_Intake]) -> None:
     for intake in list(intakes):
         intake.wake()
+
+
+class SecondLooks:
+    """
+    When to look again whether a context has ended, after something could have been a signal.
+
+    On a signal rclpy wakes everybody first and shuts the contexts down then, in another thread:
+    who is quick still finds the context well, and nobody wakes him again.
+    """
+
+    def __init__(self) -> None:
+        self.at: int | None = None
+        self._step = 0
+
+    def begin(self) -> None:
+        """Look again, in steps that grow from 5 ms to half a second."""
+        self._step = FIRST_LOOK_NS
+        self.at = _now() + self._step
+
+    def due(self) -> bool:
+        """Return whether it is time to; if so, the next time is the next step's."""
+        if self.at is None or _now() < self.at:
+            return False
+        self._step *= 4
+        self.at = _now() + self._step if self._step <= LAST_LOOK_NS else None
+        return True
+
+    def seconds(self) -> float:
+        """Return how long it is until the next look."""
+        return 0.0 if self.at is None else max(0.0, (self.at - _now()) / 1e9)

@@ -114,8 +114,7 @@ class Work:
     ``origin`` is the vertex and job that it executes (UNDECLARED for others).
     """
 
-    __slots__ = ('entry', 'x', 'function', 'args', 'then', 'coroutine', 'origin', 'ready_ns',
-                 'reference_deadline', 'release_ns')
+    __slots__ = ('entry', 'x', 'function', 'args', 'then', 'coroutine', 'origin', 'ready_ns')
 
     def __init__(
         self, entry: Entry, function: Callable[..., Any], args: tuple[Any, ...],
@@ -129,8 +128,6 @@ class Work:
         self.coroutine: Any = None
         self.origin: Origin | None = None
         self.ready_ns = 0
-        self.reference_deadline = 0
-        self.release_ns = 0
 
     def step(self) -> Any:
         """

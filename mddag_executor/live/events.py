@@ -31,7 +31,7 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.live.endings import stop_at_exit, wake_at_shutdown
+from mddag_executor.live.endings import SecondLooks, stop_at_exit, wake_at_shutdown
 from mddag_executor.live.entities import EMPTY, EntitySet, Receiver, snapshot
 from mddag_executor.live.native import NodeStandIn
 from mddag_executor.live.waitset import PATIENCE, WaitSetIntake
@@ -85,7 +85,7 @@ class _NativeThread:
     A thread in which a native EventsExecutor spins, made anew for each start.
 
     It installs no signal handler; rclpy's own, where it is installed, ends its spin on SIGINT and
-    SIGTERM. So the context is looked at whenever a spin ends.
+    SIGTERM. So the context is looked at whenever a spin ends, and some more times soon after.
 
     :param on_end: called at the end of the thread, unless by ``stop``, with whether the context
         has ended; if not, the native executor has failed.
@@ -138,6 +138,7 @@ class _NativeThread:
     def _run(self) -> None:
         ended = broken = False
         failures = 0
+        looks = SecondLooks()
         try:
             while not ended and not broken:
                 with self._lock:
@@ -145,7 +146,12 @@ class _NativeThread:
                         break
                     future = self._future = Future()
                 try:
-                    self._native.spin_until_future_complete(future, SPIN_SEC)
+                    if looks.at is None:
+                        self._native.spin_until_future_complete(future, SPIN_SEC)
+                        looks.begin()  # a signal, or a wake
+                    else:
+                        self._native.spin_until_future_complete(future, looks.seconds())
+                        looks.due()
                     failures = 0
                 except ExternalShutdownException:
                     pass

@@ -32,6 +32,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+import gc
 import os
 import sys
 import threading
@@ -90,6 +91,8 @@ class MultiDeadlineExecutor(Executor):
     :param worker_policy: real-time policy of the workers, ``SCHED_FIFO`` or ``SCHED_RR``.
     :param worker_priority: their priority under it.
     :param worker_cpus: the CPUs that they may use.
+    :param freeze_gc: when the first spin begins, collect garbage and have the collector leave
+        alone what there is by then (``gc.freeze``): for programs that make their nodes first.
     :raises msg_graph.GraphError: when the declaration is not right.
     :raises mddag_executor.errors.MddagError: on an unknown policy, intake or thread setting, and
         when the trace can not be written.
@@ -112,6 +115,7 @@ class MultiDeadlineExecutor(Executor):
         worker_policy: str | None = None,
         worker_priority: int | None = None,
         worker_cpus: set[int] | None = None,
+        freeze_gc: bool = False,
     ) -> None:
         task_set = load(graph) if isinstance(graph, (str, os.PathLike)) else graph
         if num_workers is None:
@@ -137,6 +141,7 @@ class MultiDeadlineExecutor(Executor):
         self._spinning = threading.Lock()
         self._refreshing = threading.Lock()
         self._finished = False
+        self._freeze_gc = freeze_gc
         self._dispatcher = Dispatcher(
             task_set, num_workers, policy, default_deadline=default_deadline,
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
@@ -243,6 +248,10 @@ class MultiDeadlineExecutor(Executor):
             if self._is_shutdown:
                 return
             self._check_context()
+            if self._freeze_gc:
+                self._freeze_gc = False
+                gc.collect()
+                gc.freeze()
             self._start_intake()
             self._pool.start()
             while not self._is_shutdown:

@@ -36,6 +36,7 @@ import threading
 from time import monotonic_ns
 from typing import Any
 
+from mddag_executor.core.rules import schedule, take
 from mddag_executor.core.state import N_IDLE
 from mddag_executor.live.attribution import PublisherState
 from mddag_executor.live.dispatcher import Dispatcher
@@ -50,9 +51,10 @@ LOOK_AGAIN_S = 0.02
 class Seat:
     """A worker thread's place: the worker it is (-1: spare), and what it is to run."""
 
-    __slots__ = ('worker', 'wake', 'x', 'work', 'thread', 'vtid', 'waits')
+    __slots__ = ('worker', 'wake', 'x', 'work', 'thread', 'vtid', 'waits', 'running')
 
-    def __init__(self, worker: int) -> None:
+    def __init__(self, pool: Pool, worker: int) -> None:
+        self.running = Running(pool, self)
         self.worker = worker
         self.wake = threading.Lock()
         self.wake.acquire()
@@ -66,12 +68,17 @@ class Seat:
 class Running:
     """What runs in a thread: the hooks find the executor and the job through it."""
 
-    __slots__ = ('pool', 'work', 'seat')
+    __slots__ = ('pool', 'seat')
 
-    def __init__(self, pool: Pool, work: Work, seat: Seat) -> None:
+    def __init__(self, pool: Pool, seat: Seat) -> None:
         self.pool = pool
-        self.work = work
         self.seat = seat
+
+    @property
+    def work(self) -> Work:
+        """Return the execution that runs on the seat."""
+        assert self.seat.work is not None
+        return self.seat.work
 
     def publish(self, send: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
         """Publish on behalf of the running callback."""
@@ -97,6 +104,7 @@ class Pool:
         self.lent = 0
         self._lock = dispatcher.lock
         self._scheduler = dispatcher.scheduler
+        self._key = dispatcher.scheduler.policy.key
         self._prepare_thread = prepare_thread
         self._closed = False
         self._seats: list[Seat] = []
@@ -156,7 +164,7 @@ class Pool:
         return True
 
     def _new_seat(self, worker: int) -> Seat:
-        seat = Seat(worker)
+        seat = Seat(self, worker)
         seat.thread = threading.Thread(
             target=self._work_in, args=(seat,), daemon=True, name=f'mddag-worker-{worker}')
         seat.thread.start()
@@ -182,8 +190,9 @@ class Pool:
         if self.dispatcher.held:
             return
         while self.running and state.ready and state.scalars[N_IDLE] > 0:
-            x = self._scheduler.schedule(now)
-            self.dispatcher.decided(now)
+            x = schedule(self.dispatcher.tables, state, self._key, now)
+            if state.decisions:
+                self.dispatcher.decided(now)
             if x < 0:
                 return
             seat = self._seats[state.x_worker[x]]
@@ -205,7 +214,7 @@ class Pool:
             self.dispatcher.decided(now)
             if x < 0:
                 return False
-            seat = Seat(state.x_worker[x])
+            seat = Seat(self, state.x_worker[x])
             self._assign(seat, x)
         seat.vtid = threading.get_native_id()
         self._execute(seat, False)
@@ -217,7 +226,7 @@ class Pool:
         work = seat.work
         assert work is not None
         previous = current.running
-        current.running = Running(self, work, seat)
+        current.running = seat.running
         waits_for: Any = None
         start = monotonic_ns() + dispatcher.clock_offset
         try:
@@ -238,7 +247,8 @@ class Pool:
             self._next(seat, more, now)
         if waits_for is not None:
             self._resume_when_done(work, waits_for)
-        dispatcher.verdicts.tell()
+        if dispatcher.verdicts.misses:
+            dispatcher.verdicts.tell()
 
     def _next(self, seat: Seat, more: bool, now: int) -> None:
         """Leave the next execution in the seat; wake others for the rest."""
@@ -250,21 +260,29 @@ class Pool:
             self._lenders.remove(seat)
             self._spares.append(seat)
         elif more and self.running:
-            x = self._scheduler.take(seat.worker, now)
-            self.dispatcher.decided(now)
+            state = self._scheduler.state
+            x = take(self.dispatcher.tables, state, seat.worker, now)
+            if state.decisions:
+                self.dispatcher.decided(now)
             if x >= 0:
                 self._assign(seat, x)
+            if not state.ready:
+                return
         self._dispatch(now)
 
     def _record(self, work: Work, seat: Seat, start: int, end: int) -> None:
         record = self.dispatcher.record
         assert record is not None
         _, dag, job, vertex = work.origin or NO_ORIGIN
+        tables = self.dispatcher.tables
+        index, deadline = -1, 0
+        if dag >= 0:
+            index = tables.index_in_dag[vertex]
+            deadline = self.dispatcher.release_of(work) + tables.rad_offset[vertex]
         address = work.entry.address
         record(
-            'dispatch', start, seat.vtid, address, dag,
-            self.dispatcher.tables.index_in_dag[vertex] if dag >= 0 else -1, job, seat.worker,
-            work.ready_ns, work.reference_deadline)
+            'dispatch', start, seat.vtid, address, dag, index, job, seat.worker, work.ready_ns,
+            deadline)
         record('callback_start', start, seat.vtid, address, False)
         record('callback_end', end, seat.vtid, address)
 

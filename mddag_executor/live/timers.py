@@ -61,19 +61,16 @@ from rclpy.timer import Timer
 TOLERANCE_NS = 20_000
 """How far a due time may be off the phase grid before the grid is anchored anew."""
 
-SCAN_GAP_NS = 10_000_000
-SCAN_LATEST_NS = 100_000_000
-SCAN_CANCELLED_NS = 5_000_000
-"""Scans happen at most and at least that often; and at most while a timer is cancelled."""
-
+# Scans happen at most and at least that often, and at most while a timer is cancelled; and they
+# are repeated only after so many times what the last one took, so they have 1 % of a CPU at most.
+SCAN_GAP_NS, SCAN_LATEST_NS, SCAN_CANCELLED_NS = 10_000_000, 100_000_000, 5_000_000
 SCAN_SHARE = 100
-"""A scan may be repeated after this many times what the last one took: at most 1 % of a CPU."""
 
+# A timer without a period is always due; so often it is handed over.
 ZERO_PERIOD_NS = 1_000_000
-"""A timer without a period is always due; so often it is handed over."""
 
+# An interval wider than this comes from a preempted thread and is measured again.
 WIDE_NS = 50_000
-"""An interval wider than this comes from a preempted thread and is measured again."""
 
 _now = time.monotonic_ns
 _PR_SET_TIMERSLACK = 29

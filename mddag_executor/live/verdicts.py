@@ -93,7 +93,7 @@ class Verdicts:
         self._tables = tables
         self._on_miss = on_miss
         self._fail = fail
-        self._misses: deque[DeadlineMiss] = deque()
+        self.misses: deque[DeadlineMiss] = deque()
         self._aborted: dict[tuple[int, int], None] = {}
 
     def add(self, decisions: list[Decision], now: int) -> list[int]:
@@ -130,16 +130,16 @@ class Verdicts:
                 'deadline', now, threading.get_native_id(), dag,
                 self._tables.index_in_dag[vertex], job, deadline, time)
         if self._on_miss is not None:
-            self._misses.append(DeadlineMiss(
+            self.misses.append(DeadlineMiss(
                 self._dags[dag].name, self.tally.vertex_name(vertex), job,
                 deadline - self._tables.sink_deadline[vertex], deadline,
                 time if kind == SINK_DONE else None, _WHY[kind]))
 
     def tell(self) -> None:
         """Tell the user of the misses since the last call."""
-        while self._misses and self._on_miss is not None:
+        while self.misses and self._on_miss is not None:
             try:
-                self._on_miss(self._misses.popleft())
+                self._on_miss(self.misses.popleft())
             except IndexError:
                 return  # another thread told it
             except Exception as error:

@@ -47,7 +47,7 @@ from collections.abc import Callable, Iterable
 import threading
 import time
 
-from mddag_executor.live.endings import stop_at_exit, wake_at_shutdown
+from mddag_executor.live.endings import SecondLooks, stop_at_exit, wake_at_shutdown
 from mddag_executor.live.entities import EMPTY, EntitySet, Receiver, snapshot
 from mddag_executor.live.refilled import RefilledSet
 from mddag_executor.live.timers import sharpen_wake_ups, TimerQueue
@@ -130,6 +130,7 @@ class WaitSetIntake:
         self._thread: threading.Thread | None = None
         self._stopping = False
         self._failures = 0
+        self._looks = SecondLooks()
         self._threaded = False
         self._polling = False
         self._events: RefilledSet | None = None  # apart from the others in a thread only
@@ -203,6 +204,9 @@ class WaitSetIntake:
         :return: how many things were handed over, and whether something rang to end the wait.
         """
         filled = self._filled
+        look = self._looks.at
+        if look is not None and (until is None or look < until):
+            until = look
         left = -1 if until is None else max(0, until - _now())
         if filled is None or not (filled.size or self._guards):
             rang = self._bell.acquire(True, left / 1e9) if left >= 0 else self._bell.acquire()
@@ -247,7 +251,8 @@ class WaitSetIntake:
                 until = limit if look is None or (limit is not None and limit < look) else look
                 more, rang = self._wait(0 if count else until)
                 count += more + self._timers.fire(_now())
-                if count or rang or (limit is not None and _now() >= limit):
+                ended = self._context_ended(rang)
+                if count or rang or ended or (limit is not None and _now() >= limit):
                     return count
         except _rclpy.RCLError:
             if self._context.ok():
@@ -262,6 +267,14 @@ class WaitSetIntake:
     def running(self) -> bool:
         """Whether the intake's thread runs."""
         return self._thread is not None and self._thread.is_alive()
+
+    def _context_ended(self, rang: bool) -> bool:
+        """Return whether the context has ended, which it does not without a ring."""
+        if rang:
+            self._looks.begin()
+        elif not self._looks.due():
+            return False
+        return not self._context.ok()
 
     # --- thread ----------------------------------------------------------------------------------
 
@@ -309,8 +322,7 @@ class WaitSetIntake:
         try:
             while not self._stopping and not ended:
                 try:
-                    rang = self._turn()
-                    ended = rang and not self._context.ok()
+                    ended = self._context_ended(self._turn())
                 except Exception as error:
                     ended = not self._context.ok()
                     if not ended:

@@ -53,8 +53,8 @@ def quoted(text: str) -> str:
 
 
 def _label(lines: Iterable[str], end: str = _CENTRED) -> str:
-    r"""Return lines as one label; they are centred with ``\n``, and start at the left with ``\l``."""
-    return '"' + end.join(quoted(line)[1:-1] for line in lines) + (end if end == _LEFT else '') + '"'
+    r"""Return lines as one label, centred (``\n`` ends each) or from the left on (``\l``)."""
+    return '"' + ''.join(quoted(line)[1:-1] + end for line in lines) + '"'
 
 
 def _wrapped(name: str) -> list[str]:
@@ -71,7 +71,8 @@ def _lines(picture: Picture) -> Iterator[str]:
     boxes = sum(len(node.boxes) for dag in picture.dags for node in dag.nodes)
     yield 'digraph mddag {'
     yield '  graph [rankdir=LR, compound=true, newrank=false, ranksep=0.35, nodesep=0.1,'
-    yield f'    fontname="Helvetica", labelloc=t, labeljust=l, fontsize=20, label={quoted(picture.title)}]'
+    yield '    fontname="Helvetica", labelloc=t, labeljust=l, fontsize=20,'
+    yield f'    label={quoted(picture.title)}]'
     if boxes > _MANY:
         yield '  graph [splines=line, nslimit=1, nslimit1=1, mclimit=0.1, searchsize=5]'
     yield '  node [fontname="Helvetica", fontsize=12, margin="0.08,0.04", height=0.3]'
@@ -85,11 +86,11 @@ def _lines(picture: Picture) -> Iterator[str]:
 
 
 def _dag(dag: DagFrame) -> Iterator[str]:
-    yield f'  subgraph {quoted("cluster_" + dag.id)} {{'
+    yield f'  subgraph {quoted("cluster_" + dag.mark)} {{'
     yield (f'    label={quoted(dag.title)} labeljust=l fontsize=16 style="rounded,bold" '
            'color="#444444"')
     for node in dag.nodes:
-        yield f'    subgraph {quoted("cluster_" + node.id)} {{'
+        yield f'    subgraph {quoted("cluster_" + node.mark)} {{'
         yield (f'      label={_label(_wrapped(node.title), _LEFT)} labeljust=l fontsize=10 '
                'style="filled" color="#bbbbbb" fillcolor="#f6f6f6" penwidth=1')
         for box in node.boxes:
@@ -100,7 +101,7 @@ def _dag(dag: DagFrame) -> Iterator[str]:
 
 def _box(box: Box) -> str:
     sink = ', peripheries=2' if box.sink else ''
-    return (f'{quoted(box.id)} [label={_label(box.lines)}, {_SHAPES[box.kind]}, '
+    return (f'{quoted(box.mark)} [label={_label(box.lines)}, {_SHAPES[box.kind]}, '
             f'fillcolor={quoted(box.colour)}{sink}, tooltip={quoted(box.note)}]')
 
 

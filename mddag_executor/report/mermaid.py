@@ -53,15 +53,15 @@ def _lines(picture: Picture) -> Iterator[str]:
     members: dict[str, list[str]] = {}
     sinks = []
     for dag in picture.dags:
-        yield f'  subgraph {dag.id}[{quoted(dag.title)}]'
+        yield f'  subgraph {dag.mark}[{quoted(dag.title)}]'
         for node in dag.nodes:
-            yield f'    subgraph {node.id}[{quoted(node.title)}]'
+            yield f'    subgraph {node.mark}[{quoted(node.title)}]'
             for box in node.boxes:
                 yield f'      {_box(box)}'
                 name = classes.setdefault(box.colour, f'c{len(classes)}')
-                members.setdefault(name, []).append(box.id)
+                members.setdefault(name, []).append(box.mark)
                 if box.sink:
-                    sinks.append(box.id)
+                    sinks.append(box.mark)
             yield '    end'
         yield '  end'
     for arrow in picture.arrows:
@@ -76,4 +76,4 @@ def _lines(picture: Picture) -> Iterator[str]:
 def _box(box: Box) -> str:
     opening, closing = _BRACKETS[box.kind]
     label = '<br>'.join(quoted(line)[1:-1] for line in box.lines)
-    return f'{box.id}{opening}"{label}"{closing}'
+    return f'{box.mark}{opening}"{label}"{closing}'

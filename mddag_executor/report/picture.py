@@ -44,14 +44,14 @@ _MOST_IN_LEGEND = 12
 @dataclass(frozen=True, slots=True)
 class Box:
     """
-    A vertex.
+    A vertex; ``mark`` is what arrows call it.
 
     :ivar lines: its text: name, what starts it if that is not a topic, a sink's deadline.
     :ivar kind: ``timer``, ``subscription``, ``sync`` or ``service``.
     :ivar note: all about it, for a tool tip.
     """
 
-    id: str
+    mark: str
     lines: tuple[str, ...]
     kind: str
     colour: str
@@ -63,7 +63,7 @@ class Box:
 class NodeFrame:
     """The vertices that a node has in a DAG."""
 
-    id: str
+    mark: str
     title: str
     boxes: tuple[Box, ...]
 
@@ -72,7 +72,7 @@ class NodeFrame:
 class DagFrame:
     """A DAG; ``title`` has its name and period."""
 
-    id: str
+    mark: str
     title: str
     nodes: tuple[NodeFrame, ...]
 

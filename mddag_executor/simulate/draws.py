@@ -34,6 +34,7 @@ from typing import Any
 import zipfile
 import zlib
 
+from mddag_executor.core import rad_offsets
 from mddag_executor.errors import InputError, UsageError
 from msg_graph import ExecutionTime, TaskSet
 from msg_graph.analysis import topological_order
@@ -174,23 +175,29 @@ def utilisations(task_set: TaskSet, times: Times, workers: int) -> Floats:
     return total / workers
 
 
-def feasible(task_set: TaskSet, times: Times, workers: int) -> npt.NDArray[np.bool_]:
+def feasible(
+    task_set: TaskSet, times: Times, workers: int, duration_ns: int
+) -> npt.NDArray[np.bool_]:
     """
     Return for each run whether a scheduler could meet all deadlines, as far as is easily known.
 
-    It could not where the longest path to a sink is longer than the sink's deadline, nor, in the
-    long run, where the utilisation is above the number of workers.
+    It could not where the longest path to a sink is longer than the sink's deadline, nor where
+    more has to be executed by deadlines within the duration than the workers can by then.
     """
-    possible = utilisations(task_set, times, workers) <= 1.0
+    possible = np.ones(len(times), dtype=np.bool_)
+    demand = np.zeros(len(times), dtype=np.float64)
     first = 0
     for dag in task_set.dags:
+        offsets = rad_offsets(dag)
         lengths = np.empty((len(dag.vertices), len(times)), dtype=np.int64)
         for index in topological_order(dag):
             vertex = dag.vertices[index]
             lengths[index] = times[:, first + index]
             if vertex.predecessors:
                 lengths[index] += lengths[list(vertex.predecessors)].max(axis=0)
-            if vertex.deadline_ns is not None:
+            if vertex.deadline_ns is not None and vertex.deadline_ns <= duration_ns:
                 possible &= lengths[index] <= vertex.deadline_ns
+            jobs = max(0, (duration_ns - offsets[index]) // dag.period_ns + 1)
+            demand += float(jobs) * times[:, first + index]
         first += len(dag.vertices)
-    return possible
+    return possible & (demand <= float(workers) * duration_ns)

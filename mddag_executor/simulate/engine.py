@@ -39,7 +39,14 @@ from typing import NamedTuple
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.state import add_slot, SINK_ABORTED, SINK_DONE, SINK_EXPIRED, State
+from mddag_executor.core.state import (
+    add_slot,
+    SINK_ABORTED,
+    SINK_DONE,
+    SINK_EXPIRED,
+    SINK_MISSED,
+    State,
+)
 from mddag_executor.core.tables import NEVER, Tables
 
 # Kinds of log entries.
@@ -165,6 +172,8 @@ def any_missed(s: State, first: int) -> bool:
     """Tell whether a miss is among the decisions from number ``first`` on."""
     for i in range(first, len(s.decisions)):
         kind, deadline, time = s.decisions[i][0], s.decisions[i][4], s.decisions[i][5]
-        if kind == SINK_EXPIRED or kind == SINK_ABORTED or kind == SINK_DONE and time > deadline:
+        if kind == SINK_DONE and time > deadline:
+            return True
+        if kind == SINK_MISSED or kind == SINK_EXPIRED or kind == SINK_ABORTED:
             return True
     return False

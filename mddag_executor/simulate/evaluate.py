@@ -153,12 +153,13 @@ class Evaluator:
     def __call__(self, first: int, count: int) -> Chunk:
         """Evaluate ``count`` runs from number ``first`` on."""
         task_set, workers = self._experiment.task_set, self._experiment.workers
+        duration_ns = self._experiment.duration_ns
         begin = time.monotonic()
         times = self._draws.times(first, count)
         accepted = np.array([self._judge(settings, times) for settings in self._settings])
         return Chunk(
-            first, utilisations(task_set, times, workers), feasible(task_set, times, workers),
-            accepted, time.monotonic() - begin)
+            first, utilisations(task_set, times, workers),
+            feasible(task_set, times, workers, duration_ns), accepted, time.monotonic() - begin)
 
 
 class PlainJudge:

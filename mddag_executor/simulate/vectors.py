@@ -241,7 +241,7 @@ def _overload_setitem(vector: Any, index: Any, value: Any) -> Any:
 
 @overload(operator.delitem, strict=False)
 def _overload_delitem(vector: Any, index: Any) -> Any:
-    """Cut the end off: ``del vector[start:]``."""
+    # del vector[start:], which cuts the end off
     if isinstance(vector, VectorType) and isinstance(index, types.SliceType):
         return lambda vector, index: _set_word(vector, 1, index.start)
     return None

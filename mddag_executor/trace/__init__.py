@@ -17,9 +17,11 @@ Traces: recorded by a live run, written by importers and simulations, read by th
 
 A trace is one MCAP file with a channel for each kind of event, as CARET and ros2_tracing name
 them, in CDR; every MCAP and rosbag2 tool reads it. `TraceWriter` records from many threads,
-`TraceFile` writes event by event, `TraceReader` and `read_events` read.
+`TraceFile` writes event by event, `TraceReader` and `read_events` read, `import_ctf` brings CARET
+and ros2_tracing recordings in.
 """
 
+from mddag_executor.trace.ctf import import_ctf, Imported
 from mddag_executor.trace.errors import TraceError, TraceWarning
 from mddag_executor.trace.reader import read_events, TraceReader
 from mddag_executor.trace.schema import EVENTS, EventType
@@ -27,6 +29,6 @@ from mddag_executor.trace.trace_file import TraceFile
 from mddag_executor.trace.writer import TraceWriter
 
 __all__ = [
-    'EVENTS', 'EventType', 'TraceError', 'TraceFile', 'TraceReader', 'TraceWarning',
-    'TraceWriter', 'read_events',
+    'EVENTS', 'EventType', 'Imported', 'TraceError', 'TraceFile', 'TraceReader', 'TraceWarning',
+    'TraceWriter', 'import_ctf', 'read_events',
 ]

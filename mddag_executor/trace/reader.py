@@ -33,6 +33,7 @@ from mddag_executor.trace.errors import TraceError, TraceWarning
 from mddag_executor.trace.reading import Reading
 
 _TASK_SET = 'mddag:task_set'
+_PROCESS = 'mddag:process'
 _REMEDY = 'check its name, that you may read it, and the disk it is on'
 
 
@@ -148,14 +149,24 @@ def read_events(path: str | os.PathLike[str],
     Yield the events of a trace in the order of time, as CARET's analysis takes them.
 
     Each is a dict of `_name` (as in `ros2:callback_start`), `_timestamp` (ns), `_vpid`, `_vtid`
-    and the event's fields as the file has them. A `TraceWarning` at the end says what is missing.
+    and the event's fields as the file has them. In an imported recording it has `_procname`, too:
+    the events `mddag:process` that hold it are given out only where they are asked for by name. A
+    `TraceWarning` at the end says what is missing.
 
     :param names: full names of the events wanted, None for all
     :raises TraceError: where the file cannot be read
     """
     reader = TraceReader(path)
-    for layout, timestamp, vpid, vtid, *fields in reader.layout_events(names):
+    wanted = None if names is None else set(names)
+    named: dict[tuple[int, int], dict[str, Any]] = {}       # by process and thread
+    for layout, timestamp, vpid, vtid, *fields in reader.layout_events(
+            None if wanted is None else wanted | {_PROCESS}):
+        values = dict(zip(layout.fields, fields))
+        if layout.name == _PROCESS:
+            named[vpid, vtid] = {'_procname': values.get('procname', '')}
+            if wanted is None or _PROCESS not in wanted:
+                continue
         yield {'_name': layout.name, '_timestamp': timestamp, '_vpid': vpid, '_vtid': vtid,
-               **dict(zip(layout.fields, fields))}
+               **named.get((vpid, vtid), {}), **values}
     for text in reader.warnings:
         warnings.warn(text, TraceWarning, stacklevel=2)

@@ -145,6 +145,8 @@ _ALL = (
     _event('mddag', 'abort', dag=_I32, job=_I64),
     _event('mddag', 'lost', count=_I64),
     _event('mddag', 'shutdown', end=_I64),
+    # of imported recordings: what the event's thread is called from here on
+    _event('mddag', 'process', procname=_STR),
 )
 
 #: Every event of the table by its full name.

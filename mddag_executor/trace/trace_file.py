@@ -53,9 +53,12 @@ _COMPRESSION_LEVEL = 1      # of zstd; higher levels cost more than they save on
 class _Channel:
     """What the writer knows of one kind of event."""
 
-    __slots__ = ('channel', 'count', 'encode', 'index', 'number', 'schema', 'undefined')
+    __slots__ = ('channel', 'count', 'encode', 'event', 'index', 'number', 'schema',
+                 'schema_name', 'undefined')
 
     def __init__(self, event: EventType, number: int, schema_name: str) -> None:
+        self.event = event
+        self.schema_name = schema_name
         self.number = number            # of the channel and of its schema
         self.schema = records.schema(number, schema_name, event.text)
         self.channel = records.channel(number, number, event.topic)
@@ -142,6 +145,33 @@ class TraceFile:
                              'name a file in an existing folder that you may write') from None
         content = records.string('ros2') + records.string(LIBRARY)
         self._write(records.MAGIC + records.record(records.HEADER, content))
+
+    def define(self, event: EventType) -> str:
+        """
+        Make a kind of event known while the file is being written.
+
+        Where there are events of its name with other fields already, its own go to another channel
+        of the same topic.
+
+        :returns: the name that `add` and `extend` know it by
+        """
+        key, number = event.key, 1
+        while key in self._channels and self._channels[key].event != event:
+            number += 1
+            key = f'{event.key}#{number}'
+        if key not in self._channels:
+            names = {channel.schema_name for channel in self._in_order}
+            stem = schema_name = f'mddag_trace/msg/{camel_case(event.name)}'
+            if schema_name in names:
+                stem = schema_name = \
+                    f'mddag_trace/msg/{camel_case(event.provider)}{camel_case(event.name)}'
+            while schema_name in names:
+                number += 1
+                schema_name = f'{stem}V{number}'
+            channel = _Channel(event, len(self._in_order) + 1, schema_name)
+            self._channels[key] = channel
+            self._in_order.append(channel)
+        return key
 
     def add(self, event: str, timestamp: int, vpid: int, vtid: int, *fields: Any) -> None:
         """

@@ -19,6 +19,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 from pathlib import Path
 import signal
 import subprocess
@@ -35,7 +36,7 @@ workers: 1
 nodes:
   - node: /n
     callbacks:
-      - {name: a, timer: 10ms, dag: a, deadline: 10ms, execution_time: 2500us}
+      - {name: a, timer: 10ms, dag: a, deadline: 5ms, execution_time: 2500us}
       - name: b
         timer: 20ms
         dag: b
@@ -67,10 +68,10 @@ def test_table(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = [line.split() for line in out.splitlines()]
     assert lines[0] == ['utilisation', 'runs', 'rad', 'fifo', 'bound']
     assert lines[1] == ['0.50', '0', '-', '-', '-']
-    # Run without preemption, 14 ms after one of 2.5 ms leave the next of these no time.
+    # Without preemption one of 14 ms leaves that of 2.5 ms, released 10 ms later, no time.
     rows = {line[0]: line[2:] for line in lines[1:13]}
-    assert rows['0.75'] == ['0.0', '%', '0.0', '%', '100.0', '%'] or rows['0.75'][0] == '100.0'
-    assert rows['0.95'][:2] == ['0.0', '%']
+    assert rows['0.75'] == ['100.0', '%', '100.0', '%', '100.0', '%']
+    assert rows['0.95'] == ['0.0', '%', '0.0', '%', '100.0', '%']
     assert lines[12][:2] == ['all', '40']
     assert '40 runs in' in out and 'plain core' in out
 
@@ -127,7 +128,7 @@ def test_samples(graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     result = json.loads(out)
     assert result['samples'] is True
     assert result['counts'][8] == 5  # 0.9 + 1 us / 20 ms
-    assert result['acceptance']['rad'][8] == 1.0
+    assert result['acceptance']['rad'][8] == 0.0  # 9 ms, and a deadline of 5 ms
 
 
 @pytest.mark.parametrize(('arguments', 'line'), [
@@ -176,13 +177,21 @@ def test_without_matplotlib(
                    "install 'mddag_executor[batch]' with pip\n")
 
 
+def cpu_seconds(process: int) -> float:
+    """Return the processor time that a process has taken so far."""
+    fields = Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
 def test_interrupted(graph: Path, tmp_path: Path) -> None:
     """Ctrl-C: the exit status is 130, and what is done is written as a whole."""
     process = subprocess.Popen(
         [sys.executable, '-m', 'mddag_executor', 'evaluate', str(graph), '--runs', '5000000',
-         '--core', 'plain', '--jobs', '2', '--json', 'out.json', '--plot', 'out.png'],
+         '--core', 'plain', '--jobs', '1', '--json', 'out.json', '--plot', 'out.png'],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
-    time.sleep(5)
+    begin = time.monotonic()
+    while cpu_seconds(process.pid) < 2 and time.monotonic() < begin + 60:
+        time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     result = json.loads((tmp_path / 'out.json').read_text())

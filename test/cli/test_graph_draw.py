@@ -24,7 +24,7 @@ import sys
 
 import pytest
 
-Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+Mddag = Callable[..., subprocess.CompletedProcess[str]]
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
 

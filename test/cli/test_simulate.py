@@ -221,7 +221,7 @@ def changed(**times: Any) -> str:
     (['--workers', '-2'], None, '--workers'),
     (['--workers', 'many'], None, '--workers'),
     (['--policy', 'edf'], None,
-     "policy 'edf': there is no such policy: choose one of rad, rm, wc, fifo, gedf"),
+     "policy 'edf': there is no such policy: choose one of rad, rm, wc, fifo, gedf, dm, "),
     (['--duration', '-3s'], None, '--duration'),
     (['--duration=-3s'], None, 'negative'),
     (['--duration', '0s'], None, 'too short'),

@@ -33,6 +33,7 @@ Its reading of the documents:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 import math
@@ -85,6 +86,25 @@ def reachable_sinks(dag: Dag, index: int) -> set[int]:
     if not vertex.successors:
         return {index}
     return set().union(*(reachable_sinks(dag, after) for after in vertex.successors))
+
+
+def paths(dag: Dag, index: int) -> Iterator[list[Vertex]]:
+    """Yield every path from a vertex to a sink."""
+    vertex = dag.vertices[index]
+    for after in vertex.successors:
+        for path in paths(dag, after):
+            yield [vertex, *path]
+    if not vertex.successors:
+        yield [vertex]
+
+
+def least_laxity(dag: Dag, index: int) -> int:
+    """Return the least of the sinks' deadlines less the mean times of a path to them, in ns."""
+    return min(
+        (path[-1].deadline_ns or 0) - sum(
+            v.callback.execution_time.mean_ns for v in path
+            if v.callback.execution_time is not None)
+        for path in paths(dag, index))
 
 
 class BruteForce:
@@ -158,6 +178,11 @@ class BruteForce:
             return max(self._deadline(job, sink) for sink in job.dag.sinks)
         if self.policy == 'rm':
             return self._period(job.dag)
+        if self.policy == 'dm':
+            sinks = reachable_sinks(job.dag, execution.vertex.index)
+            return min(self._deadline(job, sink) for sink in sinks) - job.release
+        if self.policy == 'llf':  # in ns: declared execution times are no multiples of a tick
+            return job.release * self.tick + least_laxity(job.dag, execution.vertex.index)
         if self.policy == 'wc':
             return job.index
         assert self.policy == 'fifo'
@@ -166,9 +191,9 @@ class BruteForce:
     def key(self, execution: Execution) -> tuple[Any, ...]:
         """Return the order in which ready executions run."""
         job = execution.job
-        if self.policy in ('rad', 'gedf'):
+        if self.policy in ('rad', 'gedf', 'llf'):
             ties: tuple[Any, ...] = (execution.vertex.index, job.dag.index)
-        elif self.policy == 'rm':
+        elif self.policy in ('rm', 'dm'):
             ties = (job.index,)
         else:
             ties = ()

@@ -27,6 +27,7 @@ from typing import Any
 
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
+from mddag_executor.core import POLICIES
 from mddag_executor.simulate import (
     END,
     Load,
@@ -179,6 +180,8 @@ def task_sets(
             group = draw(st.sampled_from([None, None, 'g', 'h']))
             if group is not None:
                 callback['group'] = group
+        if draw(st.booleans()):  # only llf looks at it; the times of a run are the case's
+            callback['execution_time'] = _ticks(draw, 1, 9)
         if not callback['publishes']:
             callback['deadline'] = _ticks(draw, 1, 40)
         callback['publishes'] = sorted(callback['publishes'])
@@ -190,7 +193,7 @@ def task_sets(
 
 @st.composite
 def cases(
-    draw: st.DrawFn, /, policies: tuple[str, ...] = ('rad', 'rm', 'wc', 'fifo', 'gedf'),
+    draw: st.DrawFn, /, policies: tuple[str, ...] = tuple(POLICIES),
     overheads: bool = False, **options: Any,
 ) -> Case:
     """Draw a task set and how to run it."""

@@ -35,6 +35,7 @@ from mddag_executor.core.state import (
 )
 from msg_graph import Dag
 
+from .brute_force import least_laxity
 from .task_sets import Case, cases, examples, task_sets, TICK
 
 Id = tuple[int, int, int]
@@ -111,6 +112,7 @@ class Schedule:
         return {
             'rad': (release + rad_offset(dag, v), v, d),
             'gedf': (release + max(dag.vertices[s].deadline_ns or 0 for s in dag.sinks), v, d),
+            'llf': (release + least_laxity(dag, v), v, d), 'dm': (rad_offset(dag, v), job),
             'rm': (dag.period_ns, job), 'wc': (job,), 'fifo': (self.ready[each],),
         }[self.case.policy]
 

@@ -101,12 +101,33 @@ def test_rad_of_a_long_chain_is_found_without_recursion() -> None:
     assert rad_offsets(declaration(chain).dags[0]) == [5_000_000] * n
 
 
+def test_latest_start_by_hand() -> None:
+    """The sink with the earlier deadline is not the one that has to start first."""
+    tables = Tables.build(declaration([
+        {'node': '/n', 'name': 's', 'timer': '90us', 'publishes': ['/s'], 'dag': 'd',
+         'execution_time': '2us'},
+        {'node': '/n', 'name': 'quick', 'subscription': '/s', 'deadline': '40us'},
+        {'node': '/n', 'name': 'way', 'subscription': '/s', 'publishes': ['/w'],
+         'execution_time': {'quantiles_us': [10, 30]}},
+        {'node': '/n', 'name': 'long', 'subscription': '/w', 'deadline': '60us',
+         'execution_time': '15us'}]), default_deadline=7)
+    assert tables.rad_offset == [40 * US, 40 * US, 60 * US, 60 * US, 7]
+    assert tables.latest_start == [23 * US, 40 * US, 25 * US, 45 * US, 7]
+    assert policy('llf').key(tables, 2, 1_000, 6, 8, 9) == (1_000 + 25 * US, 2, 0, 9)
+
+
+def test_without_execution_times_the_latest_start_is_rad() -> None:
+    tables = Tables.build(two_dags())
+    assert tables.latest_start == tables.rad_offset
+
+
 @pytest.mark.parametrize(('name', 'key'), [
     ('rad', (1_000 + 25 * US, 3, 0, 9)),
     ('gedf', (1_000 + 40 * US, 3, 0, 9)),
     ('rm', (10 * US, 6, 8, 9)),
     ('wc', (6, 8, 9, 0)),
     ('fifo', (8, 9, 0, 0)),
+    ('dm', (25 * US, 6, 8, 9)),
 ])
 def test_keys(name: str, key: tuple[int, ...]) -> None:
     """Vertex 3 of the first DAG, job 6, released at 1000, readiness 8, order 9."""
@@ -115,8 +136,8 @@ def test_keys(name: str, key: tuple[int, ...]) -> None:
 
 
 def test_every_policy_has_its_row() -> None:
-    assert set(POLICIES) == {'rad', 'rm', 'wc', 'fifo', 'gedf'}
-    assert {name for name, row in POLICIES.items() if row.preemptive} == {'rad', 'rm', 'gedf'}
+    assert set(POLICIES) == {'rad', 'rm', 'wc', 'fifo', 'gedf', 'dm', 'llf'}
+    assert {name for name, row in POLICIES.items() if not row.preemptive} == {'wc', 'fifo'}
     for name, row in POLICIES.items():
         assert policy(name) is row
         assert row.name == name

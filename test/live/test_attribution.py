@@ -154,3 +154,13 @@ def test_publish_notes_its_window_and_passes_exceptions_on():
     except TypeError:
         pass
     assert bench.topic.publications[1].end < 2 ** 62
+
+
+def test_a_long_publication_is_forgotten_with_those_of_its_time():
+    """Else one stall would make every later look-up long."""
+    bench = Bench()
+    bench.published(0, 10 ** 12, 0)
+    for job in range(2 * KEEP):
+        bench.published(10 ** 12 + 1000 * job, 10 ** 12 + 1000 * job + 10, job)
+    assert bench.topic.longest == 10
+    assert bench.job(10 ** 12 + 1000 * (2 * KEEP - 1) + 5) == 2 * KEEP - 1

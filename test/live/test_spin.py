@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from typing import Any
@@ -164,6 +165,16 @@ def test_shutdown_waits_for_a_running_callback(make_executor):
         assert not executor.shutdown(0.01)
         assert executor.shutdown(5.0)
         assert done
+
+
+def test_freeze_gc_leaves_what_there_is_alone(make_executor):
+    before = gc.get_freeze_count()
+    executor = make_executor(freeze_gc=True)
+    try:
+        executor.spin_until_future_complete(Future(), 0.05)
+        assert gc.get_freeze_count() > before + 1000
+    finally:
+        gc.unfreeze()
 
 
 def test_rclpy_spin_uses_all_workers(make_executor, make_node, ros_context):

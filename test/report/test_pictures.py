@@ -23,7 +23,8 @@ import re
 import shutil
 import subprocess
 
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 from mddag_executor.report import dot, mermaid
 from mddag_executor.report.dot import to_dot
 from mddag_executor.report.mermaid import to_mermaid
@@ -74,7 +75,7 @@ def test_frames_boxes_and_arrows() -> None:
 
 def test_colours_follow_the_rad_offset() -> None:
     result = drawn()
-    colours = {box.id: box.colour for dag in result.dags for node in dag.nodes
+    colours = {box.mark: box.colour for dag in result.dags for node in dag.nodes
                for box in node.boxes}
     assert colours['d0v0'] == colours['d0v4'] == result.legend[0][0]  # 5 ms: the most urgent
     assert colours['d0v1'] == colours['d0v2'] == colours['d0v3'] == result.legend[1][0]
@@ -129,9 +130,9 @@ def test_graphviz_reads_hostile_names_as_they_are() -> None:
     result = drawn()
     first = result.dags[0]
     node = first.nodes[0]
-    boxes = tuple(replace(node.boxes[0], id=f'd0v{place}', lines=(name,), note=name)
+    boxes = tuple(replace(node.boxes[0], mark=f'd0v{place}', lines=(name,), note=name)
                   for place, name in enumerate(HOSTILE))
-    titles = tuple(replace(node, id=f'd0n{place}', title=name, boxes=(boxes[place],))
+    titles = tuple(replace(node, mark=f'd0n{place}', title=name, boxes=(boxes[place],))
                    for place, name in enumerate(HOSTILE))
     hostile = replace(result, title='\\N"', arrows=(),
                       dags=(replace(first, title='"<\\', nodes=titles),))
@@ -147,6 +148,6 @@ def test_graphviz_reads_hostile_names_as_they_are() -> None:
 def test_the_workload() -> None:
     result = picture(msg_graph.load(CONFIG / 'autoware_multi.yaml'))
     boxes = [box for dag in result.dags for node in dag.nodes for box in node.boxes]
-    assert (len(result.dags), len(boxes), len({box.id for box in boxes})) == (11, 86, 86)
-    assert {arrow.start for arrow in result.arrows} <= {box.id for box in boxes}
+    assert (len(result.dags), len(boxes), len({box.mark for box in boxes})) == (11, 86, 86)
+    assert {arrow.start for arrow in result.arrows} <= {box.mark for box in boxes}
     assert sum(arrow.queue for arrow in result.arrows) >= 32

@@ -56,6 +56,17 @@ def least_deadline(dag: int, index: int) -> int:
     return min(least_deadline(dag, after) for after in vertex.successors)
 
 
+@cache
+def latest_start(dag: int, index: int) -> int:
+    """Return the latest start minus release: every vertex takes its mean time and none waits."""
+    vertex = autoware().dags[dag].vertices[index]
+    assert vertex.callback.execution_time is not None
+    end = vertex.deadline_ns
+    if end is None:
+        end = min(latest_start(dag, after) for after in vertex.successors)
+    return end - vertex.callback.execution_time.mean_ns
+
+
 class Auditor:
     """Goes through the log of a run and holds it against the rules, with its own bookkeeping."""
 
@@ -81,7 +92,8 @@ class Auditor:
         return {
             'rad': (release + least_deadline(d, v), v, d), 'gedf': (release + latest, v, d),
             'rm': (self.dags[d].period_ns, job, readiness), 'wc': (job, readiness),
-            'fifo': (readiness,)}[self.policy]
+            'dm': (least_deadline(d, v), job, readiness),
+            'llf': (release + latest_start(d, v), v, d), 'fifo': (readiness,)}[self.policy]
 
     def priority(self, each: Id) -> int:
         return self.key(each)[0]

@@ -27,7 +27,8 @@ import math
 from pathlib import Path
 
 from mddag_executor.core import POLICIES, PolicyError
-from mddag_executor.simulate import compiled, evaluate as module
+from mddag_executor.simulate import compiled
+from mddag_executor.simulate import evaluate as module
 from mddag_executor.simulate.acceptance import BINS
 from mddag_executor.simulate.draws import Draws
 from mddag_executor.simulate.evaluate import evaluate, Evaluation, Experiment

@@ -30,7 +30,7 @@ import os
 import sys
 import threading
 import traceback
-from typing import Any
+from typing import Any, TextIO
 
 from mddag_executor.errors import MddagError
 from mddag_executor.live.bench.declared import run_declared
@@ -61,6 +61,7 @@ def main() -> int:
     args = parser.parse_args()
     if args.tied:
         threading.Thread(target=_end_with_stdin, daemon=True).start()
+    output = _take_stdout()
     try:
         result = run(Spec.from_json(args.spec))
     except (MddagError, GraphError) as error:
@@ -69,9 +70,21 @@ def main() -> int:
     except BaseException:
         traceback.print_exc()
         return 70
-    json.dump(result, sys.stdout)
-    print(flush=True)
+    with output:
+        json.dump(result, output)
+        output.write('\n')
     return 0
+
+
+def _take_stdout() -> TextIO:
+    """
+    Return standard output, and let everybody else who writes to it write to standard error.
+
+    Native code of rclpy's does: where a clock has many timers, for instance.
+    """
+    output = os.fdopen(os.dup(sys.stdout.fileno()), 'w')
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return output
 
 
 if __name__ == '__main__':

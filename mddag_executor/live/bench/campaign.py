@@ -48,11 +48,13 @@ class CrashError(BenchError):
     """A measurement whose executor crashed or hung."""
 
 
-def measure(spec: Spec, tick: Tick | None = None, patience_s: float = PATIENCE_S) -> dict[str, Any]:
+def measure(
+    spec: Spec, tick: Tick | None = None, patience_s: float = PATIENCE_S
+) -> dict[str, Any]:
     """
     Make one measurement in a new process; return its figures.
 
-    :raises CrashError: when the process crashed, or did not end and was killed.
+    :raises CrashError: when the process crashed, did not end and was killed, or gave no result.
     :raises BenchError: when the measurement can not be made.
     """
     # Of this machine only: it must not find another one's nodes, nor be found by them.
@@ -77,7 +79,12 @@ def measure(spec: Spec, tick: Tick | None = None, patience_s: float = PATIENCE_S
             raise BenchError(lines[-1])
         if process.returncode != 0:
             raise CrashError(f'{spec.name}: {_reason(process.returncode, limit, lines)}')
-        result: dict[str, Any] = json.loads(out.read())
+        text = out.read()
+        try:
+            result: dict[str, Any] = json.loads(text)
+        except ValueError:
+            raise CrashError(
+                f'{spec.name}: it ended well but gave no result: {text[:60]!r}') from None
         return result
 
 
@@ -131,7 +138,9 @@ def run_all(
 
 _COUNTS = ('published', 'received', 'lost')
 _VERDICTS = ('sink_jobs_due', 'on_time', 'late', 'missing')
-_FIGURES = ('callbacks_per_s', 'cpu_us_per_callback', 'utilisation_taken')
+_FIGURES = (
+    'callbacks_per_s', 'cpu_us_per_callback', 'middleware_cpu_us_per_callback',
+    'utilisation_taken')
 _QUANTILES = ('dispatch_latency_us', 'hot_path_us')
 
 
@@ -143,13 +152,15 @@ def combine(spec: Spec, runs: Sequence[dict[str, Any]], repeat: int = 1) -> dict
     """
     result: dict[str, Any] = {
         'load': spec.load, 'executor': spec.name, 'workers': spec.workers,
-        'seconds': spec.seconds, 'seed': spec.seed, 'repeat': repeat, 'crashed': repeat - len(runs)}
+        'seconds': spec.seconds, 'seed': spec.seed, 'repeat': repeat,
+        'crashed': repeat - len(runs)}
     declared = spec.load in DECLARED
     if declared:
         result['graph'] = spec.graph
         result['bodies'] = spec.bodies
     else:
-        result.update(topics=spec.topics, rate_hz=spec.rate_hz, idle=spec.idle)
+        result.update(
+            topics=spec.topics, rate_hz=spec.rate_hz, idle=spec.idle, groups=spec.groups)
     result['utilisation'] = _median(run.get('utilisation') for run in runs)
     for name in _VERDICTS:
         result[name] = _median(run.get(name) for run in runs)

@@ -23,6 +23,7 @@ tuple for each start; appending is one indivisible step in CPython, so there is 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+import inspect
 import time
 from typing import Any
 
@@ -33,6 +34,19 @@ from rclpy.timer import Timer
 
 Start = tuple[int, int]
 """When a callback started, ns since the epoch, and its dispatch latency, ns."""
+
+
+def _with_info(callback: Callable[..., None]) -> Callable[..., None]:
+    """
+    Let rclpy take a callback for one that wants message and info, as two arguments.
+
+    rclpy goes by the signature.  Its EventsExecutor (7.1) then gives both in one tuple, which is
+    why the second argument has a default.
+    """
+    parameters = [
+        inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY) for name in ('message', 'info')]
+    vars(callback)['__signature__'] = inspect.Signature(parameters)
+    return callback
 
 
 class Starts:
@@ -46,26 +60,30 @@ class Starts:
         self.messages: list[Start] = []
         self._timers: list[tuple[list[int], list[int]]] = []
 
-    def empty_callback(self) -> Callable[[Any, Any], None]:
+    def empty_callback(self) -> Callable[..., None]:
         """Return a subscription's callback that does nothing else."""
         append, time_ns = self.messages.append, time.time_ns
 
-        def on_message(message: Any, info: Any) -> None:
+        def on_message(message: Any, info: Any = None) -> None:
             now = time_ns()
+            if info is None:
+                message, info = message
             append((now, now - info['source_timestamp']))
 
-        return on_message
+        return _with_info(on_message)
 
     def watch_subscription(self, subscription: Subscription) -> None:
         """Note the starts of a subscription whose callback takes the message only."""
         append, time_ns, callback = self.messages.append, time.time_ns, subscription.callback
 
-        def on_message(message: Any, info: Any) -> None:
+        def on_message(message: Any, info: Any = None) -> None:
             now = time_ns()
+            if info is None:
+                message, info = message
             append((now, now - info['source_timestamp']))
             callback(message)
 
-        subscription.callback = on_message
+        subscription.callback = _with_info(on_message)
 
     def watch_timer(self, timer: Timer, delays: list[int]) -> None:
         """
@@ -91,10 +109,15 @@ class Starts:
             for timer in node.timers:
                 self.watch_timer(timer, delays(timer))
 
-    def within(self, begin: int, end: int) -> list[int]:
-        """Return the latencies of what started in a window, ns; its ends in ns of the epoch."""
+    def within(self, begin: int, end: int, timers: bool = True) -> list[int]:
+        """
+        Return the latencies of what started in a window, ns.
+
+        :param begin: of the window, ns since the epoch; so is the end.
+        :param timers: whether those of timers count, too.
+        """
         found = [latency for at, latency in list(self.messages) if begin <= at <= end]
-        for starts, delays in self._timers:
+        for starts, delays in self._timers if timers else ():
             # One of each for every call.  Calls of one timer that overlap may come in another
             # order here than there, which can matter only at the edges of the window.
             found += [late for at, late in zip(list(starts), delays) if begin <= at <= end]

@@ -22,17 +22,23 @@ middleware, interpreter, and reading the clock.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import os
 import time
 from typing import Any
 
+from mddag_executor.live.bench.cpu import middleware_cpu_ns
 from mddag_executor.live.bench.executors import make_executor, UnfinishedSession
 from mddag_executor.live.bench.latency import quantiles_us, Starts
 from mddag_executor.live.bench.publisher import make_node, PublisherProcess
 from mddag_executor.live.bench.spec import BenchError, Spec
 from mddag_executor.live.session import MATCH_TIMEOUT_S
 from mddag_executor.live.synthetic import QOS
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import (
+    CallbackGroup,
+    MutuallyExclusiveCallbackGroup,
+    ReentrantCallbackGroup,
+)
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from std_msgs.msg import Header
@@ -56,9 +62,10 @@ def run_messages(spec: Spec) -> dict[str, Any]:
     topics = [f'{prefix}/topic_{i}' for i in range(spec.topics)]
     node = make_node('mddag_bench')
     starts = Starts()
-    active = [_subscribe(node, topic, starts) for topic in topics]
+    group = _groups(spec, node)
+    active = [_subscribe(node, topic, starts, group()) for topic in topics]
     for i in range(spec.idle):
-        _subscribe(node, f'{prefix}/idle_{i}', starts)
+        _subscribe(node, f'{prefix}/idle_{i}', starts, group())
     executor.add_node(node)
     session = UnfinishedSession(executor, spec)
     with session, PublisherProcess(topics, spec.rate_hz, spec.seed) as publisher:
@@ -66,9 +73,9 @@ def run_messages(spec: Spec) -> dict[str, Any]:
         _wait_until_matched(session, active)
         publisher.begin()
         session.wait(spec.warm_up_s)
-        begin, cpu_begin = time.time_ns(), time.process_time_ns()
+        begin, cpu_begin, dds_begin = _clocks()
         session.wait(spec.seconds)
-        end, cpu_end = time.time_ns(), time.process_time_ns()
+        end, cpu_end, dds_end = _clocks()
         published = sum(publisher.finish())
         _drain(session, starts, published)
         received = len(starts.messages)
@@ -80,14 +87,30 @@ def run_messages(spec: Spec) -> dict[str, Any]:
         'window_ns': end - begin, 'callbacks': callbacks,
         'callbacks_per_s': callbacks / ((end - begin) / 1e9),
         'cpu_us_per_callback': (cpu_end - cpu_begin) / 1000 / callbacks if callbacks else None,
+        'middleware_cpu_us_per_callback':
+            None if dds_begin is None or dds_end is None or not callbacks
+            else (dds_end - dds_begin) / 1000 / callbacks,
         'dispatch_latency_us': quantiles_us(latencies), 'published': published,
         'received': received, 'lost': published - received}
 
 
-def _subscribe(node: Node, topic: str, starts: Starts) -> Subscription:
-    # Reentrant groups, as the synthetic nodes have them: no executor has to wait for itself.
+def _clocks() -> tuple[int, int, int | None]:
+    """Return the time, the CPU time of the process and that of its middleware's threads, ns."""
+    return time.time_ns(), time.process_time_ns(), middleware_cpu_ns()
+
+
+def _groups(spec: Spec, node: Node) -> Callable[[], CallbackGroup]:
+    """Return what gives the next subscription its callback group."""
+    if spec.groups == 'own':
+        return MutuallyExclusiveCallbackGroup
+    reentrant = spec.groups == 'reentrant'
+    shared = ReentrantCallbackGroup() if reentrant else node.default_callback_group
+    return lambda: shared
+
+
+def _subscribe(node: Node, topic: str, starts: Starts, group: CallbackGroup) -> Subscription:
     return node.create_subscription(
-        Header, topic, starts.empty_callback(), QOS, callback_group=ReentrantCallbackGroup())
+        Header, topic, starts.empty_callback(), QOS, callback_group=group)
 
 
 def _wait_until_matched(session: UnfinishedSession, active: list[Subscription]) -> None:

@@ -34,6 +34,11 @@ LOADS = ('autoware', 'topics', 'entities', 'reference-system')
 DECLARED = {
     'autoware': 'config/autoware.yaml', 'reference-system': 'config/reference_system.yaml'}
 """The loads that are synthetic nodes, and the declarations that ship for them."""
+GROUPS = ('shared', 'own', 'reentrant')
+"""
+The callback groups of message loads: the node's default one, in which one callback runs at a time;
+a mutually exclusive one for each subscription; one for all in which callbacks overlap freely.
+"""
 
 
 class BenchError(MddagError):
@@ -55,6 +60,7 @@ class Spec:
     :ivar topics: how many topics are published, each with one subscription.
     :ivar rate_hz: how often each is.
     :ivar idle: how many subscriptions there are besides, whose topics nobody publishes.
+    :ivar groups: the callback groups of the subscriptions, one of ``GROUPS``.
     """
 
     load: str
@@ -70,6 +76,7 @@ class Spec:
     topics: int = 1
     rate_hz: float = 100.0
     idle: int = 0
+    groups: str = 'shared'
 
     @property
     def name(self) -> str:

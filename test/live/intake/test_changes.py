@@ -21,9 +21,12 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.live.events import EventsIntake
+from mddag_executor.live.waitset import WaitSetIntake
 import pytest
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
+from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
@@ -264,6 +267,45 @@ def test_it_ends_with_its_context(
     intake.stop()
     node.destroy_node()
     assert not recorder.errors
+
+
+@pytest.mark.parametrize('kind', THREADED)
+def test_it_ends_with_a_context_that_ends_after_the_wake_up(
+    kind: str, ros_context: Context, recorder: Recorder
+) -> None:
+    """As signals do it: everybody is woken, and then, without a word, the context ends."""
+    node = make_node(ros_context)
+    guard = GuardCondition(None, None, ros_context)
+    ended = threading.Event()
+    intake = {'events': EventsIntake, 'waitset': WaitSetIntake}[kind](
+        ros_context, recorder, (guard,), on_shutdown=ended.set)
+    start(intake, node)
+    time.sleep(0.05)
+    guard.trigger()
+    if kind == 'events':
+        intake.wake()
+    time.sleep(0.03)
+    assert not ended.is_set()
+    ros_context.handle.shutdown()
+    assert ended.wait(1.0)
+    assert wait_for(lambda: not intake_threads(), 1.0)
+    intake.stop()
+    node.destroy_node()
+    assert not recorder.errors
+
+
+def test_a_poll_ends_with_a_context_that_ends_after_the_wake_up(
+    ros_context: Context, recorder: Recorder
+) -> None:
+    guard = GuardCondition(None, None, ros_context)
+    inline = WaitSetIntake(ros_context, recorder, (guard,))
+    guard.trigger()
+    assert inline.poll(None) == 0
+    threading.Timer(0.03, ros_context.handle.shutdown).start()
+    begin = time.monotonic()
+    assert inline.poll(None) == 0
+    assert time.monotonic() - begin < 1.0 and not ros_context.ok()
+    assert inline.poll(None) == 0
 
 
 # --- cost ----------------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ from std_msgs.msg import String
 from .helpers import (
     cpu_ns,
     intake_threads,
+    make_node,
     matched,
     MS,
     nothing,

@@ -213,3 +213,21 @@ def test_one_take_empties_a_queue_up_to_its_depth(
     time.sleep(0.2)
     assert inline.poll(1.0) == 4
     assert recorder.texts(subscription) == ['6', '7', '8', '9']  # as the QoS says
+
+
+def test_a_topic_that_never_rests_does_not_keep_a_poll_for_itself(
+    inline: WaitSetIntake, node: Node, recorder: Recorder
+) -> None:
+    name = topic()
+    node.create_subscription(String, name, lambda _: None, 4)
+    publisher = node.create_publisher(String, name, 20)
+
+    def answer(*_: Any) -> None:
+        publisher.publish(text(''))
+        time.sleep(0.010)
+
+    recorder.react['message'] = answer
+    inline.update([node])
+    assert matched(publisher)
+    publisher.publish(text(''))
+    assert 1 <= inline.poll(1.0) <= 4

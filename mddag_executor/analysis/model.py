@@ -1,0 +1,123 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""DAG tasks as the schedulability tests see them: costs, volumes, lengths and deadlines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mddag_executor.core import Tables
+from mddag_executor.errors import MddagError
+from msg_graph import Dag, ExecutionTime, TaskSet
+from msg_graph.analysis import path_lengths, topological_order
+
+BUDGETS = ('max', 'p99', 'mean')
+
+
+class AnalysisError(MddagError):
+    """A declaration that cannot be analysed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """
+    A DAG task with a budget for each vertex; all times in ns, vertices by their index.
+
+    :ivar costs: the budgets.
+    :ivar rad: RAD minus release.
+    :ivar latest: when a vertex has to be done, after the release, so that what follows can be.
+    :ivar sinks: index, relative deadline and length of the longest path, of each sink.
+    :ivar volume: sum of the budgets.
+    :ivar length: the longest path of all.
+    :ivar deadline: the latest relative deadline.
+    """
+
+    dag: Dag
+    costs: tuple[int, ...]
+    rad: tuple[int, ...]
+    latest: tuple[int, ...]
+    sinks: tuple[tuple[int, int, int], ...]
+    volume: int
+    length: int
+    deadline: int
+
+    @property
+    def period(self) -> int:
+        """Return the time between two releases, ns."""
+        return self.dag.period_ns
+
+    @property
+    def utilisation(self) -> float:
+        """Return the share of one worker that the task needs."""
+        return self.volume / self.period
+
+    @property
+    def one_deadline(self) -> bool:
+        """Whether all sinks have the same deadline."""
+        return len({deadline for _, deadline, _ in self.sinks}) == 1
+
+
+def tasks_of(task_set: TaskSet, budget: str = 'max') -> list[Task]:
+    """
+    Return the tasks of a task set.
+
+    :param budget: what of each declared execution time counts: ``max``, ``p99`` or ``mean``.
+    :raises AnalysisError: an execution time is not declared.
+    """
+    tables = Tables.build(task_set)
+    tasks = []
+    for dag in task_set.dags:
+        first = tables.first_vertex[dag.index]
+        costs = _costs(task_set, dag, budget)
+        lengths = path_lengths(dag, costs)
+        sinks = tuple((i, dag.vertices[i].deadline_ns or 0, lengths[i]) for i in dag.sinks)
+        tasks.append(Task(
+            dag=dag, costs=tuple(costs),
+            rad=tuple(tables.rad_offset[first:first + len(dag.vertices)]),
+            latest=tuple(_latest(dag, costs)), sinks=sinks, volume=sum(costs),
+            length=max(lengths), deadline=max(deadline for _, deadline, _ in sinks)))
+    return tasks
+
+
+def _costs(task_set: TaskSet, dag: Dag, budget: str) -> list[int]:
+    costs = []
+    for vertex in dag.vertices:
+        time = vertex.callback.execution_time
+        if time is None:
+            raise AnalysisError(
+                f'{task_set.file}:{vertex.callback.line}: {vertex.callback.key} declares no '
+                'execution_time: add one')
+        costs.append(_budget(time, budget))
+    return costs
+
+
+def _budget(time: ExecutionTime, budget: str) -> int:
+    if budget == 'max':
+        return time.quantiles_ns[-1]
+    if budget == 'p99':
+        return time.draw(0.99)
+    if budget == 'mean':
+        return time.mean_ns
+    raise AnalysisError(
+        f"budget '{budget}': there is no such budget: choose one of {', '.join(BUDGETS)}")
+
+
+def _latest(dag: Dag, costs: list[int]) -> list[int]:
+    latest = [vertex.deadline_ns or 0 for vertex in dag.vertices]
+    for index in reversed(topological_order(dag)):
+        after = dag.vertices[index].successors
+        if after:
+            latest[index] = min(latest[s] - costs[s] for s in after)
+    return latest

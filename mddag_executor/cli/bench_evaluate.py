@@ -1,0 +1,128 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The verb `bench evaluate`: how long a run takes, and a job of a vertex in task sets of any size.
+
+The machine decides about the figures, and whatever else it does: all are medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+from typing import Any
+
+from mddag_executor.cli import common
+from mddag_executor.cli.text import Progress, table
+from mddag_executor.core import policy as find_policy
+from mddag_executor.errors import UsageError
+from mddag_executor.resources import find
+
+HELP = 'measure the batch evaluation: time for each run and policy, and for each vertex job'
+EXAMPLE = """\
+mddag bench evaluate
+mddag bench evaluate --runs 5000 --jobs 1,2,4 --repeat 5 --json evaluate.json"""
+
+SIZES = (10, 100, 1000, 10_000)
+CORES = ('compiled', 'plain')
+# Plain Python takes some 30 times as long; fewer say as much.
+_PLAIN_SHARE = 50
+_VERTEX_JOBS = {'compiled': 200_000, 'plain': 20_000}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add('--graph', metavar='FILE',
+        help="a declaration to take instead of the paper's workload ('-': standard input)")
+    add('--runs', type=common.positive_int, default=2000, metavar='N',
+        help=f'for each measurement; one in {_PLAIN_SHARE} in plain Python (default: %(default)s)')
+    add('--policies', default='rad,rm,wc', metavar='P,P…', help='(default: %(default)s)')
+    add('--jobs', type=_counts, metavar='N,N…',
+        help='runs to simulate at a time (default: 1 and the number of processors)')
+    add('--vertices', type=_counts, default=SIZES, metavar='N,N…',
+        help='sizes of the random task sets (default: 10,100,1000,10000)')
+    add('--repeat', type=common.positive_int, default=3, metavar='R',
+        help='measure everything R times, and take the medians (default: %(default)s)')
+    common.add_json(parser)
+
+
+def _counts(text: str) -> list[int]:
+    return [common.positive_int(part.strip()) for part in text.split(',')]
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Measure and print.
+
+    :raises msg_graph.GraphError: when the declaration is wrong
+    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    """
+    from mddag_executor.simulate.compiled import available
+    common.check_output(args.json)
+    policies = tuple(name.strip() for name in args.policies.split(','))
+    for name in policies:
+        find_policy(name)
+    if max(args.vertices) > 100_000:
+        raise UsageError('--vertices: that is too many: give at most 100000')
+    cores = CORES if available() else CORES[1:]
+    result = _measure(args, policies, cores)
+    if args.json is not None:
+        common.write_json(args.json, result)
+    if common.wants_tables(args):
+        _show(result, cores)
+    return 0
+
+
+def _measure(
+    args: argparse.Namespace, policies: tuple[str, ...], cores: tuple[str, ...]
+) -> dict[str, Any]:
+    from mddag_executor.simulate.evaluate import Experiment
+    from mddag_executor.simulate.measure import time_runs, time_vertex_jobs
+    task_set = common.load_graph(args.graph or str(find('config/autoware.yaml')))
+    experiment = Experiment(task_set, policies, workers=task_set.workers or 7)
+    jobs = args.jobs or sorted({1, len(os.sched_getaffinity(0))})
+    runs: list[dict[str, Any]] = []
+    sizes: list[dict[str, Any]] = []
+    steps = len(cores) * (len(jobs) + len(args.vertices))
+    with Progress('measuring', steps) as line:
+        for core in cores:
+            count = args.runs if core == 'compiled' else max(1, args.runs // _PLAIN_SHARE)
+            for number in jobs:
+                line.update(len(runs) + len(sizes), f'{core} core, {number} at a time')
+                runs.append(time_runs(
+                    experiment, count, core=core, jobs=number, repeat=args.repeat))
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        for size in args.vertices:
+            for core in cores:
+                line.update(len(runs) + len(sizes), f'{core} core, {size} vertices')
+                sizes.append(time_vertex_jobs(
+                    size, core=core, vertex_jobs=_VERTEX_JOBS[core], repeat=args.repeat))
+    return {'graph': task_set.file, 'runs': runs, 'vertex_jobs': sizes,
+            'peak_memory_mb': peak / 1024}
+
+
+def _show(result: dict[str, Any], cores: tuple[str, ...]) -> None:
+    print(table(
+        ('core', 'at a time', 'runs', 'ms a run and policy', 'runs a second'),
+        [(row['core'], row['jobs'], row['runs'], f'{row["ms"]:.3f}', round(row['runs_per_s']))
+         for row in result['runs']]))
+    found = {(row['vertices'], row['core']): row['ns'] for row in result['vertex_jobs']}
+    sizes = list(dict.fromkeys(row['vertices'] for row in result['vertex_jobs']))
+    print(table(
+        ('vertices', *(f'ns a vertex job, {core}' for core in cores)),
+        [(size, *(round(found[size, core]) for core in cores)) for size in sizes]))
+    print(f'peak memory of the runs: {result["peak_memory_mb"]:.0f} MB')

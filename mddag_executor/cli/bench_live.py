@@ -1,0 +1,298 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The verb `bench live`: executors of rclpy nodes side by side, each in a process of its own.
+
+Everything that can be wrong with the command line is found before the first measurement.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+import sys
+import tempfile
+from typing import Any, TypeVar
+
+from mddag_executor.cli import common
+from mddag_executor.cli.text import Cell, printable, Progress, table
+from mddag_executor.core import POLICIES
+from mddag_executor.errors import UsageError
+from mddag_executor.live.bench.spec import (
+    DECLARED,
+    EXECUTORS,
+    GROUPS,
+    LOADS,
+    parse_executors,
+    Spec,
+)
+from mddag_executor.report.tables import percent
+from mddag_executor.resources import find
+
+HELP = 'measure executors of rclpy nodes, this one and those of rclpy, side by side'
+EXAMPLE = """\
+mddag bench live --load autoware --utilisation 0.3,0.6,0.8 --seconds 10 --plot live.png
+mddag bench live --load autoware --executors rad-events,multi --policies rad,fifo,rm,wc,gedf
+mddag bench live --load topics --topics 50 --rate 100 --repeat 3 --json topics.json
+"""
+
+UTILISATIONS = (0.3, 0.6, 0.8)
+TOPICS = ((20, 50.0), (50, 100.0))
+IDLE = (1, 10, 100, 1000)
+ENTITIES_RATE_HZ = 100.0
+
+# What an option belongs to; with any other load it is an error and not silently ignored.
+_LOADS_OF_OPTIONS = {
+    'graph': ('autoware', 'reference-system'), 'utilisation': ('autoware', 'reference-system'),
+    'bodies': ('autoware', 'reference-system'), 'topics': ('topics',),
+    'rate': ('topics', 'entities'), 'idle': ('entities',), 'groups': ('topics', 'entities')}
+
+_T = TypeVar('_T')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add('--load', choices=LOADS, required=True,
+        help='autoware and reference-system: the synthetic nodes of these declarations; topics: '
+        'empty callbacks of many topics; entities: one active topic beside idle subscriptions')
+    add('--executors', default=','.join(EXECUTORS), metavar='E[,E…]',
+        help=f'some of {", ".join(EXECUTORS)}; the first two are this one, by intake, also with a '
+        'policy as rad-events:fifo (default: all)')
+    add('--policies', metavar='P[,P…]',
+        help=f'run this executor with each of these: {", ".join(POLICIES)} (default: rad)')
+    add('--utilisation', type=_list_of(common.positive_float), metavar='U[,U…]',
+        help='scale the execution times to these normalised utilisations, sum(C/T)/workers '
+        '(default: 0.3,0.6,0.8 for autoware, as declared for reference-system)')
+    add('--graph', metavar='FILE', help='a declaration to take instead of the one that ships '
+        "with the package ('-': standard input)")
+    add('--bodies', choices=('sleep', 'spin'),
+        help='how the synthetic callbacks execute (default: sleep)')
+    add('--topics', type=common.positive_int, metavar='N',
+        help='with --load topics: how many (default: both 20 at 50 Hz and 50 at 100 Hz)')
+    add('--rate', type=common.positive_float, metavar='HZ',
+        help='how often each topic is published (default: see --topics; 100 for entities)')
+    add('--idle', type=_list_of(_natural), metavar='N[,N…]',
+        help='with --load entities: how many idle subscriptions (default: 1,10,100,1000)')
+    add('--groups', choices=GROUPS,
+        help="with topics and entities: the node's default callback group, one for each "
+        'subscription, or a reentrant one (default: shared)')
+    add('--workers', type=common.positive_int, default=7, metavar='M',
+        help='threads of this executor and of MultiThreadedExecutor (default: %(default)s)')
+    add('--seconds', type=common.positive_float, default=10.0, metavar='S',
+        help='how long each measurement is, after a warm-up of 1 s (default: 10)')
+    add('--seed', type=int, default=0, metavar='N',
+        help='of the execution times and phases, the same for all (default: %(default)s)')
+    add('--repeat', type=common.positive_int, default=1, metavar='R',
+        help='measure everything R times in turn, and take the medians (default: %(default)s)')
+    add('--plot', metavar='OUT', help='draw a figure (.png, .svg or .pdf)')
+    common.add_json(parser)
+
+
+def _list_of(item: Callable[[str], _T]) -> Callable[[str], list[_T]]:
+    def parse(text: str) -> list[_T]:
+        return [item(part.strip()) for part in text.split(',')]
+
+    return parse
+
+
+def _natural(text: str) -> int:
+    if text != '0':
+        return common.positive_int(text)
+    return 0
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Make all measurements and print them.
+
+    :raises msg_graph.GraphError: when the declaration is wrong
+    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    """
+    _check(args)
+    executors = parse_executors(args.executors, args.policies)
+    with _graph(args) as graph:
+        specs = make_specs(args, executors, graph)
+        results = _measure(specs, args.repeat)
+    for result in results:
+        if graph is not None:
+            result['graph'] = args.graph or graph
+    if args.json is not None:
+        common.write_json(args.json, results)
+    if args.plot is not None:
+        from mddag_executor.live.bench.plot import draw
+        with common.output_file(args.plot) as file:
+            draw(results, file, args.plot)
+    if common.wants_tables(args):
+        print(result_table(results))
+        for line in notes(results):
+            print(line)
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    for option, loads in _LOADS_OF_OPTIONS.items():
+        if getattr(args, option) is not None and args.load not in loads:
+            raise UsageError(
+                f'--{option}: it means nothing to --load {args.load}: leave it out, or take '
+                f'--load {" or ".join(loads)}')
+    if args.json == '-' and args.plot == '-':
+        raise UsageError('-: standard output can take only one of --json and --plot: name a file')
+    for path in (args.json, args.plot):
+        common.check_output(path)
+    if args.plot is not None:
+        from mddag_executor.simulate.plot import check_plot
+        check_plot(args.plot)
+    if find_spec('rclpy') is None:
+        raise ModuleNotFoundError('there is no rclpy', name='rclpy')
+
+
+@contextmanager
+def _graph(args: argparse.Namespace) -> Iterator[str | None]:
+    """Give the path of the declaration, checked with all utilisations; None: the load has none."""
+    if args.load not in DECLARED:
+        yield None
+        return
+    from mddag_executor.live.execution import ExecutionPlan
+    from msg_graph import load, loads
+    with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
+        path = args.graph or str(find(DECLARED[args.load]))
+        if path == '-':
+            name, text = common.read_text(path)
+            task_set = loads(text, name=name)
+            path = str(Path(folder, 'graph.yaml'))
+            Path(path).write_text(text, encoding='utf-8')
+        else:
+            task_set = load(path)
+        for utilisation in _utilisations(args):
+            plan = ExecutionPlan(task_set, args.seed, utilisation, args.workers)
+            if infeasible := plan.infeasible():
+                print(
+                    f'warning: at utilisation {plan.utilisation:.2f} with seed {args.seed} '
+                    f'{len(infeasible)} sinks have a critical path longer than their deadline: '
+                    'no scheduler can keep these', file=sys.stderr)
+        yield path
+
+
+def _utilisations(args: argparse.Namespace) -> Sequence[float | None]:
+    if args.utilisation is not None:
+        given: list[float | None] = args.utilisation
+        return given
+    return UTILISATIONS if args.load == 'autoware' else [None]
+
+
+def make_specs(
+    args: argparse.Namespace, executors: Sequence[tuple[str, str]], graph: str | None
+) -> list[Spec]:
+    """Return the measurements that a command line asks for, in the order of the table."""
+    variants: list[dict[str, Any]]
+    groups = args.groups or 'shared'
+    if graph is not None:
+        variants = [{'graph': graph, 'utilisation': utilisation, 'bodies': args.bodies or 'sleep'}
+                    for utilisation in _utilisations(args)]
+    elif args.load == 'topics':
+        pairs = TOPICS if args.topics is None and args.rate is None else [
+            (args.topics or TOPICS[0][0], args.rate or TOPICS[0][1])]
+        variants = [{'topics': topics, 'rate_hz': rate, 'groups': groups}
+                    for topics, rate in pairs]
+    else:
+        rate = args.rate or ENTITIES_RATE_HZ
+        variants = [{'idle': idle, 'rate_hz': rate, 'groups': groups}
+                    for idle in args.idle or IDLE]
+    return [
+        Spec(load=args.load, executor=executor, policy=policy, workers=args.workers,
+             seconds=args.seconds, seed=args.seed, **variant)
+        for variant in variants for executor, policy in executors]
+
+
+def _measure(specs: Sequence[Spec], repeat: int) -> list[dict[str, Any]]:
+    from mddag_executor.live.bench.campaign import run_all
+    each = specs[0].seconds + specs[0].warm_up_s + 2.0
+    with Progress('measuring', len(specs) * repeat * each) as progress:
+        def tick(spec: Spec, made: int, passed: float) -> None:
+            note = f'({spec.name}, {made + 1} of {len(specs) * repeat})'
+            progress.update(made * each + min(passed, each), note)
+
+        def warn(text: str) -> None:
+            print(f'warning: {printable(text)}', file=sys.stderr)
+
+        return run_all(specs, repeat, tick, warn)
+
+
+def result_table(results: Sequence[dict[str, Any]]) -> str:
+    """Return the table for people: a row for each measurement."""
+    load = results[0]['load']
+    header = {'topics': ['topics', 'rate'], 'entities': ['idle']}.get(load, ['utilisation'])
+    header += ['executor']
+    header += ['due', 'in time'] if load in DECLARED else ['published', 'lost']
+    header += ['callbacks/s', 'CPU each'] + ([] if load in DECLARED else ['of it DDS'])
+    header += ['dispatch p50', 'p99', 'max']
+    if load == 'reference-system':
+        header += ['hot path p50', 'p99', 'max']
+    return table(header, [_row(load, result) for result in results])
+
+
+def _row(load: str, result: dict[str, Any]) -> list[Cell]:
+    row: list[Cell]
+    if load == 'topics':
+        row = [result['topics'], f'{result["rate_hz"]:g} Hz']
+    elif load == 'entities':
+        row = [result['idle']]
+    else:
+        row = [_number(result['utilisation'], '.2f')]
+    row.append(result['executor'])
+    if load in DECLARED:
+        due = result['sink_jobs_due']
+        row += [due, None if due is None else percent(result['on_time'], due)]
+    else:
+        row += [result['published'], result['lost']]
+    row += [_number(result['callbacks_per_s'], '.0f'),
+            _number(result['cpu_us_per_callback'], '.1f', ' us')]
+    if load not in DECLARED:
+        row.append(_number(result['middleware_cpu_us_per_callback'], '.1f', ' us'))
+    row += _times(result['dispatch_latency_us'])
+    return row + (_times(result['hot_path_us']) if load == 'reference-system' else [])
+
+
+def _times(latency: dict[str, Any] | None) -> list[Cell]:
+    if latency is None or latency['p50'] is None:
+        return [None, None, None]
+    return [f'{latency[name] / 1000:.2f} ms' for name in ('p50', 'p99', 'max')]
+
+
+def _number(value: float | None, form: str, unit: str = '') -> str | None:
+    return None if value is None else f'{value:{form}}{unit}'
+
+
+def notes(results: Sequence[dict[str, Any]]) -> Iterator[str]:
+    """Yield the lines below the table."""
+    first = results[0]
+    how = f', medians of {first["repeat"]}' if first['repeat'] > 1 else ''
+    yield (f'{first["seconds"]:g} s each{how}, seed {first["seed"]}, {first["workers"]} '
+           'workers' + (f', {first["groups"]} callback groups' if 'groups' in first else ''))
+    if first['load'] in DECLARED:
+        yield ('in time: of the sink jobs that were due, noticed by the executor or not; CPU: of '
+               'the whole process')
+    else:
+        yield ('lost: published and never run, warm-up included; CPU: of the whole process, '
+               "without the publishers; of it DDS: the middleware's own threads")
+    for result in results:
+        for run in result['runs']:
+            wrong = run.get('attribution', {}).get('wrong', 0)
+            if wrong:
+                yield f'{result["executor"]}: {wrong} callbacks ran as the wrong job'

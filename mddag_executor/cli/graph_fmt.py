@@ -1,0 +1,62 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `graph fmt`: declarations in normal form."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from mddag_executor.cli import common
+from mddag_executor.cli.text import one_line
+
+HELP = 'lay a declaration out evenly; comments and order stay'
+EXAMPLE = """\
+mddag graph fmt graph.yaml
+mddag graph fmt --check graph.yaml
+"""
+DESCRIPTION = """\
+Bring a declaration into its normal form: two more spaces for each level, long lists in brackets
+broken near column 90. Comments, quotes, order and meaning stay. The file is replaced as a whole;
+'-' reads standard input and writes standard output."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    common.add_graph(parser)
+    parser.add_argument(
+        '--check', action='store_true',
+        help='change nothing; exit with 1 if the declaration is not in its normal form')
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Lay out.
+
+    :returns: 1 with `--check` if there is something to change
+    :raises msg_graph.GraphError: when the declaration is wrong
+    """
+    from msg_graph.layout import format_text
+    name, text = common.read_text(args.graph)
+    result = format_text(text, name)
+    if args.check:
+        if result != text:
+            print(one_line(f"{name}: not in normal form: run 'mddag graph fmt' on it"),
+                  file=sys.stderr)
+        return int(result != text)
+    if args.graph == '-' or result != text:
+        common.check_output(args.graph)
+        common.write_text(args.graph, result)
+    return 0

@@ -1,0 +1,81 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `import`: recordings of other tools become traces."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import TYPE_CHECKING
+
+from mddag_executor.cli import common
+from mddag_executor.cli.text import one_line, printable, Progress
+from mddag_executor.errors import UsageError
+
+if TYPE_CHECKING:
+    from mddag_executor.trace import Imported
+
+NAME = 'import'
+HELP = 'turn a CARET or ros2_tracing recording into a trace'
+EXAMPLE = 'mddag import ctf ~/.ros/tracing/session-20261121101500 -o drive.mcap'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the formats and their arguments."""
+    formats = parser.add_subparsers(
+        dest='format', metavar='FORMAT', required=True, title='formats')
+    ctf = formats.add_parser(
+        'ctf', help='a session that LTTng recorded', allow_abbrev=False,
+        description='Turn a session that LTTng recorded (CARET, ros2_tracing), all its processes '
+        'and events, into a trace. It is read with the Python bindings of babeltrace2 '
+        '(apt install python3-bt2), in whichever Python of this machine has them.',
+        epilog=f'example:\n  {EXAMPLE}', formatter_class=argparse.RawDescriptionHelpFormatter)
+    ctf.add_argument('session', metavar='SESSION', help='the folder that was recorded to')
+    ctf.add_argument('-o', '--output', metavar='OUT.mcap', required=True,
+                     help='the trace to write')
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Import a session and say what was in it.
+
+    :raises mddag_executor.trace.TraceError: when it cannot be read, or the trace not be written
+    """
+    if args.output == '-':
+        raise UsageError('-o -: a trace is not written to standard output: name a file')
+    common.check_output(args.output)
+    imported = _import(args.session, args.output)
+    for warning in imported.warnings:
+        print(f'warning: {one_line(warning)}', file=sys.stderr)
+    print(f'{_count(imported.events, "event")} of {_count(imported.kinds, "kind")} from '
+          f'{_count(len(imported.processes), "process", "processes")}: {printable(args.output)}')
+    return 0
+
+
+def _import(session: str, output: str) -> Imported:
+    """Write the trace as a whole or not at all."""
+    from mddag_executor.trace import import_ctf, TraceError
+    with common.output_file(output) as file, Progress('importing') as line:
+        try:
+            return import_ctf(session, file.name,
+                              progress=lambda events: line.update(events, 'events'))
+        except TraceError as error:
+            if error.file != file.name:
+                raise
+            raise TraceError(output, error.problem, error.remedy) from None
+
+
+def _count(number: int, one: str, many: str | None = None) -> str:
+    return f'{number} {one if number == 1 else many or one + "s"}'

@@ -1,0 +1,110 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Draw what was measured: a curve for each executor, the load from left to right.
+
+Above is what the load asks for: for declared loads with deadlines the share in time, as in the
+paper's figure, for message loads the dispatch latency.  Below is the CPU time for each callback.
+matplotlib (the extra ``batch``) is imported when a figure is drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import os
+from typing import Any, BinaryIO, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_MARKERS = 'os^Dv*PX'
+_X_LABELS = {
+    'autoware': 'normalised utilisation', 'reference-system': 'normalised utilisation',
+    'topics': 'load', 'entities': 'idle subscriptions beside an active one'}
+
+
+def draw(results: Sequence[dict[str, Any]], file: BinaryIO, path: str) -> None:
+    """
+    Draw results of one load into a file.
+
+    :param results: as ``run_all`` returns them.
+    :param path: the file's name, whose ending tells the kind of picture.
+    """
+    from matplotlib import rc_context, style
+    from matplotlib.figure import Figure
+    kind = os.path.splitext(path)[1].lower()[1:]
+    load = results[0]['load']
+    metadata: dict[str, Any] = {'png': {}, 'svg': {'Date': None}, 'pdf': {'CreationDate': None}}
+    with style.context('tableau-colorblind10'), rc_context(
+            {'svg.hashsalt': 'mddag', 'font.size': 9.0}):
+        figure = Figure(figsize=(6.4, 5.6), layout='constrained')
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        _curves(above, results, _in_time if load == 'autoware' else _latency)
+        _curves(below, results, _cpu)
+        if load == 'autoware':
+            above.set_ylabel('sink jobs in time, %')
+            above.set_ylim(-3, 103)
+        else:
+            hot = load == 'reference-system'
+            above.set_ylabel('hot path p99, ms' if hot else 'dispatch latency p99, us')
+            above.set_yscale('log')
+        below.set_ylabel('CPU for each callback, us')
+        below.set_yscale('log')
+        below.set_xlabel(_X_LABELS[load])
+        if load == 'entities':
+            below.set_xscale('symlog', linthresh=1)
+            below.set_xlim(left=-0.3)
+        above.legend(fontsize=8, frameon=False)
+        first = results[0]
+        above.set_title(
+            f'{load}: {first["seconds"]:g} s each, median of {first["repeat"]}, '
+            f'{first["workers"]} workers', fontsize=9)
+        figure.savefig(file, format=kind, dpi=150, metadata=metadata[kind])
+
+
+def _curves(axes: Axes, results: Sequence[dict[str, Any]], value: Any) -> None:
+    for i, name in enumerate(dict.fromkeys(result['executor'] for result in results)):
+        points = [(_x(result), value(result)) for result in results
+                  if result['executor'] == name]
+        points = [(x, y) for x, y in points if x is not None and y is not None]
+        axes.plot([x for x, _ in points], [y for _, y in points], label=name,
+                  marker=_MARKERS[i % len(_MARKERS)], markersize=4.5, linewidth=1.2)
+    axes.grid(color='0.9', linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def _x(result: dict[str, Any]) -> Any:
+    if result['load'] == 'topics':
+        return f'{result["topics"]} topics at {result["rate_hz"]:g} Hz'
+    return result['idle'] if result['load'] == 'entities' else result['utilisation']
+
+
+def _in_time(result: dict[str, Any]) -> float | None:
+    ratio = result['on_time_ratio']
+    return None if ratio is None else 100 * float(ratio)
+
+
+def _latency(result: dict[str, Any]) -> float | None:
+    """Return the p99 of the hot path in ms, or else of the dispatch latency in us."""
+    if result['load'] == 'reference-system':
+        hot = result['hot_path_us']
+        return None if hot is None or hot['p99'] is None else float(hot['p99']) / 1000
+    latency = result['dispatch_latency_us']
+    return None if latency is None else float(latency['p99'])
+
+
+def _cpu(result: dict[str, Any]) -> float | None:
+    cpu: float | None = result['cpu_us_per_callback']
+    return cpu

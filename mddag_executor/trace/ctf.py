@@ -1,0 +1,399 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Importing CARET and ros2_tracing recordings: sessions of LTTng in the Common Trace Format (CTF).
+
+Theory of operation:
+
+1. babeltrace2 reads the session, through its Python bindings in a process of their own
+   (`ctf_helper`): they usually belong to the system's Python, and they abort on some damage. The
+   Pythons are tried one after the other, this one first, until one has the bindings.
+2. All traces below the folder (processes, hosts, kernel) come as one stream in the order of time.
+   What CARET's analysis leaves beside them, its cache `caret_converted`, is a Python pickle of the
+   same events and is not read: a pickle runs whatever code is in it.
+3. Every event becomes one event of the trace, with all fields of its payload. An event of the
+   table (`schema.EVENTS`) has the table's types for the table's fields: flags that C has as
+   integers become bool, unsigned times int64 of the same bits. Any other event, and any other
+   fields, come with the types that they have in the session. A name that ROS does not allow is
+   changed; one that the preamble or the table has for something else gets `_` at its end.
+4. Contexts `vpid` and `vtid` are the preamble. Before the first event of a thread, and where its
+   name changes, stands an event `mddag:process` with its `procname`.
+5. What the tracer discarded is an event `mddag:lost` at the end of the gap; a packet that was
+   lost counts as one event at least, and a warning says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+import json
+import os
+from pathlib import Path
+import re
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+from typing import Any, IO
+
+from mddag_executor.trace.cdr import FieldType
+from mddag_executor.trace.ctf_helper import PATIENCE_S
+from mddag_executor.trace.errors import TraceError
+from mddag_executor.trace.schema import EVENTS, EventType, PREAMBLE
+from mddag_executor.trace.trace_file import TraceFile
+
+INSTALL = 'apt install python3-bt2'
+_HELPER = Path(__file__).with_name('ctf_helper.py')
+_CACHE = 'caret_converted'
+_FRAME_LIMIT = 1 << 30      # bytes; a longer one is no frame
+_RECORD = 'check the recording, or record it anew'
+
+Row = list[Any]
+
+
+@dataclass
+class Imported:
+    """What an import has brought."""
+
+    events: int = 0
+    kinds: int = 0
+    processes: set[int] = field(default_factory=set)
+    #: Events that the tracer discarded, as far as it counted them.
+    discarded: int = 0
+    #: What is missing or was changed, one line each.
+    warnings: list[str] = field(default_factory=list)
+
+
+def import_ctf(
+    session: str | os.PathLike[str], output: str | os.PathLike[str], *,
+    progress: Callable[[int], None] | None = None,
+) -> Imported:
+    """
+    Write the events of a CTF session into a trace file.
+
+    :param session: the folder of the session; traces are looked for in all folders below it
+    :param output: the trace; it is not complete when an exception comes up
+    :param progress: told now and then how many events there have been
+    :raises TraceError: where the session or the file cannot be used, or babeltrace2 is missing
+    """
+    path = os.fspath(session)
+    _check_session(path)
+    with TraceFile(output) as file:
+        importer = _Importer(path, file)
+        for row in _rows(path):
+            importer.take(row)
+            if progress is not None and row[0] == 'event' and importer.result.events % 5000 == 0:
+                progress(importer.result.events)
+        if importer.result.events == 0:
+            raise TraceError(path, 'no event is recorded in it', _RECORD)
+        importer.finish()
+    return importer.result
+
+
+def _check_session(path: str) -> None:
+    """Raise TraceError where there is no session, before babeltrace2 says so in its own words."""
+    remedy = 'name the folder that LTTng recorded to, such as ~/.ros/tracing/SESSION'
+    if '\0' in path or not os.path.exists(path):
+        raise TraceError(path, 'there is no such folder', remedy)
+    if not os.path.isdir(path):
+        raise TraceError(path, 'is no folder', remedy)
+    found = [os.path.join(folder, 'metadata') for folder, _, names in os.walk(path)
+             if 'metadata' in names]
+    if not found:
+        what = 'holds no CTF recording: there is no file called metadata in it or below'
+        if os.path.exists(os.path.join(path, _CACHE)):
+            what = f'holds only what CARET converted ({_CACHE}), not the recording itself'
+        raise TraceError(path, what, remedy)
+    for metadata in found:
+        _check_metadata(metadata)
+
+
+# The head of a metadata packet: magic, UUID, checksum, sizes of content and packet in bits, and
+# compression, encryption, checksum scheme, major, minor (CTF 1.8.3, 7.1).
+_PACKET = '16sIII5B'
+_MAGIC = 0x75D11D57
+
+
+def _check_metadata(path: str) -> None:
+    """Raise TraceError where a packet of the metadata is cut: babeltrace2 2.0 never ends on it."""
+    try:
+        with open(path, 'rb') as stream:
+            data = stream.read()
+    except OSError as error:
+        raise TraceError(path, f'cannot be read ({error.strerror})', _RECORD) from None
+    order = next((order for order in '<>' if data[:4] == struct.pack(f'{order}I', _MAGIC)), None)
+    if order is None:
+        if not data:
+            raise TraceError(path, 'the metadata is empty', _RECORD)
+        return      # plain text
+    head = struct.Struct(f'{order}I{_PACKET}')
+    position = 0
+    while position < len(data):
+        if position + head.size > len(data):
+            raise TraceError(path, f'the metadata is cut at byte {len(data)}', _RECORD)
+        magic, _, _, content, size, *_ = head.unpack_from(data, position)
+        if magic != _MAGIC or not head.size * 8 <= content <= size or size % 8:
+            raise TraceError(path, f'the metadata is damaged at byte {position}', _RECORD)
+        position += size // 8
+        if position > len(data):
+            raise TraceError(path, f'the metadata is cut at byte {len(data)}', _RECORD)
+
+
+# --- the helper process --------------------------------------------------------------------------
+
+
+def interpreters() -> list[str]:
+    """Return the Pythons that may have babeltrace2's bindings, this one first."""
+    system = sorted(str(path) for path in Path('/usr/bin').glob('python3.[0-9]*')
+                    if re.fullmatch(r'python3\.\d+', path.name))
+    found = [sys.executable, '/usr/bin/python3', shutil.which('python3'), *reversed(system)]
+    return list(dict.fromkeys(name for name in found if name and os.access(name, os.X_OK)))
+
+
+def _rows(path: str) -> Iterator[Row]:
+    """Yield the rows of the first Python that has the bindings."""
+    for interpreter in interpreters():
+        rows = _rows_of(interpreter, path)
+        first = next(rows, None)
+        if first is not None and first[0] == 'ready':
+            yield from rows
+            return
+        rows.close()
+    raise TraceError(
+        path, "babeltrace2's Python bindings, which read it, are not installed", INSTALL)
+
+
+def _rows_of(interpreter: str, path: str) -> Generator[Row, None, None]:
+    """
+    Yield the rows of a helper process.
+
+    :raises TraceError: where it does not come to the end
+    """
+    # A home that is set for one Python breaks another. Bytecode would be the only thing written.
+    environment = {name: value for name, value in os.environ.items() if name != 'PYTHONHOME'}
+    environment['PYTHONDONTWRITEBYTECODE'] = '1'
+    try:
+        process = subprocess.Popen(
+            [interpreter, str(_HELPER), os.path.abspath(path)], env=environment,
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    except OSError:
+        return      # the next one, then
+    assert process.stdout is not None
+    ready = False
+    try:
+        for row in _frames(process.stdout):
+            if row[0] == 'error':
+                raise TraceError(path, f'cannot be read ({row[1]})', _RECORD)
+            if row[0] == 'end':
+                return
+            ready = ready or row[0] == 'ready'
+            yield row
+        if ready:
+            raise TraceError(path, f'babeltrace2 gave up ({_end_of(process)})', _RECORD)
+    finally:
+        process.kill()
+        process.stdout.close()
+        process.wait()
+
+
+def _frames(stream: IO[bytes]) -> Iterator[Row]:
+    """Yield the rows of all frames, up to where the stream ends or is none of the helper's."""
+    while True:
+        head = stream.read(4)
+        if len(head) < 4:
+            return
+        length, = struct.unpack('>I', head)
+        data = stream.read(length) if length <= _FRAME_LIMIT else b''
+        if len(data) < length:
+            return
+        try:
+            yield from json.loads(data)
+        except ValueError:
+            return
+
+
+def _end_of(process: subprocess.Popen[bytes]) -> str:
+    try:
+        status = process.wait(10)
+    except subprocess.TimeoutExpired:
+        return 'it does not answer'
+    if status == -signal.SIGALRM:
+        return f'it did nothing for {PATIENCE_S} s'
+    if status >= 0:
+        return f'exit status {status}'
+    try:
+        return f'ended by {signal.Signals(-status).name}'
+    except ValueError:
+        return f'ended by signal {-status}'
+
+
+# --- from rows to events -------------------------------------------------------------------------
+
+
+class _Kind:
+    """How the events of one class are written."""
+
+    __slots__ = ('converts', 'key')
+
+    def __init__(self, key: str, converts: Sequence[Callable[[Any], Any] | None]) -> None:
+        self.key = key
+        # None where no value changes
+        self.converts = converts if any(converts) else None
+
+
+class _Importer:
+    """Writes the rows of a session as events."""
+
+    def __init__(self, path: str, file: TraceFile) -> None:
+        self.result = Imported()
+        self._path = path
+        self._file = file
+        self._kinds: dict[int, _Kind] = {}
+        self._originals: dict[str, str] = {}        # full name in the trace: that in the session
+        self._changed: dict[str, str] = {}
+        self._procnames: dict[tuple[int, int], str] = {}
+        self._nameless = 0                          # events without process or thread
+        self._uncounted = 0                         # gaps of an unknown number of events
+        self._time = 0
+
+    def take(self, row: Row) -> None:
+        """Write what a row says."""
+        if row[0] == 'event':
+            self._event(*row[1:])
+        elif row[0] == 'class':
+            self._class(*row[1:])
+        elif row[0] == 'discarded':
+            self._discarded(*row[1:])
+
+    def _event(self, number: int, time: int, vpid: int | None, vtid: int | None,
+               procname: str | None, values: list[Any]) -> None:
+        if vpid is None or vtid is None:
+            self._nameless += 1
+            vpid, vtid = vpid or 0, vtid or 0
+        if procname is not None and self._procnames.get((vpid, vtid)) != procname:
+            self._procnames[vpid, vtid] = procname
+            self._file.extend((('mddag:process', time, vtid, procname),), vpid)
+        kind = self._kinds[number]
+        if kind.converts is not None:
+            values = [value if convert is None else convert(value)
+                      for convert, value in zip(kind.converts, values)]
+        self._file.extend(((kind.key, time, vtid, *values),), vpid)
+        self.result.events += 1
+        self.result.processes.add(vpid)
+        self._time = time
+
+    def _discarded(self, time: int, count: int) -> None:
+        if count < 0:
+            self._uncounted += 1
+        self.result.discarded += max(count, 1)
+        self._file.extend((('mddag:lost', max(time, self._time), 0, max(count, 1)),), 0)
+
+    def _class(self, number: int, original: str, fields: list[tuple[str, str]]) -> None:
+        event, converts = event_type(self._name(original), fields)
+        for (given, _), (name, _) in zip(fields, event.fields):
+            if given != name:
+                self._changed[f'{original}.{given}'] = name
+        self._kinds[number] = _Kind(self._file.define(event), converts)
+
+    def _name(self, original: str) -> str:
+        """Return the full name of an event; different ones stay different."""
+        provider, colon, name = original.partition(':')
+        if not colon:
+            provider, name = 'ctf', original
+        key = f'{_legal(provider)}:{_legal(name)}'
+        while self._originals.setdefault(key, original) != original:
+            key += '_'
+        if key != original:
+            self._changed[original] = key
+        return key
+
+    def finish(self) -> None:
+        """Write down what is missing or was changed."""
+        result, path = self.result, self._path
+        result.kinds = len(self._originals)
+        if result.discarded:
+            about = ' at least' if self._uncounted else ''
+            result.warnings.append(
+                f'{path}: the tracer discarded {result.discarded} events{about}: what followed '
+                'from them is missing; record with larger or more sub-buffers')
+        if self._nameless:
+            result.warnings.append(
+                f'{path}: {self._nameless} events are of no known process or thread: add the '
+                'contexts vpid and vtid when recording')
+        if self._file.rejected:
+            result.warnings.append(
+                f'{path}: {self._file.rejected} events are left out, the first because of: '
+                f'{self._file.rejection}')
+        if self._changed:
+            given, name = next(iter(self._changed.items()))
+            result.warnings.append(
+                f'{path}: {len(self._changed)} names are none that ROS can have here and were '
+                f'changed, such as {given!r} to {name!r}')
+
+
+def _legal(name: str) -> str:
+    """Return a name as ROS allows it."""
+    name = re.sub(r'[^A-Za-z0-9_]', '_', name).lstrip('_') or 'unnamed'
+    return name if name[0].isalpha() else f'n{name}'
+
+
+def event_type(
+    name: str, fields: Sequence[tuple[str, str]]
+) -> tuple[EventType, list[Callable[[Any], Any] | None]]:
+    """
+    Return how an event of a session is written, and what converts the values of its fields.
+
+    :param name: its full name, legal in ROS
+    :param fields: names and types as the session has them; None stands for no conversion
+    """
+    table = dict(EVENTS[name].fields) if name in EVENTS else {}
+    preamble = {preamble_name for preamble_name, _ in PREAMBLE}
+    chosen: dict[str, str] = {}
+    converts: list[Callable[[Any], Any] | None] = []
+    for given, kind in fields:
+        field_name, convert = _legal(given), None
+        if field_name in table:
+            fit = _fit(kind, table[field_name])
+            if fit is None:
+                field_name += '_'
+            else:
+                kind, convert = fit
+        while field_name in preamble or field_name in chosen:
+            field_name += '_'
+        chosen[field_name] = kind
+        converts.append(convert)
+    provider, _, short = name.partition(':')
+    return EventType(provider, short, tuple(chosen.items())), converts
+
+
+def _fit(given: str, wanted: str) -> tuple[str, Callable[[Any], Any] | None] | None:
+    """Return the type for a field of the table and what converts to it, None where none can."""
+    if given == wanted:
+        return given, None
+    have, want = FieldType.parse(given), FieldType.parse(wanted)
+    if wanted == 'bool' and have.kind == 'int':
+        return wanted, bool
+    if want.kind == 'int' and have.kind in ('int', 'bool'):
+        bits = _bits(wanted)
+        if have.kind == 'int' and _bits(given) > bits:
+            return given, None      # a reader takes any integer
+        half = 0 if wanted.startswith('u') else 1 << bits - 1
+        return wanted, lambda value: (value + half) % (1 << bits) - half
+    return (given, None) if have.kind == want.kind else None
+
+
+def _bits(kind: str) -> int:
+    return int(re.sub(r'\D', '', kind))

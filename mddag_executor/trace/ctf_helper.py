@@ -1,0 +1,254 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The process that reads a CTF session with babeltrace2 and streams its events to `ctf`.
+
+Theory of operation:
+
+1. This file runs as a program of its own, in whichever Python has the module `bt2`; it imports
+   nothing of this project and runs from Python 3.9 on. babeltrace2 may also abort the process on
+   damaged input; that then ends this process only.
+2. Standard output is a row of frames: the length as 4 bytes (big endian), then a JSON list of
+   rows. A row is one of
+   `["missing", reason]` (no bt2 here; the only row), `["ready", version]` (the first row),
+   `["class", number, name, [[field, type], ...]]` (before the first event of it),
+   `["event", number, timestamp, vpid, vtid, procname, [value, ...]]`,
+   `["discarded", timestamp, count]` (-1: not known how many),
+   `["error", reason]` and `["end"]`; one of these two is the last row. Whatever ends without is
+   incomplete.
+3. The types are those of ros2msg: integers by sign and size, `float32`, `float64`, `string`,
+   `bool`, arrays and sequences of these. A structure becomes its members, `outer_inner`. What has
+   no such type (variants, arrays of structures) is passed on as JSON text: nothing gets lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+import json
+import os
+import signal
+import struct
+import sys
+from typing import Any, BinaryIO
+
+BATCH = 256     # events in a frame
+PATIENCE_S = 60     # for the next frame; on some damage babeltrace2 2.0 never comes back
+
+Member = tuple[str, str, Callable[[Any], Any]]      # name, type, and what gets it from the payload
+
+
+class Frames:
+    """Gathers rows and writes them as frames."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        """Write to a binary stream."""
+        self._stream = stream
+        self._rows: list[Any] = []
+
+    def add(self, *row: Any) -> None:
+        """Add a row."""
+        self._rows.append(row)
+        if len(self._rows) >= BATCH:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what there is."""
+        data = json.dumps(self._rows, separators=(',', ':')).encode('ascii')
+        signal.alarm(0)             # the importer may take its time
+        self._stream.write(struct.pack('>I', len(data)) + data)
+        self._stream.flush()
+        signal.alarm(PATIENCE_S)    # SIGALRM ends the process, whatever it is at
+        self._rows = []
+
+
+def plain(field: Any) -> Any:
+    """Return any field as what JSON can hold."""
+    kind = type(field).__name__
+    if 'Structure' in kind:
+        return {name: plain(value) for name, value in field.items()}
+    if 'Variant' in kind:
+        return plain(field.selected_option)
+    if 'Option' in kind:
+        return None if field.field is None else plain(field.field)
+    if 'Array' in kind and 'BitArray' not in kind:
+        return [plain(value) for value in field]
+    return scalar(kind)[1](field)
+
+
+def scalar(kind: str, size: int = 64) -> tuple[str, Callable[[Any], Any]]:
+    """
+    Return the type of a primitive and what converts it.
+
+    :param kind: the name of its class in bt2, of the field or of the field's class
+    :param size: an integer's bits
+    :raises ValueError: for what is no primitive
+    """
+    if 'String' in kind:
+        return 'string', str
+    if 'Bool' in kind:
+        return 'bool', bool
+    if 'Real' in kind:
+        return ('float32' if 'SinglePrecision' in kind else 'float64'), float
+    if 'Integer' in kind or 'Enumeration' in kind or 'BitArray' in kind:
+        bits = next(bits for bits in (8, 16, 32, 64) if bits >= size)
+        sign = 'int' if 'Signed' in kind else 'uint'
+        return f'{sign}{bits}', int
+    raise ValueError(kind)
+
+
+def primitive(cls: Any) -> tuple[str, Callable[[Any], Any]]:
+    """Return the type of a primitive's class and what converts it; raise ValueError otherwise."""
+    kind = type(cls).__name__
+    return scalar(kind, getattr(cls, 'field_value_range', 0) or getattr(cls, 'length', 64))
+
+
+def member(cls: Any) -> tuple[str, Callable[[Any], Any]]:
+    """Return the type that the fields of a class have in a message, and what converts them."""
+    kind = type(cls).__name__
+    try:
+        if 'Array' not in kind or 'BitArray' in kind:
+            return primitive(cls)
+        base, convert = primitive(cls.element_field_class)
+    except ValueError:
+        return 'string', lambda field: json.dumps(plain(field))
+    length = cls.length if 'Static' in kind else 0
+
+    def convert_all(field: Any) -> list[Any]:
+        return [convert(value) for value in field]
+
+    return f'{base}[{length or ""}]', convert_all
+
+
+def members(cls: Any, prefix: str = '') -> list[Member]:
+    """Return what a structure's class holds, structures within it flattened."""
+    found: list[Member] = []
+    if cls is None:
+        return found
+    for place, name in enumerate(cls):
+        inner = cls[name].field_class
+        if 'Structure' in type(inner).__name__:
+            found += [(deeper, kind, _within(place, get))
+                      for deeper, kind, get in members(inner, f'{prefix}{name}_')]
+        else:
+            kind, convert = member(inner)
+            found.append((prefix + name, kind, _within(place, convert)))
+    return found
+
+
+def _within(place: int, get: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda field: get(field.member_at_index(place))
+
+
+class Session:
+    """The events of a session, as rows."""
+
+    def __init__(self, bt2: Any, frames: Frames) -> None:
+        """Write to `frames`."""
+        self._bt2 = bt2
+        self._frames = frames
+        # By the address of the event's class, which is kept so that none gets its address.
+        self._known: dict[int, tuple[int, Any, list[Callable[[Any], Any]]]] = {}
+
+    def read(self, path: str) -> None:
+        """Write a row for each event below a folder, in the order of time."""
+        bt2 = self._bt2
+        discarded = (bt2._DiscardedEventsMessageConst, bt2._DiscardedPacketsMessageConst)
+        for message in bt2.TraceCollectionMessageIterator(path):
+            if type(message) is bt2._EventMessageConst:
+                self._event(message)
+            elif isinstance(message, discarded):
+                self._discarded(message)
+
+    def _event(self, message: Any) -> None:
+        event = message.event
+        known = self._known.get(event.cls.addr)
+        if known is None:
+            known = self._define(event.cls)
+        number, _, getters = known
+        payload = event.payload_field
+        context = event.common_context_field
+        self._frames.add(
+            'event', number, message.default_clock_snapshot.ns_from_origin,
+            *[_pick(context, names) for names in _IDENTITY], [get(payload) for get in getters])
+
+    def _define(self, cls: Any) -> tuple[int, Any, list[Callable[[Any], Any]]]:
+        fields = members(cls.payload_field_class)
+        number = len(self._known)
+        known = number, cls, [get for _, _, get in fields]
+        self._known[cls.addr] = known
+        self._frames.add('class', number, cls.name or '', [field[:2] for field in fields])
+        return known
+
+    def _discarded(self, message: Any) -> None:
+        """Say what the tracer discarded; a packet counts as an unknown number of events."""
+        packets = isinstance(message, self._bt2._DiscardedPacketsMessageConst)
+        count = None if packets else message.count
+        try:
+            time = message.end_default_clock_snapshot.ns_from_origin
+        except (AttributeError, ValueError):
+            time = -1       # the stream has no times for it
+        self._frames.add('discarded', time, -1 if count is None else count)
+
+
+# Process, thread and name: of user space first, then of the kernel.
+_IDENTITY = (('vpid', 'pid'), ('vtid', 'tid'), ('procname',))
+
+
+def _pick(context: Any, names: tuple[str, ...]) -> Any:
+    """Return the first of the named contexts that there is, None where there is none."""
+    for name in names if context is not None else ():
+        if name in context:
+            return str(context[name]) if name == 'procname' else int(context[name])
+    return None
+
+
+def reason(error: BaseException) -> str:
+    """Return the first cause of an error in one line, without babeltrace2's chain of causes."""
+    causes = list(getattr(error, '_causes', None) or ())
+    text = getattr(causes[0], 'message', None) if causes else None
+    return ' '.join(str(text or error or type(error).__name__).split())
+
+
+def main(session: str) -> int:
+    """Read a session; the outcome is the last row."""
+    # What a library prints must not come between the frames.
+    stream = os.fdopen(os.dup(1), 'wb')
+    os.dup2(2, 1)
+    frames = Frames(stream)
+    try:
+        bt2 = import_module('bt2')      # which type checkers need not have
+    except Exception as error:      # also a binding that does not fit its library
+        frames.add('missing', f'{type(error).__name__}: {error}')
+        frames.flush()
+        return 0
+    frames.add('ready', str(getattr(bt2, '__version__', '')))
+    frames.flush()
+    try:
+        Session(bt2, frames).read(session)
+        frames.add('end')
+    except BrokenPipeError:
+        return 1        # the importer has gone
+    except Exception as error:      # whatever it is: the other side has to say it
+        frames.add('error', reason(error))
+    frames.flush()
+    return 0
+
+
+if __name__ == '__main__':
+    # The folder of this file is no place to import from: its modules are the project's.
+    _here = os.path.dirname(os.path.abspath(__file__))
+    sys.path[:] = [_path for _path in sys.path if os.path.abspath(_path or '.') != _here]
+    sys.exit(main(sys.argv[1]))

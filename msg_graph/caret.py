@@ -1,0 +1,244 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+CARET architecture files: what they say about nodes and callbacks.
+
+Theory of operation
+-------------------
+An architecture file (caret_analyze's ``Architecture.export``) lists for each node its callbacks
+with what starts them, its callback groups, the topics that it publishes and subscribes, with the
+callbacks that do, its ``variable_passings`` and its ``message_contexts``. ``UNDEFINED`` stands for
+what CARET could not find out and nobody filled in.
+
+1. A topic's publisher is the callback that the file names; where it names none, the only callback
+   of the node; else it is not known.
+2. A variable passing is a queue edge: the reading callback reads the writing one's variable.
+3. A message context ``use_latest_message`` from a subscribed to a published topic says that the
+   publisher's callback uses the latest message: nothing new if it is that message's own callback,
+   a queue edge on that callback if another one takes it, and on the topic if no callback does. The
+   other contexts (``callback_chain``, ``inherit_unique_stamp``) say what variable passings say.
+4. A mutually exclusive callback group counts where it has several callbacks.
+5. Keys that are not used here are not looked at: the format grows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from msg_graph.errors import GraphError, shown
+from msg_graph.fields import check_callback, check_group, check_node, check_service, check_topic
+from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Sequence, Tree
+
+UNDEFINED = 'UNDEFINED'
+_REMEDY = "give an architecture file as caret_analyze's Architecture.export writes it"
+
+
+@dataclass
+class CaretCallback:
+    """A callback; ``maybe`` are topics of its node whose publisher the file does not know."""
+
+    node: str
+    name: str
+    kind: str
+    start: str
+    period_ns: int | None = None
+    publishes: list[str] = field(default_factory=list)
+    maybe: list[str] = field(default_factory=list)
+    reads: list[str] = field(default_factory=list)
+    group: str | None = None
+
+    @property
+    def key(self) -> str:
+        """Return the key that the callback has in a declaration."""
+        return f'{self.node}:{self.name}'
+
+
+@dataclass
+class CaretNode:
+    """A node with its callbacks by their full names, and topics subscribed without a callback."""
+
+    name: str
+    callbacks: dict[str, CaretCallback] = field(default_factory=dict)
+    taken: list[str] = field(default_factory=list)
+
+
+@dataclass
+class CaretPath:
+    """A named path: node, subscribed and published topic of each step."""
+
+    name: str
+    steps: list[tuple[str, str, str]]
+
+
+@dataclass
+class Architecture:
+    """An architecture file."""
+
+    nodes: list[CaretNode]
+    paths: list[CaretPath]
+
+    def callbacks(self) -> Iterator[CaretCallback]:
+        """Yield the callbacks of all nodes."""
+        for node in self.nodes:
+            yield from node.callbacks.values()
+
+
+def read_architecture(text: str, file: str) -> Architecture:
+    """
+    Return what an architecture file says.
+
+    :raises GraphError: it is not YAML, or no architecture file.
+    """
+    tree = parse_yaml(text, file)
+    if not isinstance(tree, Mapping) or 'nodes' not in tree.entries:
+        raise GraphError(file, None, 'this is no architecture file of CARET', _REMEDY)
+    reader = _Reader(file)
+    nodes = [reader.node(each) for each in reader.mappings(tree, 'nodes')]
+    paths = [reader.path(each) for each in reader.mappings(tree, 'named_paths')]
+    return Architecture([node for node in nodes if node.callbacks], paths)
+
+
+class _Reader:
+
+    def __init__(self, file: str) -> None:
+        self._file = file
+
+    def error(self, tree: Tree, problem: str) -> GraphError:
+        return GraphError(self._file, tree.line, problem, _REMEDY)
+
+    def mappings(self, tree: Mapping, key: str) -> list[Mapping]:
+        value = tree.entries.get(key)
+        if value is None or (isinstance(value, Scalar) and value.is_null):
+            return []
+        if not isinstance(value, Sequence):
+            raise self.error(value, f"'{key}' is no list")
+        for item in value.items:
+            if not isinstance(item, Mapping):
+                raise self.error(item, f"an entry of '{key}' is no mapping")
+        return [item for item in value.items if isinstance(item, Mapping)]
+
+    def text(self, tree: Mapping, key: str) -> str:
+        value = tree.entries.get(key)
+        if not isinstance(value, Scalar):
+            raise self.error(tree, f"'{key}' is missing")
+        return value.text
+
+    def texts(self, tree: Mapping, key: str) -> list[str]:
+        value = tree.entries.get(key)
+        items = value.items if isinstance(value, Sequence) else []
+        return [item.text for item in items if isinstance(item, Scalar)]
+
+    def name(self, tree: Mapping, key: str,
+             check: Callable[[str], tuple[str, str] | None]) -> str:
+        text = self.text(tree, key)
+        wrong = check(text)
+        if wrong is not None:
+            raise GraphError(self._file, tree.line, f"'{key}': {wrong[0]}", wrong[1])
+        return text
+
+    def node(self, tree: Mapping) -> CaretNode:
+        node = CaretNode(self.name(tree, 'node_name', check_node))
+        for each in self.mappings(tree, 'callbacks'):
+            callback = self.callback(each, node.name)
+            full = self.text(each, 'callback_name')
+            if full in node.callbacks:
+                raise self.error(each, f'the callback {shown(full)} stands there twice')
+            node.callbacks[full] = callback
+        for each in self.mappings(tree, 'callback_groups'):
+            self._group(node, each)
+        for each in self.mappings(tree, 'subscribes'):
+            topic = self.name(each, 'topic_name', check_topic)
+            if self.text(each, 'callback_name') not in node.callbacks:
+                node.taken.append(topic)
+        for each in self.mappings(tree, 'publishes'):
+            self._publisher(node, each)
+        for each in self.mappings(tree, 'variable_passings'):
+            writer = node.callbacks.get(self.text(each, 'callback_name_write'))
+            reader = node.callbacks.get(self.text(each, 'callback_name_read'))
+            if writer is not None and reader is not None:
+                _read(reader, writer.name)
+        for each in self.mappings(tree, 'message_contexts'):
+            self._context(node, each)
+        return node
+
+    def callback(self, tree: Mapping, node: str) -> CaretCallback:
+        full = self.text(tree, 'callback_name')
+        name = full[len(node) + 1:] if full.startswith(f'{node}/') else full.rpartition('/')[2]
+        wrong = check_callback(name)
+        if wrong is not None:
+            raise GraphError(self._file, tree.line, f"'callback_name': {wrong[0]}", wrong[1])
+        kind = self.text(tree, 'callback_type').removesuffix('_callback')
+        if kind == 'timer':
+            period = self.text(tree, 'period_ns')
+            if not (period.isascii() and period.isdecimal() and 0 < int(period[:19]) < 2 ** 62):
+                raise self.error(tree, f"'period_ns' is {shown(period)}")
+            return CaretCallback(node, name, kind, f'{int(period)}ns', int(period))
+        if kind == 'subscription':
+            return CaretCallback(node, name, kind, self.name(tree, 'topic_name', check_topic))
+        if kind == 'service':
+            return CaretCallback(node, name, kind, self.name(tree, 'service_name', check_service))
+        raise self.error(tree, f"'callback_type' {shown(kind)} is not known")
+
+    def _group(self, node: CaretNode, tree: Mapping) -> None:
+        members = [node.callbacks[name] for name in self.texts(tree, 'callback_names')
+                   if name in node.callbacks]
+        name = self.text(tree, 'callback_group_name').rpartition('/')[2]
+        if self.text(tree, 'callback_group_type') != 'mutually_exclusive' or len(members) < 2:
+            return
+        if check_group(name) is not None:
+            raise self.error(tree, f"'callback_group_name' {shown(name)} is no name")
+        for callback in members:
+            callback.group = name
+
+    def _publisher(self, node: CaretNode, tree: Mapping) -> None:
+        topic = self.name(tree, 'topic_name', check_topic)
+        names = self.texts(tree, 'callback_names')
+        known = [node.callbacks[name] for name in names if name in node.callbacks]
+        if not known and len(node.callbacks) == 1:
+            known = list(node.callbacks.values())
+        for callback in known:
+            if topic not in callback.publishes:
+                callback.publishes.append(topic)
+        if not known:
+            for callback in node.callbacks.values():
+                callback.maybe.append(topic)
+
+    def _context(self, node: CaretNode, tree: Mapping) -> None:
+        kind = tree.entries.get('context_type')
+        if not isinstance(kind, Scalar) or kind.text != 'use_latest_message':
+            return
+        taken = self.text(tree, 'subscription_topic_name')
+        published = self.text(tree, 'publisher_topic_name')
+        for callback in node.callbacks.values():
+            if published not in callback.publishes or callback.start == taken:
+                continue
+            takers = [c.name for c in node.callbacks.values()
+                      if c.kind == 'subscription' and c.start == taken]
+            for read in takers or ([taken] if taken in node.taken else []):
+                _read(callback, read)
+
+    def path(self, tree: Mapping) -> CaretPath:
+        steps = []
+        for each in self.mappings(tree, 'node_chain'):
+            steps.append((self.text(each, 'node_name'),
+                          self.text(each, 'subscribe_topic_name'),
+                          self.text(each, 'publish_topic_name')))
+        return CaretPath(self.text(tree, 'path_name'), steps)
+
+
+def _read(reader: CaretCallback, what: str) -> None:
+    if what != reader.name and what not in reader.reads:
+        reader.reads.append(what)

@@ -1,0 +1,154 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+JSON Schema of the declaration, for editors that complete and check what is typed.
+
+Theory of operation
+-------------------
+The keys are those of the parser's own tables (``declaration``), the names and times match the
+parser's own patterns (``fields``, ``duration``); what stands here is their types and their help.
+A key that the parser learns and this module does not know is a ``KeyError`` in ``schema``, so that
+the first test shows it.
+
+The schema is that of draft 7, which the language servers for YAML know best. It says what one
+entry may look like; what takes more than one entry to judge (publishers, cycles, sinks) only
+``load`` can tell.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from msg_graph import declaration as language
+from msg_graph import fields
+from msg_graph.duration import UNITS
+
+_Schema = dict[str, Any]
+
+
+def schema() -> _Schema:
+    """Return the JSON Schema of the declaration."""
+    return {
+        '$schema': 'http://json-schema.org/draft-07/schema#',
+        'title': 'mddag declaration',
+        'description': 'Nodes, their callbacks and what starts them, with periods and deadlines.',
+        **_mapping(language.FILE_KEYS, _FILE, required=('mddag', 'nodes')),
+        'definitions': {
+            'node': _mapping(language.NODE_KEYS, _NODE, required=language.NODE_KEYS),
+            'callback': {
+                **_mapping(language.CALLBACK_KEYS, _CALLBACK, required=('name',)),
+                'oneOf': [{'required': [key]} for key in language.TRIGGERS],
+            },
+            'path': _mapping(language.PATH_KEYS, _PATH, required=language.PATH_KEYS),
+            'time': {
+                'type': 'string',
+                'pattern': rf'^[ \t]*\+?([0-9]+(\.[0-9]*)?|\.[0-9]+)[ \t]*({"|".join(UNITS)})'
+                           r'[ \t]*$',
+                'examples': ['100ms', '20us', '1.5s'],
+            },
+            'execution_time': {
+                'oneOf': [
+                    {'$ref': '#/definitions/time'},
+                    _mapping(language.TIME_KEYS, _TIME, required=('quantiles_us',)),
+                ],
+            },
+        },
+    }
+
+
+def _mapping(keys: tuple[str, ...], meaning: dict[str, _Schema], required: tuple[str, ...]
+             ) -> _Schema:
+    return {
+        'type': 'object', 'additionalProperties': False, 'required': list(required),
+        'properties': {key: meaning[key] for key in keys}}
+
+
+def _named(pattern: re.Pattern[str], longest: int, text: str) -> _Schema:
+    return {'type': 'string', 'pattern': f'^(?:{pattern.pattern})$', 'maxLength': longest,
+            'description': text}
+
+
+def _word(pattern: re.Pattern[str], text: str) -> _Schema:
+    """Return the schema of a short name; YAML reads some as numbers, and the parser does not."""
+    return {**_named(pattern, fields.LONGEST_WORD, text), 'type': ['string', 'integer']}
+
+
+def _topic(text: str) -> _Schema:
+    return _named(fields.ROS_NAME, fields.LONGEST_TOPIC, text)
+
+
+def _time(text: str) -> _Schema:
+    return {'allOf': [{'$ref': '#/definitions/time'}], 'description': text}
+
+
+def _list(items: _Schema, text: str, least: int = 0, unique: bool = False) -> _Schema:
+    return {'type': 'array', 'items': items, 'minItems': least, 'uniqueItems': unique,
+            'description': text}
+
+
+_FILE: dict[str, _Schema] = {
+    'mddag': {'enum': [int(language.FORMAT), language.FORMAT],
+              'description': 'Version of the format.'},
+    'workers': {'type': 'integer', 'minimum': 1, 'maximum': language.MOST_WORKERS,
+                'description': 'Number of workers that the system is made for.'},
+    'nodes': _list({'$ref': '#/definitions/node'},
+                   'The nodes; a node may have several entries, and their order counts for ties.',
+                   least=1),
+    'paths': _list({'$ref': '#/definitions/path'},
+                   'End-to-end paths over trigger and queue edges.', least=1),
+}
+_NODE: dict[str, _Schema] = {
+    'node': _named(fields.ROS_NAME, fields.LONGEST_NODE, 'Fully qualified name of the node.'),
+    'callbacks': _list({'$ref': '#/definitions/callback'}, 'Its callbacks.', least=1),
+}
+_CALLBACK: dict[str, _Schema] = {
+    'name': _word(fields.WORD, 'Name of the callback, unique in its node.'),
+    'timer': _time('A timer of this period starts it.'),
+    'subscription': _topic('A message on this topic starts it.'),
+    'sync': _list(_topic('A topic that is joined.'),
+                  'Messages on all of these topics together start it.', least=2, unique=True),
+    'service': _topic('A request of this service starts it.'),
+    'period': _time('Time between two releases of a source that is no timer.'),
+    'publishes': _list(_topic('A topic that it publishes.'), 'The topics that it publishes.',
+                       unique=True),
+    'reads': _list(
+        {'anyOf': [_topic('A topic that it takes messages from.'),
+                   _word(fields.WORD, 'A callback of its node whose variable it reads.')]},
+        'Queue edges: data that it reads later and that never starts it.', unique=True),
+    'deadline': _time('Relative deadline of a sink, counted from the release of its DAG.'),
+    'release_from': {'enum': list(language.RELEASE_FROM),
+                     'description': 'Where the release time of a source comes from.'},
+    'execution_time': {'allOf': [{'$ref': '#/definitions/execution_time'}],
+                       'description': 'Its execution time: constant, or quantiles.'},
+    'group': _word(fields.WORD, 'Its mutually exclusive callback group in the node.'),
+    'dag': _word(fields.DAG_NAME, 'Name of the DAG that it is the source of.'),
+    'on_miss': {'enum': list(language.ON_MISS),
+                'description': 'What is done with a late job of its DAG, if it is a source.'},
+    'max_active_jobs': {'type': 'integer', 'minimum': 1, 'maximum': language.MOST_ACTIVE_JOBS,
+                        'description': 'Bound on the open jobs of its DAG, if it is a source.'},
+}
+_PATH: dict[str, _Schema] = {
+    'name': _word(fields.WORD, 'Name of the path.'),
+    'callbacks': _list(
+        {'type': 'string', 'pattern': f'^(?:{fields.ROS_NAME.pattern}):'
+                                      f'(?:{fields.WORD.pattern})$'},
+        "The callbacks along it, each as '/node:callback'.", least=2, unique=True),
+}
+_TIME: dict[str, _Schema] = {
+    'quantiles_us': _list({'type': 'number', 'minimum': 0}, 'Quantiles in us, rising.', least=1),
+    'percent': _list({'type': 'number', 'minimum': 0, 'maximum': 100},
+                     'The shares that they belong to, rising.', least=1),
+}

@@ -1,0 +1,122 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The tests of the analysis against simulated runs, on random task sets.
+
+A sufficient test that holds must never meet a simulated miss under its own assumptions, whatever
+the phases and with times below the budgets; a necessary one that fails must meet one.
+"""
+
+from __future__ import annotations
+
+import random
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mddag_executor.analysis import analyse, FAILS, HOLDS
+from mddag_executor.simulate import Load, periodic_load, Settings, simulate
+import msg_graph
+from msg_graph import TaskSet
+
+MS = 1_000_000
+HORIZON = 240 * MS
+
+
+def random_graph(seed: int, one_deadline: bool, dags: int, load: float) -> str:
+    """Return a declaration: trees with joins, periods that divide the horizon."""
+    rng = random.Random(seed)
+    lines = ['mddag: 1', 'nodes:']
+    for dag in range(dags):
+        period = rng.choice([4, 5, 6, 8, 10, 12, 20, 24])
+        size = rng.randint(1, 7)
+        deadline = max(1, round(period * rng.choice([1, 1, 1, 0.8, 1.5, 2.5])))
+        parents = [[0]] + [sorted(rng.sample(range(i), min(i, rng.choice([1, 1, 1, 2]))))
+                           for i in range(1, size)]
+        sinks = set(range(size)) - {p for i in range(1, size) for p in parents[i]}
+        share = load * period / size
+        lines += [f'  - node: /n{dag}', '    callbacks:']
+        for i in range(size):
+            start = f'timer: {period}ms'
+            if i > 0:
+                # A topic for each edge: vertices that start several publish several.
+                topics = [f'/d{dag}_{p}_{i}' for p in parents[i]]
+                start = (f'subscription: {topics[0]}' if len(topics) == 1
+                         else f'sync: [{", ".join(topics)}]')
+            out = [f'/d{dag}_{i}_{j}' for j in range(i + 1, size) if i in parents[j]]
+            own = deadline if one_deadline else max(1, round(deadline * rng.uniform(0.6, 1.6)))
+            ends = f', deadline: {own}ms' if i in sinks else f', publishes: [{", ".join(out)}]'
+            cost = max(1, round(1000 * share * rng.uniform(0.1, 1.9)))
+            lines.append(f'      - {{name: c{i}, {start}{ends}, execution_time: {cost}us}}')
+    return '\n'.join(lines) + '\n'
+
+
+def shifted(load: Load, phases: list[int]) -> Load:
+    """Return the load with a phase for each DAG."""
+    releases = sorted((time + phases[dag], dag, job)
+                      for time, dag, job in zip(load.times, load.dags, load.jobs))
+    return load._replace(times=[r[0] for r in releases], dags=[r[1] for r in releases],
+                         jobs=[r[2] for r in releases])
+
+
+def missed(task_set: TaskSet, times: list[list[int]], policy: str, preemptive: bool,
+           workers: int, phases: list[int]) -> bool:
+    load = shifted(periodic_load(task_set, times, HORIZON), phases)
+    run = simulate(task_set, load, Settings(
+        policy=policy, workers=workers, duration_ns=HORIZON, preemptive=preemptive,
+        stop_at_first_miss=True))
+    return bool(run.result()['deadline_missed'])
+
+
+PROVEN = {
+    "Graham's bound": [('fifo', False), ('rad', True), ('gedf', True), ('rm', False)],
+    'response time, any policy': [
+        ('fifo', False), ('rad', False), ('rad', True), ('rm', True), ('wc', False)],
+    'response time, RAD': [('rad', True)],
+    'GEDF demand': [('gedf', True), ('rad', True)],
+    'GEDF capacity bound': [('gedf', True), ('rad', True)],
+}
+held: dict[str, int] = dict.fromkeys(PROVEN, 0)
+
+
+@settings(max_examples=400)
+@given(seed=st.integers(0, 2 ** 32), one=st.booleans(), dags=st.integers(1, 4),
+       workers=st.integers(1, 5), part=st.floats(0.05, 1.1))
+def check_random_set(seed: int, one: bool, dags: int, workers: int, part: float) -> None:
+    task_set = msg_graph.loads(random_graph(seed, one, dags, part * workers / dags))
+    analysis = analyse(task_set, workers)
+    rng = random.Random(seed)
+    budgets = [[v.callback.execution_time.mean_ns for v in dag.vertices
+                if v.callback.execution_time is not None] for dag in task_set.dags]
+    together = [0] * len(task_set.dags)
+    for verdict in analysis.verdicts:
+        if verdict.name in ('longest path', 'demand bound') and verdict.verdict == FAILS:
+            if verdict.details.get('time_ns', 0) < HORIZON:
+                for policy in ('rad', 'fifo'):
+                    assert missed(task_set, budgets, policy, True, workers, together)
+        if verdict.kind != 'sufficient' or verdict.verdict != HOLDS:
+            continue
+        held[verdict.name] += 1
+        phases = [rng.randrange(dag.period_ns) for dag in task_set.dags]
+        shorter = [[max(1, round(cost * rng.uniform(0.2, 1))) for cost in row] for row in budgets]
+        for policy, preemptive in PROVEN[verdict.name]:
+            assert not missed(task_set, budgets, policy, preemptive, workers, together)
+            assert not missed(task_set, budgets, policy, preemptive, workers, phases)
+            assert not missed(task_set, shorter, policy, preemptive, workers, phases)
+
+
+def test_no_verdict_is_contradicted_by_a_run() -> None:
+    check_random_set()
+    # Each test has been on trial, and not just silent.
+    assert min(held.values()) >= 5, held

@@ -1,0 +1,197 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The tests of the analysis, on figures worked out by hand."""
+
+from __future__ import annotations
+
+from mddag_executor.analysis import (
+    analyse,
+    AnalysisError,
+    FAILS,
+    HOLDS,
+    NOTHING,
+    tasks_of,
+    Verdict,
+)
+from mddag_executor.analysis.necessary import largest_demand
+from mddag_executor.analysis.sufficient import capacity_bound, graham, workload
+from msg_graph import loads
+import pytest
+
+MS = 1_000_000
+FORK = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: t, timer: 100ms, publishes: [/a], execution_time: 1ms}
+      - {name: x, subscription: /a, deadline: 3ms, execution_time: 2ms}
+      - {name: y, subscription: /a, deadline: 50ms, execution_time: 40ms}
+"""
+
+
+def timers(*callbacks: str) -> str:
+    """Return a declaration of timers, each as `PERIOD DEADLINE COST`."""
+    lines = ['mddag: 1', 'nodes:']
+    for place, each in enumerate(callbacks):
+        period, deadline, cost = each.split()
+        lines.append(f'  - {{node: /n{place}, callbacks: [{{name: t, timer: {period}, '
+                     f'deadline: {deadline}, execution_time: {cost}}}]}}')
+    return '\n'.join(lines)
+
+
+def verdicts(text: str, workers: int, budget: str = 'max') -> dict[str, Verdict]:
+    found = analyse(loads(text, 'g.yaml'), workers, budget).verdicts
+    assert len({verdict.name for verdict in found}) == len(found)
+    return {verdict.name: verdict for verdict in found}
+
+
+def test_tasks() -> None:
+    task, = tasks_of(loads(FORK))
+    assert (task.volume, task.length, task.deadline) == (43 * MS, 41 * MS, 50 * MS)
+    assert task.rad == (3 * MS, 3 * MS, 50 * MS)
+    assert task.latest == (1 * MS, 3 * MS, 50 * MS)
+    assert task.sinks == ((1, 3 * MS, 3 * MS), (2, 50 * MS, 41 * MS))
+    assert not task.one_deadline
+
+
+@pytest.mark.parametrize(('budget', 'cost'), [('max', 100), ('p99', 99), ('mean', 50)])
+def test_budgets(budget: str, cost: int) -> None:
+    text = timers('1ms 1ms 1us').replace('1us', '{quantiles_us: [0, 100]}')
+    task, = tasks_of(loads(text), budget)
+    assert task.costs == (cost * 1000,)
+
+
+def test_what_is_not_declared() -> None:
+    text = FORK.replace(', execution_time: 2ms', '')
+    with pytest.raises(AnalysisError, match='g.yaml:6: /n:x declares no execution_time: add one'):
+        verdicts(text, 2)
+    with pytest.raises(AnalysisError, match='workers: 0 is too few'):
+        verdicts(FORK, 0)
+    with pytest.raises(AnalysisError, match="budget 'min': there is no such"):
+        verdicts(FORK, 1, 'min')
+
+
+def test_a_path_that_is_too_long() -> None:
+    found = verdicts(FORK.replace('deadline: 3ms', 'deadline: 2.9ms'), 8)
+    assert found['longest path'].verdict == FAILS
+    assert found['longest path'].figure == '3ms of 2.9ms at /n: /n:x'
+    assert found['longest path'].reason == 'too long for 1 of 2 sinks'
+    assert all(v.verdict == NOTHING for v in found.values() if v.kind == 'sufficient')
+
+
+def test_too_much_work() -> None:
+    found = verdicts(timers('10ms 20ms 9ms', '10ms 20ms 2ms'), 1)
+    assert found['longest path'].verdict == HOLDS
+    assert (found['utilisation'].verdict, found['utilisation'].figure) == (FAILS, 'U = 1.100 of 1')
+
+
+def test_demand() -> None:
+    found = verdicts(timers('10ms 1ms 1ms', '10ms 1ms 1ms'), 1)
+    assert found['utilisation'].verdict == HOLDS
+    assert found['demand bound'].verdict == FAILS
+    assert found['demand bound'].figure == '2ms due within 1ms, of 1ms'
+    # Refined for each sink: 1 ms by 1 ms, 3 ms by 3 ms, and 43 ms by 50 ms.
+    demand = largest_demand(tasks_of(loads(FORK)), 2)
+    assert (demand.time, demand.work, demand.complete) == (1 * MS, 1 * MS, True)
+    assert verdicts(FORK, 1)['demand bound'].verdict == HOLDS
+
+
+def test_graham() -> None:
+    task, = tasks_of(loads(FORK))
+    assert [bound.response for bound in graham(task, 2)] == [None, 42 * MS]  # 3 + 40 / 2 > 3
+    slower, = tasks_of(loads(FORK.replace('deadline: 3ms', 'deadline: 23ms')))
+    assert [bound.response for bound in graham(slower, 2)] == [23 * MS, 42 * MS]
+    often, = tasks_of(loads(FORK.replace('deadline: 3ms', 'deadline: 23ms').replace(
+        '100ms', '41ms')))
+    assert [bound.response for bound in graham(often, 2)] == [None, None]  # jobs overlap
+    assert verdicts(timers('10ms 10ms 1ms'), 1)["Graham's bound"].verdict == HOLDS
+    two = verdicts(timers('10ms 10ms 1ms', '10ms 10ms 1ms'), 1)["Graham's bound"]
+    assert (two.verdict, two.figure) == (NOTHING, '2 of 2 DAGs would be in time, each alone')
+
+
+def test_workload() -> None:
+    task, = tasks_of(loads(timers('10ms 10ms 4ms')))
+    # One job ends as late as it may and one follows: y = 6 + 10 - 4 / 2 = 14, so 4 + min(4, 8).
+    assert workload(task, 6 * MS, 2) == 8 * MS
+    assert workload(task, 1 * MS, 1) == 1 * MS
+
+
+def test_only_rad_tells_the_sinks_apart() -> None:
+    found = verdicts(FORK, 1)
+    assert found['response time, any policy'].verdict == NOTHING
+    rad = found['response time, RAD']
+    assert rad.verdict == HOLDS
+    assert rad.details['/n: /n:x'] == {'deadline_ns': 3 * MS, 'response_bound_ns': 3 * MS}
+    assert rad.details['/n: /n:y'] == {'deadline_ns': 50 * MS, 'response_bound_ns': 43 * MS}
+    for name in ('GEDF demand', 'GEDF capacity bound'):
+        assert found[name].verdict == NOTHING
+        assert 'different deadlines, which need a priority for each vertex' in found[name].reason
+
+
+def test_response_times_with_others() -> None:
+    found = verdicts(timers('10ms 10ms 2ms', '20ms 20ms 3ms'), 1)
+    bounds = found['response time, any policy'].details
+    # One job of the other may end late and the next follow at once: 2 + 2 * 3, and 3 + 2 * 2.
+    assert bounds['/n0: /n0:t']['response_bound_ns'] == 8 * MS
+    assert bounds['/n1: /n1:t']['response_bound_ns'] == 7 * MS
+
+
+def test_capacity_bound() -> None:
+    assert capacity_bound(1) == pytest.approx(2)
+    assert capacity_bound(7) == pytest.approx(2.618034)
+    assert verdicts(timers('10ms 10ms 4ms'), 1)['GEDF capacity bound'].verdict == HOLDS
+    assert verdicts(timers('10ms 10ms 6ms'), 1)['GEDF capacity bound'].verdict == NOTHING
+    other = verdicts(timers('10ms 9ms 1ms'), 1)['GEDF capacity bound']
+    assert (other.verdict, other.reason) == (
+        NOTHING, 'the deadline of DAG /n0 is not its period')
+
+
+def test_gedf_demand() -> None:
+    # With a = 1 the jobs count from 8 ms and 14 ms on: 2 <= 8, 8 <= 14, 10 <= 18.
+    good = verdicts(timers('10ms 10ms 2ms', '20ms 20ms 6ms'), 1)['GEDF demand']
+    assert good.verdict == HOLDS
+    bad = verdicts(timers('10ms 10ms 9ms', '10ms 10ms 1ms'), 1)['GEDF demand']
+    assert bad.verdict == NOTHING
+
+
+@pytest.mark.parametrize(('right', 'wrong', 'reason'), [
+    ('name: x,', 'name: x, group: g,', '/n:x is in a callback group'),
+    ('name: t, timer: 100ms,', 'name: t, subscription: /o, period: 100ms, '
+     'release_from: header_stamp,', 'released from header_stamp'),
+    ('deadline: 50ms', 'deadline: 250ms', None),
+    ('name: t,', 'name: t, max_active_jobs: 1,', None),
+])
+def test_assumptions(right: str, wrong: str, reason: str | None) -> None:
+    found = verdicts(FORK.replace(right, wrong), 2)
+    for verdict in found.values():
+        if reason is not None and verdict.kind == 'sufficient':
+            assert verdict.verdict == NOTHING
+            assert reason in verdict.reason
+    if reason is None:
+        assert found['response time, RAD'].verdict == HOLDS
+
+
+def test_a_bound_on_open_jobs_that_could_end_one() -> None:
+    text = FORK.replace('deadline: 50ms', 'deadline: 250ms').replace(
+        'name: t,', 'name: t, max_active_jobs: 2,')
+    assert 'max_active_jobs of DAG /n' in verdicts(text, 2)['response time, RAD'].reason
+    text = text.replace('max_active_jobs: 2', 'max_active_jobs: 3')
+    assert verdicts(text, 2)['response time, RAD'].verdict == HOLDS
+
+
+def test_deadlines_of_very_many_periods_take_no_time() -> None:
+    found = verdicts(timers('1ms 1000s 0.2ms', '1s 1000s 1ms'), 2)
+    assert found['utilisation'].verdict == HOLDS

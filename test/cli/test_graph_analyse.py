@@ -1,0 +1,79 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `graph analyse`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import json
+from pathlib import Path
+import subprocess
+
+Mddag = Callable[..., subprocess.CompletedProcess[str]]
+
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
+GRAPH = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /n
+    callbacks:
+      - {name: t, timer: 10ms, deadline: 5ms, execution_time: {quantiles_us: [1000, 2000, 9000]}}
+"""
+
+
+def test_table(mddag: Mddag) -> None:
+    done = mddag('graph', 'analyse', '-', '--budget', 'mean', input=GRAPH)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert 'Li et al. 2013 and 2014' in done.stdout
+    assert done.stdout.splitlines()[-1] == (
+        '2 workers, budget mean: the deadlines hold under any work-conserving, preemptive or not; '
+        'rad, preemptive')
+    done = mddag('graph', 'analyse', '-', input=GRAPH)
+    assert done.stdout.splitlines()[-1] == (
+        '2 workers, budget max: no scheduler can keep these deadlines')
+
+
+def test_json(mddag: Mddag) -> None:
+    done = mddag('graph', 'analyse', CONFIG / 'autoware.yaml', '--budget', 'mean', '--workers',
+                 '5', '--json', '-')
+    assert (done.returncode, done.stderr) == (0, '')
+    result = json.loads(done.stdout)
+    assert (result['workers'], result['budget']) == (5, 'mean')
+    assert round(result['utilisation'], 3) == 5.102
+    tests = {test['name']: test for test in result['tests']}
+    assert len(tests) == 8
+    assert tests['longest path']['verdict'] == 'holds'
+    assert tests['utilisation']['verdict'] == 'fails'
+    assert {test['verdict'] for test in result['tests'] if test['kind'] == 'sufficient'} == {
+        'says nothing'}
+    assert all(test['reason'] and test['source'] and test['assumption']
+               for test in result['tests'])
+
+
+def test_bad_input(mddag: Mddag) -> None:
+    text = GRAPH[:GRAPH.index(', execution')] + '}\n'
+    for arguments in (('-',), ('-', '--workers', '0'), ('-', '--budget', 'min')):
+        done = mddag('graph', 'analyse', *arguments, input=text)
+        assert (done.returncode, done.stdout) == (2, '')
+        assert done.stderr.startswith('error: ')
+        assert done.stderr.count('\n') == 1
+
+
+def test_help_has_an_example(mddag: Mddag) -> None:
+    done = mddag('graph', 'analyse', '--help')
+    assert done.returncode == 0
+    assert 'mddag graph analyse config/autoware.yaml --budget p99' in done.stdout
+    assert '99 % quantile' in done.stdout

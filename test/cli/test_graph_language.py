@@ -1,0 +1,81 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verbs `graph schema` and `graph fmt`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import json
+from pathlib import Path
+import subprocess
+
+from msg_graph.schema import schema
+
+Mddag = Callable[..., subprocess.CompletedProcess[str]]
+
+UGLY = """\
+mddag:   1  # format
+nodes:
+- {node: /n,   callbacks: [{name: t, timer: 10ms, deadline: 5ms}]}
+"""
+NORMAL = """\
+mddag: 1    # format
+nodes:
+  - {node: /n, callbacks: [{name: t, timer: 10ms, deadline: 5ms}]}
+"""
+
+
+def test_schema(mddag: Mddag, tmp_path: Path) -> None:
+    done = mddag('graph', 'schema')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert json.loads(done.stdout) == schema()
+    done = mddag('graph', 'schema', '-o', 's.json', cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (0, '')
+    assert json.loads((tmp_path / 's.json').read_text()) == schema()
+
+
+def test_fmt_in_place(mddag: Mddag, tmp_path: Path) -> None:
+    path = tmp_path / 'g.yaml'
+    path.write_text(UGLY)
+    done = mddag('graph', 'fmt', '--check', 'g.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (1, '')
+    assert done.stderr == "g.yaml: not in normal form: run 'mddag graph fmt' on it\n"
+    assert path.read_text() == UGLY
+    done = mddag('graph', 'fmt', 'g.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+    assert path.read_text() == NORMAL
+    done = mddag('graph', 'fmt', '--check', 'g.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+
+
+def test_fmt_standard_input(mddag: Mddag) -> None:
+    done = mddag('graph', 'fmt', '-', input=UGLY)
+    assert (done.returncode, done.stdout, done.stderr) == (0, NORMAL, '')
+
+
+def test_fmt_leaves_a_wrong_declaration_alone(mddag: Mddag, tmp_path: Path) -> None:
+    path = tmp_path / 'g.yaml'
+    path.write_text(UGLY.replace('timer', 'tmer'))
+    done = mddag('graph', 'fmt', 'g.yaml', cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith('error: g.yaml:3: ')
+    assert path.read_text() == UGLY.replace('timer', 'tmer')
+
+
+def test_help_has_an_example(mddag: Mddag) -> None:
+    for verb, example in (('schema', 'mddag graph schema -o'), ('fmt', 'mddag graph fmt --check')):
+        done = mddag('graph', verb, '--help')
+        assert done.returncode == 0
+        assert example in done.stdout

@@ -1,0 +1,97 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `import`: the trace as a whole or nothing, bad input in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import sys
+
+from mddag_executor.cli import main as program
+from mddag_executor.trace import ctf, read_events
+import pytest
+
+HELPER = """\
+import json, struct, sys
+rows = [['ready', '2'], ['class', 0, 'ros2:callback_end', [['callback', 'uint64']]],
+        ['event', 0, 5, 1, 2, 'p', [3]], [{last!r}]]
+data = json.dumps(rows).encode()
+sys.stdout.buffer.write(struct.pack('>I', len(data)) + data)
+"""
+
+
+@pytest.fixture
+def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give a folder that looks like a session, read by a stand-in for babeltrace2."""
+    folder = tmp_path / 'session'
+    folder.mkdir()
+    (folder / 'metadata').write_text('/* CTF 1.8 */')
+    helper = tmp_path / 'helper.py'
+    helper.write_text(HELPER.format(last='end'))
+    monkeypatch.setattr(ctf, '_HELPER', helper)
+    monkeypatch.setattr(ctf, 'interpreters', lambda: [sys.executable])
+    return folder
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    status = program.main(['import', *map(str, arguments)])
+    output = capsys.readouterr()
+    return status, output.out, output.err
+
+
+def test_it_writes_a_trace(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = recording.with_name('out.mcap')
+    status, text, errors = call(capsys, 'ctf', recording, '-o', out)
+    assert (status, text, errors) == (0, f'1 event of 1 kind from 1 process: {out}\n', '')
+    assert [event['callback'] for event in read_events(out)] == [3]
+
+
+def test_what_was_there_stays_when_the_import_fails(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = recording.with_name('out.mcap')
+    out.write_text('precious')
+    recording.with_name('helper.py').write_text(HELPER.format(last='nothing'))
+    before = sorted(recording.parent.iterdir())
+    status, text, errors = call(capsys, 'ctf', recording, '-o', out)
+    assert (status, text) == (2, '')
+    assert errors.startswith(f'error: {recording}: babeltrace2 gave up')
+    assert errors.count('\n') == 1
+    assert out.read_text() == 'precious'
+    assert sorted(recording.parent.iterdir()) == before
+
+
+@pytest.mark.parametrize('name, what', [
+    ('missing', 'there is no such folder'), ('file', 'is no folder'),
+    ('empty', 'holds no CTF recording'), ('cache', 'holds only what CARET converted'),
+])
+def test_bad_sessions(name: str, what: str, tmp_path: Path,
+                      capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'file').touch()
+    (tmp_path / 'empty').mkdir()
+    (tmp_path / 'cache').mkdir()
+    (tmp_path / 'cache' / 'caret_converted').touch()
+    status, text, errors = call(capsys, 'ctf', tmp_path / name, '-o', tmp_path / 'out.mcap')
+    assert (status, text, errors.count('\n')) == (2, '', 1)
+    assert errors.startswith(f'error: {tmp_path / name}: {what}')
+    assert not list(tmp_path.glob('*.mcap')) + list(tmp_path.glob('.*'))
+
+
+def test_bad_outputs(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(capsys, 'ctf', recording, '-o', '-')[0] == 2
+    status, _, errors = call(capsys, 'ctf', recording, '-o', '/nowhere/out.mcap')
+    assert status == 2
+    assert errors == ('error: /nowhere/out.mcap: there is no directory /nowhere: '
+                      'make it first\n')

@@ -1,0 +1,191 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Declarations from CARET architecture files, made up here in CARET's format."""
+
+from __future__ import annotations
+
+import re
+
+from msg_graph import GraphError, loads
+from msg_graph.from_caret import declaration_from_caret, MARK
+import pytest
+
+HEAD = 'executors: []\nnamed_paths: []\nnodes:\n'
+
+
+def node(name: str, *callbacks: str, extra: str = '') -> str:
+    """Return a node; each callback as `timer NS`, `subscription TOPIC` or `service NAME`."""
+    lines = [f'- node_name: {name}', '  callbacks:']
+    keys = {'timer': 'period_ns', 'subscription': 'topic_name', 'service': 'service_name'}
+    for place, callback in enumerate(callbacks):
+        kind, start = callback.split()
+        lines += [f'  - callback_name: {name}/callback_{place}',
+                  f'    callback_type: {kind}_callback', f'    {keys[kind]}: {start}',
+                  '    symbol: A::A(std::vector<int,',
+                  '      std::allocator<int> >)::{lambda()#1}']
+    return '\n'.join(lines) + '\n' + extra
+
+
+def publishes(topic: str, *names: str) -> str:
+    items = ''.join(f'    - {name}\n' for name in names)
+    return f'  publishes:\n  - topic_name: {topic}\n    callback_names:\n{items}'
+
+
+CHAIN = HEAD.replace('named_paths: []', """\
+named_paths:
+- path_name: whole
+  node_chain:
+  - {node_name: /a, publish_topic_name: /x, subscribe_topic_name: UNDEFINED}
+  - {node_name: /b, publish_topic_name: UNDEFINED, subscribe_topic_name: /x}
+- path_name: open
+  node_chain:
+  - {node_name: /a, publish_topic_name: /none, subscribe_topic_name: UNDEFINED}""") + (
+    node('/a', 'timer 33333333', extra=publishes('/x', '/a/callback_0'))
+    + node('/b', 'subscription /x', 'subscription /outside', 'service /serve', extra="""\
+  callback_groups:
+  - callback_group_type: mutually_exclusive
+    callback_group_name: /b/callback_group_0
+    callback_names: [/b/callback_0, /b/callback_1]
+  - callback_group_type: reentrant
+    callback_group_name: /b/callback_group_1
+    callback_names: [/b/callback_1, /b/callback_2]
+  variable_passings:
+  - callback_name_write: /b/callback_1
+    callback_name_read: /b/callback_0
+  - {callback_name_write: UNDEFINED, callback_name_read: UNDEFINED}
+"""))
+
+
+def accepted(text: str) -> str:
+    """Return a declaration with all proposals accepted."""
+    return re.sub(rf'^( +)# (\w+: .*# {MARK})', r'\1\2', text, flags=re.MULTILINE)
+
+
+def test_a_chain() -> None:
+    text = declaration_from_caret(CHAIN, 'arch.yaml')
+    with pytest.raises(GraphError) as caught:
+        loads(text)
+    assert "nobody publishes '/outside'" in caught.value.problem
+    task_set = loads(accepted(text))
+    assert [c.key for c in task_set.callbacks] == [
+        '/a:callback_0', '/b:callback_0', '/b:callback_1', '/b:callback_2']
+    assert [dag.name for dag in task_set.dags] == ['/a', '/b/callback_1', '/b/callback_2']
+    timer, chained, outside, service = task_set.callbacks
+    assert timer.timer_period_ns == chained.deadline_ns == 33_333_333
+    assert (chained.topics, chained.group, chained.reads) == (
+        ('/x',), 'callback_group_0', ('callback_1',))
+    assert (outside.group, outside.period_ns) == ('callback_group_0', 100_000_000)
+    assert (service.service, service.group) == ('/serve', None)
+    assert [(p.name, p.callbacks) for p in task_set.paths] == [
+        ('whole', ('/a:callback_0', '/b:callback_0'))]
+    assert f'# {MARK}: path open: which callbacks? /a' in text
+
+
+def test_an_unknown_publisher_is_a_blank_on_each_callback_that_may() -> None:
+    text = declaration_from_caret(
+        HEAD + node('/a', 'timer 1000000', 'timer 2000000', extra=publishes('/x', 'UNDEFINED'))
+        + node('/b', 'subscription /x'), 'arch.yaml')
+    assert text.count(f'# publishes: [/x]  # {MARK}: which callback publishes /x?') == 2
+    assert '# /x has no known publisher yet' in text
+    assert '# period' not in text
+    assert text.count(f'{MARK}: if it is a sink') == 2
+
+
+def test_the_only_callback_of_a_node_publishes() -> None:
+    text = declaration_from_caret(
+        HEAD + node('/a', 'timer 1000000', extra=publishes('/x', 'UNDEFINED'))
+        + node('/b', 'subscription /x'), 'arch.yaml')
+    task_set = loads(accepted(text))
+    assert task_set.dags[0].edges == ((0, 1),)
+    assert task_set.dags[0].vertices[1].deadline_ns == 1_000_000
+
+
+def test_message_contexts_become_queue_edges() -> None:
+    contexts = """\
+  subscribes:
+  - {topic_name: /x, callback_name: /b/callback_0}
+  - {topic_name: /y, callback_name: UNDEFINED}
+  message_contexts:
+  - context_type: use_latest_message
+    subscription_topic_name: /x
+    publisher_topic_name: /z
+  - context_type: use_latest_message
+    subscription_topic_name: /y
+    publisher_topic_name: /z
+  - context_type: callback_chain
+    subscription_topic_name: /x
+    publisher_topic_name: /z
+"""
+    text = declaration_from_caret(
+        HEAD + node('/a', 'timer 1000000', extra=publishes('/x', '/a/callback_0'))
+        + node('/c', 'timer 1000000', extra=publishes('/y', '/c/callback_0'))
+        + node('/b', 'subscription /x', 'timer 5000000',
+               extra=publishes('/z', '/b/callback_1') + contexts), 'arch.yaml')
+    task_set = loads(accepted(text))
+    assert [(e.reader, e.topic, e.writers) for e in task_set.queue_edges] == [
+        ('/b:callback_1', None, ('/b:callback_0',)), ('/b:callback_1', '/y', ('/c:callback_0',))]
+
+
+def test_cycles_come_with_the_edges_that_cut_them() -> None:
+    text = declaration_from_caret(
+        HEAD + node('/t', 'timer 1000000', extra=publishes('/x', '/t/callback_0'))
+        + node('/a', 'subscription /x', extra=publishes('/y', '/a/callback_0'))
+        + node('/b', 'subscription /y', 'subscription /w',
+               extra=publishes('/x', '/b/callback_0', '/b/callback_1'))
+        + node('/c', 'subscription /y', extra=publishes('/w', '/c/callback_0'))
+        + node('/s', 'subscription /self', extra=publishes('/self', '/s/callback_0')),
+        'arch.yaml')
+    lines = [line for line in text.splitlines() if line.startswith('#')]
+    start = next(i for i, line in enumerate(lines) if 'cycle' in line)
+    # Two rounds meet in /a, which two publishers start and which starts two: no one edge does.
+    assert lines[start:] == [
+        f'# {MARK}: these callbacks start each other in a cycle: /a:callback_0, /b:callback_0, '
+        '/b:callback_1, /c:callback_0.',
+        "# Several of these cut it (write it under 'reads:', start the callback by something "
+        'else):',
+        '#   /b:callback_0 reads /y (published by /a:callback_0)',
+        '#   /c:callback_0 reads /y (published by /a:callback_0)',
+        '#   /a:callback_0 reads /x (published by /b:callback_0)',
+        '#   /a:callback_0 reads /x (published by /b:callback_1)',
+        '#   /b:callback_1 reads /w (published by /c:callback_0)',
+        f'# {MARK}: these callbacks start each other in a cycle: /s:callback_0.',
+        "# Each of these queue edges cuts it (write it under 'reads:', start the callback by "
+        'something else):',
+        '#   /s:callback_0 reads /self (published by /s:callback_0)']
+    simple = declaration_from_caret(
+        HEAD + node('/a', 'subscription /x', extra=publishes('/y', '/a/callback_0'))
+        + node('/b', 'subscription /y', extra=publishes('/x', '/b/callback_0')), 'arch.yaml')
+    assert '#   /a:callback_0 reads /x (published by /b:callback_0)' in simple
+
+
+@pytest.mark.parametrize(('text', 'problem'), [
+    ('', 'this is no architecture file'),
+    ('[1]', 'this is no architecture file'),
+    ('mddag: 1\nworkers: 2\n', 'this is no architecture file'),
+    ('nodes: 3\n', "'nodes' is no list"),
+    ('nodes: [3]\n', "an entry of 'nodes' is no mapping"),
+    ('nodes: [{}]\n', "'node_name' is missing"),
+    (HEAD + node('no/slash', 'timer 1'), 'is not an absolute node name'),
+    (HEAD + node('/a', 'timer soon'), "'period_ns' is 'soon'"),
+    (HEAD + node('/a', 'timer 0'), "'period_ns' is '0'"),
+    (HEAD + node('/a', 'subscription x]'), 'topic name'),
+    (HEAD + node('/a', 'timer 5').replace('timer_callback', 'magic'), "'magic' is not known"),
+    (HEAD + node('/a', 'timer 5').replace('/callback_0', '/c 0'), 'no name for a callback'),
+])
+def test_what_is_no_architecture_file(text: str, problem: str) -> None:
+    with pytest.raises(GraphError, match=re.escape(problem)) as caught:
+        declaration_from_caret(text, 'arch.yaml')
+    assert str(caught.value).startswith('arch.yaml')
+    assert '\n' not in str(caught.value)

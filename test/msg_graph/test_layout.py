@@ -1,0 +1,125 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The normal form of declarations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+
+from hypothesis import given
+from hypothesis import strategies as st
+import msg_graph
+from msg_graph.layout import format_text
+import pytest
+
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
+UGLY = """\
+
+
+# what this is
+
+mddag:   1    # the format
+nodes:
+- node:   /n    # a node
+  callbacks:
+  # first
+  - {name: t,   timer: 10ms,publishes: [ /a ]}   # why
+  -   name:  "x"
+      # on the topic
+      subscription: /a
+      deadline:    5ms
+      execution_time: &e 0.50ms
+
+  # last
+  - name: '0x10'
+    subscription: /a
+    deadline: 010ms
+    execution_time: *e
+# the end
+"""
+NORMAL = """\
+# what this is
+
+mddag: 1      # the format
+nodes:
+  - node: /n    # a node
+    callbacks:
+  # first
+      - {name: t, timer: 10ms, publishes: [/a]}  # why
+      - name: "x"
+      # on the topic
+        subscription: /a
+        deadline: 5ms
+        execution_time: &e 0.50ms
+
+  # last
+      - name: '0x10'
+        subscription: /a
+        deadline: 010ms
+        execution_time: *e
+# the end
+"""
+
+
+def meaning(text: str) -> object:
+    task_set = msg_graph.loads(text)
+    dags = [(d.name, d.period_ns, d.edges, [v.name for v in d.vertices],
+             [v.deadline_ns for v in d.vertices]) for d in task_set.dags]
+    times = [c.execution_time for c in task_set.callbacks]
+    return dags, times, task_set.queue_edges, task_set.paths, task_set.workers
+
+
+def test_by_hand() -> None:
+    assert format_text(UGLY) == NORMAL
+
+
+@pytest.mark.parametrize('name', ['autoware.yaml', 'autoware_multi.yaml'])
+def test_what_ships_keeps_its_meaning_and_its_comments(name: str) -> None:
+    text = (CONFIG / name).read_text(encoding='utf-8')
+    result = format_text(text, name)
+    assert meaning(result) == meaning(text)
+    assert re.findall('#.*', result) == re.findall('#.*', text)
+    # Only what cannot be broken, a long name, is longer than a line may be.
+    assert [line for line in result.splitlines() if len(line) > 99 and len(line.split()) > 2] == []
+    assert format_text(result, name) == result
+
+
+def test_a_wrong_declaration_is_an_error() -> None:
+    with pytest.raises(msg_graph.GraphError, match="g.yaml:1: .*'2' is no known version"):
+        format_text('mddag: 2\nnodes: []\n', 'g.yaml')
+
+
+WORDS = st.sampled_from(
+    ['a', '1', '1.0', '007', '0x1F', '1e3', 'yes', 'on', 'null_', 'true', '2026-01-01', '1_0',
+     '0o7', '-', '"q"', "'s'"]).filter(lambda word: word != '-')
+SPACES = st.sampled_from(['', ' ', '  ', '   # note'])
+
+
+@given(st.lists(WORDS, min_size=1, max_size=6, unique_by=lambda word: word.strip('\'"')),
+       st.data(), st.booleans())
+def test_any_names_and_spaces(names: list[str], data: st.DataObject, flow: bool) -> None:
+    lines = ['mddag: 1', 'nodes:', '- node: /n', '  callbacks:']
+    for name in names:
+        if flow:
+            lines.append(f'  - {{ name: {name}, timer: 10ms , deadline: "1s",dag: {name} }}')
+        else:
+            lines += [f'  -   name: {name}', '      timer: 10 ms', '      deadline: 1s',
+                      f'      dag: {name}']
+    text = ''.join(f'{line}{data.draw(SPACES)}\n' for line in lines)
+    result = format_text(text)
+    assert meaning(result) == meaning(text)
+    assert format_text(result) == result
+    assert re.findall('# .*', result) == re.findall('# .*', text)

@@ -1,0 +1,116 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The JSON Schema of declarations says what the parser says about one entry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import msg_graph
+from msg_graph import declaration, GraphError
+from msg_graph.schema import schema
+import pytest
+import yaml
+
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
+GRAPH = """\
+mddag: 1
+workers: 3
+nodes:
+  - node: /n
+    callbacks:
+      - {name: t, timer: 10ms, publishes: [/a], dag: one, on_miss: abort, max_active_jobs: 3,
+         execution_time: 2 ms}
+      - {name: x, subscription: /a, deadline: 1.5s, group: g,
+         execution_time: {quantiles_us: [1, 2.5], percent: [0, 100]}}
+      - {name: y, subscription: /o, period: 1min, reads: [x, /a], publishes: [/b],
+         release_from: header_stamp}
+      - {name: w, subscription: /b, publishes: [/c]}
+      - {name: v, subscription: /b, publishes: [/d]}
+      - {name: 7, sync: [/c, /d], deadline: 50ms}
+      - {name: s, service: /s, period: 1s, deadline: 1s, dag: service}
+paths:
+  - {name: p, callbacks: ['/n:t', '/n:x']}
+"""
+
+
+def errors(text: str) -> list[str]:
+    validator = jsonschema.Draft7Validator(schema())
+    return [error.message for error in validator.iter_errors(yaml.safe_load(text))]
+
+
+def test_it_is_a_schema() -> None:
+    jsonschema.Draft7Validator.check_schema(schema())
+
+
+@pytest.mark.parametrize('name', ['autoware.yaml', 'autoware_multi.yaml'])
+def test_what_ships_is_valid(name: str) -> None:
+    assert errors((CONFIG / name).read_text(encoding='utf-8')) == []
+
+
+def test_a_declaration_with_every_key_is_valid() -> None:
+    msg_graph.loads(GRAPH)
+    assert errors(GRAPH) == []
+    words = GRAPH.replace('{', ' ').replace(',', ' ').split()
+    keys = {*declaration.FILE_KEYS, *declaration.NODE_KEYS, *declaration.CALLBACK_KEYS,
+            *declaration.PATH_KEYS, *declaration.TIME_KEYS}
+    assert {f'{key}:' for key in keys} <= set(words)
+
+
+def test_each_key_of_the_parser_is_there() -> None:
+    result = schema()
+    inside: dict[str, Any] = result['definitions']
+    assert set(result['properties']) == set(declaration.FILE_KEYS)
+    assert set(inside['node']['properties']) == set(declaration.NODE_KEYS)
+    assert set(inside['callback']['properties']) == set(declaration.CALLBACK_KEYS)
+    assert set(inside['path']['properties']) == set(declaration.PATH_KEYS)
+    times = inside['execution_time']['oneOf'][1]['properties']
+    assert set(times) == set(declaration.TIME_KEYS)
+
+
+@pytest.mark.parametrize(('right', 'wrong'), [
+    ('mddag: 1', 'mddag: 2'),
+    ('workers: 3', 'workers: 0'),
+    ('workers: 3', 'wokers: 3'),
+    ('- node: /n', '- node: n'),
+    ('- node: /n', '- name: /n'),
+    ('timer: 10ms', 'timer: 10'),
+    ('timer: 10ms', 'timer: 10 parsec'),
+    ('timer: 10ms', 'timer: -10ms'),
+    ('timer: 10ms', 'timer: 10ms, subscription: /q'),
+    ('timer: 10ms, ', ''),
+    ('name: x', 'name: x y'),
+    ('name: x, ', ''),
+    ('subscription: /a', 'subscription: a'),
+    ('sync: [/c, /d]', 'sync: [/c]'),
+    ('sync: [/c, /d]', 'sync: /c'),
+    ('publishes: [/b]', 'publishes: [/b, /b]'),
+    ('on_miss: abort', 'on_miss: stop'),
+    ('max_active_jobs: 3', 'max_active_jobs: many'),
+    ('release_from: header_stamp', 'release_from: stamp'),
+    ('quantiles_us: [1, 2.5]', 'quantiles_us: []'),
+    ('percent: [0, 100]', 'percent: [0, 101]'),
+    ('quantiles_us: [1, 2.5], ', ''),
+    ("'/n:x'", "'/n'"),
+    (", '/n:x'", ''),
+])
+def test_both_refuse(right: str, wrong: str) -> None:
+    text = GRAPH.replace(right, wrong, 1)
+    assert text != GRAPH
+    with pytest.raises(GraphError):
+        msg_graph.loads(text)
+    assert errors(text)

@@ -1,0 +1,126 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A small CTF 1.8 writer: sessions as LTTng records them, for the importer's tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+import struct
+from typing import Any
+
+from mddag_executor.trace.ctf import interpreters
+import pytest
+
+CLOCK_OFFSET = 1_732_000_000_000_000_000
+MAGIC = 0xC1FC1FC1
+
+_HEAD = """/* CTF 1.8 */
+typealias integer {{ size = 32; align = 8; signed = false; }} := uint32_t;
+typealias integer {{ size = 64; align = 8; signed = false; }} := uint64_t;
+trace {{
+  major = 1; minor = 8; byte_order = le;
+  packet.header := struct {{ uint32_t magic; uint32_t stream_id; }};
+}};
+clock {{ name = monotonic; freq = 1000000000; offset = {offset}; absolute = true; }};
+typealias integer {{ size = 64; align = 8; map = clock.monotonic.value; }} := time_t;
+stream {{
+  id = 0;
+  packet.context := struct {{ time_t timestamp_begin; time_t timestamp_end; uint64_t content_size;
+    uint64_t packet_size; uint64_t events_discarded; }};
+  event.header := struct {{ uint32_t id; time_t timestamp; }};
+  event.context := struct {{ {context} }};
+}};
+"""
+_INT = 'integer { size = %d; align = 8; signed = %s; }'
+TYPES = {
+    'u64': (_INT % (64, 'false'), 'Q'), 'i64': (_INT % (64, 'true'), 'q'),
+    'u32': (_INT % (32, 'false'), 'I'), 'i32': (_INT % (32, 'true'), 'i'),
+    'u8': (_INT % (8, 'false'), 'B'),
+    'f64': ('floating_point { exp_dig = 11; mant_dig = 53; byte_order = le; align = 8; }', 'd'),
+}
+CONTEXT = f'{TYPES["i32"][0]} _vpid; {TYPES["i32"][0]} _vtid; string _procname;'
+
+Kind = tuple[str, Sequence[tuple[str, str]]]
+
+
+def needs_babeltrace() -> pytest.MarkDecorator:
+    """Return the mark of tests that read sessions, which some Python's `bt2` has to do."""
+    import subprocess
+    there = any(subprocess.run([python, '-c', 'import bt2'], capture_output=True).returncode == 0
+                for python in interpreters())
+    return pytest.mark.skipif(not there, reason='python3-bt2 is not installed')
+
+
+def session(
+    folder: Path, kinds: Sequence[Kind], events: Sequence[tuple[Any, ...]], *,
+    context: bool = True, discarded: int = 0,
+) -> Path:
+    """
+    Write a trace into a new folder and return it.
+
+    :param kinds: names and fields of the events; types are those of `TYPES`, `str`, `TYPE[n]`
+        and `TYPE[]`
+    :param events: place in `kinds`, time since the clock's offset, pid, tid, procname, values
+    :param discarded: events that the tracer says to have discarded in the second of two packets
+    """
+    folder.mkdir(parents=True)
+    text = _HEAD.format(offset=CLOCK_OFFSET, context=CONTEXT if context else '')
+    for number, (name, fields) in enumerate(kinds):
+        text += (f'event {{ name = "{name}"; id = {number}; stream_id = 0; fields := struct {{ '
+                 + ' '.join(_declared(*field) for field in fields) + ' }; };\n')
+    (folder / 'metadata').write_text(text)
+    half = len(events) // 2 if discarded else len(events)
+    data = _packet(kinds, events[:half], context, 0)
+    if discarded:
+        data += _packet(kinds, events[half:], context, discarded)
+    (folder / 'channel_0').write_bytes(data if events else b'')
+    return folder
+
+
+def _declared(name: str, kind: str) -> str:
+    if kind == 'str':
+        return f'string _{name};'
+    base, bracket, length = kind.partition('[')
+    if not bracket:
+        return f'{TYPES[base][0]} _{name};'
+    if length == ']':
+        return f'{TYPES["u32"][0]} __{name}_length; {TYPES[base][0]} _{name}[ __{name}_length ];'
+    return f'{TYPES[base][0]} _{name}[{length};'
+
+
+def _packed(kind: str, value: Any) -> bytes:
+    if kind == 'str':
+        return value.encode() + b'\0'
+    base, bracket, length = kind.partition('[')
+    code = TYPES[base][1]
+    if not bracket:
+        return struct.pack('<' + code, value)
+    head = struct.pack('<I', len(value)) if length == ']' else b''
+    return head + struct.pack(f'<{len(value)}{code}', *value)
+
+
+def _packet(kinds: Sequence[Kind], events: Sequence[tuple[Any, ...]], context: bool,
+            discarded: int) -> bytes:
+    body = b''
+    for kind, time, pid, tid, procname, *values in events:
+        body += struct.pack('<IQ', kind, time)
+        if context:
+            body += struct.pack('<ii', pid, tid) + procname.encode() + b'\0'
+        body += b''.join(_packed(field[1], value)
+                         for field, value in zip(kinds[kind][1], values))
+    times = [event[1] for event in events] or [0]
+    bits = (8 + 40 + len(body)) * 8
+    return struct.pack('<IIQQQQQ', MAGIC, 0, times[0], times[-1], bits, bits, discarded) + body

@@ -1,0 +1,213 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Importing CTF sessions: every event with every field, and damage said in one line."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+import pickle
+import struct
+import sys
+from typing import NoReturn
+
+from mddag_executor.trace import ctf, import_ctf, read_events, TraceError, TraceReader
+import pytest
+
+from .ctf_session import CLOCK_OFFSET, needs_babeltrace, session
+
+START = ('ros2:callback_start', [('callback', 'u64'), ('is_intra_process', 'i32')])
+END = ('ros2:callback_end', [('callback', 'u64')])
+BIND = ('ros2_caret:dds_bind_addr_to_stamp', [('addr', 'u64'), ('source_stamp', 'u64')])
+SAMPLE = Path(__file__).resolve().parents[3] / 'shared' / 'caret'
+
+UNREADABLE = r's: (cannot be read|babeltrace2 gave up) \('
+
+bt2 = needs_babeltrace()
+
+
+def imported(folder: Path, tmp_path: Path) -> Path:
+    import_ctf(folder, tmp_path / 'out.mcap')
+    return tmp_path / 'out.mcap'
+
+
+@bt2
+def test_events_of_several_processes_come_in_the_order_of_time(tmp_path: Path) -> None:
+    session(tmp_path / 's/ust/pid/a', [START, END], [
+        (0, 10, 100, 101, 'talker', 2**64 - 1, 1), (1, 40, 100, 101, 'renamed', 2**64 - 1)])
+    session(tmp_path / 's/ust/pid/b', [END, START, BIND], [
+        (1, 20, 200, 201, 'listener', 5, 0), (0, 30, 200, 201, 'listener', 5),
+        (2, 50, 200, 202, 'dds', 7, 2**63 - 1)])
+    result = import_ctf(tmp_path / 's', tmp_path / 'out.mcap')
+    assert (result.events, result.processes, result.warnings) == (5, {100, 200}, [])
+
+    def event(name: str, time: int, pid: int, tid: int, procname: str, **fields: int) -> object:
+        return {'_name': name, '_timestamp': CLOCK_OFFSET + time, '_vpid': pid, '_vtid': tid,
+                '_procname': procname, **fields}
+
+    assert list(read_events(tmp_path / 'out.mcap')) == [
+        event('ros2:callback_start', 10, 100, 101, 'talker', callback=2**64 - 1,
+              is_intra_process=True),
+        event('ros2:callback_start', 20, 200, 201, 'listener', callback=5,
+              is_intra_process=False),
+        event('ros2:callback_end', 30, 200, 201, 'listener', callback=5),
+        event('ros2:callback_end', 40, 100, 101, 'renamed', callback=2**64 - 1),
+        event('ros2_caret:dds_bind_addr_to_stamp', 50, 200, 202, 'dds', addr=7,
+              source_stamp=2**63 - 1)]
+
+
+@bt2
+def test_unknown_events_keep_all_fields(tmp_path: Path) -> None:
+    kind = ('my-app:frame', [('timestamp', 'i64'), ('ratio', 'f64'), ('label', 'str'),
+                             ('small', 'u8'), ('box', 'i32[4]'), ('points', 'f64[]')])
+    folder = session(tmp_path / 's', [kind], [
+        (0, 1, 1, 1, 'p', -5, 0.1, 'Größe', 255, (1, -2, 3, -2**31), (0.5, 1e300)),
+        (0, 2, 1, 1, 'p', 6, -0.0, '', 0, (0, 0, 0, 0), ())])
+    result = import_ctf(folder, tmp_path / 'out.mcap')
+    assert len(result.warnings) == 1 and "'my-app:frame' to 'my_app:frame'" in result.warnings[0]
+    reader = TraceReader(tmp_path / 'out.mcap')
+    events = [event for event in reader.events() if event[0] != 'mddag:process']
+    assert events == [
+        ('my_app:frame', CLOCK_OFFSET + 1, 1, 1, -5, 0.1, 'Größe', 255, (1, -2, 3, -2**31), 2,
+         (0.5, 1e300)),
+        ('my_app:frame', CLOCK_OFFSET + 2, 1, 1, 6, -0.0, '', 0, (0, 0, 0, 0), 0, ())]
+    assert reader.fields['my_app:frame'] == (
+        'timestamp_', 'ratio', 'label', 'small', 'box', 'points_length', 'points')
+
+
+@bt2
+def test_one_event_with_other_fields_in_another_process(tmp_path: Path) -> None:
+    session(tmp_path / 's/a', [('ros2_caret:dds_write', [('message', 'u64')])],
+            [(0, 10, 1, 1, 'old', 11)])
+    session(tmp_path / 's/b', [('ros2_caret:dds_write',
+                                [('rmw_publisher_handle', 'u64'), ('message', 'u64')])],
+            [(0, 20, 2, 2, 'new', 7, 22)])
+    path = imported(tmp_path / 's', tmp_path)
+    assert [{name: value for name, value in event.items() if name[0] != '_'}
+            for event in read_events(path)] == [
+        {'message': 11}, {'rmw_publisher_handle': 7, 'message': 22}]
+    assert [event[4:] for event in TraceReader(path).events({'ros2_caret:dds_write'})] == [
+        (11,), (22,)]
+
+
+@bt2
+def test_discarded_events_are_counted(tmp_path: Path) -> None:
+    folder = session(tmp_path / 's', [END], [(0, time, 1, 1, 'p', 3) for time in range(10)],
+                     discarded=17)
+    result = import_ctf(folder, tmp_path / 'out.mcap')
+    assert result.discarded == 17
+    assert 'discarded 17 events' in result.warnings[0]
+    assert [event[4] for event in TraceReader(tmp_path / 'out.mcap').events({'mddag:lost'})] == [
+        17]
+
+
+@bt2
+def test_events_without_contexts(tmp_path: Path) -> None:
+    folder = session(tmp_path / 's', [END], [(0, 1, 0, 0, '', 3)], context=False)
+    result = import_ctf(folder, tmp_path / 'out.mcap')
+    assert 'vpid and vtid' in result.warnings[0]
+    assert next(iter(read_events(tmp_path / 'out.mcap')))['callback'] == 3
+
+
+@bt2
+def test_damage_is_one_error(tmp_path: Path) -> None:
+    folder = session(tmp_path / 's', [END], [(0, time, 1, 1, 'p', 3) for time in range(10)])
+    stream = folder / 'channel_0'
+    whole = stream.read_bytes()
+    for damaged in (whole[:-5], whole[:30], b'\0' * 8 + whole[8:]):
+        stream.write_bytes(damaged)
+        with pytest.raises(TraceError, match=UNREADABLE):
+            import_ctf(folder, tmp_path / 'out.mcap')
+    stream.write_bytes(b'')
+    with pytest.raises(TraceError, match='no event is recorded'):
+        import_ctf(folder, tmp_path / 'out.mcap')
+    (folder / 'metadata').write_text('trace {')
+    with pytest.raises(TraceError, match=UNREADABLE):
+        import_ctf(folder, tmp_path / 'out.mcap')
+
+
+def test_cut_metadata_is_found_before_babeltrace_reads_it(tmp_path: Path) -> None:
+    head = struct.pack('<I16sIII5B', 0x75D11D57, b'', 0, 1000 * 8, 4096 * 8, 0, 0, 0, 1, 8)
+    for data, what in ((head + bytes(3000), 'is cut at byte 3037'), (head[:20], 'is cut'),
+                       (head[:24] + bytes(13), 'is damaged'), (b'', 'is empty')):
+        (tmp_path / 'metadata').write_bytes(data)
+        with pytest.raises(TraceError, match=what):
+            import_ctf(tmp_path, tmp_path / 'out.mcap')
+
+
+HELPER = """\
+import json, os, struct, sys
+rows = {rows}
+data = json.dumps(rows).encode()
+sys.stdout.buffer.write(struct.pack('>I', len(data)) + data)
+sys.stdout.flush()
+{then}
+"""
+EVENTS = [['ready', '2'], ['class', 0, 'ros2:callback_end', [['callback', 'uint64']]],
+          ['event', 0, 5, 1, 2, 'p', [3]]]
+
+
+@pytest.mark.parametrize('rows, then, what', [
+    (EVENTS, 'os.kill(os.getpid(), 6)', r'gave up \(ended by SIGABRT\)'),
+    (EVENTS, '', r'gave up \(exit status 0\)'),
+    (EVENTS, 'os.kill(os.getpid(), 14)', 'did nothing for'),
+    (EVENTS, 'sys.stdout.buffer.write(bytes([255] * 9))', 'gave up'),
+    ([*EVENTS, ['error', 'because']], '', r'cannot be read \(because\)'),
+    ([['missing', 'no module']], '', 'are not installed: apt install python3-bt2'),
+])
+def test_a_helper_that_fails(rows: list[object], then: str, what: str, tmp_path: Path,
+                             monkeypatch: pytest.MonkeyPatch) -> None:
+    helper = tmp_path / 'helper.py'
+    helper.write_text(HELPER.format(rows=rows, then=then))
+    (tmp_path / 'metadata').write_text('/* CTF 1.8 */')
+    monkeypatch.setattr(ctf, '_HELPER', helper)
+    monkeypatch.setattr(ctf, 'interpreters', lambda: ['/nowhere/python', sys.executable])
+    with pytest.raises(TraceError, match=what):
+        import_ctf(tmp_path, tmp_path / 'out.mcap')
+
+
+class Plain(pickle.Unpickler):
+    """Reads pickles of plain values only."""
+
+    def find_class(self, module: str, name: str) -> NoReturn:
+        raise pickle.UnpicklingError(f'{module}.{name}')
+
+
+@bt2
+@pytest.mark.skipif(not SAMPLE.is_dir(), reason='the sample recording is not here')
+def test_events_of_a_real_recording_equal_what_caret_made_of_them(tmp_path: Path) -> None:
+    path = imported(SAMPLE / 'end_to_end_sample', tmp_path)
+    with open(SAMPLE / 'end_to_end_sample' / 'caret_converted', 'rb') as file:
+        expected = Plain(file).load()
+    assert len(expected) == 2880
+    assert list(read_events(path)) == expected
+
+
+@bt2
+@pytest.mark.skipif(not SAMPLE.is_dir(), reason='the sample recording is not here')
+def test_callback_times_of_a_real_recording_equal_those_of_caret(tmp_path: Path) -> None:
+    path = imported(SAMPLE / 'end_to_end_sample', tmp_path)
+    with open(SAMPLE / 'cb_filter_node_callback_0.csv', newline='') as file:
+        expected = [tuple(map(int, row)) for row in list(csv.reader(file))[1:]]
+    runs: dict[int, list[tuple[int, int]]] = {}
+    started: dict[int, int] = {}
+    for event in read_events(path, {'ros2:callback_start', 'ros2:callback_end'}):
+        if event['_name'] == 'ros2:callback_start':
+            started[event['callback']] = event['_timestamp']
+        else:
+            runs.setdefault(event['callback'], []).append(
+                (started.pop(event['callback']), event['_timestamp']))
+    assert len(expected) == 49
+    assert expected in runs.values()
