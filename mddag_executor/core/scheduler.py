@@ -18,7 +18,15 @@ from __future__ import annotations
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import policy
-from mddag_executor.core.state import add_group, add_slot, Decision, N_IDLE, N_STALE, new_state
+from mddag_executor.core.state import (
+    add_group,
+    add_slot,
+    Decision,
+    N_IDLE,
+    N_STALE,
+    new_state,
+    OPEN,
+)
 from mddag_executor.core.tables import Tables
 
 
@@ -112,6 +120,11 @@ class Scheduler:
     def resume(self, x: int) -> None:
         """Make a suspended execution ready to go on."""
         rules.resume(self.state, x)
+
+    def expire_open(self, slot: int, now: int) -> None:
+        """Expire the job in a slot unless it has ended already."""
+        if self.state.job_state[slot] == OPEN:
+            self.expire(slot, now)
 
     def expire(self, slot: int, now: int) -> None:
         """Expire the open job in a slot."""

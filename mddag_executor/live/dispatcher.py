@@ -297,6 +297,17 @@ class Dispatcher:
         if state.decisions:
             self.decided(now)
 
+    def give_up(self, work: Work, now: int) -> None:
+        """End a dispatched execution that must not run: its job can not complete any more."""
+        x = work.x
+        work.x = -1
+        origin = work.origin
+        if origin is not None:
+            self.scheduler.expire_open(origin.slot, now)
+        self.scheduler.complete(x, now)
+        self.verdicts.note_drop(work.entry, origin or NO_ORIGIN, 'destroyed', now)
+        self.decided(now)
+
     def decided(self, now: int) -> None:
         """Carry out what the core has decided since the last call."""
         if not self.scheduler.state.decisions:

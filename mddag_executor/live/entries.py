@@ -23,12 +23,18 @@ from typing import Any
 from mddag_executor.core import Tables
 from mddag_executor.live.attribution import Origin
 from msg_graph import Callback, TaskSet
+from rclpy.exceptions import InvalidHandle
 
 TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
     'timer', 'subscription', 'service', 'client', 'guard', 'waitable', 'task')
 
 
+_HANDLED = (TIMER, SUBSCRIPTION, SERVICE)
 _COUNTS = ('ready', 'ran', 'dropped', 'skipped', 'unattributed', 'busy_ns')
+
+
+class Destroyed(Exception):
+    """The entity was destroyed after its execution had become ready: it must not run."""
 
 
 class Entry:
@@ -43,7 +49,7 @@ class Entry:
     __slots__ = (
         'kind', 'entity', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'dropped', 'skipped', 'last_due', 'busy_ns',
-        'unattributed', 'removed', 'address')
+        'unattributed', 'removed', 'address', 'handle')
 
     def __init__(
         self, kind: str, entity: Any, node: str, callback: Callback | None, group: int,
@@ -71,6 +77,8 @@ class Entry:
         self.unattributed = 0
         self.removed = False
         self.address = id(self)
+        # taken from before a callback runs: it raises once the entity is destroyed
+        self.handle = entity.handle if kind in _HANDLED else None
 
     def count_into(self, counts: dict[str, dict[str, Any]]) -> None:
         """
@@ -133,9 +141,16 @@ class Work:
         """
         Run, or go on running; return None when it has finished, else what it waits for.
 
+        :raises Destroyed: where it must not run any more.
         :raises BaseException: whatever the callback raises.
         """
         if self.coroutine is None:
+            if self.entry.handle is not None:
+                try:
+                    with self.entry.handle:
+                        pass
+                except InvalidHandle:
+                    raise Destroyed from None
             result = self.function(*self.args)
             if type(result) is not types.CoroutineType:
                 if self.then is not None:

@@ -46,7 +46,11 @@ Mode = Literal['sleep', 'spin']
 MODES: tuple[Mode, ...] = ('sleep', 'spin')
 
 Emulate = Callable[[int], None]
-"""Executes for that many nanoseconds in the calling thread."""
+"""
+Executes for that many nanoseconds in the calling thread.
+
+Its attribute ``busy_below_ns`` tells up to which execution time it takes CPU for it.
+"""
 
 
 class PlanError(MddagError):
@@ -184,6 +188,7 @@ def sleeper(oversleep_ns: int | None = None) -> Emulate:
         while monotonic_ns() < end:
             pass
 
+    emulate.busy_below_ns = typical  # type: ignore[attr-defined]
     return emulate
 
 
@@ -196,6 +201,7 @@ def spinner() -> Emulate:
         while thread_time_ns() < end:
             pass
 
+    emulate.busy_below_ns = 2 ** 63  # type: ignore[attr-defined]
     return emulate
 
 

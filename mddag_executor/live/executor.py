@@ -39,7 +39,6 @@ import threading
 import time
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.errors import UsageError
 from mddag_executor.live import hooks
 from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.entities import EntitySet, snapshot
@@ -49,12 +48,12 @@ from mddag_executor.live.pool import Pool
 from mddag_executor.live.receiver import Receiver
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import looked_after, Registry
+from mddag_executor.live.settings import resolve, thread_setting
 from mddag_executor.live.statistics import statistics
 from mddag_executor.live.tasks import make_task
-from mddag_executor.live.threads import thread_setting
 from mddag_executor.live.verdicts import DeadlineMiss
 from mddag_executor.live.waitset import ALL_KINDS, WaitSetIntake
-from msg_graph import load, parse_duration, TaskSet
+from msg_graph import TaskSet
 import rclpy
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import Executor, ExternalShutdownException, TimeoutObject
@@ -66,6 +65,9 @@ if TYPE_CHECKING:
 
 LOOK_AFTER_S = 0.1
 """How often ``spin`` looks whether the context is still there (signals only end the context)."""
+
+REFRESH_REST = 3
+"""After looking at all entities, rest for so many times what it took."""
 
 EXPIRE_AFTER_NS = 1_000_000_000
 MAX_ACTIVE_JOBS = 64
@@ -117,33 +119,27 @@ class MultiDeadlineExecutor(Executor):
         worker_cpus: set[int] | None = None,
         freeze_gc: bool = False,
     ) -> None:
-        task_set = load(graph) if isinstance(graph, (str, os.PathLike)) else graph
-        if num_workers is None:
-            num_workers = (task_set.workers if task_set is not None else None) or 7
-        if num_workers < 1:
-            raise UsageError(f'num_workers: {num_workers} is too few: give at least 1')
-        if isinstance(default_deadline, str):
-            default_deadline = parse_duration(default_deadline)
-        if intake not in ('auto', 'events', 'waitset'):
-            raise UsageError(f"intake: '{intake}' is unknown: give auto, events or waitset")
+        task_set, num_workers, deadline_ns = resolve(
+            graph, num_workers, default_deadline, intake)
         prepare = thread_setting(worker_policy, worker_priority, worker_cpus)
         hooks.install()
         self._recorder: Recorder | None = None
         clock_offset = time.time_ns() - time.monotonic_ns()
         if trace is not None:
             self._recorder = Recorder(
-                trace, task_set, policy, num_workers, default_deadline, max_active_jobs,
+                trace, task_set, policy, num_workers, deadline_ns, max_active_jobs,
                 clock_offset)
         self._errors: deque[BaseException] = deque()
         self._attention = threading.Event()
         self._changed = True
+        self._refresh_at = 0.0
         self._entities: EntitySet | None = None
         self._spinning = threading.Lock()
         self._refreshing = threading.Lock()
         self._finished = False
         self._freeze_gc = freeze_gc
         self._dispatcher = Dispatcher(
-            task_set, num_workers, policy, default_deadline=default_deadline,
+            task_set, num_workers, policy, default_deadline=deadline_ns,
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
             clock_offset=clock_offset, fail=self._fail,
             record=self._recorder.record if self._recorder else None, on_miss=on_deadline_miss)
@@ -193,6 +189,7 @@ class MultiDeadlineExecutor(Executor):
         with self._refreshing:
             if not self._changed:
                 return
+            start = time.monotonic()
             self._changed = False
             nodes = self.get_nodes()
             added, gone = self._registry.refresh(nodes)
@@ -204,6 +201,8 @@ class MultiDeadlineExecutor(Executor):
             for intake in (self._intake, self._inline):
                 if intake is not None:
                     intake.update(self._entities)
+            end = time.monotonic()
+            self._refresh_at = end + REFRESH_REST * (end - start)
 
     # --- tasks -----------------------------------------------------------------------------------
 
@@ -259,8 +258,12 @@ class MultiDeadlineExecutor(Executor):
                 if done():
                     return
                 self._check_context()
-                self._refresh()
                 left = LOOK_AFTER_S
+                if self._changed:  # where entities are made in a row, not anew for each of them
+                    left = min(left, max(0.0, self._refresh_at - time.monotonic()))
+                if left == 0.0:
+                    self._refresh()
+                    left = LOOK_AFTER_S
                 if self._pool.resume_polled():
                     left = 0.002
                 if deadline is not None:
@@ -413,10 +416,5 @@ class MultiDeadlineExecutor(Executor):
             self._recorder.close(end)
 
     def statistics(self) -> dict[str, Any]:
-        """
-        Return a snapshot of what has happened since the executor was made.
-
-        ``dags`` is in the result format of ``mddag replay``; ``callbacks`` counts for each
-        entity what became ready, ran, was dropped for QoS or skipped; times in ns.
-        """
+        """Return a snapshot of what has happened so far (see the module ``statistics``)."""
         return statistics(self._dispatcher, self._pool, self._registry, self._recorder)

@@ -40,7 +40,7 @@ from mddag_executor.core.rules import schedule, take
 from mddag_executor.core.state import N_IDLE
 from mddag_executor.live.attribution import PublisherState
 from mddag_executor.live.dispatcher import Dispatcher
-from mddag_executor.live.entries import UNKNOWN, Work
+from mddag_executor.live.entries import Destroyed, UNKNOWN, Work
 from mddag_executor.live.hooks import current
 from mddag_executor.live.verdicts import NO_ORIGIN
 
@@ -228,19 +228,24 @@ class Pool:
         previous = current.running
         current.running = seat.running
         waits_for: Any = None
+        ran = True
         start = monotonic_ns() + dispatcher.clock_offset
         try:
             waits_for = work.step()
+        except Destroyed:
+            ran = False
         except BaseException as error:
             dispatcher.fail(error)
         end = monotonic_ns() + dispatcher.clock_offset
         current.running = previous
-        if dispatcher.record is not None:
+        if ran and dispatcher.record is not None:
             self._record(work, seat, start, end)
         with self._lock:
             now = dispatcher.core_time(end)
             work.entry.busy_ns += end - start
-            if waits_for is None:
+            if not ran:
+                dispatcher.give_up(work, now)
+            elif waits_for is None:
                 dispatcher.complete(work, end, now, seat.vtid)
             else:
                 dispatcher.suspend(work)

@@ -65,7 +65,7 @@ class Recorder:
         self.record(event, now, threading.get_native_id(), *fields)
 
     def entities(self, nodes: Iterable[Any], added: list[Entry]) -> None:
-        """Record what is new among nodes, publishers and entities (CARET initialization)."""
+        """Record new nodes, publishers and entities, with the tracepoints CARET expects."""
         by_name: dict[str, int] = {}
         for node in nodes:
             address = id(node)

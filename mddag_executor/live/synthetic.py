@@ -126,6 +126,7 @@ class SyntheticWorkload:
         self._current_job = current_job
         self._context = context
         self._emulate = emulator(plan.mode)
+        self.ledger.busy_below_ns = getattr(self._emulate, 'busy_below_ns', 0)
         # Timers on the steady clock: steps of the system's clock move no release.
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._nodes: dict[str, Node] = {}

@@ -39,7 +39,7 @@ _LEFT = '\\l'
 _WIDTH = 22
 _PIECES = re.compile(r'[^/_]*[/_]?')
 _MANY = 2_000
-"""With more boxes than this Graphviz takes short cuts, which cost some beauty and save minutes."""
+"""With more boxes than this Graphviz is told to take short cuts."""
 
 
 def to_dot(picture: Picture) -> str:

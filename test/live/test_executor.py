@@ -29,7 +29,6 @@ from rclpy.action import ActionClient, ActionServer
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.serialization import deserialize_message
 from rclpy.task import Future
-from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
@@ -377,41 +376,6 @@ def test_no_message_is_lost(make_executor, make_node):
     assert sorted(got) == list(range(1000))
 
 
-def test_wait_for_message_from_a_callback(make_executor, make_node, ros_context):
-    node = make_node()
-    publisher = node.create_publisher(Header, '/topic', 10)
-    node.create_timer(0.01, lambda: publisher.publish(Header(frame_id='it')))
-    executor = make_executor()
-    executor.add_node(node)
-    with Spinning(executor):
-        found, message = wait_for_message(Header, node, '/topic', time_to_wait=5.0)
-    assert found and message.frame_id == 'it'
-
-
-def test_rate_sleeps_inside_a_callback(make_executor, make_node):
-    node = make_node()
-    executor = make_executor()
-    executor.add_node(node)
-    rate = node.create_rate(100)
-    task = executor.create_task(lambda: [rate.sleep() for _ in range(3)])
-    with Spinning(executor):
-        assert wait_for(task.done)
-
-
-def test_parameters_of_a_node(make_executor, make_node):
-    from rclpy.parameter_client import AsyncParameterClient
-    node = make_node(start_parameter_services=True)
-    node.declare_parameter('speed', 3)
-    executor = make_executor()
-    executor.add_node(node)
-    client = AsyncParameterClient(node, 'node')
-    with Spinning(executor):
-        assert client.wait_for_services(5.0)
-        future = client.get_parameters(['speed'])
-        assert wait_for(future.done)
-    assert future.result().values[0].integer_value == 3
-
-
 @pytest.mark.parametrize('kwargs, says', [
     ({'num_workers': 0}, 'give at least 1'),
     ({'policy': 'nonsense'}, 'choose one of'),
@@ -424,3 +388,20 @@ def test_parameters_of_a_node(make_executor, make_node):
 def test_bad_arguments_say_what_to_do(ros_context, kwargs, says):
     with pytest.raises(MddagError, match=says):
         MultiDeadlineExecutor(context=ros_context, **kwargs)
+
+
+def test_a_destroyed_subscription_does_not_run_what_it_has_queued(make_executor, make_node):
+    node, got, gate = make_node(), [], threading.Event()
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    subscription = node.create_subscription(Header, '/topic', got.append, 10)
+    publisher = node.create_publisher(Header, '/topic', 10)
+    with Spinning(executor):
+        assert wait_for(lambda: publisher.get_subscription_count() > 0)
+        executor.create_task(gate.wait, 5.0)
+        publisher.publish(Header())
+        assert wait_for(lambda: executor.statistics()['queue'] == 1)
+        node.destroy_subscription(subscription)
+        gate.set()
+        assert stays(got)
+    assert got == []

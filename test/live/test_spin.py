@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Spinning: what ends it, what comes out of it, one callback at a time, shutdown."""
+"""Spinning: what ends it, what comes out of it, one callback at a time, waiting inside."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ import pytest
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.task import Future
+from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import Spinning
+from .conftest import Spinning, wait_for
 
 
 @pytest.mark.parametrize('kind', ['timer', 'subscription', 'task', 'coroutine', 'service'])
@@ -185,3 +186,38 @@ def test_rclpy_spin_uses_all_workers(make_executor, make_node, ros_context):
     with pytest.raises(ExternalShutdownException):
         rclpy.spin(node, executor)
     assert tasks[0].done()
+
+
+def test_wait_for_message_from_a_callback(make_executor, make_node, ros_context):
+    node = make_node()
+    publisher = node.create_publisher(Header, '/topic', 10)
+    node.create_timer(0.01, lambda: publisher.publish(Header(frame_id='it')))
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        found, message = wait_for_message(Header, node, '/topic', time_to_wait=5.0)
+    assert found and message.frame_id == 'it'
+
+
+def test_rate_sleeps_inside_a_callback(make_executor, make_node):
+    node = make_node()
+    executor = make_executor()
+    executor.add_node(node)
+    rate = node.create_rate(100)
+    task = executor.create_task(lambda: [rate.sleep() for _ in range(3)])
+    with Spinning(executor):
+        assert wait_for(task.done)
+
+
+def test_parameters_of_a_node(make_executor, make_node):
+    from rclpy.parameter_client import AsyncParameterClient
+    node = make_node(start_parameter_services=True)
+    node.declare_parameter('speed', 3)
+    executor = make_executor()
+    executor.add_node(node)
+    client = AsyncParameterClient(node, 'node')
+    with Spinning(executor):
+        assert client.wait_for_services(5.0)
+        future = client.get_parameters(['speed'])
+        assert wait_for(future.done)
+    assert future.result().values[0].integer_value == 3

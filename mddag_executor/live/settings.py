@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Real-time setting of worker threads: scheduling policy, priority, CPU set."""
+"""What an executor is told when it is made: checked, and brought into one form."""
 
 from __future__ import annotations
 
@@ -20,8 +20,36 @@ from collections.abc import Callable
 import os
 
 from mddag_executor.errors import UsageError
+from msg_graph import load, parse_duration, TaskSet
 
-POLICIES = ('SCHED_OTHER', 'SCHED_FIFO', 'SCHED_RR')
+INTAKES = ('auto', 'events', 'waitset')
+DEFAULT_WORKERS = 7
+POLICIES = ('SCHED_OTHER', 'SCHED_BATCH', 'SCHED_FIFO', 'SCHED_RR')
+
+
+def resolve(
+    graph: str | os.PathLike[str] | TaskSet | None, num_workers: int | None,
+    default_deadline: int | str, intake: str,
+) -> tuple[TaskSet | None, int, int]:
+    """
+    Return the task set, the number of workers and the default deadline (ns) of an executor.
+
+    :raises msg_graph.GraphError: when the declaration is not right.
+    :raises UsageError: on a value that makes no sense.
+    """
+    task_set = load(graph) if isinstance(graph, (str, os.PathLike)) else graph
+    if num_workers is None:
+        num_workers = (task_set.workers if task_set is not None else None) or DEFAULT_WORKERS
+    if num_workers < 1:
+        raise UsageError(f'num_workers: {num_workers} is too few: give at least 1')
+    if isinstance(default_deadline, str):
+        default_deadline = parse_duration(default_deadline)
+    if default_deadline < 1:
+        raise UsageError(f'default_deadline: {default_deadline} ns is too short: give at least 1')
+    if intake not in INTAKES:
+        raise UsageError(f"intake: '{intake}' is unknown: give {', '.join(INTAKES[:-1])} or "
+                         f'{INTAKES[-1]}')
+    return task_set, num_workers, default_deadline
 
 
 def thread_setting(
