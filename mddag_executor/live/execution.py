@@ -49,7 +49,7 @@ Emulate = Callable[[int], None]
 """
 Executes for that many nanoseconds in the calling thread.
 
-Its attribute ``busy_below_ns`` tells up to which execution time it takes CPU for it.
+A sleeper's attribute ``busy_below_ns`` tells up to which execution time it takes CPU for it.
 """
 
 
@@ -201,7 +201,6 @@ def spinner() -> Emulate:
         while thread_time_ns() < end:
             pass
 
-    emulate.busy_below_ns = 2 ** 63  # type: ignore[attr-defined]
     return emulate
 
 

@@ -73,6 +73,9 @@ def test_cpu_is_shared_among_the_callbacks_of_the_window() -> None:
     assert (slept['callbacks'], slept['callbacks_per_s']) == (20, 10.0)
     assert slept['cpu_us_per_callback'] == 20_000
     assert spun['cpu_us_per_callback'] == 10_000  # 10 ms of each are the bodies themselves
+    ledger.busy_below_ns = 10 * MS
+    assert measure(ledger, ExecutionPlan(task_set, mode='sleep'), start, end) == {
+        **slept, 'cpu_us_per_callback': 10_000}  # too short to be slept: waited out busily
 
 
 def test_nothing_due_is_no_division_by_zero() -> None:
