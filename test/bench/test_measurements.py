@@ -182,7 +182,10 @@ def test_dispatch_latency_of_timers_is_counted(tmp_path: Path) -> None:
 def test_a_hanging_executor_is_killed() -> None:
     with pytest.raises(CrashError, match='events: it did not end within 2 s and was killed'):
         measure(Spec('topics', 'events', seconds=30.0), patience_s=-29.0)
-    assert not [pid for pid in descendants(os.getpid()) if running(pid)]
+    end = time.monotonic() + 5.0  # the kernel may take a moment over it
+    while [pid for pid in descendants(os.getpid()) if running(pid)]:
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 def test_one_crash_does_not_end_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
