@@ -169,6 +169,7 @@ def test_action_with_feedback_result_and_cancel(make_executor, make_node):
     executor.add_node(node)
     with Spinning(executor) as spinning:
         assert client.wait_for_server(5.0)
+        time.sleep(0.3)  # the server may see the client later than the client the server
         handles = [
             client.send_goal_async(Fibonacci.Goal(order=n), feedback_callback=feedback.append)
             for n in (3, 4, 99)]
