@@ -93,13 +93,9 @@ class Dispatcher:
         """Return the time on the trace's clock: ns since the epoch, steady during the run."""
         return monotonic_ns() + self.clock_offset
 
-    def _tick(self) -> int:
-        """Return the core's time now."""
-        now = monotonic_ns() + self.clock_offset
-        if now < self._last:
-            return self._last
-        self._last = now
-        return now
+    def tick(self) -> int:
+        """Return the core's time now; the caller holds the lock."""
+        return self.core_time(monotonic_ns() + self.clock_offset)
 
     def core_time(self, now: int) -> int:
         """Return ``now``, or the time of the core's last event where that is later."""
@@ -123,14 +119,14 @@ class Dispatcher:
         """End one ``hold``."""
         with self.lock:
             self.held -= 1
-            self.dispatch(self._tick())
+            self.dispatch(self.tick())
 
     def timer_due(self, entry: Entry, work: Work, due: int) -> None:
         """Take in a timer that became due at ``due`` (trace's clock)."""
         with self.lock:
             if entry.removed:
                 return
-            now = self._tick()
+            now = self.tick()
             if entry.depth and len(entry.waiting) >= entry.depth:
                 entry.skipped += 1
                 if entry.source >= 0:
@@ -154,7 +150,7 @@ class Dispatcher:
         with self.lock:
             if entry.removed:
                 return
-            now = self._tick()
+            now = self.tick()
             if entry.depth and len(entry.waiting) >= entry.depth:
                 self._drop_oldest(entry, now)
             if entry.source >= 0 and release is not None:
@@ -170,7 +166,7 @@ class Dispatcher:
         with self.lock:
             if entry.removed:
                 return
-            now = self._tick()
+            now = self.tick()
             self._start_undeclared(entry, work, now)
             self.dispatch(now)
 
@@ -238,7 +234,7 @@ class Dispatcher:
         with self.lock:
             if work.x >= 0 and self.scheduler.state.x_state[work.x] == SUSPENDED:
                 self.scheduler.resume(work.x)
-                self.dispatch(self._tick())
+                self.dispatch(self.tick())
 
     # --- what does not run -----------------------------------------------------------------------
 
@@ -258,7 +254,7 @@ class Dispatcher:
         """Forget a destroyed entity: what waits of it never runs."""
         with self.lock:
             entry.removed = True
-            now = self._tick()
+            now = self.tick()
             for x in list(entry.waiting):
                 self._drop(entry, x, 'destroyed', now)
             self.decided(now)
@@ -338,7 +334,7 @@ class Dispatcher:
     def finish(self) -> int:
         """Judge what is open, once, when the run ends; return the time on the trace's clock."""
         with self.lock:
-            now = self._tick()
+            now = self.tick()
             self.scheduler.expire_idle(now)
             self.decided(now)
             self.scheduler.finish(now)

@@ -123,7 +123,7 @@ class Pool:
             for worker in range(len(self._seats), self.dispatcher.n_workers):
                 self._seats.append(self._new_seat(worker))
             self.running = True
-            self._dispatch(self.dispatcher.core_time(self.dispatcher.now()))
+            self._dispatch(self.dispatcher.tick())
 
     def pause(self) -> None:
         """Start nothing more; what runs goes on."""
@@ -209,7 +209,7 @@ class Pool:
         with self._lock:
             if state.scalars[N_IDLE] == 0:
                 return False
-            now = self.dispatcher.core_time(self.dispatcher.now())
+            now = self.dispatcher.tick()
             x = self._scheduler.take(state.worker_x.index(-1), now)
             self.dispatcher.decided(now)
             if x < 0:
@@ -326,7 +326,7 @@ class Pool:
                 spare = self._spares.pop() if self._spares else self._new_seat(worker)
                 spare.worker = worker
                 self._seats[worker] = spare
-            self._dispatch(self.dispatcher.core_time(self.dispatcher.now()))
+            self._dispatch(self.dispatcher.tick())
         seat.waits = True
         try:
             with nullcontext() if seat.thread is not None else self.pump():

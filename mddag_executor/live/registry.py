@@ -123,10 +123,12 @@ class Registry:
 
     def _fold(self) -> None:
         """Keep of retired entries that are through only their counts: memory is bounded."""
-        through = [e for e in self._retired if e.ready <= e.ran + e.dropped]
-        self._retired = [e for e in self._retired if e not in through]
-        for entry in through:
-            entry.count_into(self._past)
+        retired, self._retired = self._retired, []
+        for entry in retired:
+            if entry.ready <= entry.ran + entry.dropped:
+                entry.count_into(self._past)
+            else:
+                self._retired.append(entry)
 
     def counts(self) -> dict[str, dict[str, Any]]:
         """Return the counts of all entities there have been, by callback (see ``Entry``)."""
