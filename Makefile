@@ -12,12 +12,14 @@ ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: help env demo test lint clean distclean
+.PHONY: help env demo test soak fuzz lint clean distclean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo       run the Autoware workload under the executor, record and replay it'
 	@echo 'make test       run all tests (PYTEST_ARGS=... for some of them)'
+	@echo 'make soak       the Autoware workload with random faults for SOAK_SECONDS (600)'
+	@echo 'make fuzz       read damaged traces and bags for FUZZ_SECONDS (600) each'
 	@echo 'make lint       run the linters and mypy only'
 	@echo 'make env        make or refresh the environment in $(VENV)/ (the others do it, too)'
 	@echo 'make clean      remove what builds and tests left behind'
@@ -31,6 +33,17 @@ demo: env
 
 test: env
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+FUZZ_SECONDS ?= 600
+
+fuzz: env
+	@FUZZ_SECONDS=$(FUZZ_SECONDS) $(BIN)/python -m pytest -q -s test/replay/test_fuzz.py
+
+SOAK_SECONDS ?= 600
+
+soak: env
+	@ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m mddag_executor.live.bench.soak \
+		config/autoware.yaml --seconds $(SOAK_SECONDS) $(SOAK_ARGS)
 
 lint: env
 	@$(BIN)/python -m pytest -q -m linter test/test_linters.py test/test_layers.py

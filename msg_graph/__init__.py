@@ -30,6 +30,7 @@ from msg_graph.declaration import parse_declaration
 from msg_graph.derive import derive_task_set
 from msg_graph.duration import DurationError, format_duration, parse_duration
 from msg_graph.errors import GraphError, GraphErrors
+from msg_graph.flat import flat_text
 from msg_graph.model import (
     Callback,
     Dag,
@@ -63,20 +64,25 @@ def load(path: str | PathLike[str]) -> TaskSet:
         raise GraphError(
             name, None, f'the file cannot be read ({reason or error})',
             'give the path of a declaration') from None
-    return loads(data, name)
+    return loads(data, name, name)
 
 
-def loads(text: str | bytes, name: str = '<string>') -> TaskSet:
+def loads(
+    text: str | bytes, name: str = '<string>', path: str | PathLike[str] | None = None
+) -> TaskSet:
     """
     Return the task set of a declaration.
 
     :param text: the YAML; bytes must be UTF-8.
     :param name: what errors call it.
+    :param path: the file that it comes from, if it is to include others that lie beside it.
     :raises GraphError: it is not YAML, or breaks a rule of the language or of the model.
     """
     text = decode(text, name) if isinstance(text, bytes) else text
     with _no_collection():
-        return derive_task_set(parse_declaration(text, name), text)
+        declaration = parse_declaration(text, name, None if path is None else fspath(path))
+        return derive_task_set(declaration, flat_text(declaration) if declaration.composed
+                               else text)
 
 
 @contextmanager

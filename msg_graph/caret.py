@@ -35,68 +35,17 @@ what CARET could not find out and nobody filled in.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
 
 from msg_graph.errors import GraphError, shown
 from msg_graph.fields import check_callback, check_group, check_node, check_service, check_topic
+from msg_graph.sketch import Sketch, SketchCallback, SketchNode, SketchPath
 from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Sequence, Tree
 
-UNDEFINED = 'UNDEFINED'
 _REMEDY = "give an architecture file as caret_analyze's Architecture.export writes it"
 
 
-@dataclass
-class CaretCallback:
-    """A callback; ``maybe`` are topics of its node whose publisher the file does not know."""
-
-    node: str
-    name: str
-    kind: str
-    start: str
-    period_ns: int | None = None
-    publishes: list[str] = field(default_factory=list)
-    maybe: list[str] = field(default_factory=list)
-    reads: list[str] = field(default_factory=list)
-    group: str | None = None
-
-    @property
-    def key(self) -> str:
-        """Return the key that the callback has in a declaration."""
-        return f'{self.node}:{self.name}'
-
-
-@dataclass
-class CaretNode:
-    """A node with its callbacks by their full names, and topics subscribed without a callback."""
-
-    name: str
-    callbacks: dict[str, CaretCallback] = field(default_factory=dict)
-    taken: list[str] = field(default_factory=list)
-
-
-@dataclass
-class CaretPath:
-    """A named path: node, subscribed and published topic of each step."""
-
-    name: str
-    steps: list[tuple[str, str, str]]
-
-
-@dataclass
-class Architecture:
-    """An architecture file."""
-
-    nodes: list[CaretNode]
-    paths: list[CaretPath]
-
-    def callbacks(self) -> Iterator[CaretCallback]:
-        """Yield the callbacks of all nodes."""
-        for node in self.nodes:
-            yield from node.callbacks.values()
-
-
-def read_architecture(text: str, file: str) -> Architecture:
+def read_architecture(text: str, file: str) -> Sketch:
     """
     Return what an architecture file says.
 
@@ -108,7 +57,8 @@ def read_architecture(text: str, file: str) -> Architecture:
     reader = _Reader(file)
     nodes = [reader.node(each) for each in reader.mappings(tree, 'nodes')]
     paths = [reader.path(each) for each in reader.mappings(tree, 'named_paths')]
-    return Architecture([node for node in nodes if node.callbacks], paths)
+    return Sketch(
+        f'the CARET architecture file {file}', [node for node in nodes if node.callbacks], paths)
 
 
 class _Reader:
@@ -149,8 +99,8 @@ class _Reader:
             raise GraphError(self._file, tree.line, f"'{key}': {wrong[0]}", wrong[1])
         return text
 
-    def node(self, tree: Mapping) -> CaretNode:
-        node = CaretNode(self.name(tree, 'node_name', check_node))
+    def node(self, tree: Mapping) -> SketchNode:
+        node = SketchNode(self.name(tree, 'node_name', check_node))
         for each in self.mappings(tree, 'callbacks'):
             callback = self.callback(each, node.name)
             full = self.text(each, 'callback_name')
@@ -174,7 +124,7 @@ class _Reader:
             self._context(node, each)
         return node
 
-    def callback(self, tree: Mapping, node: str) -> CaretCallback:
+    def callback(self, tree: Mapping, node: str) -> SketchCallback:
         full = self.text(tree, 'callback_name')
         name = full[len(node) + 1:] if full.startswith(f'{node}/') else full.rpartition('/')[2]
         wrong = check_callback(name)
@@ -185,14 +135,15 @@ class _Reader:
             period = self.text(tree, 'period_ns')
             if not (period.isascii() and period.isdecimal() and 0 < int(period[:19]) < 2 ** 62):
                 raise self.error(tree, f"'period_ns' is {shown(period)}")
-            return CaretCallback(node, name, kind, f'{int(period)}ns', int(period))
+            return SketchCallback(node, name, kind, period_ns=int(period))
         if kind == 'subscription':
-            return CaretCallback(node, name, kind, self.name(tree, 'topic_name', check_topic))
+            return SketchCallback(node, name, kind, [self.name(tree, 'topic_name', check_topic)])
         if kind == 'service':
-            return CaretCallback(node, name, kind, self.name(tree, 'service_name', check_service))
+            service = self.name(tree, 'service_name', check_service)
+            return SketchCallback(node, name, kind, [service])
         raise self.error(tree, f"'callback_type' {shown(kind)} is not known")
 
-    def _group(self, node: CaretNode, tree: Mapping) -> None:
+    def _group(self, node: SketchNode, tree: Mapping) -> None:
         members = [node.callbacks[name] for name in self.texts(tree, 'callback_names')
                    if name in node.callbacks]
         name = self.text(tree, 'callback_group_name').rpartition('/')[2]
@@ -203,7 +154,7 @@ class _Reader:
         for callback in members:
             callback.group = name
 
-    def _publisher(self, node: CaretNode, tree: Mapping) -> None:
+    def _publisher(self, node: SketchNode, tree: Mapping) -> None:
         topic = self.name(tree, 'topic_name', check_topic)
         names = self.texts(tree, 'callback_names')
         known = [node.callbacks[name] for name in names if name in node.callbacks]
@@ -216,29 +167,29 @@ class _Reader:
             for callback in node.callbacks.values():
                 callback.maybe.append(topic)
 
-    def _context(self, node: CaretNode, tree: Mapping) -> None:
+    def _context(self, node: SketchNode, tree: Mapping) -> None:
         kind = tree.entries.get('context_type')
         if not isinstance(kind, Scalar) or kind.text != 'use_latest_message':
             return
         taken = self.text(tree, 'subscription_topic_name')
         published = self.text(tree, 'publisher_topic_name')
         for callback in node.callbacks.values():
-            if published not in callback.publishes or callback.start == taken:
+            if published not in callback.publishes or taken in callback.starts:
                 continue
             takers = [c.name for c in node.callbacks.values()
-                      if c.kind == 'subscription' and c.start == taken]
+                      if c.kind == 'subscription' and taken in c.starts]
             for read in takers or ([taken] if taken in node.taken else []):
                 _read(callback, read)
 
-    def path(self, tree: Mapping) -> CaretPath:
+    def path(self, tree: Mapping) -> SketchPath:
         steps = []
         for each in self.mappings(tree, 'node_chain'):
             steps.append((self.text(each, 'node_name'),
                           self.text(each, 'subscribe_topic_name'),
                           self.text(each, 'publish_topic_name')))
-        return CaretPath(self.text(tree, 'path_name'), steps)
+        return SketchPath(self.text(tree, 'path_name'), steps)
 
 
-def _read(reader: CaretCallback, what: str) -> None:
+def _read(reader: SketchCallback, what: str) -> None:
     if what != reader.name and what not in reader.reads:
         reader.reads.append(what)

@@ -39,6 +39,7 @@ from msg_graph.fields import (
     check_topic,
     Fields,
 )
+from msg_graph.include import Assembler, is_composed, Part
 from msg_graph.model import Callback, ExecutionTime, Kind, OnMiss, Path, ReleaseFrom
 from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Tree
 
@@ -46,7 +47,7 @@ FORMAT = '1'
 MOST_WORKERS = 1024
 MOST_ACTIVE_JOBS = 1_000_000
 
-FILE_KEYS = ('mddag', 'workers', 'nodes', 'paths')
+FILE_KEYS = ('mddag', 'arguments', 'include', 'workers', 'nodes', 'paths')
 NODE_KEYS = ('node', 'callbacks')
 TRIGGERS = ('timer', 'subscription', 'sync', 'service')
 CALLBACK_KEYS = (
@@ -81,18 +82,24 @@ class PathEntry:
 
 @dataclass(frozen=True, slots=True)
 class Declaration:
-    """A declaration as it stands in the file; callbacks in file order."""
+    """
+    A declaration as it stands in its files; callbacks in the order of the file.
+
+    :ivar composed: whether it is put together, so that its text is not that of one file.
+    """
 
     file: str
     workers: int | None
     entries: tuple[Entry, ...]
     paths: tuple[PathEntry, ...]
+    composed: bool = False
 
 
-def parse_declaration(text: str, file: str) -> Declaration:
+def parse_declaration(text: str, file: str, path: str | None = None) -> Declaration:
     """
-    Return the declaration that a YAML text holds.
+    Return the declaration that a YAML text holds, with all that it includes.
 
+    :param path: the file that it was read from, if it was; beside it others are looked for.
     :raises GraphError: it is not YAML, or an entry is wrong by itself.
     """
     tree = parse_yaml(text, file)
@@ -104,6 +111,10 @@ def parse_declaration(text: str, file: str) -> Declaration:
             file, tree.line, 'this is not a declaration', "write one that starts with 'mddag: 1'")
     fields = Fields(tree, file, 'the declaration', FILE_KEYS)
     fields.text('mddag', _check_format)
+    parts = None
+    if is_composed(tree):
+        tree, parts = Assembler(path, FILE_KEYS, _check_format).assemble(tree, file)
+        fields = Fields(tree, file, 'the declaration', FILE_KEYS)
     found = Collector()
     workers: int | None = None
     entries: tuple[Entry, ...] = ()
@@ -111,11 +122,16 @@ def parse_declaration(text: str, file: str) -> Declaration:
     with found:
         workers = fields.integer_or_none('workers', 1, MOST_WORKERS)
     with found:
-        entries = _entries(fields.sequence('nodes'), file)
+        nodes = [] if parts is None else parts.nodes
+        entries = _entries(
+            nodes or [(each, file) for each in fields.sequence('nodes')], file)
     with found:
-        paths = _paths(fields.sequence('paths'), file) if fields.has('paths') else ()
+        if parts is not None:
+            paths = _paths(parts.paths)
+        elif fields.has('paths'):
+            paths = _paths([(each, file) for each in fields.sequence('paths')])
     found.check()
-    return Declaration(file, workers, entries, paths)
+    return Declaration(file, workers, entries, paths, parts is not None)
 
 
 def _check_format(text: str) -> tuple[str, str] | None:
@@ -124,35 +140,38 @@ def _check_format(text: str) -> tuple[str, str] | None:
     return f'{shown(text)} is no known version of the format', f"write 'mddag: {FORMAT}'"
 
 
-def _entries(nodes: list[Tree], file: str) -> tuple[Entry, ...]:
+def _entries(nodes: list[Part], top: str) -> tuple[Entry, ...]:
     entries: dict[str, Entry] = {}
     found = Collector()
-    for place, tree in enumerate(nodes, 1):
+    for place, (tree, file) in enumerate(nodes, 1):
         with found:
             fields = Fields(tree, file, f'node {place}', NODE_KEYS)
             node = fields.text('node', check_node)
             fields.entry = f'node {shown(node)}'
             for number, callback_tree in enumerate(fields.sequence('callbacks'), 1):
                 with found:
-                    _add_entry(entries, callback_tree, file, node, number)
+                    _add_entry(entries, callback_tree, file, node, number, top)
     found.check()
     return tuple(entries.values())
 
 
 def _add_entry(
-    entries: dict[str, Entry], tree: Tree, file: str, node: str, number: int
+    entries: dict[str, Entry], tree: Tree, file: str, node: str, number: int, top: str
 ) -> None:
     entry = _callback(
-        Fields(tree, file, f'callback {number} of node {shown(node)}', CALLBACK_KEYS), node)
+        Fields(tree, file, f'callback {number} of node {shown(node)}', CALLBACK_KEYS), node,
+        None if file == top else file)
     key = entry.callback.key
     if key in entries:
+        first = entries[key].fields
+        where = f'line {first.line}' if first.file == file else f'{first.file}:{first.line}'
         raise entry.fields.error(
-            'name', f'this name is taken in line {entries[key].callback.line}',
+            'name', f'this name is taken in {where}',
             'give each callback of a node a name of its own')
     entries[key] = entry
 
 
-def _callback(fields: Fields, node: str) -> Entry:
+def _callback(fields: Fields, node: str, file: str | None) -> Entry:
     name = fields.text('name', check_callback)
     key = f'{node}:{name}'
     fields.entry = f'callback {shown(key)}'
@@ -186,6 +205,7 @@ def _callback(fields: Fields, node: str) -> Entry:
         line=fields.line,
         on_miss=cast(OnMiss, fields.choice('on_miss', ON_MISS)),
         max_active_jobs=fields.integer_or_none('max_active_jobs', 1, MOST_ACTIVE_JOBS),
+        file=file,
     )
     return Entry(callback, fields)
 
@@ -250,10 +270,10 @@ def _percent(fields: Fields, count: int) -> tuple[float, ...]:
     return tuple(percent)
 
 
-def _paths(trees: list[Tree], file: str) -> tuple[PathEntry, ...]:
+def _paths(trees: list[Part]) -> tuple[PathEntry, ...]:
     paths: dict[str, PathEntry] = {}
     found = Collector()
-    for place, tree in enumerate(trees, 1):
+    for place, (tree, file) in enumerate(trees, 1):
         with found:
             entry = _path(Fields(tree, file, f'path {place}', PATH_KEYS))
             name = entry.path.name

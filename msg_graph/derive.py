@@ -156,7 +156,7 @@ class _Expansion:
         topic = next(topic for topic in entry.callback.topics if topic in published)
         keys = [self.links.callbacks[source].key for source in (first, self.source[other])]
         raise GraphError(
-            self.links.file, entry.fields.line_of('sync', topic),
+            entry.fields.file, entry.fields.line_of('sync', topic),
             f'{entry.fields.entry}: it joins two sources, {shown(keys[0])} and {shown(keys[1])}, '
             'but a DAG has one',
             f"read {shown(topic)} by a queue edge: take it out of 'sync:' and list it under "

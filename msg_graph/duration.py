@@ -103,3 +103,9 @@ def format_duration(ns: int) -> str:
         if abs(ns) >= factor:
             return f'{ns / factor:.3f}'.rstrip('0').rstrip('.') + unit
     return f'{ns}ns'
+
+
+def exact_duration(ns: int) -> str:
+    """Return a time that ``parse_duration`` reads back as just this one."""
+    text = format_duration(ns)
+    return text if parse_duration(text, minimum_ns=0) == ns else f'{ns}ns'

@@ -23,6 +23,8 @@ Theory of operation
 2. The text must be a declaration before, and give an equal task set after; else it is left alone,
    with an error. Lines are the one thing that may differ.
 3. The normal form of a normal form is itself.
+4. A file with ``include:`` or ``arguments:`` is one part of a declaration only. Of it all values
+   must be equal after; whether it is right, the whole declaration shows.
 """
 
 from __future__ import annotations
@@ -30,8 +32,12 @@ from __future__ import annotations
 from dataclasses import replace
 import io
 
+from msg_graph.declaration import FILE_KEYS
 from msg_graph.errors import GraphError
+from msg_graph.fields import Fields
+from msg_graph.include import is_composed
 from msg_graph.model import Callback, Dag, TaskSet
+from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Sequence, Tree
 
 WIDTH = 87
 """A line of a list in brackets is broken after the item that reaches this column."""
@@ -45,25 +51,43 @@ def format_text(text: str, name: str = '<string>') -> str:
     :raises GraphError: it is no declaration, or it cannot be laid out anew without a change of
         its meaning.
     """
-    from msg_graph import loads
-    before = loads(text, name)
+    before = _meaning(text, name)
     result = text
     for _ in range(3):  # a comment that moves may make room for one more change
         last, result = result, _laid_out(result, name)
         if result == last:
             break
     else:
-        raise _refused(name)
+        raise refused(name)
     try:
-        after = loads(result, name)
+        after = _meaning(result, name)
     except GraphError:
-        raise _refused(name) from None
-    if _without_lines(before) != _without_lines(after):
-        raise _refused(name)
+        raise refused(name) from None
+    if before != after:
+        raise refused(name)
     return result
 
 
-def _refused(name: str) -> GraphError:
+def _meaning(text: str, name: str) -> object:
+    """Return what must stay the same: the task set, or all that stands in the text (rule 4)."""
+    from msg_graph import loads
+    tree = parse_yaml(text, name)
+    if not isinstance(tree, Mapping) or not is_composed(tree):
+        return without_lines(loads(text, name))
+    Fields(tree, name, 'the declaration', FILE_KEYS).text('mddag', lambda _: None)
+    return _plain(tree)
+
+
+def _plain(tree: Tree) -> object:
+    if isinstance(tree, Scalar):
+        return tree.text, tree.plain
+    if isinstance(tree, Sequence):
+        return [_plain(item) for item in tree.items]
+    return [(key, _plain(value)) for key, value in tree.entries.items()]
+
+
+def refused(name: str) -> GraphError:
+    """Return the error about a text that cannot be written anew."""
     return GraphError(name, None, 'its layout cannot be changed without a change of its meaning',
                       'write anchors, quotes and multi-line texts more plainly')
 
@@ -79,12 +103,12 @@ def _laid_out(text: str, name: str) -> str:
     try:
         yaml.dump(yaml.load(text), stream)
     except (YAMLError, ValueError, NotImplementedError):
-        raise _refused(name) from None
+        raise refused(name) from None
     lines = [line.rstrip() for line in stream.getvalue().strip('\n').splitlines()]
     return '\n'.join(lines) + '\n'
 
 
-def _without_lines(task_set: TaskSet) -> TaskSet:
+def without_lines(task_set: TaskSet) -> TaskSet:
     """Return the task set with everything left out that tells where in the text it stood."""
     callbacks = {callback.key: replace(callback, line=0) for callback in task_set.callbacks}
     return replace(

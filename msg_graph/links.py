@@ -63,7 +63,8 @@ class Links:
             raise entry.fields.error(
                 'service', 'a service is a source, and it has no period',
                 "add 'period:' with the time between two requests")
-        if callback.kind == 'timer' and callback.release_from != 'arrival':
+        # header_stamp says of a timer what its messages carry on to other processes
+        if callback.kind == 'timer' and callback.release_from == 'source_timestamp':
             raise entry.fields.error(
                 'release_from', 'a timer is released when it is due',
                 "remove 'release_from:', or start the callback by a subscription")
@@ -98,7 +99,7 @@ class Links:
                 if entry.callback.kind == 'subscription':
                     remedy += ", or add 'period:' if it comes from outside of the graph"
                 raise GraphError(
-                    self.file, entry.fields.line_of(entry.callback.kind, topic),
+                    entry.fields.file, entry.fields.line_of(entry.callback.kind, topic),
                     f'{entry.fields.entry}: nobody publishes {shown(topic)}',
                     did_you_mean(topic, self.publishers, remedy))
 
@@ -149,7 +150,7 @@ class Links:
         if len(keys) > 9:
             keys[8:-1] = [f'… ({len(keys) - 9} more)']
         return GraphError(
-            self.file, self.entries[cut].fields.line_of(callback.kind, topic),
+            self.entries[cut].fields.file, self.entries[cut].fields.line_of(callback.kind, topic),
             f'callbacks start each other in a cycle: {" -> ".join(keys)}',
             f'cut it with a queue edge: in {shown(callback.key)} list {shown(topic)} under '
             f"'reads:' and {how}")
@@ -218,11 +219,13 @@ class Links:
         line = entry.fields.line_of('reads', read)
         if read.startswith('/'):
             return GraphError(
-                self.file, line, f'{entry.fields.entry}: it reads {shown(read)}, which nobody '
-                'publishes', did_you_mean(read, self.publishers, "add it to a 'publishes:'"))
+                entry.fields.file, line,
+                f'{entry.fields.entry}: it reads {shown(read)}, which nobody publishes',
+                did_you_mean(read, self.publishers, "add it to a 'publishes:'"))
         siblings = [c.name for c in self.callbacks if c.node == entry.callback.node]
         return GraphError(
-            self.file, line, f'{entry.fields.entry}: it reads the unknown callback {shown(read)}',
+            entry.fields.file, line,
+            f'{entry.fields.entry}: it reads the unknown callback {shown(read)}',
             did_you_mean(read, siblings, f'name a callback of its node: {listed(siblings)}'))
 
     def paths(self, declaration: Declaration) -> tuple[Path, ...]:
@@ -239,13 +242,13 @@ class Links:
         for key in keys:
             if key not in self.by_key:
                 raise GraphError(
-                    self.file, entry.fields.line_of('callbacks', key),
+                    entry.fields.file, entry.fields.line_of('callbacks', key),
                     f'{entry.fields.entry}: unknown callback {shown(key)}',
                     did_you_mean(key, self.by_key, 'name a declared callback'))
         for before, after in zip(keys, keys[1:]):
             if not self._linked(self.by_key[before], self.by_key[after]):
                 raise GraphError(
-                    self.file, entry.fields.line_of('callbacks', after),
+                    entry.fields.file, entry.fields.line_of('callbacks', after),
                     f'{entry.fields.entry}: no trigger or queue edge leads from '
                     f'{shown(before)} to {shown(after)}',
                     "name the callbacks between them, or add what is missing to 'reads:'")

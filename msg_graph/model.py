@@ -100,6 +100,7 @@ class Callback:
     :ivar line: line of its declaration, counted from 1.
     :ivar on_miss: what is done with a late job of the DAG that it is the source of.
     :ivar max_active_jobs: bound on the open jobs of the DAG that it is the source of, or None.
+    :ivar file: name of the file that declares it; None: that of the task set.
     """
 
     node: str
@@ -120,6 +121,7 @@ class Callback:
     line: int
     on_miss: OnMiss = 'continue'
     max_active_jobs: int | None = None
+    file: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +158,8 @@ class Dag:
     :ivar source: index of the one vertex with no predecessor.
     :ivar sinks: indices of the vertices with no successor, ascending.
     :ivar edges: trigger edges as pairs of indices, ascending.
-    :ivar release_from: where a job's release time comes from, if the source is no timer.
+    :ivar release_from: where a job's release time comes from; of a timer's it is when that was
+        due, and ``header_stamp`` says where other processes of the DAG have it from.
     :ivar on_miss: whether a late job goes on or is aborted.
     :ivar max_active_jobs: bound on the open jobs, or None where the declaration has none.
     """
@@ -212,7 +215,7 @@ class TaskSet:
     :ivar paths: the declared end-to-end paths, in file order.
     :ivar workers: declared number of workers, or None.
     :ivar file: name of the file that this was read from.
-    :ivar text: the declaration as it was read.
+    :ivar text: the declaration as it was read; put together to one where it includes others.
     :ivar vertices: the vertices of all DAGs, DAG by DAG.
     """
 

@@ -35,8 +35,11 @@ from typing import Any
 from msg_graph import declaration as language
 from msg_graph import fields
 from msg_graph.duration import UNITS
+from msg_graph.include import ARGUMENT, INCLUDE_KEYS
 
 _Schema = dict[str, Any]
+
+_ARGUMENT = rf'\$\({ARGUMENT.pattern}\)'  # an argument may stand in any value
 
 
 def schema() -> _Schema:
@@ -45,8 +48,12 @@ def schema() -> _Schema:
         '$schema': 'http://json-schema.org/draft-07/schema#',
         'title': 'mddag declaration',
         'description': 'Nodes, their callbacks and what starts them, with periods and deadlines.',
-        **_mapping(language.FILE_KEYS, _FILE, required=('mddag', 'nodes')),
+        **_mapping(language.FILE_KEYS, _FILE, required=('mddag',)),
+        'anyOf': [{'required': ['nodes']}, {'required': ['include']}],
         'definitions': {
+            'include': {'oneOf': [
+                {'type': 'string', 'description': 'A file, as seen from this one.'},
+                _mapping(INCLUDE_KEYS, _INCLUDE, required=('file',))]},
             'node': _mapping(language.NODE_KEYS, _NODE, required=language.NODE_KEYS),
             'callback': {
                 **_mapping(language.CALLBACK_KEYS, _CALLBACK, required=('name',)),
@@ -56,7 +63,7 @@ def schema() -> _Schema:
             'time': {
                 'type': 'string',
                 'pattern': rf'^[ \t]*\+?([0-9]+(\.[0-9]*)?|\.[0-9]+)[ \t]*({"|".join(UNITS)})'
-                           r'[ \t]*$',
+                           rf'[ \t]*$|{_ARGUMENT}',
                 'examples': ['100ms', '20us', '1.5s'],
             },
             'execution_time': {
@@ -77,7 +84,8 @@ def _mapping(keys: tuple[str, ...], meaning: dict[str, _Schema], required: tuple
 
 
 def _named(pattern: re.Pattern[str], longest: int, text: str) -> _Schema:
-    return {'type': 'string', 'pattern': f'^(?:{pattern.pattern})$', 'maxLength': longest,
+    return {'type': 'string', 'pattern': f'^(?:{pattern.pattern})$|{_ARGUMENT}',
+            'maxLength': longest,
             'description': text}
 
 
@@ -99,10 +107,31 @@ def _list(items: _Schema, text: str, least: int = 0, unique: bool = False) -> _S
             'description': text}
 
 
+def _integer(least: int, most: int) -> _Schema:
+    return {'anyOf': [{'type': 'integer', 'minimum': least, 'maximum': most}, _VALUE]}
+
+
+def _texts(text: str) -> _Schema:
+    return {'type': 'object', 'description': text,
+            'additionalProperties': {'type': ['string', 'number', 'boolean', 'null']}}
+
+
+_VALUE: _Schema = {'type': 'string', 'pattern': _ARGUMENT}
+_INCLUDE: dict[str, _Schema] = {
+    'file': {'type': 'string', 'description': 'The file, as seen from this one.'},
+    'namespace': _named(fields.ROS_NAME, fields.LONGEST_NODE,
+                        'Put before all names of the included file.'),
+    'remap': {'type': 'object', 'description': 'Names of the included file and what they become.',
+              'additionalProperties': _topic('The name that this file knows.')},
+    'set': _texts('Values of the arguments of the included file.'),
+}
 _FILE: dict[str, _Schema] = {
+    'arguments': _texts('Arguments of this file, $(name) in its values, with their defaults.'),
+    'include': _list({'$ref': '#/definitions/include'},
+                     'Files whose nodes and paths come before those of this one.', least=1),
     'mddag': {'enum': [int(language.FORMAT), language.FORMAT],
               'description': 'Version of the format.'},
-    'workers': {'type': 'integer', 'minimum': 1, 'maximum': language.MOST_WORKERS,
+    'workers': {**_integer(1, language.MOST_WORKERS),
                 'description': 'Number of workers that the system is made for.'},
     'nodes': _list({'$ref': '#/definitions/node'},
                    'The nodes; a node may have several entries, and their order counts for ties.',
@@ -129,26 +158,27 @@ _CALLBACK: dict[str, _Schema] = {
                    _word(fields.WORD, 'A callback of its node whose variable it reads.')]},
         'Queue edges: data that it reads later and that never starts it.', unique=True),
     'deadline': _time('Relative deadline of a sink, counted from the release of its DAG.'),
-    'release_from': {'enum': list(language.RELEASE_FROM),
+    'release_from': {'anyOf': [{'enum': list(language.RELEASE_FROM)}, _VALUE],
                      'description': 'Where the release time of a source comes from.'},
     'execution_time': {'allOf': [{'$ref': '#/definitions/execution_time'}],
                        'description': 'Its execution time: constant, or quantiles.'},
     'group': _word(fields.WORD, 'Its mutually exclusive callback group in the node.'),
     'dag': _word(fields.DAG_NAME, 'Name of the DAG that it is the source of.'),
-    'on_miss': {'enum': list(language.ON_MISS),
+    'on_miss': {'anyOf': [{'enum': list(language.ON_MISS)}, _VALUE],
                 'description': 'What is done with a late job of its DAG, if it is a source.'},
-    'max_active_jobs': {'type': 'integer', 'minimum': 1, 'maximum': language.MOST_ACTIVE_JOBS,
+    'max_active_jobs': {**_integer(1, language.MOST_ACTIVE_JOBS),
                         'description': 'Bound on the open jobs of its DAG, if it is a source.'},
 }
 _PATH: dict[str, _Schema] = {
     'name': _word(fields.WORD, 'Name of the path.'),
     'callbacks': _list(
         {'type': 'string', 'pattern': f'^(?:{fields.ROS_NAME.pattern}):'
-                                      f'(?:{fields.WORD.pattern})$'},
+                                      f'(?:{fields.WORD.pattern})$|{_ARGUMENT}'},
         "The callbacks along it, each as '/node:callback'.", least=2, unique=True),
 }
 _TIME: dict[str, _Schema] = {
-    'quantiles_us': _list({'type': 'number', 'minimum': 0}, 'Quantiles in us, rising.', least=1),
-    'percent': _list({'type': 'number', 'minimum': 0, 'maximum': 100},
+    'quantiles_us': _list({'anyOf': [{'type': 'number', 'minimum': 0}, _VALUE]},
+                          'Quantiles in us, rising.', least=1),
+    'percent': _list({'anyOf': [{'type': 'number', 'minimum': 0, 'maximum': 100}, _VALUE]},
                      'The shares that they belong to, rising.', least=1),
 }

@@ -43,6 +43,8 @@ MAX_SIZE = 2_000_000
 _LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _NOT_YAML = re.compile('[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]')
 _PLAIN_TAGS = (None, '!')
+_PLAIN = re.compile(r'[/A-Za-z_][/A-Za-z0-9_.-]*')
+_WORDS = {'true', 'false', 'yes', 'no', 'on', 'off', 'null', 'y', 'n'}
 
 
 class Scalar:
@@ -107,6 +109,11 @@ def decode(data: bytes, file: str) -> str:
         raise GraphError(
             file, line, f'byte {error.start} is not UTF-8 text',
             'give a YAML file in UTF-8') from None
+
+
+def plain_scalar(text: str) -> str:
+    """Return a name (without quotes in it) that stands for itself, quoted where it would not."""
+    return text if _PLAIN.fullmatch(text) and text.lower() not in _WORDS else f"'{text}'"
 
 
 def parse_yaml(text: str, file: str) -> Tree | None:

@@ -15,7 +15,8 @@
 """
 The parts of the program know one another in one direction only.
 
-    cli -> report -> (live | replay | simulate | analysis) -> trace, core -> msg_graph
+    cli -> report -> (live | replay | assign | simulate | analysis) -> trace, core, generate
+        -> msg_graph
 
 Imports are read from the sources, those inside functions and for type checkers included.
 """
@@ -37,8 +38,10 @@ LEVELS = {
     'mddag_executor': 3,  # its __init__.py, to those who want the version
     'mddag_executor.core': 4,
     'mddag_executor.trace': 4,
+    'mddag_executor.generate': 4,
     'mddag_executor.analysis': 5,
     'mddag_executor.simulate': 5,  # below replay, which reschedules with its engine
+    'mddag_executor.assign': 6,
     'mddag_executor.live': 6,
     'mddag_executor.replay': 6,
     'mddag_executor.report': 7,

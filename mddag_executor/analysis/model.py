@@ -96,11 +96,17 @@ def _costs(task_set: TaskSet, dag: Dag, budget: str) -> list[int]:
     for vertex in dag.vertices:
         time = vertex.callback.execution_time
         if time is None:
-            raise AnalysisError(
-                f'{task_set.file}:{vertex.callback.line}: {vertex.callback.key} declares no '
-                'execution_time: add one')
+            raise _unknown(task_set)
         costs.append(_budget(time, budget))
     return costs
+
+
+def _unknown(task_set: TaskSet) -> AnalysisError:
+    missing = [callback for callback in task_set.callbacks if callback.execution_time is None]
+    first, others = missing[0], len(missing) - 1
+    also = f' (and {others} more callbacks)' if others else ''
+    place = f'{first.file or task_set.file}:{first.line}'
+    return AnalysisError(f'{place}: {first.key}{also} declares no execution_time: add one')
 
 
 def _budget(time: ExecutionTime, budget: str) -> int:

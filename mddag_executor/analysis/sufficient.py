@@ -65,7 +65,7 @@ from mddag_executor.analysis.model import Task
 _MOST_POINTS = 100_000
 _MOST_JOBS = 1_000  # of more jobs than these, in one window, each counts in full
 _TRIES = 16
-_GRID = 1024
+GRID = 1024
 
 
 class Bound(NamedTuple):
@@ -93,7 +93,7 @@ def work_conserving(tasks: Sequence[Task], workers: int) -> list[Bound]:
         for sink, deadline, length in task.sinks:
             response = length
             while response <= deadline:
-                work = task.volume - length + _own_jobs(task, response, workers)
+                work = task.volume - length + own_jobs(task, response, workers)
                 work += sum(workload(other, response, workers) for other in others)
                 after = length + work // workers
                 if after <= response:
@@ -112,7 +112,7 @@ def workload(task: Task, window: int, workers: int) -> int:
     return min(workers * window, whole * task.volume + min(task.volume, rest))
 
 
-def _own_jobs(task: Task, window: int, workers: int) -> int:
+def own_jobs(task: Task, window: int, workers: int) -> int:
     """Return what the jobs of the same task before and after work in a window, ns."""
     work = 0
     for reach in (task.deadline, window):
@@ -127,17 +127,17 @@ def _own_jobs(task: Task, window: int, workers: int) -> int:
 def rad_preemptive(tasks: Sequence[Task], workers: int) -> list[Bound]:
     """Return the bounds of test 3, up to the first sink that has none."""
     bounds = []
-    urgent: dict[tuple[int, int], int] = {}
+    known: dict[tuple[int, int], int] = {}
     for task in tasks:
         for sink, deadline, length in task.sinks:
-            own = _own_urgent(task, deadline) - length
+            own = own_urgent(task, deadline) - length
             fixed = []
             for other in tasks:
                 if other is not task:
                     key = (other.dag.index, deadline)
-                    if key not in urgent:
-                        urgent[key] = _urgent(other, deadline)
-                    fixed.append((other, urgent[key]))
+                    if key not in known:
+                        known[key] = urgent(other, deadline)
+                    fixed.append((other, known[key]))
             response = length
             while response <= deadline:
                 work = own + sum(
@@ -152,7 +152,7 @@ def rad_preemptive(tasks: Sequence[Task], workers: int) -> list[Bound]:
     return bounds
 
 
-def _urgent(task: Task, deadline: int) -> int:
+def urgent(task: Task, deadline: int) -> int:
     """Return what another task works with RADs up to the end of a window as long, ns."""
     if deadline > _MOST_JOBS * task.period:
         return -(-deadline // task.period) * task.volume
@@ -161,7 +161,7 @@ def _urgent(task: Task, deadline: int) -> int:
         for left in range(deadline, 0, -task.period))
 
 
-def _own_urgent(task: Task, deadline: int) -> int:
+def own_urgent(task: Task, deadline: int) -> int:
     """Return what the own task works with RADs up to ``deadline`` after a job's release, ns."""
     work = 0
     for cost, rad in zip(task.costs, task.rad):
@@ -183,32 +183,52 @@ class Demand(NamedTuple):
     points: int
 
 
+def factors(tasks: Sequence[Task]) -> list[int]:
+    """Return the values of a that tests like 4 try, times GRID; none where a path is too long."""
+    largest = min((Fraction(task.deadline, task.length) for task in tasks if task.length),
+                  default=Fraction(GRID))
+    if largest < 1:
+        return []
+    return [math.floor((1 + (largest - 1) * step / _TRIES) * GRID) for step in range(_TRIES + 1)]
+
+
 def bonifaci(tasks: Sequence[Task], workers: int) -> Demand | None:
     """Return how test 4 holds; None where it does not, or not within a bounded search."""
-    largest = min(Fraction(task.deadline, task.length) if task.length else Fraction(_GRID)
-                  for task in tasks)
-    if largest < 1:
-        return None
-    for step in range(_TRIES):
-        numerator = math.floor((1 + (largest - 1) * step / _TRIES) * _GRID)
+    for numerator in factors(tasks):
         points = _demand_holds(tasks, workers, numerator)
         if points:
-            return Demand(numerator / _GRID, points)
+            return Demand(numerator / GRID, points)
     return None
 
 
-def _demand_holds(tasks: Sequence[Task], workers: int, numerator: int) -> int:
-    """Look at test 4 with a = numerator / _GRID, times in units of 1 / _GRID ns; 0: it fails."""
-    share = workers * numerator - (workers - 1) * _GRID  # m - (m - 1) / a is this by numerator
-    begins = [_GRID * task.deadline - numerator * task.length for task in tasks]
+def demand_limits(
+    tasks: Sequence[Task], workers: int, numerator: int
+) -> tuple[int, float] | None:
+    """
+    Return what bounds the demand with a = numerator / GRID; None where it is too much anyhow.
+
+    The first is m - (m - 1) / a, times ``numerator``; the second the length of window, times GRID,
+    beyond which nothing can fail.
+    """
+    share = workers * numerator - (workers - 1) * GRID
     spare = share / numerator - sum(task.utilisation for task in tasks)
-    if spare <= 1e-9 or min(begins) <= 0:
-        return 0
+    if spare <= 1e-9:
+        return None
     slack = sum(
-        task.volume * max(0.0, 1 - begin / (_GRID * task.period))
-        for task, begin in zip(tasks, begins))
-    until = slack / spare * _GRID * 1.001 + 1
-    heap = [(begin, task.volume, _GRID * task.period) for task, begin in zip(tasks, begins)]
+        task.volume * max(0.0, 1 - (GRID * task.deadline - numerator * task.length)
+                          / (GRID * task.period))
+        for task in tasks)
+    return share, slack / spare * GRID * 1.001 + 1
+
+
+def _demand_holds(tasks: Sequence[Task], workers: int, numerator: int) -> int:
+    """Look at test 4 with a = numerator / GRID, times in units of 1 / GRID ns; 0: it fails."""
+    begins = [GRID * task.deadline - numerator * task.length for task in tasks]
+    limits = demand_limits(tasks, workers, numerator)
+    if limits is None or min(begins) <= 0:
+        return 0
+    share, until = limits
+    heap = [(begin, task.volume, GRID * task.period) for task, begin in zip(tasks, begins)]
     heapify(heap)
     work = 0
     for points in range(1, _MOST_POINTS):
@@ -216,7 +236,7 @@ def _demand_holds(tasks: Sequence[Task], workers: int, numerator: int) -> int:
         if time > until:
             return points
         work += volume
-        if work * numerator * _GRID > share * time:
+        if work * numerator * GRID > share * time:
             return 0
         heapreplace(heap, (time + period, volume, period))
     return 0

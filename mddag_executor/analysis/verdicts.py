@@ -21,24 +21,35 @@ A necessary test *holds* or *fails*: where it fails, no scheduler can keep the d
 sufficient test *holds*, for the scheduler that it is about, or *says nothing*: because its figure
 is too large, or because one of its assumptions is not met. No sufficient test ever fails.
 
-All sufficient tests here share these assumptions: no execution takes longer than its budget;
-releases of a DAG are at least its period apart and known when the source becomes ready
-(``release_from: arrival``, timers); no callback group keeps ready work waiting; no declared
-``max_active_jobs`` ends a job that is not late; dispatching takes no time. Sinks of a DAG with
-different deadlines need a priority for each vertex, for which only the response-time tests are
-proven.
+All sufficient tests here share the assumptions of ``SHARED``; where the declaration shows that one
+is not met, they say nothing. Sinks of a DAG with different deadlines need a priority for each
+vertex, for which only the response-time tests are proven. The live executor does not preempt: of
+the tests only those whose ``scheduler`` says so speak of it (``LIVE``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from mddag_executor.analysis import necessary, sufficient
+from mddag_executor.analysis.federated import federation
+from mddag_executor.analysis.forced_forward import forced_forward
 from mddag_executor.analysis.model import AnalysisError, Task, tasks_of
-from mddag_executor.analysis.sufficient import Bound
+from mddag_executor.analysis.non_preemptive import rad_non_preemptive
+from mddag_executor.analysis.sag import Answer, JobSet
+from mddag_executor.analysis.sufficient import Bound, Demand
 from msg_graph import format_duration, TaskSet
+
+SHARED = (
+    'no execution takes longer than its budget; releases of a DAG are at least its period apart, '
+    'and known when its source becomes ready; no callback group keeps ready work waiting; no '
+    'bound on open jobs ends one that is not late; nothing undeclared runs; dispatching and '
+    'transport take no time')
+WORK_CONSERVING = 'any work-conserving, preemptive or not'
+RAD_LIVE = 'rad, not preemptive (the live executor)'
+LIVE = (WORK_CONSERVING, RAD_LIVE)
 
 HOLDS = 'holds'
 FAILS = 'fails'
@@ -81,14 +92,19 @@ class Analysis:
     def result(self) -> dict[str, Any]:
         """Return the result format of ``graph analyse --json``."""
         return {'workers': self.workers, 'budget': self.budget, 'utilisation': self.utilisation,
+                'assumptions': SHARED,
                 'tests': [asdict(verdict) for verdict in self.verdicts]}
 
 
-def analyse(task_set: TaskSet, workers: int, budget: str = 'max') -> Analysis:
+def analyse(
+    task_set: TaskSet, workers: int, budget: str = 'max',
+    progress: Callable[[int], None] | None = None,
+) -> Analysis:
     """
     Analyse a task set.
 
     :param budget: what of each execution time counts: ``max``, ``p99`` or ``mean``.
+    :param progress: told how many tests are done.
     :raises AnalysisError: an execution time is not declared, or there are no workers.
     """
     if workers < 1:
@@ -97,8 +113,32 @@ def analyse(task_set: TaskSet, workers: int, budget: str = 'max') -> Analysis:
     found = [_longest_path(tasks), _utilisation(tasks, workers), _demand(tasks, workers)]
     impossible = any(verdict.verdict == FAILS for verdict in found)
     obstacle = 'a necessary test fails' if impossible else _obstacle(tasks)
-    found += [test(tasks, workers, obstacle) for test in _SUFFICIENT]
+    for test in _SUFFICIENT:
+        if progress is not None:
+            progress(len(found))
+        found.append(test(tasks, workers, obstacle))
     return Analysis(workers, budget, sum(task.utilisation for task in tasks), tuple(found))
+
+
+def with_sag(analysis: Analysis, tasks: Sequence[Task], jobs: JobSet, answer: Answer) -> Analysis:
+    """Return the analysis with the verdict of a schedule-abstraction analysis in addition."""
+    why = _obstacle(tasks)
+    verdict = NOTHING
+    if why is None and answer.timed_out:
+        why = 'it ran out of time'
+    elif why is None and not answer.schedulable:
+        why = 'it found no proof'
+    elif why is None and not jobs.for_ever:
+        why = (f'proven only for the releases before {format_duration(jobs.horizon)}, as '
+               'a job may go on beyond that, or beyond its period')
+    elif why is None:
+        verdict, why = HOLDS, 'no order in which the jobs can run misses a deadline'
+    return replace(analysis, verdicts=(*analysis.verdicts, Verdict(
+        'schedule abstraction', 'sufficient', 'Nasri et al. 2019', RAD_LIVE,
+        'all first releases together, later ones exactly periodic', verdict,
+        f'{answer.jobs} jobs, {answer.states} states', why,
+        {'schedulable': answer.schedulable, 'timed_out': answer.timed_out,
+         'horizon_ns': jobs.horizon})))
 
 
 def _sink(task: Task, sink: int) -> str:
@@ -116,7 +156,7 @@ def _longest_path(tasks: Sequence[Task]) -> Verdict:
     if late:
         reason = f'too long for {len(late)} of {sum(len(t.sinks) for t in tasks)} sinks'
     return Verdict(
-        'longest path', 'necessary', 'Graham 1969', 'any', 'none',
+        'longest path', 'necessary', 'Graham 1969', 'any', 'executions take their budgets',
         FAILS if late else HOLDS, figure, reason,
         {_sink(task, sink): {'deadline_ns': deadline, 'longest_path_ns': length}
          for task in tasks for sink, deadline, length in task.sinks})
@@ -127,7 +167,7 @@ def _utilisation(tasks: Sequence[Task], workers: int) -> Verdict:
     fits = total <= workers * (1 + 1e-12)
     return Verdict(
         'utilisation', 'necessary', 'Liu and Layland 1973', 'any',
-        'releases as often as declared', HOLDS if fits else FAILS,
+        'releases as often as declared, executions of their budgets', HOLDS if fits else FAILS,
         f'U = {total:.3f} of {workers}',
         'U <= m' if fits else 'U > m: work piles up without end',
         {task.dag.name: task.utilisation for task in tasks})
@@ -147,8 +187,8 @@ def _demand(tasks: Sequence[Task], workers: int) -> Verdict:
         figure = f'{format_duration(demand.work)} due before it can have been done'
     return Verdict(
         'demand bound', 'necessary', 'Baruah, Mok and Rosier 1990, refined for each sink', 'any',
-        'all DAGs may be released at one time', HOLDS if fits else FAILS, figure, reason,
-        {'time_ns': demand.time, 'work_ns': demand.work})
+        'all DAGs may be released at one time, executions take their budgets',
+        HOLDS if fits else FAILS, figure, reason, {'time_ns': demand.time, 'work_ns': demand.work})
 
 
 def _obstacle(tasks: Sequence[Task]) -> str | None:
@@ -186,7 +226,7 @@ def _graham(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdic
         verdict, reason = _by(good == 1, 'the bound of each sink is within deadline and period',
                               'a bound is beyond the deadline or the period')
     return Verdict(
-        "Graham's bound", 'sufficient', 'Graham 1969', 'any work-conserving, preemptive or not',
+        "Graham's bound", 'sufficient', 'Graham 1969', WORK_CONSERVING,
         'one DAG alone, done within its period', verdict,
         f'{good} of {len(tasks)} DAGs would be in time, each alone', reason or '',
         {name: {'alone': HOLDS if ok else NOTHING} for name, ok in within.items()})
@@ -225,7 +265,7 @@ def _work_conserving(tasks: Sequence[Task], workers: int, obstacle: str | None) 
         tasks, workers, obstacle, sufficient.work_conserving)
     return Verdict(
         'response time, any policy', 'sufficient', 'after Melani et al. 2015',
-        'any work-conserving, preemptive or not', 'several and any deadlines', verdict, figure,
+        WORK_CONSERVING, 'several and any deadlines', verdict, figure,
         reason, details)
 
 
@@ -238,11 +278,23 @@ def _rad(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
         'several and any deadlines', verdict, figure, reason, details)
 
 
-def _bonifaci(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
+def _rad_live(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
+    verdict, figure, reason, details = _response_times(
+        tasks, workers, obstacle, rad_non_preemptive)
+    return Verdict(
+        'response time, RAD without preemption', 'sufficient',
+        'after Melani et al. 2015, Serrano et al. 2016', RAD_LIVE, 'several and any deadlines',
+        verdict, figure, reason, details)
+
+
+def _gedf_demand(
+    name: str, source: str, test: Callable[[Sequence[Task], int], Demand | None],
+    tasks: Sequence[Task], workers: int, obstacle: str | None,
+) -> Verdict:
     obstacle = obstacle or _several_deadlines(tasks)
     verdict, figure, reason = NOTHING, '-', obstacle
     if obstacle is None:
-        demand = sufficient.bonifaci(tasks, workers)
+        demand = test(tasks, workers)
         if demand is None:
             reason = 'too much work in some interval, at each speed that was tried'
         else:
@@ -250,8 +302,37 @@ def _bonifaci(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verd
             figure = f'speed 1/{demand.factor:.3f}, {demand.points} instants'
             reason = 'in no interval the work that EDF would have to be behind with'
     return Verdict(
-        'GEDF demand', 'sufficient', 'Bonifaci et al. 2013', 'gedf or rad, preemptive',
+        name, 'sufficient', source, 'gedf or rad, preemptive',
         'one deadline for each DAG, of any length', verdict, figure, reason or '')
+
+
+def _bonifaci(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
+    return _gedf_demand(
+        'GEDF demand', 'Bonifaci et al. 2013', sufficient.bonifaci, tasks, workers, obstacle)
+
+
+def _baruah(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
+    return _gedf_demand(
+        'GEDF forced-forward demand', 'after Baruah 2014', forced_forward, tasks, workers,
+        obstacle)
+
+
+def _federated(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
+    verdict, figure, reason, details = NOTHING, '-', obstacle, dict[str, Any]()
+    if obstacle is None:
+        found = federation(tasks)
+        if isinstance(found, str):
+            reason = f'DAG {found} takes longer than its period or a deadline on any number'
+        else:
+            figure = f'{found.workers} of {workers} workers'
+            verdict, reason = _by(
+                found.workers <= workers, 'heavy DAGs have enough workers for themselves, and the '
+                'light ones fit on the others', 'the DAGs need more workers than there are')
+            details = {'own_workers': found.own, 'shared': found.shared}
+    return Verdict(
+        'federated scheduling', 'sufficient', 'Li et al. 2014',
+        'federated: an executor for each heavy DAG, preemptive rad on a worker for light ones',
+        'a job is done before the next of its DAG', verdict, figure, reason or '', details)
 
 
 def _li(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
@@ -276,4 +357,4 @@ def _li(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
 
 
 _SUFFICIENT: tuple[Callable[[Sequence[Task], int, str | None], Verdict], ...] = (
-    _graham, _work_conserving, _rad, _bonifaci, _li)
+    _graham, _work_conserving, _rad_live, _rad, _bonifaci, _baruah, _li, _federated)

@@ -24,7 +24,7 @@ starts, so a mistyped path costs nothing.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import json
 import math
@@ -39,6 +39,8 @@ from typing import Any, BinaryIO, cast, TYPE_CHECKING
 from mddag_executor.errors import InputError, UsageError
 
 if TYPE_CHECKING:
+    from mddag_executor.report.html import Watch
+    from mddag_executor.report.html_data import ReportData
     from msg_graph import TaskSet
 
 STDIN = '<stdin>'
@@ -119,6 +121,16 @@ def input_file(path: str) -> Iterator[Path]:
         with copy.open('wb') as target:
             shutil.copyfileobj(source, target, 1 << 20)
         yield copy
+
+
+@contextmanager
+def input_trace(given: str) -> Iterator[tuple[str, str]]:
+    """Give the path of a trace (of a copy, for `-`), and what messages call it."""
+    if given != '-':
+        yield given, given  # as the user wrote it: pathlib would change ./a
+        return
+    with input_file(given) as path:
+        yield str(path), STDIN
 
 
 def _claim_stdin() -> BinaryIO:
@@ -230,9 +242,50 @@ def add_json(parser: argparse.ArgumentParser) -> None:
                              'instead of the tables)')
 
 
+def add_report(parser: argparse.ArgumentParser) -> None:
+    """Declare `--report`."""
+    parser.add_argument('--report', metavar='OUT.html',
+                        help='write tables and pictures of the run as one HTML file that needs no '
+                             "network (needs mddag_executor[report]; '-': to standard output)")
+
+
+def check_report(path: str | None) -> None:
+    """
+    Find out whether a report can be made and written, before the work starts.
+
+    :raises mddag_executor.errors.MddagError: when it cannot
+    """
+    check_output(path)
+    if path is not None:
+        from mddag_executor.report.html import check_available
+        check_available()
+
+
+def report_watch(path: str | None) -> Watch | None:
+    """Return what collects what a report shows, None where none is wanted."""
+    if path is None:
+        return None
+    from mddag_executor.report.html import Watch
+    return Watch()
+
+
+def write_report(path: str, data: Callable[[], ReportData]) -> None:
+    """
+    Write an HTML report as a whole.
+
+    :param data: makes what it is about, when it is needed
+    """
+    from mddag_executor.cli.text import Progress
+    from mddag_executor.report.html import write
+    with Progress('making the report') as line:
+        line.update(0)
+        with output_file(path) as file:
+            write(file, data())
+
+
 def wants_tables(args: argparse.Namespace) -> bool:
-    """Tell whether standard output is for people, and not taken by `--json -`."""
-    return getattr(args, 'json', None) != '-'
+    """Tell whether standard output is for people, and not taken by a result."""
+    return '-' not in (getattr(args, 'json', None), getattr(args, 'report', None))
 
 
 def duration(text: str) -> int:
@@ -253,6 +306,25 @@ def positive_int(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f'{text!r} is no whole number from 1 up')
     return value
+
+
+def seed(text: str) -> int:
+    """Return a whole number from 0 to 2**64 - 1."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value < 2 ** 64:
+        raise argparse.ArgumentTypeError(f'{text!r} is no whole number from 0 to 2**64 - 1')
+    return value
+
+
+def processors() -> int:
+    """Count the processors that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not every system has it
+        return os.cpu_count() or 1
 
 
 def positive_float(text: str) -> float:

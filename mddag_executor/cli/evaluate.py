@@ -15,25 +15,28 @@
 """
 The verb `evaluate`: the paper's experiment, acceptance ratio against normalised utilisation.
 
-Each run draws execution times and is simulated under every policy, until the first miss. Ctrl-C
-ends it early; what is done is shown and written, and the exit status is 130.
+Each run draws execution times and is simulated under every policy, until the first miss. Several
+declarations (random ones, from `mddag generate`) make one sweep. Ctrl-C ends it early; what is
+done is shown and written, and the exit status is 130.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from contextlib import ExitStack
 import csv
 import io
-import os
+from pathlib import Path
 import sys
 import time
 from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common
-from mddag_executor.cli.text import Cell, Progress, table
+from mddag_executor.cli.text import Cell, one_line, Progress, table
 from mddag_executor.core import POLICIES
 from mddag_executor.core import policy as find_policy
-from mddag_executor.errors import UsageError
+from mddag_executor.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from mddag_executor.simulate.draws import Samples
@@ -45,31 +48,37 @@ HELP = 'measure acceptance ratios over many simulated runs'
 EXAMPLE = """\
 mddag evaluate config/autoware.yaml --runs 5000 --plot acceptance.png
 mddag evaluate graph.yaml --policies rad,gedf --workers 4 --samples measured.npz --json out.json
-mddag evaluate graph.yaml --non-preemptive --overhead 50us --csv -"""
+mddag evaluate graph.yaml --non-preemptive --overhead 50us --csv -
+mddag evaluate graph.yaml --runs 1000000 --resume kept.npz --dask tcp://head:8786
+mddag generate --sets 400 --utilisation 0.1:1.0 -o sets && mddag evaluate sets --plot sets.svg"""
 
 _DEFAULT = ('rad', 'rm', 'wc', 'fifo')
+_RUNS, _RUNS_OF_EACH = 5000, 1
 _EXIT_INTERRUPTED = 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('graph', metavar='GRAPH', help="the declaration, a YAML file ('-': standard input)")
-    add('--runs', type=common.positive_int, default=5000, metavar='N',
-        help='runs, each with execution times of its own (default: %(default)s)')
+    add('graph', metavar='GRAPH', nargs='+',
+        help="declaration ('-': standard input), or several, or a folder of them (*.yaml)")
+    add('--runs', type=common.positive_int, metavar='N',
+        help='runs of each GRAPH, each with execution times of its own (default: '
+        f'{_RUNS}; {_RUNS_OF_EACH} if there are several)')
     add('--policies', default=','.join(_DEFAULT), metavar='P,P…',
         help=f'any of {", ".join(POLICIES)} (default: %(default)s)')
     add('--workers', type=common.positive_int, metavar='M',
         help="threads that run callbacks (default: the declaration's, else 7)")
     add('--duration', type=common.duration, default=3_000_000_000, metavar='TIME',
         help='virtual time of each run (default: 3s)')
-    add('--seed', type=_seed, default=0, metavar='N', help='of the draws (default: %(default)s)')
+    add('--seed', type=common.seed, default=0, metavar='N',
+        help='of the draws (default: %(default)s)')
     add('--samples', metavar='FILE.npz',
         help="measured execution times, an array of ns for each 'node:callback' (default: the "
         'quantile tables of the declaration)')
     add('--non-preemptive', action='store_true',
-        help='run all policies as an executor of callbacks can; else all but wc and fifo preempt, '
-        'as in the paper')
+        help='run all policies as an executor of callbacks can; else '
+        f'{", ".join(name for name, row in POLICIES.items() if row.preemptive)} preempt')
     add('--overhead', type=_overhead, default=0, metavar='TIME',
         help='what each dispatch of a callback takes more (default: 0)')
     add('--judge', choices=('completions', 'horizon'), default='completions',
@@ -77,22 +86,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'those that passed before the end (default: %(default)s)')
     add('--jobs', type=common.positive_int, metavar='N',
         help='runs to simulate at a time (default: the number of processors)')
+    add('--dask', metavar='ADDRESS',
+        help="let the workers of a Dask cluster do the runs; ADDRESS is its scheduler's, as "
+        "tcp://host:8786, or 'local' for --jobs processes of this machine (extra 'dask')")
+    add('--resume', metavar='FILE',
+        help='keep what is done in FILE, and go on from what it holds; the result is that of an '
+        'uninterrupted evaluation')
     add('--core', choices=('auto', 'compiled', 'plain'), default='auto',
         help="the scheduler core, compiled (by numba, the extra 'batch') or in plain Python: the "
         'results are the same (default: the one that is sooner done)')
     add('--plot', metavar='OUT', help="draw the paper's figure (.png, .svg or .pdf)")
     add('--csv', metavar='FILE', help="write the table as CSV ('-': to standard output)")
     common.add_json(parser)
-
-
-def _seed(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if not 0 <= value < 2 ** 64:
-        raise argparse.ArgumentTypeError(f'{text!r} is no whole number from 0 to 2**64 - 1')
-    return value
 
 
 def _overhead(text: str) -> int:
@@ -108,11 +113,12 @@ def main(args: argparse.Namespace) -> int:
     """
     policies = _policies(args.policies)
     _check_outputs(args)
-    task_set = common.load_graph(args.graph)
-    outcome = _evaluate(args, task_set, policies)
+    task_sets = _load(_graphs(args.graph))
+    outcome = _evaluate(args, task_sets, policies)
     if outcome.interrupted:
-        print(f'warning: interrupted: {outcome.runs} of {outcome.asked} runs are done',
-              file=sys.stderr)
+        kept = '' if args.resume is None else f', and kept in {args.resume}'
+        print(one_line(f'warning: interrupted: {outcome.runs} of {outcome.asked} runs are '
+                       f'done{kept}'), file=sys.stderr)
     if outcome.runs > 0:
         _write(args, outcome)
     return _EXIT_INTERRUPTED if outcome.interrupted else 0
@@ -128,57 +134,101 @@ def _policies(text: str) -> tuple[str, ...]:
 
 
 def _check_outputs(args: argparse.Namespace) -> None:
-    if args.graph == '-' and args.samples == '-':
+    if args.graph.count('-') > 1:
+        raise UsageError('-: standard input can be only one GRAPH: name files')
+    if '-' in args.graph and args.samples == '-':
         raise UsageError('-: standard input can be only one of GRAPH and --samples: name a file')
     if args.json == '-' and args.csv == '-':
         raise UsageError('-: standard output can take only one of --json and --csv: name a file')
-    for path in (args.json, args.csv, args.plot):
+    if args.resume == '-':
+        raise UsageError('--resume: standard input and output keep nothing: name a file')
+    for path in (args.json, args.csv, args.plot, args.resume):
         common.check_output(path)
     if args.plot is not None:
         from mddag_executor.simulate.plot import check_plot
         check_plot(args.plot)
 
 
+def _graphs(names: Sequence[str]) -> list[str]:
+    """Return the declarations' paths, with those of a folder in the order of their names."""
+    paths: list[str] = []
+    for name in names:
+        if name == '-' or not Path(name).is_dir():
+            paths.append(name)
+            continue
+        inside = sorted(str(path) for path in Path(name).glob('*.yaml'))
+        if not inside:
+            raise InputError(
+                name, 'there is no *.yaml in this folder',
+                "name a declaration, or make some with 'mddag generate'")
+        paths += inside
+    return paths
+
+
+def _load(paths: Sequence[str]) -> list[TaskSet]:
+    with Progress('reading', len(paths)) as line:
+        task_sets = []
+        for done, path in enumerate(paths):
+            line.update(done, f'of {len(paths)} declarations')
+            task_sets.append(common.load_graph(path))
+    return task_sets
+
+
 def _evaluate(
-    args: argparse.Namespace, task_set: TaskSet, policies: tuple[str, ...]
+    args: argparse.Namespace, task_sets: Sequence[TaskSet], policies: tuple[str, ...]
 ) -> Evaluation:
+    from mddag_executor.simulate.checkpoint import Checkpoint
     from mddag_executor.simulate.evaluate import evaluate, Experiment
-    experiment = Experiment(
-        task_set, policies, workers=args.workers or task_set.workers or 7,
-        duration_ns=args.duration, seed=args.seed, samples=_samples(args.samples, task_set),
-        preemptive=False if args.non_preemptive else None, overhead_ns=args.overhead,
-        judge=args.judge)
-    with Progress('evaluating', args.runs) as line:
-        begin = 0.0
-
-        def progress(done: int) -> None:
-            nonlocal begin
-            if done < 0:
-                line.update(0, 'the core is being compiled, once')
-                return
-            begin = begin or time.monotonic()
-            left = (time.monotonic() - begin) / max(1, done) * (args.runs - done)
-            line.update(done, f'of {args.runs} runs, {_clock(left)} left')
-
+    samples = _samples(args.samples, task_sets)
+    experiments = [
+        Experiment(
+            task_set, policies, workers=args.workers or task_set.workers or 7,
+            duration_ns=args.duration, seed=args.seed, samples=its_samples,
+            preemptive=False if args.non_preemptive else None, overhead_ns=args.overhead,
+            judge=args.judge)
+        for task_set, its_samples in zip(task_sets, samples)]
+    runs = args.runs or (_RUNS if len(task_sets) == 1 else _RUNS_OF_EACH)
+    checkpoint = None
+    if args.resume is not None:
+        checkpoint = Checkpoint(args.resume, lambda: common.output_file(args.resume))
+    jobs, cluster = args.jobs or common.processors(), None
+    with ExitStack() as stack:
+        if args.dask is not None:
+            from mddag_executor.simulate.cluster import Cluster
+            cluster = stack.enter_context(Cluster(args.dask, jobs))
+        line = stack.enter_context(Progress('evaluating', runs * len(task_sets)))
         return evaluate(
-            experiment, args.runs, jobs=args.jobs or _processors(), core=args.core,
-            progress=progress)
+            experiments, runs, jobs=jobs, core=args.core, cluster=cluster, checkpoint=checkpoint,
+            progress=_Clock(line, runs * len(task_sets)))
 
 
-def _samples(path: str | None, task_set: TaskSet) -> Samples | None:
+class _Clock:
+    """Shows how far an evaluation is, and how long the rest will take."""
+
+    def __init__(self, line: Progress, runs: int) -> None:
+        self._line = line
+        self._runs = runs
+        self._begin: tuple[float, int] | None = None
+
+    def __call__(self, done: int) -> None:
+        if done < 0:
+            self._line.update(0, 'the core is being compiled, once')
+            return
+        now = time.monotonic()
+        if self._begin is None:  # what is done by then may come from a file
+            self._begin = (now, done)
+        begin, before = self._begin
+        left = (now - begin) / max(1, done - before) * (self._runs - done)
+        self._line.update(done, f'of {self._runs} runs, {_clock(left)} left')
+
+
+def _samples(path: str | None, task_sets: Sequence[TaskSet]) -> list[Samples | None]:
     if path is None:
-        return None
+        return [None] * len(task_sets)
     from mddag_executor.simulate.draws import read_samples
     with common.input_file(path) as file:
-        return read_samples(task_set, file, common.STDIN if path == '-' else path)
-
-
-def _processors() -> int:
-    """Count the processors that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not every system has it
-        return os.cpu_count() or 1
+        name = common.STDIN if path == '-' else path
+        return [read_samples(task_set, file, name) for task_set in task_sets]
 
 
 def _clock(seconds: float) -> str:
@@ -197,18 +247,29 @@ def _write(args: argparse.Namespace, outcome: Evaluation) -> None:
             draw(outcome, file, args.plot)
     if common.wants_tables(args) and args.csv != '-':
         print(table(*ratio_table(outcome)))
-        each = outcome.elapsed_s / outcome.runs / len(outcome.experiment.policies)
-        print(f'{outcome.runs} runs in {outcome.elapsed_s:.1f} s, {1000 * each:.2f} ms for each '
-              f'run and policy ({"compiled" if outcome.compiled else "plain"} core, '
-              f'{outcome.jobs} at a time)')
+        print(_summary(outcome))
+
+
+def _summary(outcome: Evaluation) -> str:
+    many = len(outcome.experiments)
+    of_many = f' of {many} task sets' if many > 1 else ''
+    new = outcome.runs - outcome.resumed
+    kept = f', {outcome.resumed} of them kept from before' if outcome.resumed else ''
+    text = f'{outcome.runs} runs{of_many}{kept} in {outcome.elapsed_s:.1f} s'
+    if new:
+        each = outcome.elapsed_s / new / len(outcome.experiment.policies)
+        text += (f', {1000 * each:.2f} ms for each run and policy '
+                 f'({"compiled" if outcome.compiled else "plain"} core, {outcome.jobs} at a time)')
+    return text
 
 
 def ratio_table(outcome: Evaluation) -> tuple[list[str], list[list[Cell]]]:
     """Return the table for people: acceptance ratio by bin of normalised utilisation."""
-    from mddag_executor.simulate.acceptance import BINS
     acceptance = [*outcome.by_policy().values(), outcome.bound()]
     rows: list[list[Cell]] = []
-    for i, (centre, count) in enumerate(zip(BINS, outcome.counts())):
+    for i, (centre, count) in enumerate(zip(outcome.bins, outcome.counts())):
+        if count == 0 and len(outcome.experiments) > 1:
+            continue  # most of so many bins may be
         rows.append([f'{centre:.2f}', count, *(_percent(each.ratio[i]) for each in acceptance)])
     rows.append(['all', outcome.runs, *(_percent(each.total) for each in acceptance)])
     return ['utilisation', 'runs', *outcome.experiment.policies, 'bound'], rows
@@ -220,7 +281,6 @@ def _percent(ratio: float | None) -> str | None:
 
 def csv_text(outcome: Evaluation) -> str:
     """Return the ratios by bin with their 95 % confidence intervals as CSV (empty: no run)."""
-    from mddag_executor.simulate.acceptance import BINS
     acceptance = outcome.by_policy()
     bound = outcome.bound()
     text = io.StringIO()
@@ -228,7 +288,7 @@ def csv_text(outcome: Evaluation) -> str:
     writer.writerow([
         'utilisation', 'runs',
         *(f'{name}{part}' for name in acceptance for part in ('', '_low', '_high')), 'bound'])
-    for i, (centre, count) in enumerate(zip(BINS, outcome.counts())):
+    for i, (centre, count) in enumerate(zip(outcome.bins, outcome.counts())):
         row: list[object] = [centre, count]
         for each in acceptance.values():
             row += [each.ratio[i], *(each.interval[i] or (None, None))]

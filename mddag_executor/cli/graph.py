@@ -31,7 +31,8 @@ mddag graph draw config/autoware.yaml -o autoware.svg
 mddag graph check --help
 """
 
-VERBS = ('check', 'draw', 'schema', 'fmt', 'from-caret', 'analyse')
+VERBS = ('check', 'draw', 'schema', 'fmt', 'from-caret', 'from-trace', 'from-ros', 'analyse',
+         'assign-deadlines')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -18,24 +18,31 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+import tempfile
 from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common
-from mddag_executor.cli.text import Cell, table
+from mddag_executor.cli.text import Cell, Progress, table
+from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
     from mddag_executor.analysis import Analysis
+    from msg_graph import TaskSet
 
 HELP = 'test whether the deadlines can hold, before the first run'
 EXAMPLE = """\
 mddag graph analyse config/autoware.yaml --budget p99
 mddag graph analyse config/autoware.yaml --workers 4 --json -
+mddag graph analyse graph.yaml --sag jobs --sag-binary ~/np-schedulability-analysis/build/nptest
 """
 DESCRIPTION = """\
 Test whether the deadlines of a declaration can hold. Where a necessary test fails, no scheduler
 can keep them; where a sufficient test holds, its scheduler does, as long as no execution takes
 longer than its budget. A sufficient test that does not hold says nothing. Overheads of dispatching
-are not part of any test."""
+are not part of any test. The live executor does not preempt callbacks: of it speak only the tests
+whose scheduler says so."""
 
 _WORKERS = 7
 _HEADER = ('test', 'kind', 'verdict', 'figure', 'why')
@@ -51,6 +58,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--workers', type=common.positive_int, metavar='M',
         help=f'number of workers; default: the declared one, else {_WORKERS}')
+    parser.add_argument(
+        '--sag', metavar='DIR',
+        help='write the jobs of one hyperperiod there, for schedule-abstraction analysis: '
+        'jobs.csv and edges.csv for nptest, tasks.csv with what its task IDs stand for')
+    parser.add_argument(
+        '--sag-binary', metavar='NPTEST',
+        help='run this program (nptest, from np-schedulability-analysis) on them, and show its '
+        'verdict among the others')
+    parser.add_argument(
+        '--sag-timeout', type=common.positive_int, default=60, metavar='SECONDS',
+        help='processor time that it may take (default: 60)')
+    parser.add_argument(
+        '--horizon', type=common.duration, metavar='TIME',
+        help='with --sag or --sag-binary: only the releases before this, not of a hyperperiod')
     common.add_json(parser)
 
 
@@ -64,7 +85,14 @@ def main(args: argparse.Namespace) -> int:
     from mddag_executor.analysis import analyse
     common.check_output(args.json)
     task_set = common.load_graph(args.graph)
-    analysis = analyse(task_set, args.workers or task_set.workers or _WORKERS, args.budget)
+    if args.horizon is not None and args.sag is None and args.sag_binary is None:
+        raise UsageError('--horizon: it is about job sets: add --sag or --sag-binary')
+    with Progress('analysing') as line:
+        analysis = analyse(
+            task_set, args.workers or task_set.workers or _WORKERS, args.budget,
+            lambda tests: line.update(tests, 'tests'))
+    if args.sag is not None or args.sag_binary is not None:
+        analysis = _sag(args, task_set, analysis)
     if args.json is not None:
         common.write_json(args.json, analysis.result())
     if common.wants_tables(args):
@@ -75,6 +103,29 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
+def _sag(args: argparse.Namespace, task_set: TaskSet, analysis: Analysis) -> Analysis:
+    """Write the job set, and let the binary judge it if there is one."""
+    from mddag_executor.analysis import sag, tasks_of
+    from mddag_executor.analysis.verdicts import with_sag
+    tasks = tasks_of(task_set, args.budget)
+    jobs = sag.job_set(tasks, args.horizon)
+    with ExitStack() as stack:
+        if args.sag is None:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='mddag-')))
+        else:
+            folder = Path(args.sag)
+            folder.mkdir(exist_ok=True)
+        for name, text in ((sag.JOBS, jobs.jobs), (sag.EDGES, jobs.edges),
+                           (sag.TASKS, jobs.tasks)):
+            common.write_text(str(folder / name), text)
+        if args.sag_binary is None:
+            return analysis
+        with Progress('running nptest') as line:
+            line.update(jobs.size, 'jobs')
+            answer = sag.ask(args.sag_binary, folder, analysis.workers, args.sag_timeout)
+    return with_sag(analysis, tasks, jobs, answer)
+
+
 def _rows(analysis: Analysis) -> Iterator[list[Cell]]:
     for each in analysis.verdicts:
         yield [each.name, each.kind, each.verdict, each.figure, each.reason]
@@ -82,11 +133,16 @@ def _rows(analysis: Analysis) -> Iterator[list[Cell]]:
 
 def _summary(analysis: Analysis) -> str:
     from mddag_executor.analysis import FAILS, HOLDS
-    begin = f'{analysis.workers} workers, budget {analysis.budget}: '
+    from mddag_executor.analysis.verdicts import LIVE, SHARED
+    assumed = f'All sufficient tests assume: {SHARED}.\n'
+    begin = f'{assumed}{analysis.workers} workers, budget {analysis.budget}: '
     if any(each.verdict == FAILS for each in analysis.verdicts):
         return begin + 'no scheduler can keep these deadlines'
     proven = {each.scheduler: None for each in analysis.verdicts
               if each.kind == 'sufficient' and each.verdict == HOLDS}
     if proven:
-        return begin + 'the deadlines hold under ' + '; '.join(proven)
+        text = begin + 'the deadlines hold under ' + '; '.join(proven)
+        if not any(scheduler in LIVE for scheduler in proven):
+            text += '. For the live executor, which does not preempt, nothing is proven'
+        return text
     return begin + 'nothing is proven either way: simulate it'

@@ -17,12 +17,20 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common
+from mddag_executor.cli.text import one_line
+from mddag_executor.errors import UsageError
+
+if TYPE_CHECKING:
+    from msg_graph.sketch import Sketch
 
 HELP = 'make a declaration to fill in from a CARET architecture file'
 EXAMPLE = """\
 mddag graph from-caret architecture.yaml -o graph.yaml
+mddag graph from-caret architecture.yaml --trace ~/.ros/tracing/session-20261121 -o graph.yaml
 mddag graph check graph.yaml
 """
 DESCRIPTION = """\
@@ -30,13 +38,19 @@ Make a declaration from a CARET architecture file: nodes, callbacks, timers, top
 groups, variable passings, message contexts and named paths. What such a file cannot know
 (deadlines, rates from outside, which callback publishes, where to cut a cycle) stands in comments
 marked 'FILL IN', with a proposal; take the first '# ' of such a line away once its value is
-right."""
+right. With a recording of the same system (--trace) the rates of sources are proposed from it,
+the quantiles of the measured execution times (0, 50, 90, 99, 100 %) are filled in, and callbacks
+that were seen to publish a topic are no longer in doubt."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('architecture', metavar='ARCHITECTURE.yaml',
                         help="the architecture file ('-': standard input)")
+    parser.add_argument('--trace', metavar='TRACE',
+                        help='measure rates and execution times in this recording: a trace '
+                        "(MCAP; '-': standard input), or the folder of a session that LTTng "
+                        'recorded (needs python3-bt2)')
     parser.add_argument('-o', '--output', metavar='GRAPH', default='-',
                         help="the declaration ('-': standard output, the default)")
 
@@ -46,13 +60,26 @@ def main(args: argparse.Namespace) -> int:
     Write the declaration.
 
     :raises msg_graph.GraphError: when the file is no architecture file
+    :raises mddag_executor.trace.TraceError: when the recording cannot be used
     """
-    from msg_graph.from_caret import declaration_from_caret, MARK
+    from mddag_executor.cli.systems import recorded_system, write_declaration
+    from msg_graph.from_caret import declaration_from_caret
     common.check_output(args.output)
+    if args.architecture == '-' and args.trace == '-':
+        raise UsageError('-: standard input can be only one of ARCHITECTURE.yaml and TRACE: name '
+                         'the other')
     name, text = common.read_text(args.architecture)
-    result = declaration_from_caret(text, name)
-    common.write_text(args.output, result)
-    if args.output != '-':
-        count = sum(MARK in line for line in result.splitlines()[2:])
-        print(f"{count} blanks to fill in, marked '{MARK}'")
+
+    def measure(sketch: Sketch) -> None:
+        """Fill in what the recording shows, and tell of how much of the system."""
+        if args.trace is None:
+            return
+        system = recorded_system(args.trace)
+        every, count = len(list(sketch.callbacks())), system.measure(sketch)
+        if count < every:
+            print(f'warning: {one_line(system.name)}: {every - count} of {every} callbacks did '
+                  f'not run in it', file=sys.stderr)
+
+    result = declaration_from_caret(text, name, measure)
+    write_declaration(args.output, result)
     return 0

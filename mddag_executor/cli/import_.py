@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 
 NAME = 'import'
 HELP = 'turn a CARET or ros2_tracing recording into a trace'
-EXAMPLE = 'mddag import ctf ~/.ros/tracing/session-20261121101500 -o drive.mcap'
+EXAMPLE = """\
+mddag import ctf ~/.ros/tracing/session-20261121101500 -o drive.mcap
+mddag replay drive.mcap graph.yaml"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         description='Turn a session that LTTng recorded (CARET, ros2_tracing), all its processes '
         'and events, into a trace. It is read with the Python bindings of babeltrace2 '
         '(apt install python3-bt2), in whichever Python of this machine has them.',
-        epilog=f'example:\n  {EXAMPLE}', formatter_class=argparse.RawDescriptionHelpFormatter)
+        epilog='example:\n  ' + EXAMPLE.replace('\n', '\n  '),
+        formatter_class=argparse.RawDescriptionHelpFormatter)
     ctf.add_argument('session', metavar='SESSION', help='the folder that was recorded to')
     ctf.add_argument('-o', '--output', metavar='OUT.mcap', required=True,
                      help='the trace to write')

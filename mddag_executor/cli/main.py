@@ -69,9 +69,12 @@ VERBS = {
     'replay': Verb('replay', 'check a recorded run against its deadlines, or reschedule it'),
     'simulate': Verb('simulate', 'run a declaration in virtual time'),
     'evaluate': Verb('evaluate', 'measure acceptance ratios over many simulated runs'),
+    'generate': Verb('generate', 'make random multi-deadline, multi-rate DAG sets'),
     'graph': Verb('graph', 'check, draw, derive and analyse declarations'),
     'import': Verb('import_', 'turn a CARET or ros2_tracing recording into a trace'),
     'export': Verb('export', 'turn a trace into a file for Perfetto, spreadsheets or data frames'),
+    'diff': Verb('diff', 'compare two recorded runs sink by sink'),
+    'top': Verb('top', 'show live what running executors say of their deadlines and workers'),
     'bench': Verb('bench', 'measure the executor, the core, the replayer and the simulator'),
 }
 # What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.

@@ -17,38 +17,46 @@ The verb `replay`: what a recorded run did, or what the scheduler core would hav
 
 Without a graph the declaration in the trace judges.  What is missing of a trace is a warning on
 standard error; everything before the damage is used.
+
+An ordinary bag (a folder with metadata.yaml, or one of its files) has no jobs; with a graph and
+`--reschedule` its messages are the releases.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from contextlib import contextmanager
 import sys
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.cli import common
-from mddag_executor.cli.text import one_line, Progress
+from mddag_executor.cli import bags, common, verdicts
+from mddag_executor.cli.text import one_line, printable, Progress
 from mddag_executor.core import POLICIES
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
     from mddag_executor.replay import Replay, Reschedule
+    from mddag_executor.replay.bags_reschedule import BagReschedule
+    from mddag_executor.report.html import Watch
     from msg_graph import TaskSet
+    from msg_graph.drift import Drift
 
 NAME = 'replay'
 HELP = 'check a recorded run against its deadlines, or reschedule it'
 EXAMPLE = """\
 mddag replay run.mcap
 mddag replay run.mcap graph.yaml --fail-on-miss
-mddag replay run.mcap --reschedule --workers 2 --policy fifo --json result.json"""
+mddag replay run.mcap --reschedule --workers 2 --policy fifo --json result.json
+mddag replay drive/ graph.yaml --reschedule --execution-times measured.json
+mddag replay run.mcap --fail-on-miss --tolerate-ratio 0.01 --tolerate-burst 2 --junit junit.xml"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('trace', metavar='TRACE', help="a recorded run, an MCAP file ('-': standard input)")
+    add('trace', metavar='TRACE',
+        help="a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
+        'ordinary bag, a folder or a file')
     add('graph', metavar='GRAPH', nargs='?',
         help="the declaration that judges, a YAML file ('-': standard input; default: the one "
         'that the trace was recorded with)')
@@ -60,8 +68,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'with --reschedule: one of {", ".join(POLICIES)} (default: as recorded)')
     add('--preemptive', action='store_true',
         help='with --reschedule: what is more urgent takes the worker of what runs')
+    bags.add_arguments(parser)
     add('--callbacks', action='store_true', help='show a table of all callbacks, too')
-    add('--fail-on-miss', action='store_true', help='exit with status 1 if a deadline was missed')
+    verdicts.add_arguments(parser)
+    common.add_report(parser)
     common.add_json(parser)
 
 
@@ -74,18 +84,34 @@ def main(args: argparse.Namespace) -> int:
     :raises mddag_executor.errors.MddagError: when anything else can not be used
     """
     common.check_output(args.json)
+    common.check_report(args.report)
+    verdicts.check(args)
     _check_arguments(args)
     task_set = None if args.graph is None else common.load_graph(args.graph)
-    with _trace(args.trace) as (path, name):
-        outcome = _replay(args, path, name, task_set)
+    from mddag_executor.replay.bags import is_ordinary
+    with common.input_trace(args.trace) as (path, name):
+        watch = common.report_watch(args.report)
+        drift: list[Drift] = []
+        outcome: Replay | Reschedule | BagReschedule
+        if is_ordinary(path):
+            outcome = bags.reschedule_bag(args, path, name, task_set)
+        else:
+            outcome = _replay(args, path, name, task_set, watch, drift)
     for warning in outcome.warnings:
         print(f'warning: {one_line(warning)}', file=sys.stderr)
     result = outcome.result()
+    if not args.reschedule:
+        result['drift'] = [each.result() for each in drift]
+    status = verdicts.judge(args, outcome.tally, result)
     if args.json is not None:
         common.write_json(args.json, result)
-    if common.wants_tables(args):
+    if args.report is not None:
+        from mddag_executor.report.html import of_outcome
+        common.write_report(args.report, lambda: of_outcome(outcome, watch))
+    if verdicts.wants_tables(args):
         _show(args, result)
-    return 1 if args.fail_on_miss and outcome.tally.missed else 0
+        verdicts.show(args, result)
+    return status
 
 
 def _check_arguments(args: argparse.Namespace) -> None:
@@ -93,58 +119,77 @@ def _check_arguments(args: argparse.Namespace) -> None:
         raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
     if args.policy is not None:
         find_policy(args.policy)
+    bags.check(args)
     if args.reschedule:
         if args.callbacks:
             raise UsageError(
                 '--callbacks: it shows what was recorded: leave it or --reschedule out')
         return
-    for option in ('workers', 'policy', 'preemptive'):
+    for option in ('workers', 'policy', 'preemptive', 'overheads', 'execution_times'):
         if getattr(args, option) not in (None, False):
             raise UsageError(
-                f'--{option}: a run is replayed as it was recorded: add --reschedule')
-
-
-@contextmanager
-def _trace(given: str) -> Iterator[tuple[str, str]]:
-    """Give the trace's path, and what messages call it."""
-    if given != '-':
-        yield given, given  # as the user wrote it: pathlib would change ./a
-        return
-    with common.input_file(given) as path:
-        yield str(path), common.STDIN
+                f'--{option.replace("_", "-")}: a run is replayed as it was recorded: add '
+                '--reschedule')
 
 
 def _replay(
-    args: argparse.Namespace, path: str, name: str, task_set: TaskSet | None
+    args: argparse.Namespace, path: str, name: str, task_set: TaskSet | None,
+    watch: Watch | None, drift: list[Drift],
 ) -> Replay | Reschedule:
-    from mddag_executor.replay import replay, reschedule
+    from mddag_executor.replay import reschedule
+    from mddag_executor.replay.as_recorded import replay_recording
+    from mddag_executor.replay.drift import WatchedRecording
+    from mddag_executor.replay.following import open_recording
     with Progress('replaying') as line:
         def progress(events: int) -> None:
             line.update(round(events / 1e6, 1), 'million events')
 
+        if args.execution_times is not None:
+            raise UsageError('--execution-times: a trace has its own: leave the option out')
         if args.reschedule:
+            recorded = args.overheads in (None, bags.RECORDED)
             return reschedule(
                 path, task_set, policy=args.policy, workers=args.workers,
-                preemptive=args.preemptive, name=name, progress=progress)
-        return replay(path, task_set, name=name, progress=progress)
+                preemptive=args.preemptive, overheads=recorded,
+                dispatch_overhead=0 if recorded else args.overheads, name=name,
+                progress=progress)
+        recording = open_recording(path, name, WatchedRecording)
+        outcome = replay_recording(recording, task_set, progress, watch)
+        if isinstance(recording, WatchedRecording):
+            drift.extend(recording.drift(outcome.task_set))
+        elif task_set is not None:
+            from mddag_executor.replay.drift import drift_of_import
+            from mddag_executor.replay.sketching import System
+            drift.extend(drift_of_import(System(path, name).census, task_set))
+        return outcome
 
 
 def _show(args: argparse.Namespace, result: dict[str, Any]) -> None:
+    from mddag_executor.report.drift import drift_lines
     from mddag_executor.report.replays import (
         callbacks_table,
         comparison_table,
+        recorded_tables,
         summary,
         times_table,
     )
     from mddag_executor.report.tables import sink_table
-    if result['rescheduled']:
+    if result['rescheduled'] and result['recorded'] is None:
+        print(sink_table(result['dags']))
+        for note in result['notes']:
+            print(printable(note))
+        print('transport, dispatch and other load are not in a bag: they are left out '
+              '(--overheads)')
+    elif result['rescheduled']:
         print('Rescheduled, beside what was recorded:')
         print(comparison_table(result['dags'], result['recorded']['dags']))
-    else:
+    elif result['dags'] or 'recorded_callbacks' not in result:
         print(sink_table(result['dags']))
         print('Where the response times went: means, and the worst job of each sink:')
         print(times_table(result['dags']))
+    for line in recorded_tables(result, args.callbacks):
+        print(line)
     if args.callbacks:
         print(callbacks_table(result['callbacks']))
-    for line in summary(result):
+    for line in (*summary(result), *drift_lines(result.get('drift', ()))):
         print(line)

@@ -40,6 +40,7 @@ from mddag_executor.cli.text import printable, Progress
 from mddag_executor.core import POLICIES
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import MddagError, UsageError
+from mddag_executor.report.drift import drift_lines
 from mddag_executor.report.tables import percent, sink_table, total
 
 if TYPE_CHECKING:
@@ -85,10 +86,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'one of {", ".join(POLICIES)} (default: rad)')
     add('--intake', choices=('auto', 'events', 'waitset'), default='auto',
         help='how the executor learns what is ready (default: auto)')
+    add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
+        help="publish the executor's state on /diagnostics so often, for mddag top and other "
+        "tools; 'off': not at all (default: 1s)")
     add('--trace', metavar='OUT.mcap', help='record the run to this file')
     common.add_json(parser)
     add('--ros-args', nargs=argparse.REMAINDER, metavar='…',
         help='the rest of the command line goes to rclpy.init, as -r from:=to')
+
+
+def _or_off(text: str) -> int:
+    """Return the nanoseconds of a time, 0 for `off`."""
+    return 0 if text == 'off' else common.duration(text)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -114,7 +123,8 @@ def main(args: argparse.Namespace) -> int:
         from mddag_executor.live.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
-            intake=args.intake, freeze_gc=True)
+            intake=args.intake, freeze_gc=True,
+            diagnostics_period=args.diagnostics)
         # With `--json -` what nodes print must not get into the JSON.
         output = sys.stdout if common.wants_tables(args) else sys.stderr
         try:
@@ -146,6 +156,8 @@ def _leave_threads_behind(error: BaseException | None) -> None:
 
 def _check_arguments(args: argparse.Namespace) -> None:
     find_policy(args.policy)
+    from mddag_executor.live.settings import diagnostics_period_ns
+    diagnostics_period_ns(args.diagnostics)
     if args.trace == '-':
         raise UsageError('--trace -: a trace is not written to standard output: name a file')
     common.check_output(args.trace)
@@ -213,7 +225,9 @@ def _run(
 ) -> tuple[dict[str, Any], BaseException | None]:
     """Run until the end; return the result, and what a node raised."""
     from mddag_executor.live.session import Session
+    from mddag_executor.live.watch import Watch
     session = Session(executor)
+    watch = Watch(executor, task_set)
     seconds = None if args.duration is None else args.duration / 1e9
     measured: dict[str, Any] | None = None
     with _signals(session), Progress('running', seconds) as progress:
@@ -225,6 +239,7 @@ def _run(
     result = {
         'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
         **executor.statistics(), 'measured': measured}
+    result['drift'] = [each.result() for each in watch.drift(result)]
     if not session.clean:
         print('warning: a callback has not ended in time; it is left behind', file=sys.stderr)
     return result, session.error
@@ -319,7 +334,9 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
     never = [*result['never_ran'], *(
         name for name, counts in result['callbacks'].items()
         if counts['declared'] and not counts['ran'])]
-    if never:
+    drift = result.get('drift', ())
+    yield from drift_lines(drift)
+    if never and not any(each['kind'] == 'never ran' for each in drift):
         yield f'declared callbacks that never ran: {len(never)}: ' + _listed(never)
     if result['trace'] is not None:
         lost = result['trace']['lost']

@@ -72,6 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='end the run with the first missed deadline')
     add('--trace', metavar='OUT.mcap', help='record the run to this file')
     add('--fail-on-miss', action='store_true', help='exit with status 1 if a deadline was missed')
+    common.add_report(parser)
     common.add_json(parser)
 
 
@@ -93,9 +94,12 @@ def main(args: argparse.Namespace) -> int:
         stop_at_first_miss=args.stop_at_first_miss)
     load = periodic_load(task_set, times, args.duration)
     run = _simulate(task_set, load, settings, utilisation(task_set, times, workers),
-                    log=args.trace is not None)
+                    log=args.trace is not None or args.report is not None)
     if args.trace is not None:
         _write_trace(args.trace, task_set, load, run)
+    if args.report is not None:
+        from mddag_executor.report.html import of_run
+        common.write_report(args.report, lambda: of_run(task_set, load, run))
     result = _result(args, task_set, run)
     if args.json is not None:
         common.write_json(args.json, result)
@@ -116,6 +120,7 @@ def _check_arguments(args: argparse.Namespace) -> None:
     find_policy(args.policy)
     common.check_output(args.json)
     common.check_output(args.trace)
+    common.check_report(args.report)
 
 
 def _execution_times(

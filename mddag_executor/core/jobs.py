@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Jobs as a whole: rules 1 and 6 to 8 of the scheduling rules, whose text stands in ``rules``.
+Jobs as a whole: rules 1, 6 to 8 and 10 of the scheduling rules, whose text stands in ``rules``.
 
 Here jobs are opened, judged and ended, and their slots recycled.  Like ``rules`` this is nothing
 but integer arithmetic and list indexing.
@@ -23,10 +23,13 @@ from __future__ import annotations
 
 from mddag_executor.core.state import (
     ABORTED,
+    ELSEWHERE,
     EXPIRED,
     FREE,
+    HERE,
     IDLE,
     JOB_END,
+    LAST_HERE,
     OPEN,
     SINK_ABORTED,
     SINK_EXPIRED,
@@ -62,7 +65,49 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
         s.x_state[x] = IDLE
         s.x_pending[x] = t.n_predecessors[s.x_vertex[x]]
         s.x_worker[x] = -1
+    if s.partial[dag] != 0:
+        _leave_out(t, s, slot)
     return slot
+
+
+def expect(t: Tables, s: State, dag: int, here: list[int]) -> None:
+    """
+    Set which vertices of a DAG are expected here (rule 10), for the jobs released from now on.
+
+    :param here: by local index, 1 for a vertex that runs here and 0 for one that does not.
+    """
+    first = t.first_vertex[dag]
+    leads_on = [0] * len(here)
+    changed = True
+    while changed:  # backwards along the edges, until nothing new is found
+        changed = False
+        for i in range(len(here)):
+            for e in range(t.first_successor[first + i], t.first_successor[first + i + 1]):
+                after = t.successors[e] - first
+                if leads_on[i] == 0 and (here[after] != 0 or leads_on[after] != 0):
+                    leads_on[i] = 1
+                    changed = True
+    s.partial[dag] = 0
+    for i in range(len(here)):
+        s.expected[first + i] = HERE
+        if here[i] == 0:
+            s.expected[first + i] = ELSEWHERE
+            s.partial[dag] = 1
+        elif leads_on[i] == 0 and t.sink_deadline[first + i] < 0:
+            s.expected[first + i] = LAST_HERE
+
+
+def _leave_out(t: Tables, s: State, slot: int) -> None:
+    """Leave out of a new job what is not expected here, as if it had completed (rule 10)."""
+    dag = s.job_dag[slot]
+    last = t.n_vertices + 1 if dag == t.n_dags else t.first_vertex[dag + 1]
+    for vertex in range(t.first_vertex[dag], last):
+        if s.expected[vertex] == ELSEWHERE:
+            s.x_pending[s.job_base[slot] + t.region_offset[vertex]] = -1
+            if t.sink_deadline[vertex] >= 0:
+                s.job_sinks_left[slot] -= 1
+        elif s.expected[vertex] == LAST_HERE:
+            s.job_sinks_left[slot] += 1
 
 
 def _link_newest(s: State, dag: int, slot: int) -> None:

@@ -68,6 +68,31 @@ def key_dm(t: Tables, v: int, release: int, job: int, readiness: int, order: int
     return (t.rad_offset[v], job, readiness, order)
 
 
+def key_ros2(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+    """
+    Return the key of rclcpp's executor within a polling round: the place in the wait set.
+
+    Timers come first, then subscriptions, services and clients, each in order of registration,
+    which is that of the declaration (rclpy goes through them node by node).  The rounds, which are
+    what sets this executor apart, are rule 9 of ``rules``.  Source: D. Casini et al., "Response-
+    Time Analysis of ROS 2 Processing Chains Under Reservation-Based Scheduling", ECRTS 2019; for
+    several workers X. Jiang et al., "Real-Time Scheduling and Analysis of Processing Chains on
+    Multi-Threaded Executor in ROS 2", RTSS 2022; and rclcpp of Jazzy, where timers too are looked
+    up when it polls only.
+    """
+    return (t.entity[v], order, 0, 0)
+
+
+def key_picas(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+    """
+    Return the key of PiCAS: the fixed priority of the callback, then order of becoming ready.
+
+    Source: H. Choi, Y. Xiang and H. Kim, "PiCAS: New Design of Priority-Driven Chain-Aware
+    Scheduling for ROS2", RTAS 2021.  ``Tables.chain_rank`` says how chains and DAGs are ordered.
+    """
+    return (t.chain_rank[v], readiness, order, 0)
+
+
 def key_llf(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
     """Return the key of least laxity first by the remaining critical path: latest start."""
     return (release + t.latest_start[v], t.index_in_dag[v], t.dag_of[v], order)
@@ -78,13 +103,26 @@ class Policy(NamedTuple):
     A row of the policy table.
 
     ``preemptive`` tells how the paper's experiment runs the policy; an executor of callbacks can
-    not preempt and ignores it.
+    not preempt and ignores it.  ``polling`` tells that it works in rounds (rule 9 of ``rules``).
     """
 
     name: str
     key: KeyFunction
     preemptive: bool
     meaning: str
+    polling: bool = False
+
+    def mode(self, preemptive: bool | None) -> bool:
+        """
+        Return whether to preempt: what was asked for, or the policy's own mode (None).
+
+        :raises PolicyError: when the policy knows no preemption.
+        """
+        if preemptive and self.polling:
+            raise PolicyError(
+                f"policy '{self.name}': an executor that polls preempts no callback: "
+                'run it without preemption')
+        return self.preemptive if preemptive is None else preemptive
 
 
 POLICIES: dict[str, Policy] = {p.name: p for p in (
@@ -95,6 +133,8 @@ POLICIES: dict[str, Policy] = {p.name: p for p in (
     Policy('gedf', key_gedf, True, 'one deadline for each DAG: its latest'),
     Policy('dm', key_dm, True, 'deadline monotonic: the shortest relative deadline first'),
     Policy('llf', key_llf, True, 'least laxity first: deadline less the critical path to it'),
+    Policy('ros2', key_ros2, False, "rclcpp's executor: wait-set order by polling rounds", True),
+    Policy('picas', key_picas, False, 'chain-aware fixed priorities (PiCAS)'),
 )}
 
 

@@ -52,14 +52,24 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
     stands for a message, which is never lost silently) but make no further edge true and are not
     judged.  The slot is free for the next job when none of its executions waits, runs or is
     suspended.
+9.  **Polling.**  Under a policy that polls (``ros2``), the ready queue is what the last poll
+    found.  When an idle worker finds nothing to run there, it polls: the first waiting execution
+    of every entity (timer, subscription, …) becomes one round's queue.  What becomes ready later
+    waits for the next poll, and so does what is passed over because its group is busy when its
+    turn comes.  There is no preemption.
+10. **Several processes.**  Of a DAG whose callbacks run in several processes (live), a job has in
+    each of them the vertices that are *expected here*.  The others count as done before it begins:
+    they are not judged here and keep no job open.  A job ends when all that ends here has: the
+    sinks that are here, and the vertices after which nothing of the DAG runs here.
 """
 
 from __future__ import annotations
 
-from heapq import heapify, heappop, heappush
+from heapq import heappop, heappush
 
 from mddag_executor.core.jobs import abort_job, close_job, deactivate, overdue
 from mddag_executor.core.policies import KeyFunction
+from mddag_executor.core.queues import add_stale, is_stale, poll, wait_for_poll
 from mddag_executor.core.state import (
     ABORTED,
     COMPLETED,
@@ -67,13 +77,14 @@ from mddag_executor.core.state import (
     DONE,
     DROP,
     DROPPED,
-    Entry,
     EXPIRED,
+    LAST_HERE,
     LATE,
     N_IDLE,
     N_STALE,
     OPEN,
     ORDER,
+    POLLING,
     PREEMPTIVE,
     PROPAGATE,
     RUNNING,
@@ -87,8 +98,6 @@ from mddag_executor.core.tables import ABORT, Tables
 
 PUT_BACK = 0
 FRESH = 1
-SWEEP_AT = 64
-"""So many stale entries may stand in the queues anyway."""
 
 
 # --- readiness -----------------------------------------------------------------------------------
@@ -111,7 +120,10 @@ def _enqueue(t: Tables, s: State, key: KeyFunction, x: int, now: int, fresh: int
     entry = (k[0], k[1], k[2], k[3], x)
     s.x_key[x] = entry
     s.x_state[x] = WAITING
-    heappush(s.ready, entry)
+    if s.scalars[POLLING] == 0:
+        heappush(s.ready, entry)
+    else:
+        wait_for_poll(t, s, entry)
 
 
 def edge(t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int) -> None:
@@ -139,37 +151,7 @@ def drop(s: State, x: int, now: int) -> None:
     if dag == len(s.oldest) - 1 and s.job_state[slot] == OPEN:
         close_job(s, slot, EXPIRED, now)
     deactivate(s, slot)
-    s.scalars[N_STALE] += 1
-    if s.scalars[N_STALE] > SWEEP_AT:
-        _sweep(s)
-
-
-def _is_stale(s: State, entry: Entry) -> bool:
-    """Tell whether a queue's entry is of a dropped execution (whose id may be in use again)."""
-    return s.x_state[entry[4]] != WAITING or s.x_key[entry[4]] != entry
-
-
-def _sweep(s: State) -> None:
-    """Take stale entries out of all queues when they are the larger part: memory is bounded."""
-    length = len(s.ready)
-    for group in range(len(s.group_heap)):
-        length += len(s.group_heap[group])
-    if 2 * s.scalars[N_STALE] <= length:
-        return
-    _keep_valid(s, s.ready)
-    for group in range(len(s.group_heap)):
-        _keep_valid(s, s.group_heap[group])
-    s.scalars[N_STALE] = 0
-
-
-def _keep_valid(s: State, heap: list[Entry]) -> None:
-    kept = 0
-    for i in range(len(heap)):
-        if not _is_stale(s, heap[i]):
-            heap[kept] = heap[i]
-            kept += 1
-    del heap[kept:]
-    heapify(heap)
+    add_stale(s)
 
 
 # --- dispatch ------------------------------------------------------------------------------------
@@ -179,27 +161,37 @@ def peek(t: Tables, s: State, now: int) -> int:
     Return the execution that goes next, or -1 when none may run.
 
     On the way, what can not go next leaves the queue: dropped and aborted executions for good,
-    those whose group is busy into their group's heap (rule 4).
+    those whose group is busy into their group's heap (rule 4) or to the next poll (rule 9).
     """
-    while s.ready:
-        entry = s.ready[0]
-        if _is_stale(s, entry):
-            heappop(s.ready)
-            s.scalars[N_STALE] -= 1
-            continue
-        x = entry[4]
-        group = s.x_group[x]
-        if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
-            heappush(s.group_heap[group], heappop(s.ready))
-            continue
-        slot = s.x_slot[x]
-        if (t.on_miss[s.job_dag[slot]] == ABORT and s.job_state[slot] == OPEN
-                and overdue(t, s, slot, now)):
-            abort_job(t, s, slot, now)
-        if s.job_state[slot] != ABORTED or s.x_started[x] >= 0:
-            return x
-        drop(s, x, now)
-    return -1
+    again = True
+    while True:
+        while s.ready:
+            entry = s.ready[0]
+            if is_stale(s, entry):
+                heappop(s.ready)
+                s.scalars[N_STALE] -= 1
+                continue
+            x = entry[4]
+            group = s.x_group[x]
+            if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
+                heappop(s.ready)
+                if s.scalars[POLLING] == 0:
+                    heappush(s.group_heap[group], entry)
+                else:
+                    wait_for_poll(t, s, entry)
+                continue
+            slot = s.x_slot[x]
+            if (t.on_miss[s.job_dag[slot]] == ABORT and s.job_state[slot] == OPEN
+                    and overdue(t, s, slot, now)):
+                abort_job(t, s, slot, now)
+            if s.job_state[slot] != ABORTED or s.x_started[x] >= 0:
+                return x
+            drop(s, x, now)
+            again = True
+        if not again or len(s.unpolled) == 0:
+            return -1
+        again = False  # a poll that finds nothing but busy groups is the last
+        poll(t, s)
 
 
 def _start(s: State, x: int, worker: int, now: int) -> None:
@@ -236,6 +228,8 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
 
     A driver calls this until it answers -1.
     """
+    if s.scalars[POLLING] != 0 and s.scalars[N_IDLE] == 0:
+        return -1  # only a worker that is free looks, and polls
     x = peek(t, s, now)
     if x < 0:
         return -1
@@ -319,7 +313,7 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
 def _release_group(s: State, group: int) -> None:
     s.group_owner[group] = -1
     heap = s.group_heap[group]
-    while heap and _is_stale(s, heap[0]):
+    while heap and is_stale(s, heap[0]):
         heappop(heap)
         s.scalars[N_STALE] -= 1
     if heap:
@@ -343,6 +337,10 @@ def _complete_vertex(
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
         elif now > deadline and t.on_miss[dag] == ABORT:
             abort_job(t, s, slot, now)
-    if s.scalars[PROPAGATE] != 0:  # a sink, which may have ended the job, has no successors
+    elif s.expected[vertex] == LAST_HERE:
+        s.job_sinks_left[slot] -= 1
+        if s.job_sinks_left[slot] == 0:
+            close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
+    if s.scalars[PROPAGATE] == 1:  # a sink, which may have ended the job, has no successors
         for i in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
             edge(t, s, key, slot, t.successors[i], now)

@@ -57,8 +57,9 @@ class Scheduler:
         self.tables = tables
         self.policy = policy(policy_name)
         self.state = new_state(
-            tables, n_workers, preemptive=preemptive, propagate=propagate,
-            dispatch_overhead=dispatch_overhead, switch_overhead=switch_overhead)
+            tables, n_workers, preemptive=self.policy.mode(preemptive), propagate=propagate,
+            dispatch_overhead=dispatch_overhead, switch_overhead=switch_overhead,
+            polling=self.policy.polling)
         self._key = self.policy.key
 
     def release(self, dag: int, job: int, release: int, now: int) -> int:
@@ -68,6 +69,10 @@ class Scheduler:
             add_slot(self.tables, self.state, dag)
             slot = jobs.release_job(self.tables, self.state, dag, job, release, now)
         return slot
+
+    def expect(self, dag: int, here: list[int]) -> None:
+        """Set which vertices of a DAG run here, by local index; see ``core.jobs.expect``."""
+        jobs.expect(self.tables, self.state, dag, here)
 
     def execution(self, slot: int, vertex: int, leg: int = 0) -> int:
         """Return the execution of a (global) vertex, or of one leg of it, in a job's slot."""
@@ -162,4 +167,5 @@ class Scheduler:
     def queue_length(self) -> int:
         """Count the executions that wait, for a worker or for their group."""
         waiting = sum(len(heap) for heap in self.state.group_heap)
+        waiting += sum(len(queue) for queue in self.state.entity_queue)
         return len(self.state.ready) + waiting - self.state.scalars[N_STALE]

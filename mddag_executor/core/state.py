@@ -33,9 +33,12 @@ IDLE, WAITING, RUNNING, SUSPENDED, DONE, DROPPED = range(6)
 # States of a job.  Of the last four every ended job is in exactly one.
 FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED = range(6)
 
+# Where a vertex is expected to run; LAST_HERE: here, is no sink, and nothing after it runs here.
+ELSEWHERE, HERE, LAST_HERE = range(3)
+
 # Columns of ``scalars``.
-(ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD,
- N_SCALARS) = range(8)
+(ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
+ N_SCALARS) = range(9)
 
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  The deadline is that of the
 # sink; the time that of the decision, for a sink that completed the completion, else -1.
@@ -55,6 +58,9 @@ class State(NamedTuple):
     ready: list[Entry]
     group_heap: list[list[Entry]]
     group_owner: list[int]
+    # under a policy that polls: a heap for each entity, and the entities that have any entry there
+    entity_queue: list[list[Entry]]
+    unpolled: list[int]
     # workers
     worker_x: list[int]
     # by DAG
@@ -62,6 +68,9 @@ class State(NamedTuple):
     oldest: list[int]
     newest: list[int]
     n_open: list[int]
+    # whether some of its vertices are not expected here; by vertex: whether it is (see ``expect``)
+    partial: list[int]
+    expected: list[int]
     # by slot
     job_dag: list[int]
     job_base: list[int]
@@ -94,31 +103,34 @@ def new_state(
     n_workers: int,
     *,
     preemptive: bool = False,
-    propagate: bool = True,
+    propagate: int = 1,
     dispatch_overhead: int = 0,
     switch_overhead: int = 0,
+    polling: bool = False,
 ) -> State:
     """
     Make an empty state.
 
     :param n_workers: size of the bounded pool.
     :param preemptive: a smaller key takes the worker of a larger one.
-    :param propagate: completions make the graph's edges true (simulation, replay); live passes
-        False because there messages do.
+    :param propagate: 1: completions make the graph's edges true at once (simulation); 0: messages
+        do, leg by leg, and the driver makes each leg ready (live); 2: messages do, and the driver
+        tells of each with ``rules.edge`` (rescheduling, where they take their time).
     :param dispatch_overhead: added to an execution each time it is dispatched, ns.
     :param switch_overhead: added to an execution each time it is preempted, ns.
+    :param polling: what becomes ready waits for a poll (see ``queues``); never with preemption.
     """
     columns: dict[str, list[int]] = {name: [] for name in State._fields}
     state = State(**columns)  # type: ignore[arg-type]
     fill_state(
         tables, state, n_workers, int(preemptive), int(propagate), dispatch_overhead,
-        switch_overhead)
+        switch_overhead, int(polling))
     return state
 
 
 def fill_state(
     t: Tables, s: State, n_workers: int, preemptive: int, propagate: int, dispatch_overhead: int,
-    switch_overhead: int,
+    switch_overhead: int, polling: int,
 ) -> None:
     """Fill the columns of a state that is all empty; see ``new_state``."""
     for _ in range(N_SCALARS):
@@ -128,6 +140,10 @@ def fill_state(
     s.scalars[PROPAGATE] = propagate
     s.scalars[DISPATCH_OVERHEAD] = dispatch_overhead
     s.scalars[SWITCH_OVERHEAD] = switch_overhead
+    s.scalars[POLLING] = polling
+    if polling != 0:
+        for _ in range(t.n_entities + 1):
+            add_queue(s.entity_queue)
     for _ in range(t.n_groups):
         add_group(s)
     for _ in range(n_workers):
@@ -137,6 +153,9 @@ def fill_state(
         s.oldest.append(-1)
         s.newest.append(-1)
         s.n_open.append(0)
+        s.partial.append(0)
+    for _ in range(t.n_vertices + 1):
+        s.expected.append(HERE)
 
 
 def add_slot(t: Tables, s: State, dag: int) -> None:
@@ -172,5 +191,10 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
 def add_group(s: State) -> int:
     """Add a mutually exclusive callback group and return its number."""
     s.group_owner.append(-1)
-    s.group_heap.append([])
+    add_queue(s.group_heap)
     return len(s.group_owner) - 1
+
+
+def add_queue(queues: list[list[Entry]]) -> None:
+    """Add an empty queue."""
+    queues.append([])

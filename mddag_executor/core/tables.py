@@ -36,19 +36,36 @@ The offsets are relative to a job's release:
 * ``latest_start``: the latest time at which the vertex can start with every sink that it leads to
   in time, if each vertex takes its mean execution time (0 where none is declared) and never waits:
   the least of these sinks' deadlines minus the longest path to them (least laxity first).
+
+For policies that know callbacks, not jobs:
+
+* ``entity``: place of the callback in the wait set of an executor of ROS 2: timers, then
+  subscriptions, services and clients, each in the order of the declaration.  A sync has one place
+  for each leg, next to one another.  Vertices of one callback are one entity.
+* ``chain_rank``: fixed priority by chains, as PiCAS assigns them; smaller is more urgent.  A chain
+  is a path from the source to a sink.  Chains rank by the sink's relative deadline, then by the
+  period and order of their DAGs; a callback has the rank of its most urgent chain (so those with
+  the same least deadline in one DAG are one chain, however it branches).  Within a chain later
+  callbacks, those with more vertices on the longest path to them from the source, are more urgent;
+  vertices that are equally late go by index.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
-from msg_graph import Dag, TaskSet
+from msg_graph import Callback, Dag, TaskSet
+from msg_graph.analysis import path_lengths
 
 NEVER = 2 ** 62
 """A time that is never reached (ns): larger than any clock, small enough to add to."""
 
 CONTINUE = 0
 ABORT = 1
+
+_WAIT_SET = {'timer': 0, 'subscription': 1, 'sync': 1, 'service': 2}
+"""Kinds of callbacks in the order in which executors of ROS 2 look them up."""
 
 
 class Tables(NamedTuple):
@@ -77,6 +94,8 @@ class Tables(NamedTuple):
     rad_offset: list[int]
     latest_start: list[int]
     sink_deadline: list[int]
+    entity: list[int]
+    chain_rank: list[int]
     region_offset: list[int]
     n_legs: list[int]
     n_predecessors: list[int]
@@ -84,6 +103,7 @@ class Tables(NamedTuple):
     successors: list[int]
     group: list[int]
     n_groups: int
+    n_entities: int
 
     @staticmethod
     def build(
@@ -106,6 +126,7 @@ class Tables(NamedTuple):
         :param expire_after: how long past its latest deadline an idle job stays open, ns.
         """
         columns = _Columns(legs, groups, max_active_jobs, expire_after)
+        columns.enter(task_set.callbacks if task_set is not None else ())
         for dag in task_set.dags if task_set is not None else ():
             columns.add_dag(dag)
         return columns.finish(default_deadline)
@@ -122,15 +143,31 @@ class _Columns:
         self._max_active_jobs = max_active_jobs
         self._expire_after = expire_after
         self._groups: dict[tuple[str, str], int] = {}
-        names = [n for n in Tables._fields if n not in ('n_dags', 'n_vertices', 'n_groups')]
+        self._entities: dict[str, int] = {}
+        self._n_entities = 0
+        self._chains: list[tuple[int, ...]] = []
+        self._keys: list[str] = []
+        names = [n for n in Tables._fields if n not in (
+            'n_dags', 'n_vertices', 'n_groups', 'n_entities')]
         self.lists: dict[str, list[int]] = {name: [] for name in names}
         self.lists['first_sink'].append(0)
         self.lists['first_successor'].append(0)
+
+    def enter(self, callbacks: Sequence[Callback]) -> None:
+        """Give each declared callback its place in the wait set."""
+        for callback in sorted(callbacks, key=lambda each: _WAIT_SET[each.kind]):
+            self._entities[callback.key] = self._n_entities
+            self._n_entities += max(1, len(callback.topics)) if self._legs else 1
 
     def add_dag(self, dag: Dag) -> None:
         lists = self.lists
         first = len(lists['dag_of'])
         offsets, starts = rad_offsets(dag), latest_starts(dag)
+        self._keys += [vertex.callback.key for vertex in dag.vertices]
+        lateness = path_lengths(dag, [1] * len(dag.vertices))
+        self._chains += [
+            (offset, dag.period_ns, dag.index, -late, index)
+            for index, (offset, late) in enumerate(zip(offsets, lateness))]
         region = 0
         for vertex, offset, start in zip(dag.vertices, offsets, starts):
             countdown, legs = len(vertex.predecessors), 1
@@ -141,6 +178,7 @@ class _Columns:
             lists['rad_offset'].append(offset)
             lists['latest_start'].append(start)
             lists['sink_deadline'].append(-1 if vertex.deadline_ns is None else vertex.deadline_ns)
+            lists['entity'].append(self._entities[vertex.callback.key])
             lists['region_offset'].append(region)
             lists['n_legs'].append(legs)
             lists['n_predecessors'].append(countdown)
@@ -171,7 +209,8 @@ class _Columns:
         n_vertices = len(lists['dag_of'])
         undeclared = {
             'dag_of': n_dags, 'index_in_dag': 0, 'rad_offset': default_deadline,
-            'latest_start': default_deadline, 'sink_deadline': -1, 'region_offset': 0,
+            'latest_start': default_deadline, 'sink_deadline': -1,
+            'entity': self._n_entities, 'region_offset': 0,
             'n_legs': 1, 'n_predecessors': 0, 'first_successor': len(lists['successors']),
             'group': -1,
             'period': default_deadline, 'dag_deadline': default_deadline, 'on_miss': CONTINUE,
@@ -180,8 +219,20 @@ class _Columns:
         }
         for name, value in undeclared.items():
             lists[name].append(value)
+        self._chains.append((default_deadline, default_deadline, n_dags, 0, 0))
+        lists['chain_rank'] = self._ranks()
         return Tables(
-            n_dags=n_dags, n_vertices=n_vertices, n_groups=len(self._groups), **lists)
+            n_dags=n_dags, n_vertices=n_vertices, n_groups=len(self._groups),
+            n_entities=self._n_entities, **lists)
+
+    def _ranks(self) -> list[int]:
+        """Return the place of each vertex's callback among all, by its most urgent vertex."""
+        keys = [*self._keys, '']  # the last is the undeclared
+        best: dict[str, tuple[int, ...]] = {}
+        for key, chain in zip(keys, self._chains):
+            best[key] = min(chain, best.get(key, chain))
+        ranks = {key: rank for rank, key in enumerate(sorted(best, key=lambda key: best[key]))}
+        return [ranks[key] for key in keys]
 
 
 def rad_offsets(dag: Dag) -> list[int]:

@@ -16,14 +16,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import sys
+from typing import Any, NamedTuple
 
 __all__ = ['DeadlineMiss', 'Job', 'MultiDeadlineExecutor', 'current_job']
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """
     The job that a running callback belongs to.
 
@@ -43,8 +42,8 @@ def current_job() -> Job | None:
 
     None outside of callbacks of this executor, and in callbacks that no DAG declares.
     """
-    from mddag_executor.live.hooks import current
-    running: Any = current.running
+    hooks = sys.modules.get('mddag_executor.live.hooks')  # not imported: there is no executor
+    running: Any = hooks.current.running if hooks is not None else None
     if running is None or running.work.origin is None:
         return None
     origin = running.work.origin

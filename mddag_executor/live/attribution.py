@@ -38,8 +38,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 import threading
-import time
-from typing import Any, NamedTuple
+from time import time_ns
+from typing import Any, NamedTuple, Protocol
 
 KEEP = 256
 """How many publications of a topic are remembered."""
@@ -62,16 +62,31 @@ class Origin(NamedTuple):
     vertex: int
 
 
-class PublisherState:
-    """What is kept for each publisher: its topic, and how many messages it has published."""
+class Takes(Protocol):
+    """What a publisher takes from after it has published."""
 
-    __slots__ = ('lock', 'topic', 'count', 'offset')
+    def take(self, begin: int, /) -> None:
+        """Take what was published since then (system time, ns)."""
+
+
+class PublisherState:
+    """
+    What is kept for each publisher: its topic, and how many messages it has published.
+
+    ``takes`` are the subscriptions that it takes from itself (see ``direct``).  ``noted_by`` and
+    ``notes`` remember of one attribution what it keeps of the topic.
+    """
+
+    __slots__ = ('lock', 'topic', 'count', 'offset', 'takes', 'noted_by', 'notes')
 
     def __init__(self, topic: str) -> None:
         self.lock = threading.Lock()
         self.topic = topic
         self.count = 0
         self.offset = 0
+        self.takes: Takes | None = None
+        self.noted_by: Attribution | None = None
+        self.notes: _Topic | None = None
 
 
 class Publication:
@@ -96,6 +111,8 @@ class _Topic:
         # The longest window of those kept; a maximum of two generations, so that it is forgotten.
         self.longest = 0
         self._longest_lately = 0
+        # told the header of each message, where other processes subscribe (see ``crossings``)
+        self.told: Callable[[Any, Origin], None] | None = None
         self._count = 0
 
     def begun(self, publication: Publication) -> None:
@@ -150,16 +167,25 @@ class Attribution:
         state: PublisherState, origin: Origin,
     ) -> None:
         """Send a message and note the publication; the caller holds the publisher's lock."""
-        topic = self._topics.get(state.topic)
+        if state.noted_by is not self:
+            state.noted_by, state.notes = self, self._topics.get(state.topic)
+        topic = state.notes
         if topic is None:
             send(publisher, msg)
             return
-        publication = Publication(time.time_ns(), state, origin)
+        if topic.told is not None:
+            topic.told(msg, origin)
+        publication = Publication(time_ns(), state, origin)
         topic.begun(publication)
         try:
             send(publisher, msg)
         finally:
-            topic.ended(publication, time.time_ns())
+            topic.ended(publication, time_ns())
+
+    def tell(self, told: Callable[[Any, Origin], None], topics: set[str]) -> None:
+        """Tell of each message on these topics, and no others, before it is published."""
+        for name, topic in self._topics.items():
+            topic.told = told if name in topics else None
 
     def find(self, topic: str, stamp: int, sequence: int | None) -> Origin | None:
         """

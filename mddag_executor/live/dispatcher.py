@@ -30,15 +30,28 @@ from __future__ import annotations
 from collections.abc import Callable
 import threading
 from time import monotonic_ns
-from typing import Any
+from typing import Protocol
 
 from mddag_executor.core import Scheduler, Tables
 from mddag_executor.core.rules import complete, make_ready
 from mddag_executor.core.state import IDLE, OPEN, SUSPENDED
-from mddag_executor.live.attribution import Attribution, Origin, PublisherState
+from mddag_executor.live.attribution import Attribution, Origin
+from mddag_executor.live.crossings import Crossings
 from mddag_executor.live.entries import Entry, Work
+from mddag_executor.live.hooks import current
 from mddag_executor.live.verdicts import DeadlineMiss, NO_ORIGIN, Record, Verdicts
+from mddag_executor.trace.groups import EXECUTION
 from msg_graph import TaskSet
+
+MOST_MISSED = 1000
+"""After a long stop (a suspended machine) at most so many releases are judged one by one."""
+
+
+class Seat(Protocol):
+    """A worker's place (see ``pool``)."""
+
+    worker: int
+    vtid: int
 
 
 class Dispatcher:
@@ -71,6 +84,8 @@ class Dispatcher:
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss, fail)
         topics = {t for c in task_set.callbacks for t in c.publishes} if task_set else set()
         self.attribution = Attribution(topics)
+        self.crossings = Crossings.of(
+            task_set, self.tables, self.scheduler, self.attribution)
         self.dag_names = [d.name for d in task_set.dags] if task_set else []
         self.lock = threading.Lock()
         self.clock_offset = clock_offset
@@ -95,7 +110,11 @@ class Dispatcher:
 
     def tick(self) -> int:
         """Return the core's time now; the caller holds the lock."""
-        return self.core_time(monotonic_ns() + self.clock_offset)
+        now = monotonic_ns() + self.clock_offset
+        if now < self._last:
+            return self._last
+        self._last = now
+        return now
 
     def core_time(self, now: int) -> int:
         """Return ``now``, or the time of the core's last event where that is later."""
@@ -124,7 +143,7 @@ class Dispatcher:
     def timer_due(self, entry: Entry, work: Work, due: int) -> None:
         """Take in a timer that became due at ``due`` (trace's clock)."""
         with self.lock:
-            if entry.removed:
+            if entry.removed or self._finished:
                 return
             now = self.tick()
             if entry.depth and len(entry.waiting) >= entry.depth:
@@ -138,33 +157,54 @@ class Dispatcher:
                 self._start_undeclared(entry, work, now)
             self.dispatch(now)
 
+    def timer_missed(self, entry: Entry, due: int, period: int, count: int) -> None:
+        """Take in that the ``count`` periods after that of ``due`` were missed: they are late."""
+        with self.lock:
+            if entry.removed or self._finished:
+                return
+            entry.skipped += count
+            if entry.source >= 0:
+                now = self.tick()
+                for i in range(max(1, count - MOST_MISSED + 1), count + 1):
+                    self._skip_job(entry, min(due + i * period, now), now)
+
     def message(
-        self, entry: Entry, work: Work, origin: Origin | None, release: int | None
+        self, entry: Entry, work: Work, origin: Origin | None, release: int | None,
+        stamp: int = -1,
     ) -> None:
         """
         Take in a message.
 
         :param origin: the publication that it comes from, where one was found.
-        :param release: for a source, the release of its job on the trace's clock.
+        :param release: where it starts a job, that job's release on the trace's clock.
+        :param stamp: that of its header where it says which job it belongs to, else -1.
         """
         with self.lock:
-            if entry.removed:
+            if entry.removed or self._finished:
                 return
             now = self.tick()
             if entry.depth and len(entry.waiting) >= entry.depth:
                 self._drop_oldest(entry, now)
             if entry.source >= 0 and release is not None:
                 self._start_job(entry, work, min(release, now), now)
-            elif origin is None or not self._start_successor(entry, work, origin, now):
+                if stamp >= 0 and self.crossings is not None and work.origin is not None:
+                    self.crossings.note(stamp, work.origin)
+                self.dispatch(now)
+                return
+            if origin is None and stamp >= 0 and release is not None:
+                origin = self._enter(entry, stamp, min(release, now), now)
+            if origin is None or not self._start_successor(entry, work, origin, now):
                 if entry.callback is not None:
                     entry.unattributed += 1
                 self._start_undeclared(entry, work, now)
-            self.dispatch(now)
+            running = current.running
+            if running is None or not running.ends_soon():
+                self.dispatch(now)
 
     def undeclared_ready(self, entry: Entry, work: Work) -> None:
         """Take in anything that no DAG declares: requests, guard conditions, waitables, tasks."""
         with self.lock:
-            if entry.removed:
+            if entry.removed or self._finished:
                 return
             now = self.tick()
             self._start_undeclared(entry, work, now)
@@ -175,6 +215,18 @@ class Dispatcher:
         slot = self._release(dag, release, now)
         self._enqueue(entry, work, self.scheduler.source(slot), Origin(
             slot, dag, self.scheduler.state.job_index[slot], entry.source), now)
+
+    def _enter(self, entry: Entry, stamp: int, release: int, now: int) -> Origin | None:
+        """Find or start the job of a message from another process (see ``crossings``)."""
+        if self.crossings is None or entry.enters < 0:
+            return None
+        dag = self.tables.dag_of[entry.enters]
+        job = self.crossings.find(dag, stamp)
+        if job is None:
+            slot = self._release(dag, release, now)
+            job = Origin(slot, dag, self.scheduler.state.job_index[slot], entry.enters)
+            self.crossings.note(stamp, job)
+        return job._replace(vertex=entry.enters)
 
     def _skip_job(self, entry: Entry, release: int, now: int) -> None:
         """Account for a release whose source does not run: the job expires at once."""
@@ -188,7 +240,8 @@ class Dispatcher:
         slot = self.scheduler.release(dag, job, release, now)
         if self.scheduler.state.decisions:
             self.decided(now)
-        self.verdicts.released(dag, job, release, now)
+        if not self._finished:
+            self.verdicts.released(dag, job, release, now)
         return slot
 
     def _start_successor(self, entry: Entry, work: Work, origin: Origin, now: int) -> bool:
@@ -272,26 +325,53 @@ class Dispatcher:
         work.entry.waiting.pop(x, None)
         return work
 
-    def suspend(self, work: Work) -> None:
+    def suspend(self, work: Work, start: int, end: int, seat: Seat) -> None:
         """Take a running execution off its worker until ``resume``."""
+        if self.record is not None:
+            self._record_run(work, start, end, seat)
         self.scheduler.suspend(work.x)
         self._work[work.x] = work
 
-    def complete(self, work: Work, end: int, now: int, vtid: int) -> None:
+    def complete(self, work: Work, start: int, end: int, now: int, seat: Seat) -> None:
         """End a running execution that ended at ``end``; ``now`` is the core's time."""
         x = work.x
         work.x = -1
         work.entry.ran += 1
         state = self.scheduler.state
-        whole = complete(self.tables, state, self._key, x, end)
         origin = work.origin
-        if origin is not None and self.record is not None:
-            leg = x - self.scheduler.execution(origin.slot, origin.vertex)
-            self.record(
-                'complete', now, vtid, work.entry.address, origin.dag,
-                self.tables.index_in_dag[origin.vertex], origin.job, whole, end, leg)
+        record = self.record
+        if record is None:
+            complete(self.tables, state, self._key, x, end)
+        elif origin is None:
+            self._record_run(work, start, end, seat)
+            complete(self.tables, state, self._key, x, end)
+        else:
+            tables = self.tables
+            slot, dag, job, vertex = origin
+            deadline = state.job_release[slot] + tables.rad_offset[vertex]
+            leg = x - state.job_base[slot] - tables.region_offset[vertex]
+            whole = complete(tables, state, self._key, x, end)
+            record(
+                EXECUTION, start, seat.vtid, work.entry.address, dag, tables.index_in_dag[vertex],
+                job, seat.worker, work.ready_ns, deadline, end, now, whole, leg)
         if state.decisions:
             self.decided(now)
+
+    def _record_run(self, work: Work, start: int, end: int, seat: Seat) -> None:
+        """Record that a callback has run which no DAG declares, or which goes on later."""
+        record = self.record
+        assert record is not None
+        _, dag, job, vertex = work.origin or NO_ORIGIN
+        index, deadline = -1, 0
+        if dag >= 0:
+            index = self.tables.index_in_dag[vertex]
+            deadline = self.release_of(work) + self.tables.rad_offset[vertex]
+        address = work.entry.address
+        record(
+            'dispatch', start, seat.vtid, address, dag, index, job, seat.worker, work.ready_ns,
+            deadline)
+        record('callback_start', start, seat.vtid, address, False)
+        record('callback_end', end, seat.vtid, address)
 
     def give_up(self, work: Work, now: int) -> None:
         """End a dispatched execution that must not run: its job can not complete any more."""
@@ -318,18 +398,7 @@ class Dispatcher:
                 work.x = -1
                 self.verdicts.note_drop(work.entry, work.origin or NO_ORIGIN, 'aborted', now)
 
-    # --- publishing and the end ------------------------------------------------------------------
-
-    def publish(
-        self, send: Any, publisher: Any, msg: Any, state: PublisherState, work: Work, vtid: int
-    ) -> None:
-        """Publish for a running callback: note it for attribution, and in the trace."""
-        if self.record is not None:
-            now = self.now()
-            address, message = id(publisher), id(msg)
-            self.record('rclcpp_publish', now, vtid, address, message, 0)
-            self.record('rcl_publish', now, vtid, address, message)
-        self.attribution.publish(send, publisher, msg, state, work.origin or NO_ORIGIN)
+    # --- the end ---------------------------------------------------------------------------------
 
     def finish(self) -> int:
         """Judge what is open, once, when the run ends; return the time on the trace's clock."""

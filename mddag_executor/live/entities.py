@@ -62,8 +62,11 @@ class Receiver(Protocol):
         :param due_ns: nominal due time, ns on the scale of ``time.monotonic_ns``: a point of the
             timer's exact phase grid; with simulated time active, when it was noticed. After an
             overrun it is when the first of the missed periods was due; the others are skipped,
-            as rcl does it, and show as a gap to the next due time.
+            as rcl does it, and told by ``on_missed``.
         """
+
+    def on_missed(self, timer: Timer, due_ns: int, count: int) -> None:
+        """Take in that so many periods after that of ``due_ns`` are skipped, after an overrun."""
 
     def on_message(
         self, subscription: Subscription, message: Any, info: dict[str, Any]

@@ -29,8 +29,27 @@ TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
     'timer', 'subscription', 'service', 'client', 'guard', 'waitable', 'task')
 
 
+SOON_FROM = 8
+
 _HANDLED = (TIMER, SUBSCRIPTION, SERVICE)
-_COUNTS = ('ready', 'ran', 'dropped', 'skipped', 'unattributed', 'busy_ns')
+COUNTS = ('ready', 'ran', 'dropped', 'skipped', 'unattributed', 'busy_ns')
+
+
+class AtOnce:
+    """
+    A future's done callback that takes no time, and never fails.
+
+    A future hands its callbacks to its executor as tasks; this one is called at once instead.
+    """
+
+    __slots__ = ('_function',)
+
+    def __init__(self, function: Callable[[], Any]) -> None:
+        self._function = function
+
+    def __call__(self, _: Any = None) -> None:
+        """Call the function."""
+        self._function()
 
 
 class Destroyed(Exception):
@@ -49,7 +68,8 @@ class Entry:
     __slots__ = (
         'kind', 'entity', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'dropped', 'skipped', 'last_due', 'busy_ns',
-        'unattributed', 'removed', 'address', 'handle')
+        'unattributed', 'removed', 'address', 'handle', 'enters', 'soon', 'soon_from',
+        'publishes')
 
     def __init__(
         self, kind: str, entity: Any, node: str, callback: Callback | None, group: int,
@@ -67,6 +87,8 @@ class Entry:
         self.source = -1
         # publishing vertex -> (vertex that its message starts, leg)
         self.targets: dict[int, tuple[int, int]] = {}
+        # publishing vertex in another process whose messages start jobs here (see ``crossings``)
+        self.enters = -1
         self.waiting: dict[int, None] = {}
         self.ready = 0
         self.ran = 0
@@ -75,6 +97,12 @@ class Entry:
         self.last_due = 0
         self.busy_ns = 0
         self.unattributed = 0
+        # how many times in a row its callback ended soon after it published
+        self.soon = 0
+        # from which number on that is expected again; grows each time it turns out wrong
+        self.soon_from = SOON_FROM
+        # the topics that its callback has published on
+        self.publishes: set[str] = set()
         self.removed = False
         self.address = id(self)
         # taken from before a callback runs: it raises once the entity is destroyed
@@ -91,8 +119,8 @@ class Entry:
         name = f'{self.node}:{self.label}' if self.callback is None else self.callback.key
         total = counts.setdefault(name, {
             'kind': self.kind, 'declared': self.callback is not None, 'waiting': 0,
-            **dict.fromkeys(_COUNTS, 0)})
-        for key in _COUNTS:
+            **dict.fromkeys(COUNTS, 0)})
+        for key in COUNTS:
             total[key] += getattr(self, key)
         total['waiting'] += len(self.waiting)
 

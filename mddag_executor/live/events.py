@@ -31,6 +31,7 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.live.direct import DirectTakes
 from mddag_executor.live.endings import SecondLooks, stop_at_exit, wake_at_shutdown
 from mddag_executor.live.entities import EMPTY, EntitySet, Receiver, snapshot
 from mddag_executor.live.native import NodeStandIn
@@ -113,6 +114,10 @@ class _NativeThread:
         """Set what to look after; it comes into force soon."""
         self._node.wanted = entities
         self._native.wake()
+
+    def settled(self) -> bool:
+        """Return whether what was set by ``update`` has come into force."""
+        return self._node.settled() or not self._thread.is_alive()
 
     def wake(self) -> None:
         """Have the thread look at its context soon."""
@@ -208,7 +213,9 @@ class EventsIntake:
         self._receiver = receiver
         self._on_shutdown = on_shutdown
         self._lock = threading.RLock()
+        self._given = EMPTY
         self._latest = EMPTY
+        self._direct = DirectTakes(receiver, self._choose_again)
         self._running = False
         self._parts: dict[str, Any] = {}
         self._ending: list[Any] = []
@@ -238,14 +245,25 @@ class EventsIntake:
         """
         with self._lock:
             if not isinstance(entities, EntitySet):
-                entities = snapshot(entities, self._latest)
-            if entities is self._latest:
-                return
+                entities = snapshot(entities, self._given)
+            self._given = entities
+            self._choose()
+
+    def _choose(self) -> None:
+        """Share what is given out among the publishers and the threads."""
+        entities = self._direct.choose(self._given) if self._running else self._given
+        if entities is not self._latest:
             self._latest = entities
             for part in list(self._parts.values()):
                 part.update(entities)
             if self._running:
                 self._start_parts()
+        self._direct.settle()
+
+    def _choose_again(self) -> None:
+        with self._lock:
+            if self._running:
+                self._choose()
 
     def _start_parts(self) -> None:
         """Start the threads that have something to do, and have not had until now."""
@@ -279,6 +297,10 @@ class EventsIntake:
             if self._parts.pop(name, None) is not None and self._running:
                 self._start_parts()
 
+    def settled(self) -> bool:
+        """Return whether what was set by ``update`` has come into force everywhere."""
+        return all(part.settled() for part in list(self._parts.values()))
+
     def wake(self) -> None:
         """Have all threads look around: whether the context has ended; from any thread."""
         for part in list(self._parts.values()):
@@ -300,6 +322,7 @@ class EventsIntake:
             self._ending = []
             self._running = True
             stop_at_exit(self)
+            self._choose()
             self._start_parts()
 
     def stop(self) -> None:
@@ -311,6 +334,7 @@ class EventsIntake:
         """
         with self._lock:
             self._running = False
+            self._direct.stop()
             parts, self._parts = self._parts, {}
             self._ending = [part for part in parts.values() if isinstance(part, _NativeThread)]
         for part in parts.values():

@@ -21,8 +21,7 @@ Theory of operation
 after the executor: it takes note of entities that come and go, resumes what can not say when it
 is ready, and ends the spin on an exception, a shutdown, a done future or a time-out.
 
-``spin_once`` uses no thread at all: one wait set over everything hands over what is ready, and the
-calling thread runs the one callback that the core puts first.
+``spin_once`` (see ``stepping``) runs one callback in the calling thread.
 
 Whatever has been taken and not run yet stays with the core and runs with the next spin.
 """
@@ -34,46 +33,50 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import gc
 import os
-import sys
 import threading
 import time
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.live import hooks
+from mddag_executor.live.diagnostics import Diagnostics
 from mddag_executor.live.dispatcher import Dispatcher
-from mddag_executor.live.entities import EntitySet, snapshot
-from mddag_executor.live.entries import Entry, TASK
+from mddag_executor.live.entries import AtOnce, Entry, TASK, Work
 from mddag_executor.live.events import EventsIntake
 from mddag_executor.live.pool import Pool
+from mddag_executor.live.rates import RateWatch
 from mddag_executor.live.receiver import Receiver
 from mddag_executor.live.recorder import Recorder
-from mddag_executor.live.registry import looked_after, Registry
-from mddag_executor.live.settings import resolve, thread_setting
+from mddag_executor.live.registry import Registry
+from mddag_executor.live.settings import (
+    diagnostics_period_ns,
+    resolve,
+    thread_setting,
+    Thresholds,
+)
 from mddag_executor.live.statistics import statistics
+from mddag_executor.live.stepping import Stepping
 from mddag_executor.live.tasks import make_task
 from mddag_executor.live.verdicts import DeadlineMiss
-from mddag_executor.live.waitset import ALL_KINDS, WaitSetIntake
+from mddag_executor.live.waitset import WaitSetIntake
 from msg_graph import TaskSet
-import rclpy
-from rclpy.exceptions import InvalidHandle
-from rclpy.executors import Executor, ExternalShutdownException, TimeoutObject
+from rclpy.executors import ExternalShutdownException
 from rclpy.task import Future, Task
 
 if TYPE_CHECKING:
     from rclpy.context import Context
-    from rclpy.node import Node
 
 LOOK_AFTER_S = 0.1
 """How often ``spin`` looks whether the context is still there (signals only end the context)."""
 
-REFRESH_REST = 3
-"""After looking at all entities, rest for so many times what it took."""
+SETTLE_TURNS = 20
+"""So many milliseconds after a future is done its action's callbacks may still take."""
+SETTLED_TURNS = 3
 
 EXPIRE_AFTER_NS = 1_000_000_000
 MAX_ACTIVE_JOBS = 64
 
 
-class MultiDeadlineExecutor(Executor):
+class MultiDeadlineExecutor(Stepping):
     """
     Run callbacks in the order that their deadlines need, on a bounded pool of workers.
 
@@ -95,6 +98,9 @@ class MultiDeadlineExecutor(Executor):
     :param worker_cpus: the CPUs that they may use.
     :param freeze_gc: when the first spin begins, collect garbage and have the collector leave
         alone what there is by then (``gc.freeze``): for programs that make their nodes first.
+    :param diagnostics_period: how often to publish on ``/diagnostics`` while it spins: ns, or text
+        as ``1s``; None or 0: not at all.
+    :param thresholds: what makes a status of the diagnostics worse than OK.
     :raises msg_graph.GraphError: when the declaration is not right.
     :raises mddag_executor.errors.MddagError: on an unknown policy, intake or thread setting, and
         when the trace can not be written.
@@ -118,12 +124,15 @@ class MultiDeadlineExecutor(Executor):
         worker_priority: int | None = None,
         worker_cpus: set[int] | None = None,
         freeze_gc: bool = False,
+        diagnostics_period: int | str | None = None,
+        thresholds: Thresholds | None = None,
     ) -> None:
         task_set, num_workers, deadline_ns = resolve(
             graph, num_workers, default_deadline, intake)
         prepare = thread_setting(worker_policy, worker_priority, worker_cpus)
+        every_ns = diagnostics_period_ns(diagnostics_period)
         hooks.install()
-        self._recorder: Recorder | None = None
+        self._recorder = None
         clock_offset = time.time_ns() - time.monotonic_ns()
         if trace is not None:
             self._recorder = Recorder(
@@ -133,7 +142,7 @@ class MultiDeadlineExecutor(Executor):
         self._attention = threading.Event()
         self._changed = True
         self._refresh_at = 0.0
-        self._entities: EntitySet | None = None
+        self._entities = None
         self._spinning = threading.Lock()
         self._refreshing = threading.Lock()
         self._finished = False
@@ -149,71 +158,41 @@ class MultiDeadlineExecutor(Executor):
             task_set, self._dispatcher.tables, self._dispatcher.scheduler)
         self._receiver = Receiver(
             self._dispatcher, self._registry, task_set, self, self._fail, self._recorder)
+        self._new_tasks: deque[Work] = deque()
         self._task_entry = Entry(TASK, None, '', None, -1, 0, 'task')
+        self._rates = RateWatch(self._registry)
+        self._intake = None
         super().__init__(context=context)
-        self._inline: WaitSetIntake | None = None
-        self._intake: Any = None
+        self._inline = None
+        self._diagnostics: Diagnostics | None = None
+        if every_ns is not None:
+            self._diagnostics = Diagnostics(
+                self._context, task_set, self._dispatcher, self._pool, self._registry,
+                self._recorder, every_ns, thresholds or Thresholds())
         self._intake_kind = intake
-
-    # --- nodes and entities ----------------------------------------------------------------------
-
-    def add_node(self, node: Node) -> bool:
-        """Add a node whose callbacks this executor runs; False when it has it already."""
-        added: bool = super().add_node(node)
-        if added:
-            self.wake()
-        return added
-
-    def remove_node(self, node: Node) -> None:
-        """Stop running a node's callbacks."""
-        super().remove_node(node)
-        self.wake()
-
-    def wake(self) -> None:
-        """Take note of entities that were created or destroyed, or of a change of state."""
-        self._changed = True
-        self._ring()
-
-    def _ring(self) -> None:
-        """End the wait of whoever spins."""
-        self._attention.set()
-        guard = self._guard
-        if guard is not None:
-            try:
-                guard.trigger()
-            except InvalidHandle:
-                pass
-
-    def _refresh(self) -> None:
-        """Bring registry, intake and trace up to date with the nodes' entities."""
-        with self._refreshing:
-            if not self._changed:
-                return
-            start = time.monotonic()
-            self._changed = False
-            nodes = self.get_nodes()
-            added, gone = self._registry.refresh(nodes)
-            for entry in gone:
-                self._dispatcher.remove(entry)
-            if self._recorder is not None:
-                self._recorder.entities(nodes, added)
-            self._entities = snapshot(nodes, self._entities, looked_after)
-            for intake in (self._intake, self._inline):
-                if intake is not None:
-                    intake.update(self._entities)
-            end = time.monotonic()
-            self._refresh_at = end + REFRESH_REST * (end - start)
 
     # --- tasks -----------------------------------------------------------------------------------
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
         """Run a function or coroutine in this executor; return its task, which is a future."""
+        if type(callback) is AtOnce:
+            task = Task(callback, args, kwargs)
+            task()
+            return task
         task, work = make_task(
             self._task_entry, self, self._dispatcher.resume, callback, args, kwargs)
-        self._dispatcher.undeclared_ready(self._task_entry, work)
+        if self._spinning.locked():
+            self._dispatcher.undeclared_ready(self._task_entry, work)
+        else:
+            self._new_tasks.append(work)
         if not self._pool.running:
             self._ring()
         return task
+
+    def _submit_tasks(self) -> None:
+        """Have the tasks run that were created while nobody spun: the newest first (rclpy)."""
+        while self._new_tasks:
+            self._dispatcher.undeclared_ready(self._task_entry, self._new_tasks.pop())
 
     # --- spinning --------------------------------------------------------------------------------
 
@@ -231,7 +210,7 @@ class MultiDeadlineExecutor(Executor):
         self, future: Future, timeout_sec: float | None = None
     ) -> None:
         """Run callbacks on the pool until a future is done or the time is over."""
-        future.add_done_callback(lambda _: self._attention.set())
+        future.add_done_callback(AtOnce(self._attention.set))
         try:
             self._spin(lambda: future.done() or future.cancelled(), timeout_sec)
         except ExternalShutdownException:
@@ -252,12 +231,15 @@ class MultiDeadlineExecutor(Executor):
                 gc.collect()
                 gc.freeze()
             self._start_intake()
+            self._submit_tasks()
             self._pool.start()
             while not self._is_shutdown:
                 self._raise_error()
                 if done():
+                    self._settle()
                     return
                 self._check_context()
+                self._look_after()
                 left = LOOK_AFTER_S
                 if self._changed:  # where entities are made in a row, not anew for each of them
                     left = min(left, max(0.0, self._refresh_at - time.monotonic()))
@@ -280,6 +262,29 @@ class MultiDeadlineExecutor(Executor):
                 self._pool.close(0.5)
                 self._end_run()
             self._spinning.release()
+
+    def _settle(self) -> None:
+        """
+        Let run what belongs to a completed future's action, where there are any: its feedback.
+
+        With one thread that was published before the answer which completed the future; with
+        several it may take a moment longer.  So wait until nothing has been to do for a while.
+        """
+        if self._entities is None or not self._entities.waitables:
+            return
+        quiet = 0
+        for _ in range(SETTLE_TURNS):
+            quiet = quiet + 1 if self._pool.is_idle() else 0
+            if quiet >= SETTLED_TURNS:
+                return
+            time.sleep(0.001)
+
+    def _look_after(self) -> None:
+        """Do what is to be done now and then while somebody spins."""
+        self._submit_tasks()
+        self._rates.look()
+        if self._diagnostics is not None:
+            self._diagnostics.start()
 
     def _check_context(self) -> None:
         if not self._context.ok():
@@ -312,64 +317,6 @@ class MultiDeadlineExecutor(Executor):
     def _raise_error(self) -> None:
         if self._errors:
             raise self._errors.popleft()
-
-    def spin_once(self, timeout_sec: float | None = None) -> None:
-        """
-        Wait for one callback and run it in the calling thread.
-
-        Called by ``rclpy.spin``, which would otherwise run one callback at a time, it does what
-        ``spin`` does.
-
-        :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
-        """
-        if timeout_sec is None and sys._getframe(1).f_code is rclpy.spin.__code__:
-            self.spin()
-            return
-        self._spin_once(timeout_sec, lambda: False)
-
-    def spin_once_until_future_complete(
-        self, future: Future, timeout_sec: float | TimeoutObject | None = None
-    ) -> None:
-        """Wait for one callback, or until a future is done, and run it."""
-        seconds = timeout_sec.timeout if isinstance(timeout_sec, TimeoutObject) else timeout_sec
-        future.add_done_callback(lambda _: self.wake())
-        self._spin_once(seconds, lambda: future.done() or future.cancelled())
-
-    def _spin_once(self, timeout_sec: float | None, done: Callable[[], bool]) -> None:
-        if not self._spinning.acquire(blocking=False):
-            raise RuntimeError('Executor is already spinning')
-        deadline = None
-        if timeout_sec is not None and timeout_sec >= 0:
-            deadline = time.monotonic() + timeout_sec
-        try:
-            while not self._is_shutdown:
-                self._check_context()
-                if self._one_step(deadline) or done():
-                    return
-                if deadline is not None and time.monotonic() >= deadline:
-                    return
-        finally:
-            self._spinning.release()
-
-    def _one_step(self, deadline: float | None) -> bool:
-        """Take in what is ready, waiting where nothing is; run one callback if there is one."""
-        self._raise_error()
-        if self._inline is None:
-            self._inline = WaitSetIntake(
-                self._context, self._receiver, self._guards(), ALL_KINDS)
-            self._changed = True
-        self._refresh()
-        self._pool.resume_polled()
-        self._inline.poll(0.0)
-        if not self._pool.run_one():
-            left = None if deadline is None else max(0.0, deadline - time.monotonic())
-            self._inline.poll(left)
-            self._refresh()
-            if not self._pool.run_one():
-                self._raise_error()
-                return False
-        self._raise_error()
-        return True
 
     @contextmanager
     def _pump(self) -> Iterator[None]:
@@ -411,6 +358,9 @@ class MultiDeadlineExecutor(Executor):
         if self._finished:
             return
         self._finished = True
+        if self._diagnostics is not None:
+            self._diagnostics.stop()
+        self._release_groups()
         end = self._dispatcher.finish()
         if self._recorder is not None:
             self._recorder.close(end)

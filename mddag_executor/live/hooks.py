@@ -24,6 +24,7 @@ of this executor's callbacks they do what they always did.
 from __future__ import annotations
 
 import threading
+from time import time_ns
 from typing import Any, Protocol
 
 from mddag_executor.live.attribution import PublisherState
@@ -36,6 +37,9 @@ class Running(Protocol):
 
     def publish(self, send: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
         """Send a message on behalf of the running callback."""
+
+    def ends_soon(self) -> bool:
+        """Return whether this callback has ended soon after it published, the last times."""
 
     def waits(self) -> Any:
         """Return a context manager that lends the worker's place while it is entered."""
@@ -73,6 +77,7 @@ def install() -> None:
 
     def publish(self: Any, msg: Any) -> None:
         state = publisher_state(self)
+        begin = time_ns()
         with state.lock:
             state.count += 1
             running = current.running
@@ -80,6 +85,9 @@ def install() -> None:
                 send(self, msg)
             else:
                 running.publish(send, self, msg, state)
+        takes = state.takes  # not before: see ``direct``
+        if takes is not None:
+            takes.take(begin)
 
     def call_and_wait(self: Any, request: Any, *args: Any, **kwargs: Any) -> Any:
         running = current.running

@@ -142,6 +142,10 @@ class NodeStandIn:
             self._wake()
         return self._subscriptions
 
+    def settled(self) -> bool:
+        """Return whether what is wanted is in force, and what was withdrawn is let go of."""
+        return self.wanted is self._applied and not self._withdrawn
+
     def survives(self, error: Exception) -> bool:
         """
         Return whether the native executor can go on after an exception that came out of it.

@@ -21,6 +21,12 @@ A worker that completes takes its next execution itself; an idle worker is woken
 a lock of its own (a *seat*), with the execution that it is to run.  Nobody polls and nobody wakes
 more threads than there is work for.
 
+A worker that publishes does not wake an idle one for what it starts by that, if its callback has
+always ended *soon* after publishing, lately: then it goes on with that itself, with warm caches
+and no switch of threads.  Where that guess is wrong, the next event of any kind wakes the idle
+worker, at the latest the spinning thread, which looks every now and then; and it takes many more
+right ones until the next guess.
+
 A callback that waits inside ``Client.call`` lends its place: its seat leaves the worker, a spare
 seat takes it over, and when the callback completes its thread becomes the next spare.
 
@@ -32,6 +38,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 import threading
 from time import monotonic_ns
 from typing import Any
@@ -40,12 +47,18 @@ from mddag_executor.core.rules import schedule, take
 from mddag_executor.core.state import N_IDLE
 from mddag_executor.live.attribution import PublisherState
 from mddag_executor.live.dispatcher import Dispatcher
-from mddag_executor.live.entries import Destroyed, UNKNOWN, Work
+from mddag_executor.live.entries import AtOnce, Destroyed, Entry, UNKNOWN, Work
 from mddag_executor.live.hooks import current
 from mddag_executor.live.verdicts import NO_ORIGIN
+from mddag_executor.trace.groups import PUBLICATION
 
 STOP = -2
 LOOK_AGAIN_S = 0.02
+
+SOON_NS = 300_000
+"""So much time between publishing and the end of a callback is not worth waking a worker."""
+SOON_DOUBT = 8
+"""After a wrong guess, so many times more often it must have been right before the next one."""
 
 
 class Seat:
@@ -68,11 +81,13 @@ class Seat:
 class Running:
     """What runs in a thread: the hooks find the executor and the job through it."""
 
-    __slots__ = ('pool', 'seat')
+    __slots__ = ('pool', 'seat', 'published')
 
     def __init__(self, pool: Pool, seat: Seat) -> None:
         self.pool = pool
         self.seat = seat
+        # when the callback that runs published first (0: not yet)
+        self.published = 0
 
     @property
     def work(self) -> Work:
@@ -82,7 +97,32 @@ class Running:
 
     def publish(self, send: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
         """Publish on behalf of the running callback."""
-        self.pool.dispatcher.publish(send, publisher, msg, state, self.work, self.seat.vtid)
+        seat = self.seat
+        work = seat.work
+        assert work is not None
+        dispatcher = self.pool.dispatcher
+        if dispatcher.record is not None:
+            dispatcher.record(PUBLICATION, dispatcher.now(), seat.vtid, id(publisher), id(msg))
+        if state.topic not in work.entry.publishes:
+            work.entry.publishes.add(state.topic)
+        dispatcher.attribution.publish(send, publisher, msg, state, work.origin or NO_ORIGIN)
+        if not self.published:
+            self.published = monotonic_ns()
+
+    def ends_soon(self) -> bool:
+        """Return whether this callback has ended soon after it published, the last times."""
+        work = self.seat.work
+        return work is not None and work.entry.soon >= work.entry.soon_from
+
+    def ended(self, entry: Entry, now: int) -> None:
+        """Note how soon after publishing a callback has ended."""
+        if now - self.published < SOON_NS:
+            entry.soon += 1
+        else:
+            if entry.soon >= entry.soon_from:
+                entry.soon_from *= SOON_DOUBT
+            entry.soon = 0
+        self.published = 0
 
     def waits(self) -> Any:
         """Lend the worker's place while entered."""
@@ -189,7 +229,7 @@ class Pool:
         state = self._scheduler.state
         if self.dispatcher.held:
             return
-        while self.running and state.ready and state.scalars[N_IDLE] > 0:
+        while self.running and (state.ready or state.unpolled) and state.scalars[N_IDLE] > 0:
             x = schedule(self.dispatcher.tables, state, self._key, now)
             if state.decisions:
                 self.dispatcher.decided(now)
@@ -226,7 +266,7 @@ class Pool:
         work = seat.work
         assert work is not None
         previous = current.running
-        current.running = seat.running
+        running = current.running = seat.running
         waits_for: Any = None
         ran = True
         start = monotonic_ns() + dispatcher.clock_offset
@@ -238,17 +278,17 @@ class Pool:
             dispatcher.fail(error)
         end = monotonic_ns() + dispatcher.clock_offset
         current.running = previous
-        if ran and dispatcher.record is not None:
-            self._record(work, seat, start, end)
+        if running.published:
+            running.ended(work.entry, end - dispatcher.clock_offset)
         with self._lock:
             now = dispatcher.core_time(end)
             work.entry.busy_ns += end - start
             if not ran:
                 dispatcher.give_up(work, now)
             elif waits_for is None:
-                dispatcher.complete(work, end, now, seat.vtid)
+                dispatcher.complete(work, start, end, now, seat)
             else:
-                dispatcher.suspend(work)
+                dispatcher.suspend(work, start, end, seat)
             self._next(seat, more, now)
         if waits_for is not None:
             self._resume_when_done(work, waits_for)
@@ -271,25 +311,9 @@ class Pool:
                 self.dispatcher.decided(now)
             if x >= 0:
                 self._assign(seat, x)
-            if not state.ready:
+            if not state.ready and not state.unpolled:
                 return
         self._dispatch(now)
-
-    def _record(self, work: Work, seat: Seat, start: int, end: int) -> None:
-        record = self.dispatcher.record
-        assert record is not None
-        _, dag, job, vertex = work.origin or NO_ORIGIN
-        tables = self.dispatcher.tables
-        index, deadline = -1, 0
-        if dag >= 0:
-            index = tables.index_in_dag[vertex]
-            deadline = self.dispatcher.release_of(work) + tables.rad_offset[vertex]
-        address = work.entry.address
-        record(
-            'dispatch', start, seat.vtid, address, dag, index, job, seat.worker, work.ready_ns,
-            deadline)
-        record('callback_start', start, seat.vtid, address, False)
-        record('callback_end', end, seat.vtid, address)
 
     # --- waiting ---------------------------------------------------------------------------------
 
@@ -298,10 +322,22 @@ class Pool:
             with self._lock:
                 self._polled.append(work)
         else:
-            waits_for.add_done_callback(lambda _: self.dispatcher.resume(work))
+            waits_for.add_done_callback(AtOnce(partial(self.dispatcher.resume, work)))
+
+    def is_idle(self) -> bool:
+        """Return whether nothing runs and nothing is ready."""
+        state = self._scheduler.state
+        return not state.ready and state.scalars[N_IDLE] >= self.dispatcher.n_workers
 
     def resume_polled(self) -> bool:
-        """Let coroutines look again that wait for something unknown; False: there are none."""
+        """
+        Let coroutines look again that wait for something unknown; False: there are none.
+
+        And wake idle workers for what is still there because a worker was expected to take it.
+        """
+        if self._scheduler.state.ready or self._scheduler.state.unpolled:
+            with self._lock:
+                self._dispatch(self.dispatcher.tick())
         if not self._polled:
             return False
         with self._lock:

@@ -21,6 +21,8 @@ import time
 from typing import Any
 
 from mddag_executor.live.attribution import Origin
+from mddag_executor.live.crossings import header_stamp
+from mddag_executor.live.direct import Watch
 from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.entries import Entry, Work
 from mddag_executor.live.recorder import Recorder
@@ -65,6 +67,13 @@ class Receiver:
             self._dispatcher.timer_due(
                 entry, Work(entry, timer.callback, ()), due_ns + self._dispatcher.clock_offset)
 
+    def on_missed(self, timer: Any, due_ns: int, count: int) -> None:
+        """Take in that periods were skipped since nobody was there to look at the timer."""
+        entry = self._registry[timer]
+        if entry is not None:
+            self._dispatcher.timer_missed(
+                entry, due_ns + self._dispatcher.clock_offset, timer.timer_period_ns, count)
+
     def on_message(self, subscription: Any, message: Any, info: dict[str, Any]) -> None:
         """Take in a message with its info."""
         entry = self._registry[subscription]
@@ -74,30 +83,38 @@ class Receiver:
         work = Work(entry, subscription.callback, args)
         origin: Origin | None = None
         release: int | None = None
+        stamp = -1
         if entry.source >= 0:
-            release = self._release(entry, message, info)
+            release, stamp = self._release(entry, message, info)
         elif entry.targets:
             origin = self._dispatcher.attribution.find(
                 entry.topic, info['source_timestamp'], info.get('publication_sequence_number'))
+            if origin is None and entry.enters >= 0:
+                stamp = header_stamp(message)
+                release = self._steady(stamp)
         if self._recorder is not None:
             self._recorder.taken(entry, message, info['source_timestamp'])
-        self._dispatcher.message(entry, work, origin, release)
+        self._dispatcher.message(entry, work, origin, release, stamp)
 
-    def _release(self, entry: Entry, message: Any, info: dict[str, Any]) -> int:
-        """Return the release of the job that a source's message starts, on the trace's clock."""
-        now = self._dispatcher.now()
+    def _release(self, entry: Entry, message: Any, info: dict[str, Any]) -> tuple[int, int]:
+        """
+        Return the release of the job that a source's message starts, on the trace's clock.
+
+        :return: the release, and the header's stamp where it comes from that, else -1.
+        """
         kind = self._release_from[self._dispatcher.tables.dag_of[entry.source]]
         if kind == 'arrival':
-            return now
+            return self._dispatcher.now(), -1
         if kind == 'source_timestamp':
-            stamp = info['source_timestamp']
-        else:
-            header = getattr(message, 'header', message)
-            stamp = getattr(header, 'stamp', None)
-            if stamp is None:
-                return now  # a raw or headerless message: all that is known is its arrival
-            stamp = stamp.sec * 1_000_000_000 + stamp.nanosec
-        return int(stamp) + now - time.time_ns()  # from system time to the steady clock
+            return self._steady(info['source_timestamp']), -1
+        stamp = header_stamp(message)
+        if stamp < 0:  # raw, without a header, or not stamped: all that is known is its arrival
+            return self._dispatcher.now(), -1
+        return self._steady(stamp), stamp
+
+    def _steady(self, stamp: int) -> int:
+        """Return a system time on the trace's clock."""
+        return self._dispatcher.now() - time.time_ns() + stamp
 
     def on_request(self, service: Any, request: Any, header: Any) -> None:
         """Take in a service request."""
@@ -129,6 +146,9 @@ class Receiver:
 
     def on_waitable(self, waitable: Any, data: Any) -> None:
         """Take in what a waitable has taken."""
+        if type(waitable) is Watch:
+            waitable.look()
+            return
         entry = self._registry[waitable]
         if entry is None:
             return

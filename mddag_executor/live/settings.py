@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 import os
 
 from mddag_executor.errors import UsageError
@@ -25,6 +26,59 @@ from msg_graph import load, parse_duration, TaskSet
 INTAKES = ('auto', 'events', 'waitset')
 DEFAULT_WORKERS = 7
 POLICIES = ('SCHED_OTHER', 'SCHED_BATCH', 'SCHED_FIFO', 'SCHED_RR')
+SHORTEST_DIAGNOSTICS_NS = 10_000_000
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """
+    What makes a status of ``/diagnostics`` worse than OK.
+
+    :ivar warn_ratio: WARN when this share of the window's results missed their deadlines.
+    :ivar warn_burst: WARN when so many misses came in one period of the diagnostics.
+    :ivar error_ratio: ERROR when this share of the window's results missed them, and they are
+        ``warn_burst`` or more (two results of which one is late are no proof).
+    :ivar window: how many periods of the diagnostics the window has.
+    :ivar stale_periods: STALE when a source has released nothing for so many of its periods, and
+        for a period of the diagnostics.
+    :ivar name: what stands before the names of the statuses, for robots with several processes.
+    """
+
+    warn_ratio: float = 0.01
+    warn_burst: int = 3
+    error_ratio: float = 0.1
+    window: int = 10
+    stale_periods: int = 3
+    name: str = 'mddag'
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for field in ('warn_ratio', 'error_ratio'):
+            value = getattr(self, field)
+            if not 0.0 < value <= 1.0:
+                raise UsageError(f'{field}: {value} is no share: give more than 0, at most 1')
+        for field in ('warn_burst', 'window', 'stale_periods'):
+            value = getattr(self, field)
+            if value < 1:
+                raise UsageError(f'{field}: {value} is too few: give at least 1')
+
+
+def diagnostics_period_ns(period: int | str | None) -> int | None:
+    """
+    Return the period of the diagnostics in ns, None for none.
+
+    :param period: ns, or text as ``1s``; None or 0: no diagnostics.
+    :raises UsageError: when it is too short.
+    """
+    if isinstance(period, str):
+        period = parse_duration(period)
+    if not period:
+        return None
+    if period < SHORTEST_DIAGNOSTICS_NS:
+        raise UsageError(
+            f'diagnostics_period: {period} ns is too short: give at least '
+            f'{SHORTEST_DIAGNOSTICS_NS // 1_000_000}ms, or 0 for none')
+    return period
 
 
 def resolve(

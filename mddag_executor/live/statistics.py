@@ -24,6 +24,10 @@ from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 
 
+def _judged(sink: dict[str, Any]) -> bool:
+    return any(sink[key] for key in ('completed', 'late', 'expired', 'aborted'))
+
+
 def statistics(
     dispatcher: Dispatcher, pool: Pool, registry: Registry, recorder: Recorder | None
 ) -> dict[str, Any]:
@@ -40,9 +44,14 @@ def statistics(
         waiting = dispatcher.scheduler.queue_length
         idle = dispatcher.scheduler.idle_workers
         undeclared = dispatcher.undeclared
+        elsewhere = set() if dispatcher.crossings is None else dispatcher.crossings.elsewhere()
     callbacks = registry.counts()
     never_ran = [c.key for c in registry.declared
-                 if c.key not in callbacks or not callbacks[c.key]['ran']]
+                 if c.key not in elsewhere
+                 and (c.key not in callbacks or not callbacks[c.key]['ran'])]
+    for dag in result['dags'].values():  # their sinks are judged where they are
+        dag['sinks'] = {name: sink for name, sink in dag['sinks'].items()
+                        if name.partition('@')[0] not in elsewhere or _judged(sink)}
     return {
         'policy': dispatcher.scheduler.policy.name, 'workers': dispatcher.n_workers,
         **result, 'callbacks': callbacks, 'undeclared': undeclared,

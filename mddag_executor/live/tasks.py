@@ -17,10 +17,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 import inspect
 from typing import Any
 
-from mddag_executor.live.entries import Entry, TaskWork
+from mddag_executor.live.entries import AtOnce, Entry, TaskWork
 from rclpy.task import Future, Task
 
 
@@ -56,7 +57,7 @@ def make_task(
     work.coroutine = coroutine
     work.then = _raise_unobserved
     if coroutine is not None:
-        Future.add_done_callback(task, lambda _: resume(work))  # not an observer
+        Future.add_done_callback(task, AtOnce(partial(resume, work)))  # not an observer
     return task, work
 
 

@@ -19,9 +19,9 @@ Theory of operation
 -------------------
 rcl keeps a timer's state (next call time, period, cancelled), and stays the authority: whether a
 timer is due is asked of rcl, and ``call_timer`` moves it on (missed periods are skipped there, the
-phase is kept). What is kept here is only when to ask: the next due time of each timer in a heap.
-So a wake-up costs the same beside ten timers and beside a thousand, where a wait set has to be
-filled with all of them again.
+phase is kept; ``on_missed`` tells how many they were). What is kept here is only when to ask: the
+next due time of each timer in a heap. So a wake-up costs the same beside ten timers and beside a
+thousand, where a wait set has to be filled with all of them again.
 
 Nominal due time
     rcl tells how long it is *until* the next call, not when that is. Reading the clock before and
@@ -52,14 +52,11 @@ import time
 from typing import Any
 
 from mddag_executor.live.entities import Receiver
+from mddag_executor.live.slots import Slot, TOLERANCE_NS, WIDE_NS
 from rclpy.clock import Clock, JumpHandle, JumpThreshold
-from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.timer import Timer
-
-TOLERANCE_NS = 20_000
-"""How far a due time may be off the phase grid before the grid is anchored anew."""
 
 # Scans happen at most and at least that often, and at most while a timer is cancelled; and they
 # are repeated only after so many times what the last one took, so they have 1 % of a CPU at most.
@@ -68,9 +65,6 @@ SCAN_SHARE = 100
 
 # A timer without a period is always due; so often it is handed over.
 ZERO_PERIOD_NS = 1_000_000
-
-# An interval wider than this comes from a preempted thread and is measured again.
-WIDE_NS = 50_000
 
 _now = time.monotonic_ns
 _PR_SET_TIMERSLACK = 29
@@ -88,72 +82,6 @@ def sharpen_wake_ups() -> None:
         pass
 
 
-class _Slot:
-    """A timer with its phase grid; ``entry`` is the number of its one valid heap entry, or 0."""
-
-    __slots__ = (
-        'timer', 'handle', 'until', 'call', 'get_period', 'overridden',
-        'period', 'anchor', 'due', 'entry', 'cancelled', 'simulated')
-
-    def __init__(self, timer: Timer) -> None:
-        handle = timer.handle
-        self.timer = timer
-        self.handle: Any = handle
-        self.until: Callable[[], int | None] = handle.time_until_next_call
-        self.call: Callable[[], None] = handle.call_timer
-        self.get_period: Callable[[], int] = handle.get_timer_period
-        clock = timer.clock
-        self.overridden: Callable[[], bool] | None = None
-        if clock.clock_type == ClockType.ROS_TIME:
-            self.overridden = clock.handle.get_ros_time_override_is_enabled
-        self.period = self.get_period()
-        self.anchor = 0
-        self.due = 0
-        self.entry = 0
-        self.cancelled = False
-        self.simulated = False
-
-    def measure(self) -> tuple[int, int] | None:
-        """Return an interval that holds the next call time, or None when cancelled."""
-        best: tuple[int, int] | None = None
-        for _ in range(4):
-            before = _now()
-            until = self.until()
-            after = _now()
-            if until is None:
-                return None
-            if best is None or after - before < best[1] - best[0]:
-                best = before + until, after + until
-            if after - before < WIDE_NS:
-                break
-        return best
-
-    def take_anchor(self) -> bool:
-        """Anchor the phase grid at the next call time; False when cancelled."""
-        self.period = self.get_period()
-        best: tuple[int, int] | None = None
-        for _ in range(5):
-            interval = self.measure()
-            if interval is None:
-                return False
-            if best is None or interval[1] - interval[0] < best[1] - best[0]:
-                best = interval
-        assert best is not None
-        self.anchor = self.due = (best[0] + best[1]) // 2
-        return True
-
-    def grid_point(self, low: int, high: int) -> int | None:
-        """Return the point of the phase grid in an interval, or None if there is none."""
-        period = self.period
-        if period <= 0:
-            return None
-        middle = (low + high) // 2
-        point: int = self.anchor + (middle - self.anchor + period // 2) // period * period
-        if low - TOLERANCE_NS <= point <= high + TOLERANCE_NS:
-            return point
-        return None
-
-
 class TimerQueue:
     """
     The timers of an intake, by due time. All methods belong to one thread at a time.
@@ -165,12 +93,13 @@ class TimerQueue:
 
     def __init__(self, receiver: Receiver, wake: Callable[[], None]) -> None:
         self._on_timer = receiver.on_timer
+        self._on_missed = receiver.on_missed
         self._on_error = receiver.on_intake_error
         self._hold = receiver.hold
         self._let_go = receiver.let_go
         self._wake = wake
-        self._slots: dict[int, _Slot] = {}
-        self._heap: list[tuple[int, int, _Slot]] = []
+        self._slots: dict[int, Slot] = {}
+        self._heap: list[tuple[int, int, Slot]] = []
         self._entries = 0
         self._jumps: dict[int, tuple[Clock, JumpHandle]] | None = None
         self._jumped = False
@@ -183,12 +112,12 @@ class TimerQueue:
 
     def update(self, timers: Iterable[Timer]) -> None:
         """Set which timers there are; those that stay keep their phase grid."""
-        slots: dict[int, _Slot] = {}
+        slots: dict[int, Slot] = {}
         for timer in timers:
             slot = self._slots.get(id(timer))
             if slot is None:
                 try:
-                    slot = _Slot(timer)
+                    slot = Slot(timer)
                 except Exception as error:
                     if not isinstance(error, InvalidHandle) and _alive(timer):
                         self._on_error(error)
@@ -290,7 +219,7 @@ class TimerQueue:
         self._scan_early = end + max(min(SCAN_GAP_NS, shortest), rest)
         self._scan_latest = end + max(shortest, rest)
 
-    def _look_at(self, slot: _Slot) -> None:
+    def _look_at(self, slot: Slot) -> None:
         simulated = slot.overridden is not None and slot.overridden()
         if simulated != slot.simulated:
             slot.simulated = simulated
@@ -314,7 +243,7 @@ class TimerQueue:
             return
         self._aim(slot, low, high)
 
-    def _aim(self, slot: _Slot, low: int, high: int) -> None:
+    def _aim(self, slot: Slot, low: int, high: int) -> None:
         """Put a timer into the heap whose next call time lies in this interval."""
         period = slot.get_period()
         point = slot.grid_point(low, high) if period == slot.period and slot.anchor else None
@@ -325,18 +254,18 @@ class TimerQueue:
             return
         self._push(slot, slot.due)
 
-    def _park(self, slot: _Slot) -> None:
+    def _park(self, slot: Slot) -> None:
         """Note that a timer is cancelled: only a scan finds out that it was reset."""
         slot.cancelled = True
         self._scan_latest = min(
             self._scan_latest, _now() + max(slot.period, SCAN_CANCELLED_NS))
 
-    def _push(self, slot: _Slot, due: int) -> None:
+    def _push(self, slot: Slot, due: int) -> None:
         self._entries += 1
         slot.entry = self._entries
         heappush(self._heap, (due, self._entries, slot))
 
-    def _fire(self, slot: _Slot) -> int:
+    def _fire(self, slot: Slot) -> int:
         """Call a timer if rcl agrees that it is due; return how many were handed over."""
         try:
             with slot.handle:
@@ -348,11 +277,14 @@ class TimerQueue:
             return 0
         try:
             self._on_timer(slot.timer, due)
+            if slot.missed:
+                missed, slot.missed = slot.missed, 0
+                self._on_missed(slot.timer, due, missed)
         except Exception as error:
             self._on_error(error)
         return 1
 
-    def _call(self, slot: _Slot) -> int | None:
+    def _call(self, slot: Slot) -> int | None:
         """Call a timer and aim at its next due time; return the one that it had, if it had."""
         before = _now()
         until = slot.until()
@@ -395,11 +327,12 @@ class TimerQueue:
         if slot.due < before:
             # rcl skips missed periods too; it read its clock later, so it can be ahead of this,
             # which then shows as "not due yet".
-            slot.due += -(-(before - slot.due) // period) * period
+            slot.missed = -(-(before - slot.due) // period)
+            slot.due += slot.missed * period
         self._push(slot, slot.due)
         return due
 
-    def _failed(self, slot: _Slot, error: Exception) -> None:
+    def _failed(self, slot: Slot, error: Exception) -> None:
         """Sort out an exception of rcl: the timer was destroyed, cancelled, or it is an error."""
         slot.entry = 0
         if isinstance(error, InvalidHandle) or not _alive(slot.timer):

@@ -93,6 +93,8 @@ class Verdicts:
         self._tables = tables
         self._on_miss = on_miss
         self._fail = fail
+        #: Told DAG and release of each job that starts, under the dispatcher's lock.
+        self.on_release: Callable[[int, int], None] | None = None
         self.misses: deque[DeadlineMiss] = deque()
         self._aborted: dict[tuple[int, int], None] = {}
 
@@ -148,6 +150,8 @@ class Verdicts:
     def released(self, dag: int, job: int, release: int, now: int) -> None:
         """Take in that a job was released."""
         self.tally.released(dag)
+        if self.on_release is not None:
+            self.on_release(dag, release)
         if self.record is not None:
             self.record('job_release', now, threading.get_native_id(), dag, job, release)
 

@@ -157,6 +157,10 @@ class WaitSetIntake:
         if not pending and (self._polling or self.running):
             self.wake()
 
+    def settled(self) -> bool:
+        """Return whether what was set by ``update`` has come into force."""
+        return not self._changed or not self.running
+
     def wake(self) -> None:
         """End the present wait, or the next one, early; from any thread."""
         try:

@@ -20,7 +20,8 @@ the scheduler core would have done with its releases and execution times.
 """
 
 from mddag_executor.replay.as_recorded import Replay, replay
+from mddag_executor.replay.for_caret import caret_events
 from mddag_executor.replay.recording import ReplayError
 from mddag_executor.replay.reschedule import Reschedule, reschedule
 
-__all__ = ['Replay', 'ReplayError', 'Reschedule', 'replay', 'reschedule']
+__all__ = ['Replay', 'ReplayError', 'Reschedule', 'caret_events', 'replay', 'reschedule']

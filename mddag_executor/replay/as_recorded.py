@@ -16,18 +16,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import os
-from typing import Any
+from typing import Any, Protocol
 
-from mddag_executor.replay.follower import Follower
+from mddag_executor.replay.follower import Event, Observer
+from mddag_executor.replay.following import (
+    AnyFollower,
+    AnyMapping,
+    AnyRecording,
+    make_follower,
+    map_recording,
+    merged,
+    open_recording,
+)
+from mddag_executor.replay.groups import RecordedGroups
+from mddag_executor.replay.imported import ImportedRecording
+from mddag_executor.replay.imported_jobs import ImportedFollower
 from mddag_executor.replay.judge import Judge
-from mddag_executor.replay.mapping import Mapping
-from mddag_executor.replay.recording import Recording
+from mddag_executor.replay.own_paths import OwnPaths
+from mddag_executor.replay.path_results import path_results
+from mddag_executor.replay.paths import PathBook
+from mddag_executor.replay.seen import Seen
 from mddag_executor.replay.usage import share, Usage
+from mddag_executor.replay.waits import GroupWaits
 from msg_graph import TaskSet
 
 Progress = Callable[[int], None]
+
+
+class Watcher(Protocol):
+    """Who wants to be told of a run while it is replayed (a report, an export)."""
+
+    def observers(self, task_set: TaskSet, judge: Judge) -> Sequence[Observer]:
+        """Return observers; they are told after the judge."""
+
+    def handlers(self) -> dict[str, Callable[[Event], None]]:
+        """Return what else the follower is to tell."""
 
 
 class Replay:
@@ -38,9 +63,11 @@ class Replay:
     """
 
     def __init__(
-        self, recording: Recording, mapping: Mapping, judge: Judge, usage: Usage,
-        follower: Follower,
+        self, recording: AnyRecording, mapping: AnyMapping, judge: Judge, usage: Usage,
+        follower: AnyFollower, paths: PathBook | None = None, seen: Seen | None = None,
     ) -> None:
+        self._paths = paths
+        self._seen = seen
         self._recording = recording
         self._judge = judge
         self._usage = usage
@@ -75,18 +102,36 @@ class Replay:
             sinks = result['dags'][dag.name]['sinks']
             first = self._judge.tables.first_vertex[dag.index]
             for local in dag.sinks:
-                sinks[dag.vertices[local].name]['breakdown'] = self._judge.chains.result(
-                    self.task_set, first + local)
+                sink = sinks[dag.vertices[local].name]
+                sink['breakdown'] = self._judge.chains.result(self.task_set, first + local)
+                sink['slack_ns'] = slack(sink)
         return {
             **result, 'rescheduled': False, 'callbacks': self._usage.callbacks(),
             'undeclared': self._usage.undeclared.result(),
             'worker_use': self._usage.workers(head.workers, duration),
             'dropped': dict(sorted(self._follower.dropped.items())),
+            'paths': {} if self._paths is None else path_results(self._paths),
+            **({} if self._seen is None else {
+                'recorded_callbacks': self._seen.callbacks(),
+                'communications': self._seen.communications()}),
             'recording': recording_result(self._recording, self._follower),
             'warnings': self.warnings}
 
 
-def recording_result(recording: Recording, follower: Follower) -> dict[str, Any]:
+def slack(sink: dict[str, Any]) -> dict[str, int] | None:
+    """
+    Return how much before its deadline a sink completed, ns; negative where it was late.
+
+    ``p1`` is what 99 % of the completions had at least.
+    """
+    response, deadline = sink['response_ns'], sink['relative_deadline_ns']
+    if response is None:
+        return None
+    return {name: deadline - response[of] for name, of in (
+        ('min', 'max'), ('p1', 'p99'), ('median', 'median'), ('max', 'min'))}
+
+
+def recording_result(recording: AnyRecording, follower: AnyFollower) -> dict[str, Any]:
     """Return the part of a result that tells of the trace itself."""
     return {
         'trace': recording.name, 'declaration': recording.head.file,
@@ -100,6 +145,7 @@ def replay(
     *,
     name: str | None = None,
     progress: Progress | None = None,
+    watcher: Watcher | None = None,
 ) -> Replay:
     """
     Replay a trace as recorded.
@@ -107,24 +153,43 @@ def replay(
     Memory depends on the jobs that are open at one time, and on the number of sinks' completions
     (their response times are kept), not on the trace's length.
 
-    :param path: a trace of this executor.
-    :param task_set: the declaration that judges; None: the one in the trace.
+    :param path: a trace of this executor, or an imported one.
+    :param task_set: the declaration that judges; None: the one in the trace, if it has one.
     :param name: what messages call the trace, where that is not its path.
     :param progress: told now and then how many events have been read.
+    :param watcher: who else is told of the run.
     :raises mddag_executor.trace.TraceError: when it is no trace.
     :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, or none of
         the declaration's callbacks.
     """
-    return replay_recording(Recording(path, name), task_set, progress)
+    return replay_recording(open_recording(path, name), task_set, progress, watcher)
 
 
 def replay_recording(
-    recording: Recording, task_set: TaskSet | None, progress: Progress | None = None
+    recording: AnyRecording, task_set: TaskSet | None, progress: Progress | None = None,
+    watcher: Watcher | None = None,
 ) -> Replay:
     """Replay an open recording as recorded; see ``replay``."""
-    mapping = Mapping(recording, task_set)
-    judge = Judge(mapping.task_set, compare=mapping.same)
-    usage = Usage(mapping.task_set)
-    follower = Follower(recording, mapping, [judge, usage])
+    mapping = map_recording(recording, task_set)
+    groups = RecordedGroups()
+    waits = GroupWaits(groups)
+    judge = Judge(mapping.task_set, mapping.same, waits)
+    usage = Usage(mapping.task_set, waits)
+    observers: list[Observer] = [waits, judge, usage]
+    paths = OwnPaths(mapping.task_set)
+    imported = isinstance(recording, ImportedRecording)
+    handlers = [groups.handlers()]
+    if paths.book and not imported:
+        observers.append(paths)
+        handlers.append(paths.handlers())
+    if watcher is not None:
+        observers.extend(watcher.observers(mapping.task_set, judge))
+        handlers.append(watcher.handlers())
+    seen = Seen()
+    follower = make_follower(recording, mapping, observers, merged(*handlers), [seen])
+    if isinstance(follower, ImportedFollower):
+        follower.run(progress)
+        return Replay(recording, mapping, judge, usage, follower, follower.paths, seen)
+    paths.follower = follower
     follower.run(progress)
-    return Replay(recording, mapping, judge, usage, follower)
+    return Replay(recording, mapping, judge, usage, follower, paths.book)

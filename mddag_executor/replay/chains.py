@@ -23,7 +23,8 @@ the source.  Along the chain the response time, completion minus release, splits
 
 * release lag: from the release until the source was ready (a timer noticed late, or, with
   `release_from: header_stamp`, the way of the sensor's message);
-* waiting: from ready to the start of the execution, for a worker or for the callback group;
+* waiting: from ready to the start of the execution, for a worker or for the callback group (the
+  part while another callback of the group ran);
 * executing: from the start until the next vertex was ready, or the execution's end, whichever
   was first;
 * suspended: in between, where a coroutine waited;
@@ -55,11 +56,17 @@ class Breakdown(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A vertex of a chain, the leg that completed it (-1: it still ran), and that execution."""
+    """
+    A vertex of a chain.
+
+    `leg` is the one that completed it (-1: it still ran), `execution` that execution, `group` how
+    much of its waiting was for its callback group, ns.
+    """
 
     vertex: int
     leg: int
     execution: Execution
+    group: int = 0
 
 
 class Worst(NamedTuple):
@@ -71,15 +78,21 @@ class Worst(NamedTuple):
     chain: list[Step]
     breakdown: Breakdown
 
+    @property
+    def group(self) -> int:
+        """Return how much of the waiting was for callback groups, ns."""
+        return sum(step.group for step in self.chain)
+
 
 class SinkTimes:
     """Where the time of a sink's completed jobs went: sums, and the worst job."""
 
-    __slots__ = ('completed', 'sums', 'worst')
+    __slots__ = ('completed', 'sums', 'group', 'worst')
 
     def __init__(self) -> None:
         self.completed = 0
         self.sums = [0] * len(Breakdown._fields)
+        self.group = 0
         self.worst: Worst | None = None
 
     def add(self, worst: Worst) -> None:
@@ -87,6 +100,7 @@ class SinkTimes:
         self.completed += 1
         for i, part in enumerate(worst.breakdown):
             self.sums[i] += part
+        self.group += worst.group
         before = self.worst
         if (before is None
                 or worst.completed - worst.release > before.completed - before.release):
@@ -103,7 +117,7 @@ class Chains:
     def __init__(self, task_set: TaskSet, tables: Tables) -> None:
         self._tables = tables
         # by global vertex and leg: the vertices whose message it is
-        self._before = [before for dag in task_set.dags for before in _publishers(dag.vertices)]
+        self._before = [before for dag in task_set.dags for before in publishers(dag.vertices)]
         for vertex, legs in enumerate(self._before):
             first = tables.first_vertex[tables.dag_of[vertex]]
             self._before[vertex] = [[first + local for local in leg] for leg in legs]
@@ -122,9 +136,11 @@ class Chains:
         if before is None or before.execution.ready != ready:
             self._done[slot][vertex] = Step(vertex, -1, Execution(ready, start, NEVER, NEVER))
 
-    def completed(self, slot: int, vertex: int, leg: int, execution: Execution) -> None:
-        """Take in the execution that completed a vertex."""
-        self._done[slot][vertex] = Step(vertex, leg, execution)
+    def completed(
+        self, slot: int, vertex: int, leg: int, execution: Execution, group: int = 0
+    ) -> None:
+        """Take in the execution that completed a vertex, and its waiting for its group."""
+        self._done[slot][vertex] = Step(vertex, leg, execution, group)
 
     def sink(self, slot: int, vertex: int, job: int, completed: int) -> None:
         """Take in that a sink has completed."""
@@ -179,14 +195,15 @@ class Chains:
             return None
         means = [round(total / times.completed) for total in times.sums]
         return {
-            'mean': dict(zip(Breakdown._fields, means)),
+            'mean': {**dict(zip(Breakdown._fields, means)),
+                     'waiting_group_ns': round(times.group / times.completed)},
             'worst': {
                 'job': worst.job, 'release_ns': worst.release, 'completed_ns': worst.completed,
-                **worst.breakdown._asdict(),
+                **worst.breakdown._asdict(), 'waiting_group_ns': worst.group,
                 'chain': [_step_result(task_set, step) for step in worst.chain]}}
 
 
-def _publishers(vertices: Any) -> list[list[list[int]]]:
+def publishers(vertices: Any) -> list[list[list[int]]]:
     """Return for each vertex and leg the (local) vertices before it that publish the topic."""
     result: list[list[list[int]]] = []
     for vertex in vertices:
@@ -208,4 +225,5 @@ def _step_result(task_set: TaskSet, step: Step) -> dict[str, Any]:
     known = step.leg >= 0
     return {
         'vertex': task_set.vertices[step.vertex].name, 'ready_ns': ready, 'start_ns': start,
-        'end_ns': end if known else None, 'busy_ns': busy if known else None}
+        'end_ns': end if known else None, 'busy_ns': busy if known else None,
+        'waiting_group_ns': step.group if known else None}

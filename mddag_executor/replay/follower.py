@@ -76,6 +76,9 @@ class Execution(NamedTuple):
 class Observer:
     """Is told what happened; does nothing with it."""
 
+    def hosted(self, dag: int, vertices: set[int]) -> None:
+        """Take in which (global) vertices of a DAG the process has from here on."""
+
     def released(self, dag: int, job: int, release: int, now: int) -> None:
         """Take in the release of a job; `now` is when the executor noticed it."""
 
@@ -105,6 +108,12 @@ class Observer:
 
     def finished(self, now: int) -> None:
         """Take in that the run has ended; what it had begun may still complete."""
+
+
+def _who_cares(observers: Sequence[Observer], what: str) -> list[Callable[..., None]]:
+    """Return the methods of that name that are not the one of `Observer`, which does nothing."""
+    return [getattr(observer, what) for observer in observers
+            if getattr(type(observer), what) is not getattr(Observer, what)]
 
 
 class _Running:
@@ -138,10 +147,15 @@ class Follower:
         self._recording = recording
         self._mapping = mapping
         self._observers = observers
+        # what happens most often is told only to those who do something with it
+        self._tell_started = _who_cares(observers, 'started')
+        self._tell_ran = _who_cares(observers, 'ran')
+        self._tell_completed = _who_cares(observers, 'completed')
         self._handlers: dict[str, Callable[[Event], None]] = {
             'ros2:callback_start': self._start,
             'ros2:callback_end': self._end,
             TASK_SET: self._task_set,
+            'mddag:hosted': self._hosted,
             'mddag:job_release': self._release,
             'mddag:dispatch': self._dispatch,
             'mddag:complete': self._complete,
@@ -158,6 +172,8 @@ class Follower:
         #: The run's end, ns: as recorded, or the last thing that the executor's core saw.
         self.end = 0
         self.shut_down = False
+        #: The callback of which observers are told that it has started.
+        self.starting = 0
         self.jobs = 0
         self.lost = 0
         self.dropped: Counter[str] = Counter()
@@ -218,18 +234,26 @@ class Follower:
 
     # --- what a thread runs ----------------------------------------------------------------------
 
+    def running_in(self, thread: int) -> tuple[int, int, int, int, int] | None:
+        """Return callback, DAG, vertex, job and ready time of what a thread runs."""
+        running = self._running.get(thread)
+        if running is None:
+            return None
+        return running.callback, running.dag, running.vertex, running.job, running.ready
+
     def _dispatch(self, event: Event) -> None:
         _, now, _, thread, callback, dag, vertex, job, worker, ready, _ = event
         if not 0 <= ready <= now:
             self._strange[f'{event[0]} before it was ready'] += 1
             self._running.pop(thread, None)
             return
-        if dag >= 0:
-            dag, vertex, _ = self._mapping.look_up(dag, vertex, 0)
+        # what no DAG declares has -1; look_up answers that to other nonsense, too
+        dag, vertex, _ = self._mapping.look_up(dag, vertex, 0)
         self._running[thread] = _Running(callback, dag, vertex, job, worker, ready, now)
+        self.starting = callback
         if dag >= 0:
-            for observer in self._observers:
-                observer.started(dag, vertex, job, ready, now)
+            for started in self._tell_started:
+                started(dag, vertex, job, ready, now)
 
     def _start(self, event: Event) -> None:
         running = self._running.get(event[3])
@@ -258,8 +282,8 @@ class Follower:
         piece = Piece(
             callback, running.dag, running.vertex, running.job, running.worker, ready, start, now,
             first)
-        for observer in self._observers:
-            observer.ran(piece)
+        for ran in self._tell_ran:
+            ran(piece)
 
     def _is_new(self, callback: int, ready: int) -> bool:
         """Tell whether an undeclared callback's piece is the first of its execution."""
@@ -276,6 +300,21 @@ class Follower:
     def _advance(self, now: int) -> None:
         if now > self.end and not self.shut_down:
             self.end = now
+
+    def _hosted(self, event: Event) -> None:
+        _, now, _, _, dag, text = event
+        self._advance(now)
+        words = text.split(',') if text else []
+        declared = self._mapping.vertex
+        if not 0 <= dag < len(declared) or not all(
+                w.isascii() and w.isdigit() and int(w) < len(declared[dag]) for w in words):
+            self._strange[f'{event[0]} of a vertex that is not declared'] += 1
+            return
+        vertices = {declared[dag][int(word)] for word in words} - {-1}
+        dag = self._mapping.dag[dag]
+        if dag >= 0:
+            for observer in self._observers:
+                observer.hosted(dag, vertices)
 
     def _release(self, event: Event) -> None:
         _, now, _, _, dag, job, release = event
@@ -316,8 +355,8 @@ class Follower:
         if last is not None and last[0][:3] == (dag, vertex, job):
             execution = last[1]
             self._open.pop(last[0], None)
-        for observer in self._observers:
-            observer.completed(dag, vertex, job, leg, whole, end, execution)
+        for completed in self._tell_completed:
+            completed(dag, vertex, job, leg, whole, end, execution)
 
     def _expire(self, event: Event) -> None:
         self._job_end(event, False)

@@ -29,10 +29,12 @@ missing in the trace or wrong in this program, and ``differences`` says so.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from mddag_executor.core import NEVER, Scheduler, Tables, Tally
+from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.state import (
+    Decision,
     DROP,
     IDLE,
     JOB_END,
@@ -43,12 +45,15 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tables import CONTINUE
 from mddag_executor.replay.chains import Chains
-from mddag_executor.replay.follower import Execution, Observer
+from mddag_executor.replay.follower import Execution, Observer, Piece
+from mddag_executor.replay.tolerances import MissTally
+from mddag_executor.replay.waits import GroupWaits
 from msg_graph import TaskSet
 
 KEEP_RESPONSES = 1_000_000
 """How many response times are kept for each sink: beyond that, quantiles are of the last ones."""
 
+_KEEP_WAITED = 4096
 _MISSES = {SINK_MISSED, SINK_ABORTED, SINK_EXPIRED}
 
 
@@ -68,17 +73,25 @@ class Judge(Observer):
 
     :param task_set: the declaration that judges.
     :param compare: whether recorded misses must equal those found.
+    :param waits: knows what was waited for; told before.
     """
 
-    def __init__(self, task_set: TaskSet, compare: bool) -> None:
+    def __init__(
+        self, task_set: TaskSet, compare: bool, waits: GroupWaits | None = None
+    ) -> None:
+        self._waits = waits
+        # by DAG, vertex, job and ready time: how long an execution waited for its group, ns
+        self._waited: dict[tuple[int, int, int, int], int] = {}
         tables = Tables.build(task_set, legs=True, groups=False)
         n = tables.n_dags + 1
         self.tables = tables._replace(
             max_active_jobs=[NEVER] * n, expire_after=[NEVER] * n, on_miss=[CONTINUE] * n)
-        self.tally = Tally(task_set, self.tables, KEEP_RESPONSES)
+        self.tally = MissTally(task_set, self.tables, KEEP_RESPONSES)
         self.chains = Chains(task_set, self.tables)
         #: Events that contradict those before them.
         self.contradictions = 0
+        #: Who else is told what the core decides.
+        self.listeners: list[Callable[[Sequence[Decision]], None]] = []
         self._scheduler = Scheduler(self.tables, 1, propagate=False)
         self._slots: dict[tuple[int, int], int] = {}
         self._newest: dict[int, int] = {}
@@ -86,6 +99,11 @@ class Judge(Observer):
         # misses that only one side has seen so far: found here (+1) or recorded (-1)
         self._open_misses: dict[Miss, int] = {}
         self._n_recorded = 0
+
+    def hosted(self, dag: int, vertices: set[int]) -> None:
+        """Expect nothing of a DAG that other processes run."""
+        first, last = self.tables.first_vertex[dag:dag + 2]
+        self._scheduler.expect(dag, [int(v in vertices) for v in range(first, last)])
 
     def released(self, dag: int, job: int, release: int, now: int) -> None:
         """Open the job."""
@@ -101,11 +119,21 @@ class Judge(Observer):
         if slot is not None:
             self.chains.started(slot, vertex, ready, start)
 
+    def ran(self, piece: Piece) -> None:
+        """Keep what a piece waited for."""
+        if self._waits is not None and piece.vertex >= 0 and self._waits.last:
+            self._waited[(piece.dag, piece.vertex, piece.job, piece.ready)] = self._waits.last
+            if len(self._waited) > _KEEP_WAITED:
+                del self._waited[next(iter(self._waited))]
+
     def completed(
         self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
         execution: Execution | None,
     ) -> None:
         """Complete an execution of an open job; later ones are not judged."""
+        waited = 0
+        if execution is not None and self._waited:
+            waited = self._waited.pop((dag, vertex, job, execution.ready), 0)
         slot = self._slots.get((dag, job))
         if slot is None:
             if job > self._newest.get(dag, -1):
@@ -118,7 +146,7 @@ class Judge(Observer):
             return
         scheduler.admit(x, end)
         if scheduler.complete(x, end) and execution is not None:
-            self.chains.completed(slot, vertex, leg, execution)
+            self.chains.completed(slot, vertex, leg, execution, waited)
         self._decided(slot)
 
     def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
@@ -151,6 +179,8 @@ class Judge(Observer):
             return
         decisions = self._scheduler.decisions()
         self.tally.add(decisions)
+        for listener in self.listeners:
+            listener(decisions)
         for kind, dag, vertex, job, deadline, time in decisions:
             if kind == JOB_END:
                 del self._slots[(dag, job)]

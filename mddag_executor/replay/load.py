@@ -13,19 +13,31 @@
 # limitations under the License.
 
 """
-The load of a recorded run: releases, execution times and callback groups, for the core.
+The load of a recorded run: releases, execution times and what took time between them.
 
 Theory of operation
 -------------------
-* The jobs are those that were released, in that order.  A timer's job is ready at its release, a
-  message's when the executor noticed it, which may be later than its release (header stamp).
-* The execution time of a vertex in a job is what its execution took, its legs and the pieces of a
-  coroutine added up.  Where it did not complete (the job was dropped, expired, or open at the
-  end) it is the median of the callback's executions in the recording, or else the declared mean.
-* What no DAG declares loads the workers too: each piece is a job of the undeclared DAG, ready when
-  it was in the recording.  Callback groups of undeclared callbacks are not kept.
-* Declared callbacks keep the callback groups that they had in the recording.  A `group:` of
-  another declaration than the recorded one goes before.
+* The jobs are those that were released, in that order.  A source is ready when it was in the
+  recording, which is a little after a timer's release, or long after that of a message whose
+  header carries it.
+* The executor looks for timers in rounds and dispatches no job of a round before it has noticed
+  all of it: a more urgent one may follow.  The timers that were due when the first of a round was
+  noticed are one round.
+* The execution time of a vertex in a job is what its execution took, the pieces of a coroutine
+  added up.  Where it did not complete (the job was dropped, expired, or open at the end) it is the
+  median of the callback's executions in the recording, or else the declared mean.
+* Of a sync vertex that is the leg that made it whole.  The legs before it, which only keep their
+  message, load the workers as what no DAG declares does: each piece is a job of the undeclared
+  DAG, ready when it was in the recording.  Callback groups of undeclared callbacks are not kept.
+* *Transport*: a message is there some time after the callback that published it has ended (or
+  before that: it published early).  That is the time from its end to the successor's readiness.
+* *Dispatch*: the time from when an execution could have started (it was ready, its worker and its
+  callback group had nothing else) to when it did.  It is added to the execution time, because the
+  worker is taken.
+* Where there is no such time in a job, the median of the edge, or of all executions, stands in.
+
+Without overheads (``overheads=False``) transport and dispatch take no time and a timer's source is
+ready at its release: what an ideal executor on the same machine would do.
 
 Inside the engine a job's index is its place among the recorded jobs of its DAG; ``jobs`` has the
 indices that were recorded.
@@ -33,13 +45,17 @@ indices that were recorded.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from array import array
+from typing import NamedTuple
 
 from mddag_executor.core import quantile, Tables
 from mddag_executor.replay.follower import Execution, Observer, Piece
+from mddag_executor.replay.groups import RecordedGroups
+from mddag_executor.replay.timed import edges_of, Transports
 from mddag_executor.simulate import Load
-from msg_graph import TaskSet
+from msg_graph import Dag, TaskSet
+
+_UNKNOWN = -1
 
 
 class RecordedLoad(NamedTuple):
@@ -49,6 +65,7 @@ class RecordedLoad(NamedTuple):
     ``jobs`` has, by DAG, the recorded index of each job; ``demand`` the execution times of all
     declared jobs, ns; ``estimated`` counts vertices of jobs whose execution time was not recorded,
     ``executions`` all of them; ``unknown`` names callbacks of which no time is known at all.
+    ``dispatch_ns`` and ``transport_ns`` are medians of what was measured, None where nothing was.
     """
 
     load: Load
@@ -57,101 +74,227 @@ class RecordedLoad(NamedTuple):
     executions: int
     estimated: int
     unknown: list[str]
+    transports: Transports
+    dispatch_ns: int | None = None
+    transport_ns: int | None = None
+
+
+class _Jobs:
+    """The jobs of one DAG, flat: by job and vertex, or by job and edge; ns, or unknown."""
+
+    def __init__(self, dag: Dag, n_edges: int) -> None:
+        self.size = len(dag.vertices)
+        self.n_edges = n_edges
+        self.publishers = [v.index for v in dag.vertices for _ in v.successors]     # by edge
+        self.numbers: list[int] = []
+        self.row: dict[int, int] = {}
+        self.release = array('q')
+        self.noticed = array('q')
+        self.round = array('q')
+        self.took, self.start, self.end, self.late = (array('q') for _ in range(4))
+        self.arrived = array('q')
+        self._new = array('q', [_UNKNOWN]) * self.size
+        self._new_edges = array('q', [_UNKNOWN]) * n_edges
+
+    def add(self, job: int, release: int, now: int, number: int) -> None:
+        """Take in a job, and the round of timers that it was noticed in (or none)."""
+        self.row[job] = len(self.numbers)
+        self.numbers.append(job)
+        self.release.append(release)
+        self.noticed.append(max(release, now))
+        self.round.append(number)
+        for column in (self.took, self.start, self.end, self.late):
+            column.extend(self._new)
+        self.arrived.extend(self._new_edges)
 
 
 class LoadBuilder(Observer):
-    """Collects a load while it is told what happened."""
+    """
+    Collects a load while it is told what happened.
 
-    def __init__(self, task_set: TaskSet, tables: Tables) -> None:
+    :param groups: the callback groups, as far as the recording has told of them.
+    """
+
+    def __init__(self, task_set: TaskSet, tables: Tables, groups: RecordedGroups) -> None:
         self._task_set = task_set
         self._first = tables.first_vertex
+        self._groups = groups
+        self._jobs = [_Jobs(dag, n) for dag, n in zip(task_set.dags, edges_of(tables))]
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
-        self._sizes = [len(d.vertices) for d in task_set.dags]
-        self._row: dict[tuple[int, int], int] = {}
-        self._jobs: list[list[int]] = [[] for _ in task_set.dags]
-        # (time when ready, DAG, place of the job in its DAG, release)
-        self._releases: list[tuple[int, int, int, int]] = []
-        # by DAG, flat: what each vertex of each job took, and whether it completed
-        self._took: list[list[int]] = [[] for _ in task_set.dags]
-        self._whole = [bytearray() for _ in task_set.dags]
-        # (time when ready, what it took)
-        self._undeclared: list[tuple[int, int]] = []
+        # when each round of timers ended, and when the last one began
+        self._rounds = array('q')
+        self._round_began = _UNKNOWN
+        # by global vertex and leg: the edges (numbers in their DAG) that its message makes true
+        self._edges_into = [legs for dag in task_set.dags for legs in _edges_into(dag)]
+        # (time when ready, what it took): undeclared callbacks, and legs that completed nothing
+        self._others: list[tuple[int, int]] = []
+        self._leg: tuple[Execution, tuple[int, int]] | None = None
+        self._worker_free: dict[int, int] = {}
+        self._group_free: dict[int, int] = {}
         #: By global vertex: the address of the callback that ran as it.
         self.callback_of: dict[int, int] = {}
 
     def released(self, dag: int, job: int, release: int, now: int) -> None:
         """Take in a job."""
-        row = len(self._jobs[dag])
-        self._row[(dag, job)] = row
-        self._jobs[dag].append(job)
-        ready = release if self._timer[dag] else max(release, now)
-        self._releases.append((ready, dag, row, release))
-        self._took[dag].extend([0] * self._sizes[dag])
-        self._whole[dag].extend(bytes(self._sizes[dag]))
+        number = _UNKNOWN
+        if self._timer[dag]:
+            if release > self._round_began:
+                self._round_began = now
+                self._rounds.append(now)
+            self._rounds[-1] = now
+            number = len(self._rounds) - 1
+        self._jobs[dag].add(job, release, now, number)
 
     def ran(self, piece: Piece) -> None:
-        """Add to an execution time."""
-        took = piece.end - piece.start
-        if piece.vertex < 0:
-            self._undeclared.append((piece.ready if piece.first else piece.start, took))
+        """Find out how late a piece was dispatched; keep what is undeclared."""
+        callback, dag, vertex, job, worker, ready, start, end, first = piece
+        row = -1 if vertex < 0 else self._jobs[dag].row.get(job, -1)
+        if row >= 0 and not self._edges_into[vertex]:
+            ready = max(ready, self._round_end(self._jobs[dag], row))
+        group = self._groups.by_callback().get(callback, -1)
+        could = max(ready, self._worker_free.get(worker, 0))
+        if worker >= 0:
+            self._worker_free[worker] = end
+        if group >= 0:
+            could = max(could, self._group_free.get(group, 0))
+            self._group_free[group] = end
+        late = max(0, start - could) if first else 0
+        if vertex < 0:
+            self._others.append((ready if first else start, end - start + late))
             return
-        self.callback_of.setdefault(piece.vertex, piece.callback)
-        row = self._row.get((piece.dag, piece.job))
-        if row is not None:
-            place = row * self._sizes[piece.dag] + piece.vertex - self._first[piece.dag]
-            self._took[piece.dag][place] += took
+        self.callback_of.setdefault(vertex, callback)
+        if first and row >= 0:
+            jobs = self._jobs[dag]
+            jobs.late[row * jobs.size + vertex - self._first[dag]] = late
+
+    def _round_end(self, jobs: _Jobs, row: int) -> int:
+        number = jobs.round[row]
+        return _UNKNOWN if number < 0 else self._rounds[number]
 
     def completed(
         self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
         execution: Execution | None,
     ) -> None:
-        """Note that an execution time is complete."""
-        row = self._row.get((dag, job))
-        if whole and execution is not None and row is not None:
-            self._whole[dag][row * self._sizes[dag] + vertex - self._first[dag]] = 1
+        """Note an execution's times."""
+        jobs = self._jobs[dag]
+        row = jobs.row.get(job)
+        if execution is None or row is None:
+            return
+        several = self._leg is not None and self._leg[0] is execution       # a simulator's
+        if self._leg is not None and not several:
+            self._others.append(self._leg[1])
+        self._leg = None
+        legs = self._edges_into[vertex]
+        for edge in legs[leg] if leg < len(legs) else ():
+            jobs.arrived[row * jobs.n_edges + edge] = execution.ready
+        if not whole:
+            self._leg = execution, (execution.ready, execution.busy)
+            return
+        place = row * jobs.size + vertex - self._first[dag]
+        jobs.took[place] = execution.busy
+        jobs.start[place] = execution.start
+        jobs.end[place] = execution.end
+        if several:
+            self._all_at_once(jobs, row, legs)
+        if not legs and execution.ready >= jobs.release[row]:
+            jobs.noticed[row] = execution.ready
 
-    def build(self) -> RecordedLoad:
+    def _all_at_once(self, jobs: _Jobs, row: int, legs: list[list[int]]) -> None:
+        """Where one execution stands for all legs, only the last message's time is known."""
+        edges = [edge for leg in legs for edge in leg]
+        ends = [jobs.end[row * jobs.size + jobs.publishers[edge]] for edge in edges]
+        for edge, end in zip(edges, ends):
+            if end < max(ends):
+                jobs.arrived[row * jobs.n_edges + edge] = end
+
+    def build(self, overheads: bool = True) -> RecordedLoad:
         """Return what was collected."""
+        import numpy as np
+        if self._leg is not None:
+            self._others.append(self._leg[1])
+            self._leg = None
         typical = self._typical()
         unknown: dict[str, None] = {}
         estimated = 0
         costs: list[int] = []
         bases: list[int] = []
-        for dag in self._task_set.dags:
+        late = np.concatenate([np.asarray(jobs.late) for jobs in self._jobs])
+        late = late[late >= 0]
+        usual = quantile(np.sort(late).tolist(), 0.5) if len(late) else 0
+        demand = 0
+        for dag, jobs in zip(self._task_set.dags, self._jobs):
             bases.append(len(costs))
-            keys = [v.callback.key for v in dag.vertices]
-            for place, whole in enumerate(self._whole[dag.index]):
-                took = self._took[dag.index][place]
-                if not whole:
-                    estimated += 1
-                    key = keys[place % len(keys)]
-                    took = typical.get(key, -1)
-                    if took < 0:
+            took = np.array(jobs.took, dtype=np.int64).reshape(-1, jobs.size)
+            missing = took < 0
+            estimated += int(missing.sum())
+            for vertex in dag.vertices:
+                if missing[:, vertex.index].any():
+                    key = vertex.callback.key
+                    if key not in typical:
                         unknown[key] = None
-                costs.append(max(0, took))
-        demand, executions = sum(costs), len(costs)
+                    took[missing[:, vertex.index], vertex.index] = typical.get(key, 0)
+            demand += int(took.sum())
+            if overheads:
+                own = np.array(jobs.late, dtype=np.int64).reshape(-1, jobs.size)
+                took += np.where(own < 0, usual, own)
+            costs.extend(took.ravel().tolist())
+        executions = len(costs)
         bases.append(len(costs))
-        undeclared = sorted(self._undeclared)
-        costs.extend(max(0, took) for _, took in undeclared)
-        releases = sorted(self._releases + [
-            (ready, len(self._jobs), place, ready)
-            for place, (ready, _) in enumerate(undeclared)])
-        load = Load(
-            [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases], costs,
-            bases, [*self._sizes, 1], [r[3] for r in releases])
+        others = sorted(self._others)
+        costs.extend(max(0, took) for _, took in others)
+        transports, transport = self._transports(overheads)
         return RecordedLoad(
-            load, self._jobs, demand, executions, estimated, list(unknown))
+            self._load(costs, bases, [ready for ready, _ in others], overheads),
+            [jobs.numbers for jobs in self._jobs], demand, executions, estimated, list(unknown),
+            transports, usual if len(late) else None, transport)
+
+    def _load(
+        self, costs: list[int], bases: list[int], others: list[int], overheads: bool
+    ) -> Load:
+        # (time when ready, DAG, place of the job in its DAG, release)
+        releases = [(ready, len(self._jobs), place, ready) for place, ready in enumerate(others)]
+        for dag, jobs in zip(self._task_set.dags, self._jobs):
+            ideal = self._timer[dag.index] and not overheads
+            for row, (release, noticed) in enumerate(zip(jobs.release, jobs.noticed)):
+                ready = release if ideal else max(noticed, self._round_end(jobs, row))
+                releases.append((ready, dag.index, row, release))
+        releases.sort()
+        return Load(
+            [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases], costs,
+            bases, [*(jobs.size for jobs in self._jobs), 1], [r[3] for r in releases])
+
+    def _transports(self, overheads: bool) -> tuple[Transports, int | None]:
+        """Return the transports by job, and the median of all that were measured."""
+        import numpy as np
+        delays: list[int] = []
+        bases: list[int] = []
+        measured = []
+        for jobs in self._jobs:
+            bases.append(len(delays))
+            if jobs.n_edges == 0:
+                continue
+            start, end = (np.array(column, dtype=np.int64).reshape(-1, jobs.size)
+                          for column in (jobs.start, jobs.end))
+            arrived = np.array(jobs.arrived, dtype=np.int64).reshape(-1, jobs.n_edges)
+            ended = end[:, jobs.publishers]
+            found = arrived - ended
+            known = (arrived >= start[:, jobs.publishers]) & (ended >= 0)
+            for edge in range(jobs.n_edges):
+                column = found[known[:, edge], edge]
+                found[~known[:, edge], edge] = np.median(column) if len(column) else 0
+            measured.append(found[known])
+            delays.extend((found if overheads else np.zeros_like(found)).ravel().tolist())
+        everything = np.concatenate([[], *measured])
+        return (Transports(delays, bases, [jobs.n_edges for jobs in self._jobs]),
+                int(np.median(everything)) if len(everything) else None)
 
     def _typical(self) -> dict[str, int]:
         """Return by callback the median of its recorded times, or else the declared mean."""
         recorded: dict[str, list[int]] = {}
-        for dag in self._task_set.dags:
-            size = self._sizes[dag.index]
+        for dag, jobs in zip(self._task_set.dags, self._jobs):
             for vertex in dag.vertices:
-                took = self._took[dag.index][vertex.index::size]
-                whole = self._whole[dag.index][vertex.index::size]
                 recorded.setdefault(vertex.callback.key, []).extend(
-                    t for t, w in zip(took, whole) if w)
+                    took for took in jobs.took[vertex.index::jobs.size] if took >= 0)
         typical = {
             c.key: c.execution_time.mean_ns
             for c in self._task_set.callbacks if c.execution_time is not None}
@@ -160,74 +303,19 @@ class LoadBuilder(Observer):
         return typical
 
 
-class RecordedGroups:
-    """The callback groups of a recording: collects what the executor said at the beginning."""
-
-    def __init__(self) -> None:
-        self._exclusive: dict[int, bool] = {}
-        self._group_of_entity: dict[int, int] = {}
-        self._callbacks_of: dict[int, list[int]] = {}
-
-    def handlers(self) -> dict[str, Callable[[tuple[Any, ...]], None]]:
-        """Return what takes in the events, by full name."""
-        return {
-            'ros2_caret:add_callback_group': self._group,
-            'ros2_caret:callback_group_add_timer': self._entity,
-            'ros2_caret:callback_group_add_subscription': self._entity,
-            'ros2_caret:callback_group_add_service': self._entity,
-            'ros2:rclcpp_timer_callback_added': self._callback,
-            'ros2:rclcpp_subscription_init': self._callback,
-            'ros2:rclcpp_subscription_callback_added': self._callback,
-            'ros2:rclcpp_service_callback_added': self._callback,
-        }
-
-    def _group(self, event: tuple[Any, ...]) -> None:
-        self._exclusive[event[5]] = event[6] == 'mutually_exclusive'
-
-    def _entity(self, event: tuple[Any, ...]) -> None:
-        self._group_of_entity[event[5]] = event[4]
-
-    def _callback(self, event: tuple[Any, ...]) -> None:
-        # also from a subscription's handle to the subscription, which the callback belongs to
-        self._callbacks_of.setdefault(event[4], []).append(event[5])
-
-    def by_callback(self) -> dict[int, int]:
-        """Return by callback its mutually exclusive group, or -1 for a reentrant one."""
-        found: dict[int, int] = {}
-        for entity, group in self._group_of_entity.items():
-            number = group if self._exclusive.get(group) else -1
-            for callback in self._reachable(entity):
-                found[callback] = number
-        return found
-
-    def _reachable(self, entity: int) -> Iterable[int]:
-        seen = {entity: None}
-        todo = [entity]
-        for handle in todo:
-            for after in self._callbacks_of.get(handle, ()):
-                if after not in seen:
-                    seen[after] = None
-                    todo.append(after)
-        return seen
-
-
-def with_groups(
-    tables: Tables, callback_of: dict[int, int], groups: dict[int, int], declared_first: bool
-) -> Tables:
-    """
-    Return tables with the callback groups of a recording.
-
-    :param callback_of: by global vertex the callback that ran as it.
-    :param groups: by callback its group in the recording, -1 for a reentrant one.
-    :param declared_first: whether declared groups go before recorded ones.
-    """
-    numbers: dict[tuple[bool, int], int] = {}
-    column = []
-    for vertex, declared in enumerate(tables.group):
-        recorded = groups.get(callback_of.get(vertex, 0))
-        if recorded is None or (declared_first and declared >= 0):
-            choice = (False, declared)
-        else:
-            choice = (True, recorded)
-        column.append(-1 if choice[1] == -1 else numbers.setdefault(choice, len(numbers)))
-    return tables._replace(group=column, n_groups=len(numbers))
+def _edges_into(dag: Dag) -> list[list[list[int]]]:
+    """Return for each vertex and leg the edges, by number in the DAG, that its message is of."""
+    edges: dict[tuple[int, int], int] = {}
+    for vertex in dag.vertices:
+        for after in vertex.successors:
+            edges[vertex.index, after] = len(edges)
+    result: list[list[list[int]]] = []
+    for vertex in dag.vertices:
+        topics = vertex.callback.topics if vertex.predecessors else ()
+        if vertex.predecessors and len(topics) <= 1:
+            result.append([[edges[p, vertex.index] for p in vertex.predecessors]])
+            continue
+        result.append([
+            [edges[p, vertex.index] for p in vertex.predecessors
+             if topic in dag.vertices[p].callback.publishes] for topic in topics])
+    return result

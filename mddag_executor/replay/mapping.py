@@ -103,11 +103,11 @@ class Mapping:
         if len(missing) == len(judge.callbacks):
             raise ReplayError(
                 recording.name, f'none of the callbacks of {judge.file} is in it: it has '
-                f'{_listed([c.key for c in recording.task_set.callbacks])}',
+                f'{listed([c.key for c in recording.task_set.callbacks])}',
                 'give the graph of the nodes that were recorded, or none')
         self.warnings.append(
             f'{recording.name}: {len(missing)} of the {len(judge.callbacks)} callbacks of '
-            f'{judge.file} are not in it, so they count as never completed: {_listed(missing)}')
+            f'{judge.file} are not in it, so they count as never completed: {listed(missing)}')
 
     def _report_unreleased(self) -> None:
         if self.same:
@@ -116,7 +116,7 @@ class Mapping:
         if missing:
             self.warnings.append(
                 f'{self.task_set.file}: the sources of {len(missing)} DAGs are no sources in the '
-                f'recording, so there are no jobs of them: {_listed(missing)}')
+                f'recording, so there are no jobs of them: {listed(missing)}')
 
 
 def _first_vertices(task_set: TaskSet) -> list[int]:
@@ -147,6 +147,7 @@ def _legs(vertex: Vertex, other: Vertex) -> list[int]:
     return [theirs.index(topic) for topic in topics]
 
 
-def _listed(names: list[str]) -> str:
+def listed(names: list[str]) -> str:
+    """Return the first names of a list, and how many more there are."""
     more = len(names) - _LONGEST_LIST
     return ', '.join(names[:_LONGEST_LIST]) + (f', … ({more} more)' if more > 0 else '')

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 import os
 from typing import Any, NamedTuple
 
@@ -71,11 +71,7 @@ class Recording:
             if None in event:
                 continue  # written by something else: fields are missing
             return Head(event[1], *event[4:])
-        what = 'no run of this executor is recorded in it'
-        if self._reader.warnings:
-            what = 'no run of this executor is recorded in what is left of it, it is damaged'
-        raise ReplayError(
-            self.path, f'{what}: there is no event {TASK_SET}, so there are no jobs', _RECORD)
+        raise no_run(self._reader)
 
     def _declared(self) -> TaskSet:
         if not self.head.yaml.strip():
@@ -107,15 +103,31 @@ class Recording:
         with self._named():
             yield from self._reader.events(names, sorted=True)
 
-    @contextmanager
-    def _named(self) -> Iterator[None]:
-        """Let errors about the file call it by its name."""
-        try:
-            yield
-        except TraceError as error:
-            raise TraceError(self._rename(error.file), error.problem, error.remedy) from None
-        except ReplayError as error:
-            raise ReplayError(self._rename(error.file), error.problem, error.remedy) from None
+    def _named(self) -> AbstractContextManager[None]:
+        return named_errors(self.path, self.name)
 
     def _rename(self, text: str) -> str:
         return self.name + text[len(self.path):] if text.startswith(self.path) else text
+
+
+def no_run(reader: TraceReader) -> ReplayError:
+    """Return the error for a trace, read to its end, without a run of this executor."""
+    what = 'no run of this executor is recorded in it'
+    if reader.warnings:
+        what = 'no run of this executor is recorded in what is left of it, it is damaged'
+    return ReplayError(
+        reader.path, f'{what}: there is no event {TASK_SET}, so there are no jobs', _RECORD)
+
+
+@contextmanager
+def named_errors(path: str, name: str) -> Iterator[None]:
+    """Let errors about a file call it by its name."""
+    def rename(text: str) -> str:
+        return name + text[len(path):] if text.startswith(path) else text
+
+    try:
+        yield
+    except TraceError as error:
+        raise TraceError(rename(error.file), error.problem, error.remedy) from None
+    except ReplayError as error:
+        raise ReplayError(rename(error.file), error.problem, error.remedy) from None

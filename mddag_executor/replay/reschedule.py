@@ -15,9 +15,9 @@
 """
 Replay rescheduled: what the core would have done with the recorded releases.
 
-The recorded load (see ``load``) goes through the engine of the simulator: the same core, the
-graph's edges made true by completions, virtual time.  What became of a job in the recording does
-not matter, only when it was released and how long its callbacks took.
+The recorded load (see ``load``) goes through the core in virtual time (see ``timed``).  What
+became of a job in the recording does not matter, only when it was released, how long its callbacks
+took, and how long the executor took to notice, to dispatch and to carry messages.
 """
 
 from __future__ import annotations
@@ -25,19 +25,27 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from mddag_executor.core import NEVER, POLICIES, Tables, Tally
+from mddag_executor.core import NEVER, POLICIES, Tables
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import new_state
+from mddag_executor.core.state import Decision, new_state
 from mddag_executor.errors import UsageError
 from mddag_executor.replay.as_recorded import Progress, recording_result, Replay
-from mddag_executor.replay.follower import Follower
+from mddag_executor.replay.following import (
+    AnyFollower,
+    AnyRecording,
+    make_follower,
+    map_recording,
+    open_declared,
+)
+from mddag_executor.replay.groups import RecordedGroups, with_groups
 from mddag_executor.replay.judge import Judge
-from mddag_executor.replay.load import LoadBuilder, RecordedGroups, RecordedLoad, with_groups
-from mddag_executor.replay.mapping import Mapping
-from mddag_executor.replay.recording import Head, Recording, ReplayError
+from mddag_executor.replay.load import LoadBuilder, RecordedLoad
+from mddag_executor.replay.recording import Head, ReplayError
+from mddag_executor.replay.timed import busy_times, Engine
+from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share, Usage
-from mddag_executor.simulate.engine import LogEntry, run, START
+from mddag_executor.simulate import LogEntry
 from msg_graph import TaskSet
 
 MAX_WORKERS = 4096
@@ -50,12 +58,14 @@ class Reschedule:
 
     :ivar recorded: the same recording as it was.
     :ivar log: every start, end and preemption, on the trace's clock.
+    :ivar decisions: what the core decided.
     :ivar warnings: what is missing or doubtful, one line each.
     """
 
     def __init__(
-        self, recording: Recording, follower: Follower, recorded: Replay, work: RecordedLoad,
-        tables: Tables, policy: str, workers: int, preemptive: bool,
+        self, recording: AnyRecording, follower: AnyFollower, recorded: Replay, work: RecordedLoad,
+        tables: Tables, policy: str, workers: int, preemptive: bool, overheads: bool,
+        dispatch_overhead: int = 0,
     ) -> None:
         self._recording = recording
         self._follower = follower
@@ -66,20 +76,40 @@ class Reschedule:
         self.policy = policy
         self.workers = workers
         self.preemptive = preemptive
+        self.overheads = overheads
+        self.dispatch_overhead = dispatch_overhead
         self.warnings = recorded.warnings
-        self.log: list[LogEntry] = []
-        self.tally = Tally(self.task_set, tables)
+        self.log: list[LogEntry]
+        self.decisions: list[Decision]
+        self.tally = MissTally(self.task_set, tables)
         self._run()
 
     def _run(self) -> None:
-        state = new_state(self.tables, self.workers, preemptive=self.preemptive)
+        policy = find_policy(self.policy)
+        state = new_state(
+            self.tables, self.workers, preemptive=policy.mode(self.preemptive), propagate=2,
+            dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
         load, end = self._work.load, self._follower.end
-        run(self.tables, state, find_policy(self.policy).key, load, end, False, self.log)
+        engine = Engine(
+            self.tables, state, policy.key, load, self._work.transports)
+        engine.run(end)
+        self.log = engine.log
+        self.decisions = state.decisions
         finish(self.tables, state, end)
         for time, dag in zip(load.times, load.dags):
             if time < end:
                 self.tally.released(dag)
         self.tally.add(state.decisions)
+
+    @property
+    def work(self) -> RecordedLoad:
+        """Return the load that was scheduled."""
+        return self._work
+
+    @property
+    def end_ns(self) -> int:
+        """Return when the run ended, on the trace's clock."""
+        return self._follower.end
 
     def recorded_job(self, dag: int, job: int) -> int:
         """Return the recorded index of a job of the log or tally."""
@@ -87,16 +117,7 @@ class Reschedule:
 
     def worker_busy(self) -> list[int]:
         """Return for each worker how long it was busy, ns."""
-        busy = [0] * self.workers
-        since = [-1] * self.workers
-        for time, kind, worker, *_ in self.log:
-            if since[worker] >= 0:
-                busy[worker] += time - since[worker]
-            since[worker] = time if kind == START else -1
-        for worker, start in enumerate(since):
-            if start >= 0:
-                busy[worker] += self._follower.end - start
-        return busy
+        return busy_times(self.log, self.workers, self._follower.end)
 
     def result(self) -> dict[str, Any]:
         """Return the result format of ``replay --json``, with the recorded run beside it."""
@@ -113,6 +134,10 @@ class Reschedule:
             'utilisation': share(self._work.demand, self.workers, duration),
             **verdicts, 'first_miss': miss, 'rescheduled': True,
             'executions': self._work.executions, 'estimated_executions': self._work.estimated,
+            'overheads': {
+                'included': self.overheads, 'added_ns': self.dispatch_overhead,
+                'dispatch_median_ns': self._work.dispatch_ns,
+                'transport_median_ns': self._work.transport_ns},
             'worker_use': {
                 'busy_ns': {str(w): took for w, took in enumerate(busy)},
                 'use': share(sum(busy), self.workers, duration)},
@@ -130,6 +155,8 @@ def reschedule(
     policy: str | None = None,
     workers: int | None = None,
     preemptive: bool = False,
+    overheads: bool = True,
+    dispatch_overhead: int = 0,
     name: str | None = None,
     progress: Progress | None = None,
 ) -> Reschedule:
@@ -141,6 +168,9 @@ def reschedule(
     :param policy: a row of ``mddag_executor.core.POLICIES``; None: as recorded.
     :param workers: size of the pool; None: as recorded.
     :param preemptive: whether a smaller key takes the worker of a larger one.
+    :param overheads: whether noticing, dispatch and transport take the time that they took in the
+        recording, or none.
+    :param dispatch_overhead: added to each execution, ns.
     :param name: what messages call the trace, where that is not its path.
     :param progress: told now and then how many events have been read.
     :raises mddag_executor.trace.TraceError: when it is no trace.
@@ -149,24 +179,24 @@ def reschedule(
     :raises mddag_executor.errors.MddagError: on a policy or number of workers that can not be.
     """
     if policy is not None:
-        find_policy(policy)
+        find_policy(policy).mode(preemptive)
     if workers is not None and not 1 <= workers <= MAX_WORKERS:
         raise UsageError(f'workers: {workers} can not be: give 1 to {MAX_WORKERS}')
-    recording = Recording(path, name)
+    recording = open_declared(path, name, task_set)
     policy, workers = _settings(recording.head, recording.name, policy, workers)
-    mapping = Mapping(recording, task_set)
+    mapping = map_recording(recording, task_set)
     head = recording.head
     bound = head.max_active_jobs if head.max_active_jobs > 0 else NEVER
     tables = Tables.build(
         mapping.task_set, default_deadline=head.default_deadline, max_active_jobs=bound)
     judge = Judge(mapping.task_set, compare=mapping.same)
     usage = Usage(mapping.task_set)
-    builder = LoadBuilder(mapping.task_set, tables)
     groups = RecordedGroups()
-    follower = Follower(recording, mapping, [judge, usage, builder], groups.handlers())
+    builder = LoadBuilder(mapping.task_set, tables, groups)
+    follower = make_follower(recording, mapping, [judge, usage, builder], groups.handlers())
     follower.run(progress)
     recorded = Replay(recording, mapping, judge, usage, follower)
-    work = builder.build()
+    work = builder.build(overheads)
     if work.unknown:
         raise ReplayError(
             recording.name, f'{len(work.unknown)} callbacks neither completed in it nor declare '
@@ -175,7 +205,8 @@ def reschedule(
     tables = with_groups(
         tables, builder.callback_of, groups.by_callback(), declared_first=not mapping.same)
     return Reschedule(
-        recording, follower, recorded, work, tables, policy, workers, preemptive)
+        recording, follower, recorded, work, tables, policy, workers, preemptive, overheads,
+        dispatch_overhead)
 
 
 def _settings(

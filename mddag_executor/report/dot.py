@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 import re
 
+from mddag_executor.report.layered import place, Rectangle
 from mddag_executor.report.picture import Arrow, Box, DagFrame, Picture
 from mddag_executor.report.text import printable
 
@@ -38,13 +39,15 @@ _CENTRED = '\\n'
 _LEFT = '\\l'
 _WIDTH = 22
 _PIECES = re.compile(r'[^/_]*[/_]?')
-_MANY = 2_000
-"""With more boxes than this Graphviz is told to take short cuts."""
+_MOST_PIXELS = 16_000
+_MANY = 1_000
+"""With more boxes than this the layout is our own, and Graphviz only draws."""
 
 
 def to_dot(picture: Picture) -> str:
     """Return the DOT text of a picture."""
-    return '\n'.join(_lines(picture)) + '\n'
+    boxes = sum(len(node.boxes) for dag in picture.dags for node in dag.nodes)
+    return '\n'.join(_placed_lines(picture) if boxes > _MANY else _lines(picture)) + '\n'
 
 
 def quoted(text: str) -> str:
@@ -68,13 +71,10 @@ def _wrapped(name: str) -> list[str]:
 
 
 def _lines(picture: Picture) -> Iterator[str]:
-    boxes = sum(len(node.boxes) for dag in picture.dags for node in dag.nodes)
     yield 'digraph mddag {'
     yield '  graph [rankdir=LR, compound=true, newrank=false, ranksep=0.35, nodesep=0.1,'
     yield '    fontname="Helvetica", labelloc=t, labeljust=l, fontsize=20,'
     yield f'    label={quoted(picture.title)}]'
-    if boxes > _MANY:
-        yield '  graph [splines=line, nslimit=1, nslimit1=1, mclimit=0.1, searchsize=5]'
     yield '  node [fontname="Helvetica", fontsize=12, margin="0.08,0.04", height=0.3]'
     yield '  edge [arrowsize=0.7]'
     yield from _legend(picture)
@@ -83,6 +83,40 @@ def _lines(picture: Picture) -> Iterator[str]:
     for arrow in picture.arrows:
         yield _arrow(arrow)
     yield '}'
+
+
+def _placed_lines(picture: Picture) -> Iterator[str]:
+    """Yield the lines of a picture with positions, for the layout `nop2`, which only draws."""
+    placed = place(picture)
+    legend = placed[0].at
+    yield 'digraph mddag {'
+    width = max(d.at.x + d.at.width / 2 for d in placed)
+    dots = max(24, min(96, round(_MOST_PIXELS * 72 / width)))
+    yield f'  graph [layout=nop2, splines=line, fontname="Helvetica", dpi={dots}]'
+    yield '  node [fontname="Helvetica", fontsize=10, fixedsize=true]'
+    yield '  edge [arrowsize=0.6]'
+    top = legend.y + legend.height / 2
+    yield (f'  "title" [label={_label([picture.title], _LEFT)}, shape=plaintext, fontsize=24, '
+           f'{_at(Rectangle(300, top + 70, 600, 30))}]')
+    for number, (colour, text) in enumerate(picture.legend):
+        at = Rectangle(60 + 110 * number, top + 35, 100, 24)
+        yield (f'  "k{number}" [label={quoted(text)}, shape=box, style="filled", '
+               f'color={quoted(colour)}, fillcolor={quoted(colour)}, {_at(at)}]')
+    for dag in placed:  # frames first: what comes later is drawn over them
+        yield (f'  {quoted(dag.frame.mark)} [label={_label([dag.frame.title], _LEFT)}, '
+               'shape=box, style="rounded,bold", color="#444444", labelloc=t, fontsize=14, '
+               f'{_at(dag.at)}]')
+    for dag in placed:
+        for box, lines, at in dag.boxes:
+            yield f'  {_box(box, lines)[:-1]}, {_at(at)}]'
+    for arrow in picture.arrows:
+        yield _arrow(arrow)
+    yield '}'
+
+
+def _at(at: Rectangle) -> str:
+    return (f'pos="{at.x:.1f},{at.y:.1f}", width={at.width / 72:.3f}, '
+            f'height={at.height / 72:.3f}')
 
 
 def _dag(dag: DagFrame) -> Iterator[str]:
@@ -99,9 +133,9 @@ def _dag(dag: DagFrame) -> Iterator[str]:
     yield '  }'
 
 
-def _box(box: Box) -> str:
+def _box(box: Box, lines: Iterable[str] | None = None) -> str:
     sink = ', peripheries=2' if box.sink else ''
-    return (f'{quoted(box.mark)} [label={_label(box.lines)}, {_SHAPES[box.kind]}, '
+    return (f'{quoted(box.mark)} [label={_label(lines or box.lines)}, {_SHAPES[box.kind]}, '
             f'fillcolor={quoted(box.colour)}{sink}, tooltip={quoted(box.note)}]')
 
 

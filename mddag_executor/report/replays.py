@@ -16,17 +16,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from mddag_executor.report.tables import counts, percent, short_names, total
 from mddag_executor.report.text import Cell, format_ns, printable, table
 
 _TIMES_HEADER = (
-    'DAG', 'sink', 'release lag', 'waiting', 'executing', 'suspended', 'transport',
-    'worst job', 'waiting', 'executing', 'suspended', 'transport')
-_CALLBACKS_HEADER = (
+    'DAG', 'sink', 'release lag', 'waiting', 'for group', 'executing', 'suspended', 'transport',
+    'worst job', 'waiting', 'for group', 'executing', 'suspended', 'transport')
+CALLBACKS_HEADER = (
     'callback', 'executions', 'busy', 'mean', 'longest', 'mean wait', 'longest wait')
+PATHS_HEADER = ('path', 'arrived', 'case', 'count', 'min', 'median', 'p99', 'max')
 _COMPARISON_HEADER = (
     'DAG', 'sink', 'deadline', 'in time', 'recorded', 'median', 'recorded', 'p99', 'recorded',
     'max', 'recorded')
@@ -41,7 +42,7 @@ def times_table(dags: Mapping[str, Any]) -> str:
         for name, sink in dag['sinks'].items():
             breakdown = sink['breakdown']
             if breakdown is None:
-                rows.append([shown, short[name], *[None] * 10])
+                rows.append([shown, short[name], *[None] * 12])
             else:
                 mean, worst = breakdown['mean'], breakdown['worst']
                 rows.append([
@@ -53,7 +54,7 @@ def times_table(dags: Mapping[str, Any]) -> str:
 
 def _parts(parts: Mapping[str, int]) -> list[Cell]:
     return [_time(parts[f'{key}_ns'])
-            for key in ('waiting', 'executing', 'suspended', 'transport')]
+            for key in ('waiting', 'waiting_group', 'executing', 'suspended', 'transport')]
 
 
 def _time(nanoseconds: int) -> str:
@@ -62,14 +63,78 @@ def _time(nanoseconds: int) -> str:
 
 def callbacks_table(callbacks: Mapping[str, Mapping[str, int]]) -> str:
     """Return a table with a row for each declared callback."""
-    rows: list[list[Cell]] = []
+    return table(CALLBACKS_HEADER, callbacks_rows(callbacks))
+
+
+def callbacks_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[Cell]]:
+    """Yield the rows of the table of callbacks."""
     for key, use in callbacks.items():
         n = use['executions']
-        rows.append([
+        yield [
             key, n, _time(use['busy_ns']), _time(use['busy_ns'] // n) if n else None,
             _time(use['longest_ns']), _time(use['waiting_ns'] // n) if n else None,
-            _time(use['longest_wait_ns'])])
-    return table(_CALLBACKS_HEADER, rows)
+            _time(use['longest_wait_ns'])]
+
+
+def recorded_table(callbacks: Mapping[str, Mapping[str, int]]) -> str:
+    """Return a table with a row for each callback of an imported recording that ran."""
+    rows: list[list[Cell]] = []
+    for label, use in callbacks.items():
+        n = use['executions']
+        rows.append([
+            label, n, _time(use['busy_ns']), _time(use['shortest_ns']) if n else None,
+            _time(use['busy_ns'] // n) if n else None, _time(use['longest_ns']) if n else None])
+    return table(('callback', 'executions', 'busy', 'shortest', 'mean', 'longest'), rows)
+
+
+def communications_table(communications: Iterable[Mapping[str, Any]]) -> str:
+    """Return a table of messages: from publication to the start of the callback."""
+    rows: list[list[Cell]] = [
+        [each['topic'], each['publisher'], each['callback'], each['sent'], each['arrived'],
+         *(_time(each['latency_ns'][key]) for key in ('min', 'median', 'p99', 'max'))]
+        for each in communications]
+    return table(('topic', 'publisher', 'callback', 'sent', 'arrived', 'min', 'median', 'p99',
+                  'max'), rows)
+
+
+_CASES = ('all', 'best', 'worst', 'worst_with_external_latency')
+
+
+def recorded_tables(result: Mapping[str, Any], callbacks: bool) -> Iterator[str]:
+    """
+    Yield the tables of what was recorded besides the jobs: paths, imported callbacks.
+
+    :param callbacks: also show the imported callbacks where there are DAGs.
+    """
+    if result.get('paths'):
+        yield 'End to end, from the first publication to the start of the last callback:'
+        yield paths_table(result['paths'])
+    if 'recorded_callbacks' in result and (callbacks or not result['dags']):
+        yield 'Callbacks in the recording:'
+        yield recorded_table(result['recorded_callbacks'])
+        if result['communications']:
+            yield 'Messages, from publication to the start of the callback:'
+            yield communications_table(result['communications'])
+
+
+def paths_table(paths: Mapping[str, Any]) -> str:
+    """Return a table of the paths' end-to-end times, four response-time cases and data age."""
+    return table(PATHS_HEADER, paths_rows(paths))
+
+
+def paths_rows(paths: Mapping[str, Any]) -> Iterator[list[Cell]]:
+    """Yield the rows of the table of paths."""
+    for name, path in paths.items():
+        shown: Cell = name
+        arrived: Cell = f'{path["arrived"]} of {path["flows"]}'
+        every = {case.replace('_', '-'): path['response_time'][case] for case in _CASES}
+        every['data age'] = path['data_age']
+        for case, times in every.items():
+            figures: list[Cell] = [None] * 5 if times is None else [
+                times['count'],
+                *(_time(times[key]) for key in ('min', 'median', 'p99', 'max'))]
+            yield [shown, arrived, case, *figures]
+            shown = arrived = ''
 
 
 def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> str:
@@ -99,8 +164,10 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
     yield (f'{every.due} sink jobs due, {every.in_time} in time '
            f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
            + (f', {every.aborted} aborted' if every.aborted else ''))
-    yield (f'policy {printable(result["policy"])}, {result["workers"]} workers'
-           + (', preemptive' if result['preemptive'] else '')
+    pool = f'policy {printable(result["policy"])}, {result["workers"]} workers'
+    if 'recorded_callbacks' in result:      # another executor ran it
+        pool = f'imported: {result["workers"]} threads ran callbacks'
+    yield (pool + (', preemptive' if result['preemptive'] else '')
            + f', {format_ns(result["duration_ns"])}, utilisation {_share(result["utilisation"])}'
            + f' (all callbacks: {_share(result["worker_use"]["use"])})')
     miss = result['first_miss']

@@ -15,12 +15,13 @@
 """
 Acceptance ratios: how many runs met every deadline, by normalised utilisation.
 
-The bins are the paper's: the nearest multiple of 0.05, everything below 0.525 in 0.5 and
-everything from 0.975 up in 1.0.
+The bins of one task set are the paper's: the nearest multiple of 0.05, everything below 0.525 in
+0.5 and everything from 0.975 up in 1.0. Those of many task sets begin at 0.05.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 from typing import Any
 
@@ -28,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 BINS = tuple(round(0.5 + 0.05 * i, 2) for i in range(11))
-_EDGES = np.array([0.525 + 0.05 * i for i in range(10)])
+WIDE_BINS = tuple(round(0.05 + 0.05 * i, 2) for i in range(20))
 
 Z_95 = 1.959963984540054
 """Half the width of the central 95 % of the normal distribution, in standard deviations."""
@@ -36,9 +37,16 @@ Z_95 = 1.959963984540054
 Bools = npt.NDArray[np.bool_]
 
 
-def bins_of(utilisation: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """Return for each utilisation the number of its bin."""
-    return np.searchsorted(_EDGES, utilisation, side='right').astype(np.int64)
+def bins_of(
+    utilisation: npt.NDArray[np.float64], bins: Sequence[float] = BINS
+) -> npt.NDArray[np.int64]:
+    """
+    Return for each utilisation the number of its bin.
+
+    :param bins: their centres.
+    """
+    edges = np.array([round(centre + 0.025, 3) for centre in bins[:-1]])
+    return np.searchsorted(edges, utilisation, side='right').astype(np.int64)
 
 
 def wilson(accepted: int, runs: int) -> tuple[float, float]:
@@ -61,12 +69,16 @@ class Acceptance:
     Acceptance of one set of runs: ratio and confidence interval of each bin and of all runs.
 
     ``ratio`` and ``interval`` hold None where a bin is empty.
+
+    :param bins: number of the bin of each run.
+    :param n_bins: how many bins there are.
     """
 
-    def __init__(self, bins: npt.NDArray[np.int64], accepted: Bools) -> None:
-        counts = np.bincount(bins, minlength=len(BINS)).tolist()
-        self.accepted: list[int] = np.bincount(
-            bins[accepted], minlength=len(BINS)).tolist()
+    def __init__(
+        self, bins: npt.NDArray[np.int64], accepted: Bools, n_bins: int = len(BINS)
+    ) -> None:
+        counts = np.bincount(bins, minlength=n_bins).tolist()
+        self.accepted: list[int] = np.bincount(bins[accepted], minlength=n_bins).tolist()
         self.ratio: list[float | None] = []
         self.interval: list[tuple[float, float] | None] = []
         for good, runs in zip(self.accepted, counts):

@@ -20,7 +20,7 @@ Theory of operation
 The functions of ``core.state``, ``core.jobs``, ``core.rules``, ``core.policies`` and ``engine``
 are taken as they are and bound to a namespace of their own, in which each other's names stand for
 the compiled functions, and ``heapq``'s for those of ``vectors``.  There is no second copy of a
-rule.  Only ``add_group`` is replaced, as an empty list has no type.  The policy is a field that
+rule.  Only ``add_queue`` is replaced, as an empty list has no type.  The policy is a field that
 is added to the tables, and the key function one that looks at it, so that all policies need one
 compilation.
 
@@ -28,6 +28,10 @@ What numba makes of an entry point (with everything that it calls inside) is kep
 ``$XDG_CACHE_HOME/mddag_executor`` (``~/.cache``), under a hash of all sources and versions that it
 was made from; numba itself adds the processor.  Where that folder can not be written, each process
 compiles anew.  Nothing is compiled, and numba is not imported, before the first use.
+
+Compiling leaves some 130 MB behind: LLVM keeps a module for each of about 90 functions, with a
+copy of all that the function calls.  Loading needs none of it.  So a process of its own compiles,
+and ends.
 """
 
 from __future__ import annotations
@@ -42,13 +46,17 @@ import os
 from pathlib import Path
 import platform
 import shutil
+import signal
+import subprocess
+import sys
 import tempfile
 import time
 from types import FunctionType, ModuleType
 from typing import Any, NamedTuple
 
-from mddag_executor.core import jobs, policies, rules, state, tables
+from mddag_executor.core import jobs, policies, queues, rules, state, tables
 from mddag_executor.core.policies import POLICIES
+from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.core.state import Decision, State
 from mddag_executor.core.tables import Tables
 from mddag_executor.simulate import engine
@@ -59,11 +67,11 @@ from msg_graph import TaskSet
 import numpy as np
 import numpy.typing as npt
 
-_MODULES = (tables, state, jobs, policies, rules, engine)
+_MODULES = (tables, state, queues, jobs, policies, rules, engine)
 _NOT_COMPILED = frozenset({
-    'new_state', 'add_group', 'rad_offsets', 'policy'})  # they build the plain lists
+    'new_state', 'add_queue', 'rad_offsets', 'latest_starts', 'policy'})  # for plain lists
 _OWN = ('compiled', 'kernel', 'structures', 'vectors')
-_REPLACED = ('add_group', 'heapify', 'heappop', 'heappush')
+_REPLACED = ('add_queue', 'heapify', 'heappop', 'heappush')
 _ENTRIES = ('accept_runs', 'run_once', 'free_run')
 _KEEP_S = 90 * 86400
 _WORD = 8
@@ -180,6 +188,28 @@ def _bound(function: Any, space: dict[str, Any], file: str | None = None) -> Fun
     return FunctionType(code, space, function.__name__, function.__defaults__)
 
 
+def _compile_elsewhere() -> None:
+    """Have a process compile for ``evaluate``; if it fails, this one does when it needs it."""
+    program = f'from {__name__} import compile_here; compile_here()'
+    path = os.pathsep.join(each or os.getcwd() for each in sys.path)
+    try:
+        done = subprocess.run(
+            [sys.executable, '-c', program], env={**os.environ, 'PYTHONPATH': path},
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    except OSError:
+        return
+    if done.returncode == -signal.SIGINT:  # Ctrl-C went to both
+        raise KeyboardInterrupt
+
+
+def compile_here() -> None:
+    """Compile what ``evaluate`` needs, by evaluating no run of nothing."""
+    nothing = _Empty(max(len(Tables._fields) + 1, len(State._fields)))
+    _entries()['accept_runs'](
+        nothing.address, nothing.address, nothing.address, 0, 0, 1, 0, 0, 0, 0, 1, False,
+        np.zeros(0, dtype=np.bool_))
+
+
 # --- handing over --------------------------------------------------------------------------------
 
 class _Lent:
@@ -249,11 +279,15 @@ class CompiledJudge:
 
     def warm_up(self) -> None:
         """Compile, or load what was compiled before."""
+        if _stamp() is not None and not cached():
+            _compile_elsewhere()
         none = np.ones((0, self._columns), dtype=np.int64)
         self(Settings(preemptive=False, judge='completions'), none)
 
     def __call__(self, settings: Settings, times: Times) -> npt.NDArray[np.bool_]:
         """Tell which of the runs met every deadline."""
+        row = find_policy(settings.policy)
+        preemptive = row.mode(settings.preemptive)
         load = self._load.copy()  # whose costs become each run's
         working = _Empty(len(State._fields))
         times = np.ascontiguousarray(times, dtype=np.int64)
@@ -261,7 +295,7 @@ class CompiledJudge:
         _entries()['accept_runs'](
             self._tables[list(POLICIES).index(settings.policy)].address, load.address,
             working.address, times.ctypes.data, self._columns * _WORD, settings.workers,
-            int(bool(settings.preemptive)), settings.dispatch_overhead_ns,
+            int(preemptive), int(row.polling), settings.dispatch_overhead_ns,
             settings.switch_overhead_ns, self._duration_ns, settings.judge == 'horizon', accepted)
         return accepted
 
@@ -274,6 +308,7 @@ def run_compiled(
 
     :return: when the run ended (ns), the log of every worker, and the core's decisions.
     """
+    row = find_policy(settings.policy)
     lent = _Lent(built, list(POLICIES).index(settings.policy))
     lent_load = _Lent(load)
     working = _Empty(len(State._fields))
@@ -281,7 +316,7 @@ def run_compiled(
     entries = _entries()
     ended = entries['run_once'](
         lent.address, lent_load.address, working.address, settings.workers,
-        int(bool(settings.preemptive)), settings.dispatch_overhead_ns,
+        int(row.mode(settings.preemptive)), int(row.polling), settings.dispatch_overhead_ns,
         settings.switch_overhead_ns, settings.duration_ns, settings.stop_at_first_miss,
         settings.judge == 'horizon', log.address)
     try:

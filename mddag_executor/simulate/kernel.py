@@ -40,10 +40,12 @@ STATE_FIELDS = len(State._fields)
 
 
 def clear_state(state: int) -> None:
-    """Empty all columns of a state and keep their memory, but for that of the groups' heaps."""
-    heaps = as_state(state).group_heap
-    for group in range(len(heaps)):
-        free(heaps[group])
+    """Empty all columns of a state and keep their memory, but for what queues hold."""
+    s = as_state(state)
+    for group in range(len(s.group_heap)):
+        free(s.group_heap[group])
+    for entity in range(len(s.entity_queue)):
+        free(s.entity_queue[entity])
     for field in range(STATE_FIELDS):
         as_vector(state + 24 * field).clear()
 
@@ -57,7 +59,8 @@ def free_state(state: int) -> None:
 
 def accept_runs(
     tables: int, load: int, state: int, costs: int, row: int, n_workers: int, preemptive: int,
-    dispatch_overhead: int, switch_overhead: int, horizon: int, judge_open: bool, accepted: Any,
+    polling: int, dispatch_overhead: int, switch_overhead: int, horizon: int, judge_open: bool,
+    accepted: Any,
 ) -> None:
     """
     Simulate runs up to the first miss; tell which of them had none.
@@ -71,7 +74,8 @@ def accept_runs(
     arrivals = as_load(load)
     for i in range(len(accepted)):
         set_address(arrivals.costs, costs + i * row)
-        fill_state(t, s, n_workers, preemptive, 1, dispatch_overhead, switch_overhead)
+        fill_state(
+            t, s, n_workers, preemptive, 1, dispatch_overhead, switch_overhead, polling)
         ended = run(t, s, key_of_policy, arrivals, horizon, True, None, None)
         if judge_open:
             finish(t, s, ended)
@@ -81,8 +85,9 @@ def accept_runs(
 
 
 def run_once(
-    tables: int, load: int, state: int, n_workers: int, preemptive: int, dispatch_overhead: int,
-    switch_overhead: int, horizon: int, stop_at_first_miss: bool, judge_open: bool, log: int,
+    tables: int, load: int, state: int, n_workers: int, preemptive: int, polling: int,
+    dispatch_overhead: int, switch_overhead: int, horizon: int, stop_at_first_miss: bool,
+    judge_open: bool, log: int,
 ) -> int:
     """
     Simulate one run and return when it ended; log and state are the caller's to free.
@@ -91,7 +96,7 @@ def run_once(
     """
     t = as_tables(tables)
     s = as_state(state)
-    fill_state(t, s, n_workers, preemptive, 1, dispatch_overhead, switch_overhead)
+    fill_state(t, s, n_workers, preemptive, 1, dispatch_overhead, switch_overhead, polling)
     ended = run(
         t, s, key_of_policy, as_load(load), horizon, stop_at_first_miss, as_log(log), None)
     if judge_open and not (stop_at_first_miss and ended < horizon):

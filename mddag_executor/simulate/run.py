@@ -222,13 +222,13 @@ def simulate(
     """
     check(settings)
     policy = find_policy(settings.policy)
-    preemptive = policy.preemptive if settings.preemptive is None else settings.preemptive
+    preemptive = policy.mode(settings.preemptive)
     tables = Tables.build(
         task_set, max_active_jobs=NEVER if max_active_jobs is None else max_active_jobs)
     state = new_state(
         tables, settings.workers, preemptive=preemptive,
         dispatch_overhead=settings.dispatch_overhead_ns,
-        switch_overhead=settings.switch_overhead_ns)
+        switch_overhead=settings.switch_overhead_ns, polling=policy.polling)
     entries: list[LogEntry] = []
     ended = run(
         tables, state, policy.key, load, settings.duration_ns, settings.stop_at_first_miss,

@@ -281,8 +281,8 @@ def _overload_clear(vector: Any) -> Any:
 
 
 @njit
-def append_empty(vector):
-    """Append an empty vector to a vector of vectors."""
+def add_queue(vector):
+    """Do what ``core.state.add_queue`` does: append an empty vector to a vector of vectors."""
     length = _get_word(vector, 1)
     if length == _get_word(vector, 2):
         _grow(vector, 3)
@@ -356,14 +356,6 @@ def heapify(heap):
 
 
 # --- what the compiled core needs besides --------------------------------------------------------
-
-@njit
-def add_group(s):
-    """Do what ``core.state.add_group`` does."""
-    s.group_owner.append(-1)
-    append_empty(s.group_heap)
-    return len(s.group_owner) - 1
-
 
 @njit
 def set_address(vector, address):

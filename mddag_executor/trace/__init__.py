@@ -23,12 +23,13 @@ and ros2_tracing recordings in.
 
 from mddag_executor.trace.ctf import import_ctf, Imported
 from mddag_executor.trace.errors import TraceError, TraceWarning
+from mddag_executor.trace.messages import MessageReader
 from mddag_executor.trace.reader import read_events, TraceReader
 from mddag_executor.trace.schema import EVENTS, EventType
 from mddag_executor.trace.trace_file import TraceFile
 from mddag_executor.trace.writer import TraceWriter
 
 __all__ = [
-    'EVENTS', 'EventType', 'Imported', 'TraceError', 'TraceFile', 'TraceReader', 'TraceWarning',
-    'TraceWriter', 'import_ctf', 'read_events',
+    'EVENTS', 'EventType', 'Imported', 'MessageReader', 'TraceError', 'TraceFile', 'TraceReader',
+    'TraceWarning', 'TraceWriter', 'import_ctf', 'read_events',
 ]

@@ -37,6 +37,24 @@ _PROCESS = 'mddag:process'
 _REMEDY = 'check its name, that you may read it, and the disk it is on'
 
 
+@contextmanager
+def open_trace(path: str) -> Iterator[tuple[BinaryIO, int]]:
+    """
+    Open a file and give it with its size.
+
+    :raises TraceError: where that can not be, and for errors of the system inside of the block
+    """
+    if '\0' in path:
+        raise TraceError(path, 'is no file name', 'give the .mcap file')
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):     # a pipe would wait for its writer
+            raise TraceError(path, 'is no file', 'give the .mcap file itself')
+        with open(path, 'rb') as stream:
+            yield stream, os.fstat(stream.fileno()).st_size
+    except OSError as error:
+        raise TraceError(path, f'cannot be read ({error.strerror})', _REMEDY) from None
+
+
 class TraceReader:
     """
     Reads a trace file; every call of `events` reads it anew.
@@ -54,7 +72,7 @@ class TraceReader:
         self.path = os.fspath(path)
         self.warnings: list[str] = []
         self.fields: dict[str, tuple[str, ...]] = {}
-        with self._open() as (stream, size):
+        with open_trace(self.path) as (stream, size):
             open_data(stream, self.path, size)
             self._finished, self._summary = read_summary(stream, size)
 
@@ -77,6 +95,16 @@ class TraceReader:
             text: str | None = event[4]
             return text
         return None
+
+    def has_events(self) -> bool:
+        """
+        Tell whether there are channels of events, not only of other messages.
+
+        :raises TraceError: where the file can no longer be read
+        """
+        if self._summary:
+            return any(topic.startswith('/trace/') for topic in self._summary.topics)
+        return next(self.events(), None) is not None
 
     def events(self, names: Iterable[str] | None = None, *,
                sorted: bool = False) -> Iterator[Event]:      # noqa: A002
@@ -103,7 +131,7 @@ class TraceReader:
     def _read(self, channels: Channels, in_time_order: bool) -> Iterator[Event]:
         reading = Reading(self.path, channels)
         self.fields = channels.fields
-        with self._open() as (stream, size):
+        with open_trace(self.path) as (stream, size):
             blocks = scan(stream, open_data(stream, self.path, size), size)
             if in_time_order:
                 yield from reading.by_time(stream, blocks)
@@ -112,19 +140,6 @@ class TraceReader:
         for text in (self._missing(reading, size), reading.undecoded()):
             if text and text not in self.warnings:
                 self.warnings.append(text)
-
-    @contextmanager
-    def _open(self) -> Iterator[tuple[BinaryIO, int]]:
-        """Open the file and give it with its size; errors of the system become TraceError."""
-        if '\0' in self.path:
-            raise TraceError(self.path, 'is no file name', 'give the .mcap file')
-        try:
-            if not stat.S_ISREG(os.stat(self.path).st_mode):    # a pipe would wait for its writer
-                raise TraceError(self.path, 'is no file', 'give the .mcap file itself')
-            with open(self.path, 'rb') as stream:
-                yield stream, os.fstat(stream.fileno()).st_size
-        except OSError as error:
-            raise TraceError(self.path, f'cannot be read ({error.strerror})', _REMEDY) from None
 
     def _missing(self, reading: Reading, size: int) -> str | None:
         """Return the line that says what is missing, None where nothing is."""
@@ -139,14 +154,19 @@ class TraceReader:
             return (f'{self.path}: the summary at the end is damaged or missing: used all of the '
                     f'data, {found}')
         if summary and (summary.chunks, summary.messages) != (reading.chunks, reading.messages):
-            return f'{self.path}: events are missing: found and used {found}; {stated}'
+            what = 'are missing' if summary.messages >= reading.messages else \
+                'were put in or doubled after it was finished'
+            return f'{self.path}: events {what}: found and used {found}; {stated}'
         return None
 
 
 def read_events(path: str | os.PathLike[str],
                 names: Iterable[str] | None = None) -> Iterator[dict[str, Any]]:
     """
-    Yield the events of a trace in the order of time, as CARET's analysis takes them.
+    Yield the events of a trace in the order of time, in the form that CARET's analysis takes.
+
+    It stops on events that it does not know: `mddag_executor.replay.caret_events` leaves those
+    out, and adds what it needs of a trace of this executor.
 
     Each is a dict of `_name` (as in `ros2:callback_start`), `_timestamp` (ns), `_vpid`, `_vtid`
     and the event's fields as the file has them. In an imported recording it has `_procname`, too:

@@ -17,8 +17,8 @@ One pass over a trace file, in the order of the file or of time.
 
 Theory of operation:
 
-1. The file is read block by block (`blocks`), and a block's events are given out one by one; what
-   is in memory is one chunk, whatever the file's length.
+1. The file is read block by block (`blocks`), and a block's events are decoded some thousand at a
+   time; what is in memory is one chunk, whatever the file's length.
 2. In the order of the file the events of one thread are in order, those of different threads are
    not: each thread appends an event after it took its time, whenever it gets to run.
 3. In the order of time, chunks are loaded by the least time that their heads state, and an event
@@ -36,7 +36,6 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
-from itertools import islice
 from operator import itemgetter
 import struct
 from typing import BinaryIO
@@ -47,6 +46,7 @@ from mddag_executor.trace.cdr import ENCAPSULATION
 from mddag_executor.trace.channels import Channels, Event
 from mddag_executor.trace.errors import TraceError
 
+_SOME = 4096                     # events decoded at a time
 _PENDING_LIMIT = 2_000_000      # events in memory while putting them into the order of time
 
 # Opcode, length, channel; then, behind sequence and times, how the message is encoded.
@@ -73,7 +73,8 @@ class Reading:
         """Yield the events in the order of the file."""
         try:
             for block in blocks:
-                yield from self._decode(load(stream, block), block)
+                for events in self._decode(load(stream, block), block):
+                    yield from events
         except Damage as damage:
             self._keep(damage)
 
@@ -119,54 +120,70 @@ class Reading:
     def _in_order(self, stream: BinaryIO, block: Block, pending: int) -> list[Event]:
         """Return the events of a block in the order of time."""
         room = _PENDING_LIMIT - pending
-        events = list(islice(self._decode(load(stream, block), block), room + 1))
-        if len(events) > room:
-            raise TraceError(self._path, 'holds too much in disorder to put it into order of time',
-                             'sort it first, as with `mcap sort`')
+        events: list[Event] = []
+        for some in self._decode(load(stream, block), block):
+            events += some
+            if len(events) > room:
+                raise TraceError(
+                    self._path, 'holds too much in disorder to put it into order of time',
+                    'sort it first, as with `mcap sort`')
         events.sort(key=_time_of)
         if events and events[0][1] < block.start_time:
             raise Damage('a chunk holds an event from before the time in its head', block.offset)
         return events
 
-    def _decode(self, data: bytes, block: Block) -> Iterator[Event]:
-        """Yield the events of a block's records; raise Damage where they are malformed."""
+    def _decode(self, data: bytes, block: Block) -> Iterator[list[Event]]:
+        """Yield the events of a block's records, some at a time; raise Damage where malformed."""
         fast, passed_over = self._channels.fast, self._channels.passed_over
+        unpack_head, find, message = _HEAD.unpack_from, fast.get, records.MESSAGE
         end = len(data)
         data += bytes(_HEAD.size)       # a head can be read at any record, however short
         position = 0
         messages = 0
+        events: list[Event] = []
+        add = events.append
         while position < end:
-            opcode, length, channel, encapsulation = _HEAD.unpack_from(data, position)
+            opcode, length, channel, encapsulation = unpack_head(data, position)
             after = position + _CONTENT + length
             if after > end:
+                yield events
                 raise Damage('the records of a chunk do not fit into it', block.offset)
-            if opcode == records.MESSAGE:
+            if opcode == message:
                 messages += 1
-                decoder = fast.get(channel)
-                if (decoder is not None and encapsulation == _LITTLE_ENDIAN
-                        and position + _FIELDS + decoder[1] <= after):
-                    yield decoder[0] + decoder[2](data, position + _FIELDS)
+                decoder = find(channel)
+                if decoder is not None:
+                    head, size, unpack = decoder
+                    fields = position + _FIELDS
+                    if encapsulation == _LITTLE_ENDIAN and fields + size <= after:
+                        add(head + unpack(data, fields))
+                    else:
+                        self._add_any(events, channel, data[position:after])
                 elif channel not in passed_over:
-                    event = self._decode_any(channel, data[position:after])
-                    if event is not None:
-                        yield event
+                    self._add_any(events, channel, data[position:after])
+                if not messages % _SOME:
+                    yield events
+                    events = []
+                    add = events.append
             elif opcode in (records.SCHEMA, records.CHANNEL):
+                yield events
+                events = []
+                add = events.append
                 self._define(opcode, data[position + _CONTENT:after], block)
             position = after
         self.messages += messages
         self.chunks += block.chunk
+        yield events
 
-    def _decode_any(self, channel: int, message: bytes) -> Event | None:
-        """Return the event in a message record; count it and return None where there is none."""
+    def _add_any(self, events: list[Event], channel: int, message: bytes) -> None:
+        """Add the event in a message record; count it where it can not be decoded."""
         try:
             if message[_FIELDS - 4:_FIELDS - 2] != ENCAPSULATION[:2]:
                 raise ValueError('it is not plain little endian CDR')
             head, unpack = self._channels.decoder(channel)
-            return head + unpack(message[_FIELDS:])
+            events.append(head + unpack(message[_FIELDS:]))
         except (ValueError, struct.error) as error:
             topic = self._channels.topics.get(channel, f'channel {channel}')
             self._undecoded[f'{topic}: {error}'] += 1
-            return None
 
     def _define(self, opcode: int, content: bytes, block: Block) -> None:
         try:

@@ -42,6 +42,7 @@ import zlib
 
 from mddag_executor.trace import cdr, records
 from mddag_executor.trace.errors import TraceError
+from mddag_executor.trace.groups import Group, GROUPS
 from mddag_executor.trace.schema import camel_case, EVENTS, EventType
 import zstandard
 
@@ -124,12 +125,17 @@ class TraceFile:
         self.path = os.fspath(path)
         #: Events that are in the file, in whole chunks.
         self.written = 0
+        #: Events that `extend` was given, those that could not be encoded among them.
+        self.given = 0
         #: Events that could not be encoded, and the reason of the first.
         self.rejected = 0
         self.rejection: str | None = None
         events = {**EVENTS, **{event.key: event for event in extra_events}}
         self._channels = _channels(events.values())
         self._in_order = list(dict.fromkeys(self._channels.values()))
+        self._groups = {  # unless a caller gave one of their events other fields
+            name: Group(name, self._channels) for name, keys in GROUPS.items()
+            if all(self._channels[key].event == EVENTS[key] for key in keys)}
         self._zstd = zstandard.ZstdCompressor(level=_COMPRESSION_LEVEL)
         self._records: list[bytes] = []     # of the open chunk
         self._size = 0                      # their total size
@@ -195,19 +201,25 @@ class TraceFile:
 
     def extend(self, entries: Iterable[Sequence[Any]], vpid: int) -> None:
         """
-        Write events, given as name, timestamp, thread id and fields.
+        Write events, given as name, timestamp, thread id and fields, or as entries of `groups`.
 
         An event that is unknown or does not fit its type is left out and counted in `rejected`.
 
         :raises TraceError: where writing fails
         """
-        channels = self._channels
+        channels, groups = self._channels, self._groups
         for entry in entries:
+            self.given += 1
             try:
-                channel = channels[entry[0]]
+                channel = channels.get(entry[0])
+                if channel is None:
+                    self._extend_group(groups[entry[0]], entry, vpid)
+                    continue
                 timestamp = entry[1]
                 message = channel.encode(channel.count & 0xFFFFFFFF, timestamp, timestamp,
                                          cdr.ENCAPSULATION, timestamp, vpid, *entry[2:])
+            except TraceError:              # of writing, on the way
+                raise
             except Exception as error:      # whatever a caller gave: it costs this event only
                 self._reject(entry, error)
                 continue
@@ -220,8 +232,32 @@ class TraceFile:
             self._records.append(message)
             self._size += len(message)
 
-    def _reject(self, entry: Sequence[Any], error: Exception) -> None:
-        self.rejected += 1
+    def _extend_group(self, group: Group, entry: Sequence[Any], vpid: int) -> None:
+        parts = group.parts
+        self.given += len(parts) - 1
+        try:
+            data, times = group.encode(entry, vpid)
+        except Exception as error:
+            self._reject(entry, error, len(parts))
+            return
+        undefined = 0 if group.defined else sum(part.undefined for part in parts)
+        if self._size + len(data) + undefined > CHUNK_LIMIT:
+            self.flush()
+        if not group.defined:
+            group.defined = True
+            for part in parts:
+                if part.undefined:
+                    self._define(part)
+        offset = self._size
+        for part, size, time in zip(parts, group.sizes, times):
+            part.index += (time, offset)
+            part.count += 1
+            offset += size
+        self._records.append(data)
+        self._size = offset
+
+    def _reject(self, entry: Sequence[Any], error: Exception, events: int = 1) -> None:
+        self.rejected += events
         if self.rejection is None:
             name = entry[0] if entry else ''
             reason = 'no such event' if isinstance(error, KeyError) else str(error)

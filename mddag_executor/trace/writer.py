@@ -42,6 +42,7 @@ from types import TracebackType
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.trace.errors import TraceError
+from mddag_executor.trace.groups import events_of
 from mddag_executor.trace.schema import EventType
 from mddag_executor.trace.trace_file import TraceFile
 
@@ -86,7 +87,8 @@ class TraceWriter:
         self._lost = 0
         # Reentrant, for a finalizer or signal handler that records while its thread counts a loss.
         self._lost_lock = threading.RLock()
-        self._taken = 0                 # events that went from the deque to the file object
+        self._slice: list[tuple[Any, ...]] = []     # what went to the file object last,
+        self._given = 0                             # and how many events before that
         self._reported_lost = 0         # by `mddag:lost` events so far
         self._reported_rejection = False
         self._vpid = os.getpid()
@@ -103,8 +105,9 @@ class TraceWriter:
         """
         Record one event: its name, its time, the native thread id, then its fields.
 
-        Never waits, never raises. An event that is unknown or whose fields do not fit is left out
-        by the writer thread, counted in `dropped`, and logged once.
+        Or several at once, as an entry of `groups`. Never waits, never raises. An event that is
+        unknown or whose fields do not fit is left out by the writer thread, counted in `dropped`,
+        and logged once.
 
         :param event: name (as in `callback_start`), ns on the trace's clock, native id of the
             thread, the values of the event's fields in the order of its type
@@ -113,7 +116,7 @@ class TraceWriter:
             self._pending.append(event)
         else:
             with self._lost_lock:
-                self._lost += 1
+                self._lost += events_of(event)
 
     def now(self) -> int:
         """Return the time in ns on the trace's clock."""
@@ -127,7 +130,7 @@ class TraceWriter:
     @property
     def dropped(self) -> int:
         """Return how many recorded events are not in the file and will not be."""
-        late = len(self._pending) if self._closed or self.error else 0
+        late = sum(map(events_of, self._pending)) if self._closed or self.error else 0
         return self._lost + self._file.rejected + late
 
     def close(self) -> None:
@@ -189,13 +192,15 @@ class TraceWriter:
         self._extend([('mddag:lost', self.now(), threading.get_native_id(), count)])
 
     def _extend(self, events: list[tuple[Any, ...]]) -> None:
-        self._taken += len(events)
+        self._given = self._file.given
+        self._slice = events
         self._file.extend(events, self._vpid)
 
     def _give_up(self, error: TraceError) -> None:
         self._capacity = 0
         with self._lost_lock:
-            self._lost += self._taken - self._file.rejected - self._file.written
+            taken = self._given + sum(map(events_of, self._slice))
+            self._lost += taken - self._file.rejected - self._file.written
         self.error = error
         _LOGGER.error('%s', error)
 

@@ -27,6 +27,7 @@ import sys
 import time
 
 from mddag_executor.cli import main as program
+from msg_graph import load
 import numpy as np
 import pytest
 
@@ -142,6 +143,14 @@ def test_samples(graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     (['--seed', '-1'], "mddag evaluate: argument --seed: '-1' is no whole number from 0"),
     (['--duration', '3'], 'mddag evaluate: argument --duration: '),
     (['--overhead', 'x'], 'mddag evaluate: argument --overhead: '),
+    (['--dask', 'nonsense'], '--dask nonsense: this is no usable address (ValueError: '),
+    (['--dask', 'tcp://127.0.0.1:1'], '--dask tcp://127.0.0.1:1: no Dask scheduler answers there'),
+    (['--resume', '-'], '--resume: standard input and output keep nothing: name a file'),
+    (['--resume', 'few.npz'], 'few.npz: it is damaged, or no file of kept runs: remove it, or '),
+    (['--resume', 'nowhere/k'], 'nowhere/k: there is no directory nowhere: make it first'),
+    (['empty'], 'empty: there is no *.yaml in this folder: name a declaration, or make some'),
+    (['-', '-'], '-: standard input can be only one GRAPH: name files'),
+    (['none.yaml'], 'none.yaml: '),
     (['--samples', 'none.npz'], 'none.npz: no such file or directory: check the path'),
     (['--samples', 'graph.yaml'], 'graph.yaml: this is no .npz file: '),
     (['--samples', 'few.npz'], 'few.npz: no values for /n:b: add an array of that name'),
@@ -159,8 +168,9 @@ def test_bad_input(
 ) -> None:
     """One line, exit status 2, nothing written, and before any run is done."""
     np.savez(tmp_path / 'few.npz', **{'/n:a': [1]})
+    (tmp_path / 'empty').mkdir()
     before = sorted(tmp_path.iterdir())
-    status, out, err = call(capsys, 'graph.yaml', '--runs', '5000000', *arguments)
+    status, out, err = call(capsys, '--runs', '5000000', 'graph.yaml', *arguments)
     assert (status, out) == (2, '')
     assert err.startswith(f'error: {line}') and err.count('\n') == 1
     assert sorted(tmp_path.iterdir()) == before
@@ -200,6 +210,111 @@ def test_interrupted(graph: Path, tmp_path: Path) -> None:
     assert 0 < result['runs'] < 5000000 and result['interrupted'] is True
     assert (tmp_path / 'out.png').stat().st_size > 5000
     assert f"{result['runs']} runs in" in out
+
+
+def group_seconds(group: int) -> float:
+    """Return the processor time that the processes of a group have taken so far."""
+    total = 0.0
+    for file in Path('/proc').glob('[0-9]*/stat'):
+        try:
+            fields = file.read_text().rpartition(')')[2].split()
+        except OSError:  # it has ended
+            continue
+        if int(fields[2]) == group:
+            total += (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+    return total
+
+
+def interrupted_after(folder: Path, seconds: float, *arguments: str) -> str:
+    """Press Ctrl-C, which goes to all processes of the terminal; return what was said."""
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'evaluate', *arguments],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder,
+        start_new_session=True)
+    begin = time.monotonic()
+    while group_seconds(process.pid) < seconds and time.monotonic() < begin + 30:
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    with pytest.raises(ProcessLookupError):  # nobody of the group is left
+        for _ in range(50):
+            os.killpg(process.pid, 0)
+            time.sleep(0.1)
+    return err
+
+
+@pytest.mark.parametrize(('how', 'seconds'), [
+    ([], 4), pytest.param(['--dask', 'local'], 7, marks=pytest.mark.slow)])
+def test_resumed(graph: Path, tmp_path: Path, how: list[str], seconds: float) -> None:
+    """What two interrupted evaluations keep is what an uninterrupted one finds."""
+    if how:
+        pytest.importorskip('distributed', reason='the extra dask is not there')
+    from mddag_executor.simulate.checkpoint import Checkpoint
+    from mddag_executor.simulate.evaluate import evaluate, Evaluation, Experiment
+    counts = []
+    for name in ('first.json', 'second.json'):
+        err = interrupted_after(
+            tmp_path, seconds, 'graph.yaml', '--runs', '1000000', '--duration', '200ms',
+            '--core', 'plain', '--jobs', '2', '--policies', 'rad,fifo', '--resume', 'kept.npz',
+            '--json', name, *how)
+        result = json.loads((tmp_path / name).read_text())
+        counts.append(result['runs'])
+        assert err == (f'warning: interrupted: {counts[-1]} of 1000000 runs are done, '
+                       'and kept in kept.npz\n')
+        assert result['resumed'] == sum(counts[:-1])
+    assert 0 < counts[0] < counts[1]
+    experiment = Experiment(load(graph), ('rad', 'fifo'), workers=1, duration_ns=200_000_000)
+    kept = Evaluation((experiment,), 1000000)
+    Checkpoint(str(tmp_path / 'kept.npz'), NotImplemented).restore(kept)
+    done = kept.done.nonzero()[0][:400]
+    whole = evaluate(experiment, int(done[-1]) + 1, core='plain')
+    assert kept.runs == counts[1]
+    assert (kept.accepted[:, done] == whole.accepted[:, done]).all()
+    assert (kept.utilisation[done] == whole.utilisation[done]).all()
+
+
+def test_several_graphs(
+    graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder's declarations come by name; the bins begin at 0.05; each is counted."""
+    (tmp_path / 'sets').mkdir()
+    (tmp_path / 'sets' / 'b.yaml').write_text(GRAPH.replace('14000', '2000').replace(
+        '10000', '1000'))
+    (tmp_path / 'sets' / 'a.yaml').write_text(GRAPH.replace('workers: 1', 'workers: 2'))
+    (tmp_path / 'sets' / 'notes.txt').write_text('no declaration')
+    status, out, err = call(
+        capsys, graph, 'sets', '--runs', 20, '--policies', 'rad', '--non-preemptive', '--json',
+        'out.json', '--plot', 'out.svg')
+    assert (status, err) == (0, '')
+    assert '60 runs of 3 task sets in' in out
+    result = json.loads((tmp_path / 'out.json').read_text())
+    assert result['bins'] == [round(0.05 * i, 2) for i in range(1, 21)]
+    assert sum(result['counts']) == 60
+    names = [Path(each['graph']).name for each in result['graphs']]
+    assert names == ['graph.yaml', 'a.yaml', 'b.yaml']
+    assert [each['workers'] for each in result['graphs']] == [1, 2, 1]
+    assert [each['runs'] for each in result['graphs']] == [20, 20, 20]
+    assert [each['accepted']['rad'] for each in result['graphs']][1:] == [20, 20]
+    assert 0 < result['graphs'][0]['accepted']['rad'] < 20
+    assert result['graphs'][1]['utilisation'] < 0.5 < result['graphs'][0]['utilisation']
+    assert b'3 task sets' in (tmp_path / 'out.svg').read_bytes()
+
+
+def test_the_first_graph_is_as_alone(
+    graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call(capsys, graph, '--runs', 15, '--json', 'one.json')
+    call(capsys, graph, graph, '--runs', 15, '--json', 'two.json')
+    one = json.loads((tmp_path / 'one.json').read_text())['graphs'][0]
+    two = json.loads((tmp_path / 'two.json').read_text())['graphs']
+    assert two[0] == one
+    assert two[1]['utilisation'] != one['utilisation']  # its draws are its own
+
+
+def test_one_run_of_each_of_several(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = call(capsys, graph, graph, graph, '--policies', 'rad')
+    assert status == 0 and '3 runs of 3 task sets in' in out
 
 
 def test_help(capsys: pytest.CaptureFixture[str]) -> None:

@@ -48,6 +48,20 @@ def test_graphviz(mddag: Mddag, tmp_path: Path, ending: str, begin: bytes) -> No
     assert (tmp_path / f'o.{ending}').read_bytes().startswith(begin)
 
 
+@pytest.mark.skipif(shutil.which('dot') is None, reason='Graphviz is not installed')
+def test_a_large_graph(mddag: Mddag, tmp_path: Path) -> None:
+    lines = ['mddag: 1', 'nodes:']
+    for dag in range(60):
+        lines += [f'  - node: /n{dag}', '    callbacks:',
+                  f'      - {{name: c, timer: 10ms, publishes: [/t{dag}]}}']
+        lines += [f'      - {{name: c{i}, subscription: /t{dag}, deadline: 20ms}}'
+                  for i in range(20)]
+    done = mddag('graph', 'draw', '-', '-o', 'o.svg', cwd=tmp_path, input='\n'.join(lines))
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+    text = (tmp_path / 'o.svg').read_text()
+    assert text.count('class="edge"') == 60 * 20
+
+
 def test_without_graphviz(
         mddag: Mddag, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv('PATH', str(Path(sys.executable).parent))

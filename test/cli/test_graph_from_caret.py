@@ -34,7 +34,7 @@ def test_from_caret(mddag: Mddag, tmp_path: Path) -> None:
     (tmp_path / 'arch.yaml').write_text(TEXT)
     done = mddag('graph', 'from-caret', 'arch.yaml', '-o', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
-    assert done.stdout == "1 blanks to fill in, marked 'FILL IN'\n"
+    assert done.stdout == "1 blank to fill in, marked 'FILL IN'\n"
     done = mddag('graph', 'check', 'g.yaml', cwd=tmp_path)
     assert done.returncode == 2
     assert 'it is a sink' in done.stderr

@@ -79,8 +79,8 @@ def test_the_tables(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
             'ms'] in lines
     assert ('Where the response times went: means, and the worst job of each sink:'
             in out.splitlines())
-    assert ['/driver', 'filter:run', '0', 'ns', '1', 'ms', '6', 'ms', '0', 'ns', '0', 'ns', '2',
-            '1', 'ms', '9', 'ms', '0', 'ns', '0', 'ns'] in lines
+    assert ['/driver', 'filter:run', '0', 'ns', '1', 'ms', '0', 'ns', '6', 'ms', '0', 'ns', '0',
+            'ns', '2', '1', 'ms', '0', 'ns', '9', 'ms', '0', 'ns', '0', 'ns'] in lines
     assert '3 sink jobs due, 2 in time (66.67 %), 1 late, 0 expired' in out
     assert 'policy rad, 2 workers, 40 ms, utilisation 0.225 (all callbacks: 0.225)' in out
     assert 'first miss: /filter:run, job 2, 2 ms late' in out
@@ -106,6 +106,8 @@ def test_the_result_for_machines(
             'relative_deadline_ns': 8 * MS, 'completed': 3, 'late': 1, 'overdue': 0, 'expired': 0,
             'aborted': 0,
             'response_ns': {'min': 5 * MS, 'median': 6 * MS, 'p99': 10 * MS, 'max': 10 * MS},
+            'longest_burst': 1,
+            'slack_ns': {'min': -2 * MS, 'p1': -2 * MS, 'median': 2 * MS, 'max': 3 * MS},
             'breakdown': result['dags']['/driver']['sinks']['/filter:run']['breakdown']}}}
     assert result['first_miss'] == {
         'dag': '/driver', 'vertex': '/filter:run', 'job': 2, 'deadline_ns': START + 38 * MS,
@@ -145,7 +147,8 @@ def test_fail_on_miss(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_reschedule(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Without the recorded waiting and transport the third job is still late: 6 and 3 ms."""
     status, out, err = call(
-        capsys, trace, '--reschedule', '--workers', 1, '--policy', 'fifo', '--preemptive')
+        capsys, trace, '--reschedule', '--workers', 1, '--policy', 'fifo', '--preemptive',
+        '--overheads', 'none')
     assert (status, err) == (0, '')
     lines = [line.split() for line in out.splitlines()]
     assert ['/driver', 'filter:run', '8', 'ms', '2', 'of', '3', '2', 'of', '3', '5', 'ms', '6',
@@ -156,6 +159,13 @@ def test_reschedule(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (result['policy'], result['workers'], result['preemptive']) == ('rad', 2, False)
     assert result['rescheduled'] is True
     assert result['recorded']['dags']['/driver']['sinks']['/filter:run']['completed'] == 3
+    # the second callback was dispatched 1 ms after it was ready, though its worker was free
+    for options, longest in (([], 10 * MS), (['--overheads', 'recorded'], 10 * MS),
+                             (['--overheads', 'none'], 9 * MS), (['--overheads', '2ms'], 13 * MS)):
+        result = json.loads(call(capsys, trace, '--reschedule', '--json', '-', *options)[1])
+        sink = result['dags']['/driver']['sinks']['/filter:run']
+        assert sink['response_ns']['max'] == longest
+        assert result['overheads']['dispatch_median_ns'] == 0
 
 
 def test_a_truncated_trace_gives_what_is_there(
@@ -200,7 +210,7 @@ def test_standard_input(
 
 def nothing_recorded(path: Path) -> None:
     with TraceFile(path) as file:
-        file.add('callback_start', START, 1, 1, 5, False)
+        file.add('caret_init', START, 1, 1, 5, 'jazzy')
 
 
 def no_declaration(path: Path) -> None:
@@ -244,12 +254,15 @@ def test_other_bad_input_is_one_line(
     other = tmp_path / 'other.yaml'
     other.write_text('mddag: 1\nnodes:\n  - node: /x\n    callbacks:\n'
                      '      - {name: y, timer: 1s, deadline: 1s}\n')
+    empty = tmp_path / 'empty'
+    empty.mkdir()
     for arguments, says in (
         ([trace, wrong], f'{wrong}:'),
         ([trace, tmp_path / 'gone.yaml'], f'{tmp_path}/gone.yaml: '),
         ([trace, other], f'{trace}: none of the callbacks of {other} is in it: it has '
          '/driver:tick, /filter:run: give the graph of the nodes that were recorded, or none'),
-        ([tmp_path], f'{tmp_path}: is no file: give the .mcap file itself'),
+        ([tmp_path], f'{tmp_path}: no run of this executor is recorded in it, so there are no'),
+        ([empty], f'{empty}: is no file: give the .mcap file itself'),
         ([trace, '--json', tmp_path / 'gone' / 'a.json'], f'{tmp_path}/gone/a.json: there is no'),
         ([trace, '--workers', '2'], '--workers: a run is replayed as it was recorded: add '),
         ([trace, '--policy', 'rad'], '--policy: a run is replayed as it was recorded: add '),

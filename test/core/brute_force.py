@@ -29,17 +29,27 @@ Its reading of the documents:
   What it has ready or running goes on, without consequences.
 * ``abort`` takes effect at a late completion, and when what is next to be handed out belongs to a
   job that has an unfinished sink past its deadline. What has never run of the job vanishes.
+* ``ros2`` goes by rounds. When a worker is free and the round has nothing left that it could take,
+  the next round is, of all that waits, the first of each callback. The worker goes through it by
+  kind (timers, subscriptions and syncs, services), then by the callback's place in the file, and
+  leaves out, for the round, what is blocked when its turn comes. A round of which all is blocked
+  ends the search until something happens again.
+* ``picas``: a vertex belongs to the path to the sink with the least deadline that it leads to.
+  Paths go by that deadline, the period and the DAG's index; on one path what is later goes first.
+  A callback with several vertices has the priority of the first of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
+import functools
 import math
 from typing import Any, NamedTuple
 
-from msg_graph import Dag, TaskSet, Vertex
+from msg_graph import Callback, Dag, TaskSet, Vertex
+
+from .dag_paths import least_laxity, reachable_sinks, ways_to
 
 Event = tuple[int, str, int, int, int, int]
 """(tick, 'start' | 'end' | 'preempt', worker, DAG, vertex in its DAG, job)."""
@@ -80,33 +90,6 @@ class Miss(NamedTuple):
     completed: int | None
 
 
-def reachable_sinks(dag: Dag, index: int) -> set[int]:
-    """Return the sinks that a vertex leads to, itself included."""
-    vertex = dag.vertices[index]
-    if not vertex.successors:
-        return {index}
-    return set().union(*(reachable_sinks(dag, after) for after in vertex.successors))
-
-
-def paths(dag: Dag, index: int) -> Iterator[list[Vertex]]:
-    """Yield every path from a vertex to a sink."""
-    vertex = dag.vertices[index]
-    for after in vertex.successors:
-        for path in paths(dag, after):
-            yield [vertex, *path]
-    if not vertex.successors:
-        yield [vertex]
-
-
-def least_laxity(dag: Dag, index: int) -> int:
-    """Return the least of the sinks' deadlines less the mean times of a path to them, in ns."""
-    return min(
-        (path[-1].deadline_ns or 0) - sum(
-            v.callback.execution_time.mean_ns for v in path
-            if v.callback.execution_time is not None)
-        for path in paths(dag, index))
-
-
 class BruteForce:
     """One simulated run; ``events``, ``misses`` and ``result()`` tell what came out of it."""
 
@@ -116,6 +99,7 @@ class BruteForce:
         switch_overhead: int = 0, judge: str = 'horizon', stop_at_first_miss: bool = False,
         last_release: int | None = None,
     ) -> None:
+        self.task_set = task_set
         self.dags = task_set.dags
         self.ticks = ticks
         self.tick = tick
@@ -125,6 +109,7 @@ class BruteForce:
         self.switch_overhead = switch_overhead
         self.running: list[Execution | None] = [None] * workers
         self.waiting: list[Execution] = []
+        self.round: list[Execution] = []
         self.jobs: list[Job] = []
         self.events: list[Event] = []
         self.misses: list[Miss] = []
@@ -185,8 +170,35 @@ class BruteForce:
             return job.release * self.tick + least_laxity(job.dag, execution.vertex.index)
         if self.policy == 'wc':
             return job.index
+        if self.policy == 'ros2':
+            return self._place(execution.vertex.callback)
+        if self.policy == 'picas':
+            return self._fixed_priorities()[execution.vertex.callback.key]
         assert self.policy == 'fifo'
         return execution.arrival[0]
+
+    def _place(self, callback: Callback) -> int:
+        """Return the place of a callback in the wait set."""
+        waits_for_topics = ('subscription', 'sync')
+        timers = [c for c in self.task_set.callbacks if c.kind == 'timer']
+        others = [c for c in self.task_set.callbacks if c.kind in waits_for_topics]
+        return (timers + others).index(callback)
+
+    @functools.cache  # noqa: B019
+    def _fixed_priorities(self) -> dict[str, int]:
+        """Return the priority of each callback, by its name."""
+        order = []
+        for dag in self.dags:
+            for vertex in dag.vertices:
+                ahead = max(len(way) for way in ways_to(dag, vertex.index))
+                least = min(
+                    dag.vertices[s].deadline_ns or 0 for s in reachable_sinks(dag, vertex.index))
+                order.append((
+                    least, dag.period_ns, dag.index, -ahead, vertex.index, vertex.callback.key))
+        first: dict[str, int] = {}
+        for place, entry in enumerate(sorted(order)):
+            first.setdefault(entry[-1], place)
+        return first
 
     def key(self, execution: Execution) -> tuple[Any, ...]:
         """Return the order in which ready executions run."""
@@ -300,10 +312,13 @@ class BruteForce:
 
     def _hand_out(self) -> bool:
         """Hand out one execution; False when that is not possible."""
-        able = [e for e in self.waiting if not self._blocked(e)]
-        if not able:
+        if self.policy == 'ros2':
+            best = self._next_of_round()
+        else:
+            able = [e for e in self.waiting if not self._blocked(e)]
+            best = min(able, key=self.key) if able else None
+        if best is None:
             return False
-        best = min(able, key=self.key)
         job = best.job
         if job.outcome is None and job.dag.on_miss == 'abort' and any(
                 self._deadline(job, sink) < self.now for sink in self._open_sinks(job)):
@@ -326,6 +341,23 @@ class BruteForce:
         victim.arrival = self._arrival(PREEMPTED)
         self.waiting.append(victim)
         return True
+
+    def _next_of_round(self) -> Execution | None:
+        """Return what a free worker finds next, in this round or in a new one."""
+        if None not in self.running:
+            return None
+        for new_round in (False, True):
+            if new_round:
+                by_callback: dict[str, list[Execution]] = {}
+                for e in self.waiting:
+                    by_callback.setdefault(e.vertex.callback.key, []).append(e)
+                self.round = [min(each, key=lambda e: e.arrival) for each in by_callback.values()]
+            while self.round:
+                first = min(self.round, key=self.priority)
+                self.round.remove(first)
+                if first in self.waiting and not self._blocked(first):
+                    return first
+        return None
 
     def _start(self, execution: Execution, worker: int) -> None:
         self.waiting.remove(execution)

@@ -198,12 +198,13 @@ def cases(
 ) -> Case:
     """Draw a task set and how to run it."""
     task_set = draw(task_sets(**options))
+    policy = draw(st.sampled_from(policies))
+    preemptive = draw(st.booleans()) and not POLICIES[policy].polling
     most = draw(st.sampled_from([2, 5, 9]))  # light load to overload
     ticks = tuple(
         tuple(draw(st.lists(st.integers(1, most), min_size=len(dag.vertices),
                             max_size=len(dag.vertices))))
         for dag in task_set.dags)
     return Case(
-        task_set, ticks, draw(st.integers(1, 4)), draw(st.sampled_from(policies)),
-        draw(st.booleans()),
+        task_set, ticks, draw(st.integers(1, 4)), policy, preemptive,
         draw(st.integers(0, 2)) if overheads else 0, draw(st.integers(0, 2)) if overheads else 0)

@@ -35,7 +35,7 @@ from mddag_executor.core.state import (
 )
 from msg_graph import Dag
 
-from .brute_force import least_laxity
+from .dag_paths import least_laxity
 from .task_sets import Case, cases, examples, task_sets, TICK
 
 Id = tuple[int, int, int]
@@ -57,6 +57,11 @@ def rad_offset(dag: Dag, index: int) -> int:
     """Return RAD minus release as the paper defines it, ns."""
     deadlines = [dag.vertices[sink].deadline_ns for sink in paths_to_sinks(dag, index)]
     return min(deadline for deadline in deadlines if deadline is not None)
+
+
+def depth(dag: Dag, index: int) -> int:
+    """Return how many vertices lie before one on the longest path to it."""
+    return max((1 + depth(dag, p) for p in dag.vertices[index].predecessors), default=0)
 
 
 @dataclass
@@ -114,7 +119,21 @@ class Schedule:
             'gedf': (release + max(dag.vertices[s].deadline_ns or 0 for s in dag.sinks), v, d),
             'llf': (release + least_laxity(dag, v), v, d), 'dm': (rad_offset(dag, v), job),
             'rm': (dag.period_ns, job), 'wc': (job,), 'fifo': (self.ready[each],),
+            'ros2': (0,),  # what waits for the next poll is not to be compared: see test_polling
+            'picas': self.chain(d, v),
         }[self.case.policy]
+
+    def chain(self, d: int, v: int) -> tuple[int, ...]:
+        """Return the least (deadline, period, DAG, -depth, vertex) of a callback's vertices."""
+        callback = self.dags[d].vertices[v].callback
+        return min(
+            (rad_offset(dag, vertex.index), dag.period_ns, dag.index, -depth(dag, vertex.index),
+             vertex.index)
+            for dag in self.dags for vertex in dag.vertices if vertex.callback is callback)
+
+    def priority(self, each: Id) -> tuple[int, ...]:
+        """Return the part of the key that decides about preemption."""
+        return self.key(each) if self.case.policy == 'picas' else self.key(each)[:1]
 
     def moments(self) -> Iterator[Moment]:
         """Yield what is the case after each tick before the horizon at which something was."""
@@ -168,9 +187,9 @@ def test_every_moment(case: Case, horizon: int) -> None:
                 'a smaller key waits while a larger one starts')
         for victim, preemptor in moment.preempted:
             assert case.preemptive
-            assert schedule.key(preemptor)[0] < schedule.key(victim)[0], 'not strictly smaller'
+            assert schedule.priority(preemptor) < schedule.priority(victim), 'not smaller'
         if case.preemptive and case.policy != 'fifo':  # a preemption makes fifo's keys anew
-            assert all(schedule.key(e)[0] >= schedule.key(r)[0] for e in able
+            assert all(schedule.priority(e) >= schedule.priority(r) for e in able
                        for r in moment.running.values()), 'a preemption was forgotten'
         groups = Counter(schedule.group(e) for e in moment.running.values())
         assert all(count == 1 for group, count in groups.items() if group is not None)

@@ -16,7 +16,7 @@
 from __future__ import annotations
 
 from mddag_executor.core import NEVER, PolicyError, Scheduler, Tables
-from mddag_executor.core.rules import SWEEP_AT
+from mddag_executor.core.queues import SWEEP_AT
 from mddag_executor.core.state import (
     COMPLETED,
     DROP,

@@ -128,6 +128,8 @@ def test_without_execution_times_the_latest_start_is_rad() -> None:
     ('wc', (6, 8, 9, 0)),
     ('fifo', (8, 9, 0, 0)),
     ('dm', (25 * US, 6, 8, 9)),
+    ('ros2', (4, 9, 0, 0)),
+    ('picas', (0, 8, 9, 0)),
 ])
 def test_keys(name: str, key: tuple[int, ...]) -> None:
     """Vertex 3 of the first DAG, job 6, released at 1000, readiness 8, order 9."""
@@ -136,11 +138,48 @@ def test_keys(name: str, key: tuple[int, ...]) -> None:
 
 
 def test_every_policy_has_its_row() -> None:
-    assert set(POLICIES) == {'rad', 'rm', 'wc', 'fifo', 'gedf', 'dm', 'llf'}
-    assert {name for name, row in POLICIES.items() if not row.preemptive} == {'wc', 'fifo'}
+    assert set(POLICIES) == {
+        'rad', 'rm', 'wc', 'fifo', 'gedf', 'dm', 'llf', 'ros2', 'picas'}
+    assert {name for name, row in POLICIES.items() if not row.preemptive} == {
+        'wc', 'fifo', 'ros2', 'picas'}
+    assert [name for name, row in POLICIES.items() if row.polling] == ['ros2']
     for name, row in POLICIES.items():
         assert policy(name) is row
         assert row.name == name
         assert row.meaning
     with pytest.raises(PolicyError, match="policy 'x': there is no such policy: choose one of"):
         policy('x')
+
+
+def test_modes() -> None:
+    assert [policy('rad').mode(asked) for asked in (None, True, False)] == [True, True, False]
+    assert [policy('picas').mode(asked) for asked in (None, True, False)] == [False, True, False]
+    assert [policy('ros2').mode(asked) for asked in (None, False)] == [False, False]
+    with pytest.raises(PolicyError, match="policy 'ros2': .*: run it without preemption"):
+        policy('ros2').mode(True)
+
+
+def test_entities_are_callbacks_by_kind_and_place() -> None:
+    """Timers s, t; then late, mid, both, shared, which is one entity for its two vertices."""
+    tables = Tables.build(two_dags())
+    assert tables.entity == [0, 2, 3, 4, 5, 1, 5, 6]
+    assert tables.n_entities == 6
+    legs = Tables.build(two_dags(), legs=True)  # both takes 4 and 5
+    assert legs.entity == [0, 2, 3, 4, 6, 1, 6, 7]
+    assert legs.n_entities == 7
+    assert Tables.build(None).entity == [0]
+
+
+def test_chain_ranks() -> None:
+    """Most urgent is the chain s, mid, both (25 us), from its end; then late (30), shared, t."""
+    tables = Tables.build(two_dags(), default_deadline=27 * US)
+    # s, late, mid, both, shared; t, shared, which has the rank of its chain in the first DAG, with
+    # the shorter period; the undeclared one stands between both chains.
+    assert tables.chain_rank == [2, 4, 1, 0, 5, 6, 5, 3]
+
+
+def test_chains_of_equal_deadlines_go_by_period_then_by_dag() -> None:
+    tables = Tables.build(declaration([
+        {'node': '/n', 'name': name, 'timer': f'{period}us', 'deadline': '90us', 'dag': name}
+        for name, period in (('a', 20), ('b', 10), ('c', 20))]))
+    assert tables.chain_rank[:3] == [1, 0, 2]

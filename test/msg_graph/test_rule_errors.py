@@ -86,7 +86,7 @@ def test_what_only_a_source_may_have() -> None:
           callbacks:
             - name: s
               timer: 10ms
-              release_from: header_stamp {MARK}
+              release_from: source_timestamp {MARK}
               deadline: 10ms
     """, 'a timer is released when it is due')
 

@@ -68,7 +68,24 @@ def test_a_declaration_with_every_key_is_valid() -> None:
     words = GRAPH.replace('{', ' ').replace(',', ' ').split()
     keys = {*declaration.FILE_KEYS, *declaration.NODE_KEYS, *declaration.CALLBACK_KEYS,
             *declaration.PATH_KEYS, *declaration.TIME_KEYS}
-    assert {f'{key}:' for key in keys} <= set(words)
+    assert {f'{key}:' for key in keys} - {'arguments:', 'include:'} <= set(words)
+
+
+def test_a_declaration_of_several_files_is_valid() -> None:
+    text = """\
+mddag: 1
+arguments: {period: 10ms, workers: }
+include:
+  - other.yaml
+  - {file: one.yaml, namespace: /front, remap: {/a: /b}, set: {period: $(period), on: 3}}
+workers: $(workers)
+nodes:
+  - node: /$(period)
+    callbacks: [{name: $(period)_x, timer: $(period), deadline: 1ms, on_miss: $(period)}]
+"""
+    assert errors(text) == []
+    assert errors(text.replace('namespace', 'name_space')) != []
+    assert errors(text.replace('remap: {/a: /b}', 'remap: {/a: b}')) != []
 
 
 def test_each_key_of_the_parser_is_there() -> None:

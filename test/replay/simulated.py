@@ -38,6 +38,7 @@ def write_simulated(
     legs = Tables.build(task_set, legs=True)
     events: list[tuple[Any, ...]] = []
     ready: dict[tuple[int, int], int] = {}
+    ended: dict[tuple[int, int, int], int] = {}
     for i, (time, dag, job) in enumerate(zip(load.times, load.dags, load.jobs)):
         ready[(dag, job)] = time
         if dag < legs.n_dags:
@@ -49,9 +50,11 @@ def write_simulated(
         local = legs.index_in_dag[vertex]
         address = 1000 + vertex
         where = (dag, local, job) if declared else (-1, -1, -1)
+        before = task_set.dags[dag].vertices[local].predecessors if declared else ()
+        noticed = max((ended[(dag, p, job)] for p in before), default=ready[(dag, job)])
+        ended[(dag, local, job)] = time
         events += [
-            ('dispatch', start, 100 + worker, address, *where, worker,
-             start if declared else ready[(dag, job)], 0),
+            ('dispatch', start, 100 + worker, address, *where, worker, noticed, 0),
             ('callback_start', start, 100 + worker, address, False),
             ('callback_end', time, 100 + worker, address)]
         for leg in range(legs.n_legs[vertex] if declared else 0):

@@ -268,7 +268,8 @@ nodes:
             file.add('callback_end', end, VPID, dag, 9)
             file.add('complete', end, VPID, dag, 9, dag, 0, 0, True, end, 0)
         file.add('shutdown', START_TIME + 90 * MS, VPID, 1, START_TIME + 90 * MS)
-    outcome = reschedule(path)
+    assert starts(reschedule(path).log) == [(30, 0, 0, 0), (30, 1, 1, 0)]
+    outcome = reschedule(path, overheads=False)
     assert starts(outcome.log) == [(0, 0, 0, 0), (30, 0, 1, 0)]
     sinks = outcome.result()['dags']
     assert sinks['a']['sinks']['/n:a']['response_ns']['max'] == 3 * MS
@@ -303,8 +304,8 @@ def test_what_was_not_recorded_takes_the_median_then_the_declared_mean(tmp_path:
         reschedule(path, loads(TWO, 'g.yaml'))
 
 
-def test_pieces_and_legs_are_added_up(tmp_path: Path) -> None:
-    """A coroutine's pauses are no execution; the legs of a sync vertex are one execution."""
+def test_pieces_are_added_up_and_legs_are_not(tmp_path: Path) -> None:
+    """A coroutine's pauses are no execution; a leg that completes nothing loads the workers."""
     text = """\
 mddag: 1
 nodes:
@@ -335,12 +336,15 @@ nodes:
         piece(1, 30, 30, 36)
         complete(1, 36, True, 0)
         file.add('shutdown', START_TIME + 90 * MS, VPID, 1, START_TIME + 90 * MS)
-    outcome = reschedule(path)
-    assert [(start - START_TIME, entry[0] - START_TIME) for start, entry
-            in executions(outcome.log)] == [(0, 5 * MS), (5 * MS, 12 * MS)]
+    found = [[(start - START_TIME, entry[0] - START_TIME) for start, entry
+              in executions(reschedule(path, overheads=overheads).log)]
+             for overheads in (False, True)]
+    assert found[0] == [(0, 5 * MS), (5 * MS, 11 * MS), (25 * MS, 26 * MS)]
+    # the message is there 7 ms after the end of its publisher
+    assert found[1] == [(0, 5 * MS), (12 * MS, 18 * MS), (25 * MS, 26 * MS)]
     callbacks = replay(path).result()['callbacks']
     assert callbacks['/n:a'] == {'executions': 1, 'busy_ns': 5 * MS, 'longest_ns': 5 * MS,
-                                 'waiting_ns': 0, 'longest_wait_ns': 0}
+                                 'waiting_ns': 0, 'longest_wait_ns': 0, 'waiting_group_ns': 0}
     breakdown = replay(path).result()['dags']['a']['sinks']['/n:b']['breakdown']['worst']
     assert (breakdown['suspended_ns'], breakdown['executing_ns']) == (18 * MS, 5 * MS + 6 * MS)
 
@@ -399,6 +403,6 @@ def test_settings_that_can_not_be(tmp_path: Path) -> None:
 
 
 def test_tables_without_groups_stay_as_they_are() -> None:
-    from mddag_executor.replay.load import with_groups
+    from mddag_executor.replay.groups import with_groups
     tables = Tables.build(loads(TIMER_AND_MESSAGE.replace('dag: b', 'dag: b, group: g'), 'g.yaml'))
     assert with_groups(tables, {}, {}, declared_first=False) == tables

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from mddag_executor.simulate.acceptance import Acceptance, BINS, bins_of, wilson
+from mddag_executor.simulate.acceptance import Acceptance, BINS, bins_of, WIDE_BINS, wilson
 import numpy as np
 import pytest
 
@@ -26,6 +26,13 @@ import pytest
     (0.7, 0.7), (0.92501, 0.95), (0.97499, 0.95), (0.97501, 1.0), (1.0, 1.0), (3.0, 1.0)])
 def test_bins(utilisation: float, centre: float) -> None:
     assert BINS[bins_of(np.array([utilisation]))[0]] == centre
+
+
+@pytest.mark.parametrize(('utilisation', 'centre'), [
+    (0.0, 0.05), (0.0749, 0.05), (0.0751, 0.1), (0.5, 0.5), (0.97499, 0.95), (0.97501, 1.0),
+    (3.0, 1.0)])
+def test_wide_bins(utilisation: float, centre: float) -> None:
+    assert WIDE_BINS[bins_of(np.array([utilisation]), WIDE_BINS)[0]] == centre
 
 
 def test_bins_are_the_paper_s() -> None:

@@ -29,7 +29,7 @@ from pathlib import Path
 from mddag_executor.core import POLICIES, PolicyError
 from mddag_executor.simulate import compiled
 from mddag_executor.simulate import evaluate as module
-from mddag_executor.simulate.acceptance import BINS
+from mddag_executor.simulate.acceptance import BINS, WIDE_BINS
 from mddag_executor.simulate.draws import Draws
 from mddag_executor.simulate.evaluate import evaluate, Evaluation, Experiment
 from mddag_executor.simulate.run import periodic_load, Settings, simulate, SimulationError
@@ -161,6 +161,28 @@ def test_processes_change_nothing(autoware: TaskSet) -> None:
     assert not same(alone, evaluate(replace(experiment, seed=6), 24, core='plain'))
 
 
+def test_several_task_sets(small: TaskSet) -> None:
+    """Each has its own draws and workers; chunks may reach over several; processes, too."""
+    base = Experiment(small, ('rad', 'fifo'), workers=1, duration_ns=200_000_000, seed=1)
+    other = loads(SMALL.replace('2500us', '4500us'), 'other.yaml')
+    experiments = (base, replace(base, workers=2), replace(base, task_set=other))
+    outcome = evaluate(experiments, 20)
+    assert outcome.asked == outcome.runs == 60
+    assert same(outcome, evaluate(experiments, 20, jobs=2, core='plain'))
+    alone = evaluate(base, 20)
+    assert (outcome.accepted[:, :20] == alone.accepted).all()
+    assert (outcome.utilisation[:20] == alone.utilisation).all()
+    # With twice the workers the same runs would have half the utilisation: these are others.
+    assert (outcome.utilisation[20:40] <= 0.525).all()
+    assert (outcome.utilisation[20:40] * 2 != outcome.utilisation[:20]).any()
+    again = evaluate(experiments, 30)  # more runs of each: the first ones stay
+    assert (again.utilisation.reshape(3, 30)[:, :20] == outcome.utilisation.reshape(3, 20)).all()
+    assert outcome.bins == WIDE_BINS and sum(outcome.counts()) == 60
+    graphs = outcome.result()['graphs']
+    assert [each['graph'] for each in graphs] == ['small.yaml', 'small.yaml', 'other.yaml']
+    assert sum(each['accepted']['rad'] for each in graphs) == outcome.accepted[0].sum()
+
+
 @NEEDS_NUMBA
 @pytest.mark.timeout(400)
 def test_the_compiled_core_changes_nothing(autoware: TaskSet) -> None:
@@ -236,7 +258,7 @@ def test_choice_of_the_core(autoware: TaskSet, monkeypatch: pytest.MonkeyPatch) 
     """A cold cache costs seconds: few runs are done in plain Python."""
     def chosen(runs: int, warm: bool) -> bool:
         monkeypatch.setattr(compiled, 'cached', lambda: warm)
-        return module._compiled('auto', Experiment(autoware), runs, 2)
+        return module.uses_compiled('auto', [Experiment(autoware)], runs, 2)
 
     monkeypatch.setattr(compiled, 'available', lambda: True)
     assert [chosen(runs, False) for runs in (1, 100, 5000)] == [False, False, True]

@@ -51,6 +51,7 @@ class Recorder:
     def __init__(self) -> None:
         self.held = 0
         self.timers: list[tuple[Any, int]] = []
+        self.missed: list[tuple[Any, int, int]] = []
         self.messages: list[tuple[Any, Any, dict[str, Any]]] = []
         self.requests: list[tuple[Any, Any, Any]] = []
         self.responses: list[tuple[Any, int, Any, Any]] = []
@@ -73,6 +74,9 @@ class Recorder:
     def on_timer(self, timer: Any, due_ns: int) -> None:
         self.timers.append((timer, due_ns))
         self._reaction('timer', timer, due_ns)
+
+    def on_missed(self, timer: Any, due_ns: int, count: int) -> None:
+        self.missed.append((timer, due_ns, count))
 
     def on_message(self, subscription: Any, message: Any, info: dict[str, Any]) -> None:
         self.messages.append((subscription, message, info))

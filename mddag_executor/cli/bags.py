@@ -1,0 +1,88 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The part of `replay` for ordinary bags: their messages as releases."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from mddag_executor.cli import common
+from mddag_executor.cli.text import Progress
+from mddag_executor.errors import UsageError
+
+if TYPE_CHECKING:
+    from mddag_executor.replay.bags_reschedule import BagReschedule
+    from msg_graph import TaskSet
+
+RECORDED = -1
+"""Overheads as they were recorded."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add('--overheads', type=_overheads, metavar='WHICH',
+        help='with --reschedule: what noticing, dispatch and transport take: recorded (default), '
+        'none, or a time for each dispatch (50us); of a bag: none (default) or a time')
+    add('--execution-times', metavar='FILE',
+        help="with --reschedule of an ordinary bag: JSON with fixed execution times ('-': "
+        'standard input; default: drawn from the declared ones)')
+    add('--seed', type=int, default=0, metavar='N',
+        help='with --reschedule of an ordinary bag: of the draws (default: %(default)s)')
+
+
+def _overheads(text: str) -> int:
+    if text == 'recorded':
+        return RECORDED
+    return 0 if text == 'none' else common.duration(text)
+
+
+def check(args: argparse.Namespace) -> None:
+    """
+    Check the arguments.
+
+    :raises mddag_executor.errors.UsageError: where they do not go together
+    """
+    if args.execution_times == '-' and '-' in (args.trace, args.graph):
+        raise UsageError('-: standard input can be only one file: name the others')
+    if args.execution_times is not None and args.graph is None:
+        raise UsageError('--execution-times: they are of a declaration: give a GRAPH')
+
+
+def reschedule_bag(
+    args: argparse.Namespace, path: str, name: str, task_set: TaskSet | None
+) -> BagReschedule:
+    """
+    Run the scheduler over a bag.
+
+    :raises mddag_executor.errors.MddagError: where that can not be
+    """
+    from mddag_executor.replay.bags_reschedule import reschedule_bag as run
+    from mddag_executor.simulate import read_execution_times
+    if task_set is None or not args.reschedule:
+        raise UsageError(
+            f'{name}: no run of this executor is recorded in it, so there are no jobs: to take '
+            'its messages as releases give a GRAPH and --reschedule')
+    if args.overheads == RECORDED:
+        raise UsageError('--overheads: a bag has none: give a time for each dispatch')
+    times = None
+    if args.execution_times is not None:
+        times_name, text = common.read_text(args.execution_times)
+        times = read_execution_times(task_set, text, times_name)
+    with Progress('replaying'):
+        return run(
+            path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
+            times=times, seed=args.seed, dispatch_overhead=args.overheads or 0, name=name)

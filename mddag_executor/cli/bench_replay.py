@@ -1,0 +1,252 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The verb `bench replay`: how fast traces are read and linked, and how well reschedule predicts.
+
+The machine decides about the figures, and whatever else it does: speeds are per second of CPU, in
+processes of their own, the best of several.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+import statistics
+import subprocess
+import sys
+import tempfile
+from typing import Any, TYPE_CHECKING
+
+from mddag_executor.cli import common
+from mddag_executor.cli.text import format_ns, one_line, printable, Progress, table
+from mddag_executor.errors import MddagError, UsageError
+from mddag_executor.resources import find
+
+if TYPE_CHECKING:
+    from mddag_executor.replay.measure import Agreement
+
+HELP = 'measure the replayer: the speed and memory of reading and linking, beside other ' \
+    'readers; with --accuracy how well reschedule predicts a live run'
+EXAMPLE = """\
+mddag bench replay
+mddag bench replay --events 10000000 --json replay.json
+mddag bench replay --trace run.mcap
+mddag bench replay --accuracy --utilisation 0.3,0.6,0.8 --seconds 10
+mddag bench replay --accuracy --utilisation 0.6 --workers 7,4"""
+
+MEDIAN_LIMIT, P99_LIMIT = 0.05, 0.15
+_FEW = 30
+"""Sinks with fewer jobs are shown, but their quantiles say little."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add('--trace', metavar='FILE', help='a trace to read (default: one that is written for it)')
+    add('--events', type=common.positive_int, default=1_000_000, metavar='N',
+        help='how many events the trace is to have (default: %(default)s)')
+    add('--others', type=common.positive_int, default=200_000, metavar='N',
+        help="messages after which mcap's and rosbags' readers are stopped (default: %(default)s)")
+    add('--repeat', type=common.positive_int, default=3, metavar='R',
+        help='measure R times in turn: the best of speeds, the median of errors '
+        '(default: %(default)s)')
+    add('--accuracy', action='store_true',
+        help='record live runs, reschedule them, and compare the response times of each sink')
+    add('--utilisation', type=_numbers, default=[0.3, 0.6, 0.8], metavar='U[,U…]',
+        help='with --accuracy: of the live runs (default: 0.3,0.6,0.8)')
+    add('--seconds', type=common.positive_float, default=10.0, metavar='S',
+        help='with --accuracy: how long each live run is (default: 10)')
+    add('--workers', type=_counts, default=[7], metavar='M[,M…]',
+        help='with --accuracy: of the live runs; the runs with further numbers are predicted '
+        'from the recording with the first (default: 7)')
+    add('--graph', metavar='FILE',
+        help="a declaration to take instead of the paper's workload ('-': standard input)")
+    common.add_json(parser)
+
+
+def _numbers(text: str) -> list[float]:
+    return [common.positive_float(part.strip()) for part in text.split(',')]
+
+
+def _counts(text: str) -> list[int]:
+    return [common.positive_int(part.strip()) for part in text.split(',')]
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Measure and print.
+
+    :raises msg_graph.GraphError: when the declaration is wrong
+    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    """
+    common.check_output(args.json)
+    if args.accuracy and args.trace:
+        raise UsageError('--accuracy: it records its own runs: leave --trace out')
+    with tempfile.TemporaryDirectory(prefix='mddag-bench-') as folder:
+        result = _accuracy(args, folder) if args.accuracy else _speed(args, folder)
+    if args.json is not None:
+        common.write_json(args.json, result)
+    if common.wants_tables(args):
+        if args.accuracy:
+            _show_accuracy(result)
+        else:
+            _show_speed(result)
+    return 0
+
+
+# --- speed ---------------------------------------------------------------------------------------
+
+def _speed(args: argparse.Namespace, folder: str) -> dict[str, Any]:
+    from mddag_executor.replay.measure import measure, OTHERS, READERS, write_long_trace
+    from mddag_executor.trace import TraceReader
+    path = args.trace
+    if path is None:
+        path = os.path.join(folder, 'long.mcap')
+        task_set = common.load_graph(args.graph or str(find('config/autoware.yaml')))
+        with Progress('writing the trace', args.events) as line:
+            write_long_trace(path, task_set, args.events, progress=line.update)
+    events = TraceReader(path).message_count
+    rows: dict[str, dict[str, Any]] = {}
+    with Progress('measuring', len(READERS) * args.repeat) as line:
+        for turn in range(args.repeat):
+            for place, name in enumerate(READERS):
+                line.update(turn * len(READERS) + place, name)
+                found = measure(name, path, args.others)
+                before = rows.get(name)
+                if before is None or found.cpu_s < before['cpu_s']:
+                    rows[name] = {
+                        'events': found.events, 'cpu_s': found.cpu_s,
+                        'events_per_s': found.per_s, 'peak_mb': found.peak_mb,
+                        'partial': name in OTHERS and found.events == args.others}
+    return {'events': events, 'bytes': os.path.getsize(path), 'readers': rows}
+
+
+def _show_speed(result: dict[str, Any]) -> None:
+    print(f'{result["events"]} events, {result["bytes"] / 1e6:.1f} MB')
+    print(table(
+        ('what', 'events', 'CPU', 'events a second', 'peak memory'),
+        [(name, row['events'], f'{row["cpu_s"]:.2f} s', f'{round(row["events_per_s"]):,}',
+          f'{row["peak_mb"]:.0f} MB') for name, row in result['readers'].items()]))
+
+
+# --- accuracy ------------------------------------------------------------------------------------
+
+def _accuracy(args: argparse.Namespace, folder: str) -> dict[str, Any]:
+    graph = args.graph or str(find('config/autoware.yaml'))
+    if graph == '-':
+        name, text = common.read_text(graph)
+        graph = os.path.join(folder, 'graph.yaml')
+        Path(graph).write_text(text, encoding='utf-8')
+    runs: list[dict[str, Any]] = []
+    steps = len(args.utilisation) * len(args.workers) * args.repeat
+    with Progress('recording', steps) as line:
+        for turn in range(args.repeat):
+            for utilisation in args.utilisation:
+                first = None
+                for workers in args.workers:
+                    line.update(len(runs), f'utilisation {utilisation:g}, {workers} workers')
+                    path = os.path.join(folder, f'{turn}-{utilisation}-{workers}.mcap')
+                    _record(graph, args, utilisation, workers, path)
+                    first = first or path
+                    runs.append(_compared(first, path, utilisation, workers, args.workers[0]))
+    return {'seconds': args.seconds, 'repeat': args.repeat, 'runs': runs,
+            'summary': _summaries(runs)}
+
+
+def _record(
+    graph: str, args: argparse.Namespace, utilisation: float, workers: int, path: str
+) -> None:
+    """Record a live run, in a process of its own."""
+    # The load is what the first number of workers would be utilised by: it stays the same.
+    share = utilisation * args.workers[0] / workers
+    done = subprocess.run(
+        [sys.executable, '-m', 'mddag_executor', 'run', graph, '--synthetic', 'sleep',
+         '--utilisation', repr(share), '--workers', str(workers), '--duration',
+         f'{args.seconds:g}s', '--trace', path],
+        capture_output=True, text=True, check=False, timeout=args.seconds + 120)
+    if done.returncode != 0 or not os.path.exists(path):
+        lines = done.stderr.strip().splitlines()
+        raise MddagError(f'the live run failed: {one_line(lines[-1]) if lines else "no reason"}')
+
+
+def _compared(
+    recorded_before: str, path: str, utilisation: float, workers: int, recorded_workers: int
+) -> dict[str, Any]:
+    """Return how well a run is predicted from a recording, which may be of that very run."""
+    from mddag_executor.replay import replay, reschedule
+    from mddag_executor.replay.measure import agreements
+    predicted = reschedule(recorded_before, workers=workers).result()
+    ideal = reschedule(recorded_before, workers=workers, overheads=False).result()
+    rows = agreements(replay(path).result()['dags'], predicted['dags'], ideal['dags'])
+    return {
+        'utilisation': utilisation, 'workers': workers, 'recorded_workers': recorded_workers,
+        'overheads': predicted['overheads'], 'sinks': [_row(row) for row in rows]}
+
+
+def _row(row: Agreement) -> dict[str, Any]:
+    return {
+        **row._asdict(), 'median_error': row.median_error, 'p99_error': row.p99_error,
+        'within': abs(row.median_error) <= MEDIAN_LIMIT and abs(row.p99_error) <= P99_LIMIT}
+
+
+def _summaries(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return a row for each setting and sink: medians over the repeated runs."""
+    found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for run in runs:
+        for row in run['sinks']:
+            key = (run['utilisation'], run['workers'], run['recorded_workers'], row['dag'],
+                   row['sink'])
+            found.setdefault(key, []).append(row)
+    rows = []
+    for key, group in found.items():
+        median = {name: statistics.median(row[name] for row in group) for name in (
+            'jobs', 'recorded_median', 'predicted_median', 'ideal_median', 'recorded_p99',
+            'predicted_p99', 'median_error', 'p99_error')}
+        rows.append({
+            **dict(zip(('utilisation', 'workers', 'recorded_workers', 'dag', 'sink'), key)),
+            **median, 'within': abs(median['median_error']) <= MEDIAN_LIMIT
+            and abs(median['p99_error']) <= P99_LIMIT})
+    return rows
+
+
+def _show_accuracy(result: dict[str, Any]) -> None:
+    from mddag_executor.report.tables import short_names
+    settings = dict.fromkeys(
+        (row['utilisation'], row['workers'], row['recorded_workers'])
+        for row in result['summary'])
+    for setting in settings:
+        rows = [row for row in result['summary']
+                if (row['utilisation'], row['workers'], row['recorded_workers']) == setting]
+        short = short_names(row['sink'] for row in rows)
+        utilisation, workers, recorded = setting
+        source = 'the recording itself' if workers == recorded else \
+            f'a recording with {recorded} workers'
+        print(f'utilisation {utilisation:g} of {recorded} workers, {workers} workers, predicted '
+              f'from {source}:')
+        print(table(
+            ('DAG', 'sink', 'jobs', 'median', 'predicted', 'error', 'without overheads', 'p99',
+             'predicted', 'error', ''),
+            [(printable(row['dag']), short[row['sink']], int(row['jobs']),
+              *(format_ns(round(row[f'{side}_median'])) for side in ('recorded', 'predicted')),
+              f'{row["median_error"]:+.1%}'.replace('%', ' %'),
+              format_ns(round(row['ideal_median'])),
+              *(format_ns(round(row[f'{side}_p99'])) for side in ('recorded', 'predicted')),
+              f'{row["p99_error"]:+.1%}'.replace('%', ' %'),
+              '' if row['within'] else 'few jobs' if row['jobs'] < _FEW else 'worse')
+             for row in rows]))
+        within = sum(row['within'] for row in rows)
+        print(f'{within} of {len(rows)} sinks within {MEDIAN_LIMIT:.0%} of the median and '
+              f'{P99_LIMIT:.0%} of the p99\n')

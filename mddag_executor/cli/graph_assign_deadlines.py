@@ -1,0 +1,178 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `graph assign-deadlines`: relative deadlines for the sinks of a declaration."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any, TYPE_CHECKING
+
+from mddag_executor.cli import common
+from mddag_executor.cli.text import Cell, format_ns, one_line, Progress, table
+from mddag_executor.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from mddag_executor.assign import Found, Measured
+    from msg_graph import TaskSet
+
+HELP = 'give the sinks relative deadlines, by critical path or by search'
+EXAMPLE = """\
+mddag graph assign-deadlines graph.yaml -o assigned.yaml
+mddag graph assign-deadlines graph.yaml --by search --target 0.95 --runs 2000 -o assigned.yaml
+"""
+DESCRIPTION = """\
+Give each sink a relative deadline; comments, order and all else of the declaration stay, and sinks
+without a deadline are accepted.
+
+--by path: in proportion to the critical path. The sink of a DAG with the longest path gets the
+DAG's period, or its --base, times --factor, the others less. --by search: the critical path times
+one scale, the tightest at which the simulated acceptance stays above --target, that is with the
+lower end of its 95 % confidence interval. Either way the acceptance of the result is measured and
+reported with its confidence interval, number of runs and seed; after a search with draws that
+took no part in it."""
+
+_WORKERS = 7
+_TARGET = 0.95
+_BUDGETS = ('mean', 'p99', 'max')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    common.add_graph(parser)
+    add('-o', '--output', metavar='OUT', default='-',
+        help="the declaration ('-': standard output, the default)")
+    add('--by', choices=('path', 'search'), default='path',
+        help='how to find them (default: %(default)s)')
+    add('--base', choices=('period', 'deadline'),
+        help="with --by path: what each DAG's longest path gets, its period (the default) or the "
+        'longest deadline that it declares')
+    add('--factor', type=common.positive_float, metavar='F',
+        help='with --by path: the longest deadline of a DAG by that base (default: 1)')
+    add('--target', type=common.positive_float, metavar='RATIO',
+        help=f'with --by search: the least acceptance ratio (default: {_TARGET})')
+    add('--budget', choices=_BUDGETS, default='p99',
+        help='what of each execution time makes the critical path (default: %(default)s)')
+    add('--policy', default='rad', metavar='P', help='to simulate (default: %(default)s)')
+    add('--workers', type=common.positive_int, metavar='M',
+        help=f"threads that run callbacks (default: the declaration's, else {_WORKERS})")
+    add('--non-preemptive', action='store_true',
+        help="simulate as an executor of callbacks runs them, not in the policy's own mode")
+    add('--overhead', type=common.duration, default=0, metavar='TIME',
+        help='what each dispatch of a callback takes more (default: 0)')
+    add('--runs', type=common.positive_int, default=1000, metavar='N',
+        help='runs that measure the acceptance of each scale (default: %(default)s)')
+    add('--duration', type=common.duration, default=3_000_000_000, metavar='TIME',
+        help='virtual time of each run (default: 3s)')
+    add('--seed', type=common.seed, default=0, metavar='N',
+        help='of the draws (default: %(default)s)')
+    add('--jobs', type=common.positive_int, metavar='N',
+        help='runs to simulate at a time (default: the number of processors)')
+    common.add_json(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Assign deadlines.
+
+    :raises msg_graph.GraphError: when the declaration is wrong
+    :raises mddag_executor.errors.MddagError: when no deadlines can be found as asked
+    """
+    from msg_graph.deadlines import deadlines_in_text, load_with_or_without_deadlines
+    if args.by == 'path' and args.target is not None:
+        raise UsageError("--target: '--by path' has none: give --by search, or leave it out")
+    if args.by == 'search' and (args.factor is not None or args.base is not None):
+        option = '--base' if args.factor is None else '--factor'
+        raise UsageError(f"{option}: '--by search' has none: leave it out, or give --by path")
+    if args.json == '-' and args.output == '-':
+        raise UsageError('-: standard output can take only one of -o and --json: name a file')
+    for path in (args.output, args.json):
+        common.check_output(path)
+    name, text = common.read_text(args.graph)
+    task_set, whole = load_with_or_without_deadlines(text, name)
+    if args.base == 'deadline' and whole != text:
+        raise InputError(name, 'a sink has no deadline, on which --base deadline depends',
+                         "add it, or use '--base period'")
+    deadlines, measured, found = _assign(args, task_set)
+    common.write_text(args.output, deadlines_in_text(task_set, whole, deadlines))
+    if args.json is not None:
+        common.write_json(args.json, _result(args, deadlines, measured, found))
+    if common.wants_tables(args):
+        _tell(args, task_set, deadlines, measured, found)
+    return 0
+
+
+def _assign(
+    args: argparse.Namespace, task_set: TaskSet
+) -> tuple[dict[str, int], Measured, Found | None]:
+    from mddag_executor.assign import measure, proportional, Search
+    from mddag_executor.simulate.evaluate import Experiment
+    experiment = Experiment(
+        task_set, (args.policy,), workers=args.workers or task_set.workers or _WORKERS,
+        duration_ns=args.duration, seed=args.seed, overhead_ns=args.overhead,
+        preemptive=False if args.non_preemptive else None)
+    jobs = args.jobs or common.processors()
+    if args.by == 'path':
+        deadlines = proportional(
+            task_set, args.budget, args.factor or 1.0, args.base or 'period')
+        with Progress('measuring', args.runs) as line:
+            return deadlines, measure(
+                experiment, deadlines, args.runs, jobs,
+                lambda done: line.update(max(0, done), f'of {args.runs} runs')), None
+    with Progress('searching') as line:
+        def progress(scale: float, done: int) -> None:
+            line.update(len(search.tried),
+                        f'scales tried; {scale:.4g}: {max(0, done)} of {args.runs} runs')
+
+        search = Search(
+            experiment, _TARGET if args.target is None else args.target, args.budget, args.runs,
+            jobs, progress=progress)
+        found = search.find()
+    return found.deadlines, found.check, found
+
+
+def _result(
+    args: argparse.Namespace, deadlines: dict[str, int], measured: Measured, found: Found | None
+) -> dict[str, Any]:
+    result: dict[str, Any] = {
+        'by': args.by, 'policy': args.policy, 'budget': args.budget, 'deadlines_ns': deadlines,
+        'acceptance': measured.result()}
+    if found is not None:
+        result['scale'] = found.scale
+        result['target'] = _TARGET if args.target is None else args.target
+        result['tried'] = [{'scale': scale, **each.result()} for scale, each in found.tried]
+    return result
+
+
+def _tell(
+    args: argparse.Namespace, task_set: TaskSet, deadlines: dict[str, int], measured: Measured,
+    found: Found | None,
+) -> None:
+    """Show the deadlines, on standard error where the declaration takes the other."""
+    stream = sys.stderr if args.output == '-' else sys.stdout
+    rows: list[list[Cell]] = [
+        [dag.name if i == 0 else '', dag.vertices[sink].name, format_ns(dag.period_ns),
+         format_ns(deadlines[dag.vertices[sink].callback.key])]
+        for dag in task_set.dags for i, sink in enumerate(dag.sinks)]
+    print(table(['DAG', 'sink', 'period', 'deadline'], rows), file=stream)
+    low, high = measured.interval
+    own = '' if found is None else ', which took no part in the search'
+    if found is not None:
+        print(f'scale {found.scale:.4g}: the deadlines are so many times the critical paths '
+              f'({args.budget}); {len(found.tried)} scales tried', file=stream)
+    print(one_line(
+        f'{args.policy} accepts {100 * measured.ratio:.1f} % (95 % confidence: {100 * low:.1f} to '
+        f'{100 * high:.1f} %) of {measured.runs} runs of seed {measured.seed}{own}'), file=stream)

@@ -1,0 +1,69 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `graph from-ros`: a declaration to fill in, from the nodes that run now."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from mddag_executor.cli import common
+from mddag_executor.cli.text import one_line, Progress
+from mddag_executor.errors import InputError
+
+HELP = 'make a declaration to fill in from the nodes that run now'
+EXAMPLE = """\
+mddag graph from-ros -o graph.yaml
+mddag graph from-ros --timeout 10 -o graph.yaml
+"""
+DESCRIPTION = """\
+Make a declaration from the nodes that run now in this ROS domain: their subscriptions, services
+and publishers, and the rates of their topics. The ROS graph tells nothing of timers, callback
+groups and execution times, and not which callback publishes what: a topic is supposed to come
+from the callbacks of its node that run as often, else from a timer. All of that is marked
+'FILL IN', like deadlines and periods, with a proposal. A recorded run tells more: see
+'mddag graph from-trace'. What every node has, such as parameter services, is left out."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        '--timeout', type=common.positive_float, default=5.0, metavar='SECONDS',
+        help='how long to look and to measure rates (default: 5)')
+    parser.add_argument('-o', '--output', metavar='GRAPH', default='-',
+                        help="the declaration ('-': standard output, the default)")
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Write the declaration.
+
+    :raises mddag_executor.errors.InputError: when no node is found
+    """
+    common.check_output(args.output)
+    from mddag_executor.cli.systems import write_declaration
+    from mddag_executor.live.graph_probe import probe, sketch_of
+    from msg_graph.blanks import declaration_with_blanks
+    with Progress('looking at the nodes', args.timeout) as line:
+        found = probe(args.timeout, line.update)
+    for warning in found.warnings:
+        print(f'warning: {one_line(warning)}', file=sys.stderr)
+    sketch = sketch_of(found)
+    if not sketch.nodes:
+        raise InputError(
+            'ROS graph', 'no node with topics or services of its own was found',
+            'start the nodes, check ROS_DOMAIN_ID, or give a longer --timeout')
+    write_declaration(args.output, declaration_with_blanks(sketch))
+    return 0

@@ -1,0 +1,60 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `graph from-trace`: a declaration to fill in, from a recorded run."""
+
+from __future__ import annotations
+
+import argparse
+
+from mddag_executor.cli import common
+
+HELP = 'make a declaration to fill in from a recorded run'
+EXAMPLE = """\
+mddag graph from-trace run.mcap -o graph.yaml
+mddag graph from-trace ~/.ros/tracing/session-20261121 -o graph.yaml
+"""
+DESCRIPTION = """\
+Make a declaration from a recorded run: a trace of this executor, a CARET or ros2_tracing recording
+that was imported, or the folder of one. A trace shows the nodes, their timers, subscriptions and
+services, callback groups, what each callback published, and the quantiles of its execution time
+(0, 50, 90, 99, 100 %). What it cannot show (deadlines, periods of what comes from outside, queue
+edges) stands in comments marked 'FILL IN', with a proposal from the recorded rates; take the
+first '# ' of such a line away once its value is right. What a declaration that the run was
+recorded with says (names, deadlines, queue edges) is kept. What every node has, such as parameter
+services, is left out."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('trace', metavar='TRACE',
+                        help="a trace (MCAP; '-': standard input), or the folder of a session "
+                        'that LTTng recorded (needs python3-bt2)')
+    parser.add_argument('-o', '--output', metavar='GRAPH', default='-',
+                        help="the declaration ('-': standard output, the default)")
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Write the declaration.
+
+    :raises mddag_executor.trace.TraceError: when it is no recording
+    :raises mddag_executor.errors.InputError: when no system is recorded in it
+    """
+    from mddag_executor.cli.systems import recorded_system, write_declaration
+    from msg_graph.blanks import declaration_with_blanks
+    common.check_output(args.output)
+    sketch = recorded_system(args.trace).sketch()
+    write_declaration(args.output, declaration_with_blanks(sketch))
+    return 0

@@ -1,0 +1,68 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the verbs that make declarations share: recorded systems, and writing the declaration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import sys
+import tempfile
+from typing import TYPE_CHECKING
+
+from mddag_executor.cli import common
+from mddag_executor.cli.text import one_line, Progress
+
+if TYPE_CHECKING:
+    from mddag_executor.replay.sketching import System
+
+
+def recorded_system(given: str) -> System:
+    """
+    Return the system that was recorded to a trace, or to a session of LTTng (a folder).
+
+    :param given: as on the command line; `-` is standard input.
+    :raises mddag_executor.trace.TraceError: when it is neither.
+    :raises mddag_executor.errors.InputError: when no system is recorded in it.
+    """
+    from mddag_executor.replay.sketching import System
+    with Progress('reading the trace') as line:
+        def progress(events: int) -> None:
+            line.update(round(events / 1e6, 1), 'million events')
+
+        if given != '-' and Path(given).is_dir():
+            from mddag_executor.trace import import_ctf
+            with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
+                trace = Path(folder, 'session.mcap')
+                warnings = import_ctf(given, trace, progress=progress).warnings
+                system = System(trace, given, progress)
+            system.warnings = [*warnings, *system.warnings]
+        else:
+            name = common.STDIN if given == '-' else given
+            with common.input_file(given) as path:
+                system = System(path if given == '-' else given, name, progress)
+    for warning in system.warnings:
+        print(f'warning: {one_line(warning)}', file=sys.stderr)
+    return system
+
+
+def write_declaration(output: str, text: str) -> None:
+    """Write a declaration with blanks, and tell how many there are."""
+    from msg_graph.blanks import MARK
+    common.write_text(output, text)
+    if output == '-':
+        return
+    count = sum(MARK in line for line in text.splitlines()[2:])
+    blanks = f'{count} blank{"" if count == 1 else "s"}' if count else 'no blank left'
+    print(f"{blanks} to fill in, marked '{MARK}'" if count else f'{blanks} to fill in')

@@ -1,0 +1,103 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What `replay` shares with whoever judges a run: tolerances, JUnit XML and the exit status."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from mddag_executor.cli import common
+from mddag_executor.cli.text import printable
+from mddag_executor.errors import UsageError
+from mddag_executor.replay.tolerances import MissTally, Tolerance
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare `--fail-on-miss` and what goes with it."""
+    add = parser.add_argument
+    add('--fail-on-miss', action='store_true',
+        help='exit with status 1 if a deadline was missed, beyond what is tolerated')
+    add('--tolerate-ratio', type=_ratio, metavar='R',
+        help='with --fail-on-miss or --junit: the share of the jobs of a sink that may miss, '
+        '0 to 1')
+    add('--tolerate-burst', type=_burst, metavar='B',
+        help='the same: how many jobs of a sink may miss in a row')
+    add('--junit', metavar='OUT.xml',
+        help="write JUnit XML, a test case for each sink ('-': to standard output)")
+
+
+def _ratio(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f'{text!r} is no number from 0 to 1')
+    return value
+
+
+def _burst(text: str) -> int:
+    return 0 if text == '0' else common.positive_int(text)
+
+
+def check(args: argparse.Namespace) -> None:
+    """
+    Check the arguments.
+
+    :raises mddag_executor.errors.MddagError: where they do not go together or can not be written
+    """
+    common.check_output(args.junit)
+    if args.json == args.junit == '-':
+        raise UsageError('-: standard output can be only one of --json and --junit: name a file')
+    if args.fail_on_miss or args.junit:
+        return
+    for option in ('tolerate_ratio', 'tolerate_burst'):
+        if getattr(args, option) is not None:
+            raise UsageError(f'--{option.replace("_", "-")}: it decides about --fail-on-miss and '
+                             '--junit: add one of them')
+
+
+def wants_tables(args: argparse.Namespace) -> bool:
+    """Tell whether standard output is for people."""
+    return common.wants_tables(args) and args.junit != '-'
+
+
+def judge(args: argparse.Namespace, tally: MissTally, result: dict[str, Any]) -> int:
+    """
+    Add the bursts to a result, say and write what is not tolerated, and return the exit status.
+
+    :param result: of ``replay --json``.
+    """
+    tally.add_bursts(result['dags'])
+    tolerance = Tolerance(args.tolerate_ratio, args.tolerate_burst)
+    broken = tolerance.verdicts(result['dags'])
+    if args.junit is not None:
+        from mddag_executor.report.junit import junit
+        with common.output_file(args.junit) as file:
+            file.write(junit(result, broken, args.trace))
+    return 1 if args.fail_on_miss and broken else 0
+
+
+def show(args: argparse.Namespace, result: dict[str, Any]) -> None:
+    """Print which sinks are not within what is tolerated, where that was said."""
+    if args.tolerate_ratio is None and args.tolerate_burst is None:
+        return
+    tolerance = Tolerance(args.tolerate_ratio, args.tolerate_burst)
+    broken = tolerance.verdicts(result['dags'])
+    for (_, sink), why in broken.items():
+        print(f'not tolerated: {printable(sink)}: {why}')
+    if not broken:
+        print('all misses, if any, are within what is tolerated')

@@ -1,0 +1,123 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The queues in which executions wait: rules 3, 4 and 9 of the scheduling rules (see ``rules``).
+
+Theory of operation
+-------------------
+A waiting execution stands in exactly one of
+
+* the ready queue (``State.ready``), a heap by the keys of the policy;
+* the heap of its callback group (``State.group_heap``), if the group was busy when its turn came;
+* under a policy that polls, the queue of its *entity* (``State.entity_queue``): what the wait set
+  of rclpy and rclcpp knows, a timer or a subscription with the messages that wait for it.
+
+An execution that is dropped leaves its entry behind, *stale*, until it gets to the top or stale
+entries are the larger part of all.
+
+**Polling rounds** (rule 9).  Between two polls the ready queue is the answer of the last one: what
+becomes ready waits at its entity, in order of becoming ready.  ``poll`` takes the first of every
+entity that has any, so each runs once in a round at most.  What nobody declared has one queue for
+all, of which every entry is an entity of its own.
+"""
+
+from __future__ import annotations
+
+from heapq import heapify, heappop, heappush
+
+from mddag_executor.core.state import ABORTED, Entry, N_STALE, State, WAITING
+from mddag_executor.core.tables import Tables
+
+SWEEP_AT = 64
+"""So many stale entries may stand in the queues anyway."""
+
+
+def is_stale(s: State, entry: Entry) -> bool:
+    """Tell whether a queue's entry is of a dropped execution (whose id may be in use again)."""
+    return s.x_state[entry[4]] != WAITING or s.x_key[entry[4]] != entry
+
+
+def add_stale(s: State) -> None:
+    """Count one more stale entry; take all out when they are the larger part."""
+    s.scalars[N_STALE] += 1
+    if s.scalars[N_STALE] > SWEEP_AT:
+        _sweep(s)
+
+
+def _sweep(s: State) -> None:
+    """Take stale entries out of all queues when they are the larger part: memory is bounded."""
+    length = len(s.ready)
+    for group in range(len(s.group_heap)):
+        length += len(s.group_heap[group])
+    for entity in range(len(s.entity_queue)):
+        length += len(s.entity_queue[entity])
+    if 2 * s.scalars[N_STALE] <= length:
+        return
+    _keep_valid(s, s.ready)
+    for group in range(len(s.group_heap)):
+        _keep_valid(s, s.group_heap[group])
+    for entity in range(len(s.entity_queue)):
+        _keep_valid(s, s.entity_queue[entity])
+    kept = 0
+    for i in range(len(s.unpolled)):
+        if len(s.entity_queue[s.unpolled[i]]) > 0:
+            s.unpolled[kept] = s.unpolled[i]
+            kept += 1
+    del s.unpolled[kept:]
+    s.scalars[N_STALE] = 0
+
+
+def _keep_valid(s: State, heap: list[Entry]) -> None:
+    kept = 0
+    for i in range(len(heap)):
+        if not is_stale(s, heap[i]):
+            heap[kept] = heap[i]
+            kept += 1
+    del heap[kept:]
+    heapify(heap)
+
+
+def wait_for_poll(t: Tables, s: State, entry: Entry) -> None:
+    """Let an execution wait at its entity for a poll (rule 9)."""
+    x = entry[4]
+    vertex = s.x_vertex[x]
+    entity = t.entity[vertex]
+    if vertex < t.n_vertices:  # each leg of a sync is a subscription of its own
+        entity += x - s.job_base[s.x_slot[x]] - t.region_offset[vertex]
+    queue = s.entity_queue[entity]
+    if len(queue) == 0:
+        s.unpolled.append(entity)
+    heappush(queue, entry)
+
+
+def poll(t: Tables, s: State) -> None:
+    """Begin a round: take the first of every entity into the ready queue, which is empty."""
+    kept = 0
+    for i in range(len(s.unpolled)):
+        entity = s.unpolled[i]
+        queue = s.entity_queue[entity]
+        waits = True
+        while queue and waits:
+            entry = heappop(queue)
+            if is_stale(s, entry):
+                s.scalars[N_STALE] -= 1
+            else:
+                heappush(s.ready, entry)
+                # What was aborted only goes there to be dropped.
+                waits = entity == t.n_entities or s.job_state[s.x_slot[entry[4]]] == ABORTED
+        if queue:
+            s.unpolled[kept] = entity
+            kept += 1
+    del s.unpolled[kept:]

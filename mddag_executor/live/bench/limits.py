@@ -1,0 +1,325 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What Python's lock, its garbage collector and the system's scheduler let an executor do.
+
+    python -m mddag_executor.live.bench.limits gil|gc|policy [--seconds 2] [--workers 7]
+
+* ``gil``: callbacks a second with one, two and all workers, for callbacks that wait (``sleep``),
+  that compute in C without the interpreter lock (``sha256``), and that compute in Python
+  (``python``), each about 5 ms long by itself; and how late an empty 10 ms timer runs meanwhile,
+  with one worker left free for it.
+* ``gc``: the longest collection and how late that timer runs in a program with a million objects,
+  with and without ``freeze_gc``.
+* ``policy``: how late that timer runs while other processes take every CPU, with the workers and
+  with the whole process under the normal and a real-time policy.
+
+``docs/gil.md`` and ``docs/real_time.md`` quote it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+import gc
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+from mddag_executor.core import quantile
+from mddag_executor.errors import MddagError, UsageError
+from mddag_executor.live import current_job
+from mddag_executor.live.executor import MultiDeadlineExecutor
+from msg_graph import loads
+import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from rclpy.utilities import try_shutdown
+
+BODY_S = 0.005
+PERIOD_S = 0.01
+OBJECTS = 1_000_000
+PRIORITY = 40
+GRAPH = """
+mddag: 1
+nodes:
+  - node: /limits
+    callbacks: [{name: tick, timer: 10ms, deadline: 10ms}]
+"""
+
+Body = Callable[[], None]
+
+
+def sleeping() -> Body:
+    """Return a body that waits, as one does that talks to a device or a GPU."""
+    return lambda: time.sleep(BODY_S)
+
+
+def hashing() -> Body:
+    """Return a body that computes in C, without the interpreter lock."""
+    data = bytes(1 << 24)
+    begin = time.thread_time()
+    hashlib.sha256(data).digest()
+    part = data[:max(4096, int(len(data) * BODY_S / (time.thread_time() - begin)))]
+    return lambda: _discard(hashlib.sha256(part).digest())
+
+
+def _discard(value: Any) -> None:
+    pass
+
+
+def counting() -> Body:
+    """Return a body that computes in Python."""
+    def count(n: int) -> None:
+        x = 0
+        for i in range(n):
+            x ^= i
+
+    n = 20_000
+    begin = time.thread_time()
+    count(10 * n)
+    n = max(1, int(10 * n * BODY_S / (time.thread_time() - begin)))
+    return lambda: count(n)
+
+
+BODIES: dict[str, Callable[[], Body]] = {
+    'sleep': sleeping, 'sha256': hashing, 'python': counting}
+
+
+class Lateness:
+    """A node with an empty timer that notes how late it runs, ns."""
+
+    def __init__(self) -> None:
+        self.late: list[int] = []
+        self.clock: Callable[[], int] = time.time_ns
+        self.node = Node('limits', enable_rosout=False, start_parameter_services=False)
+        self.node.create_timer(PERIOD_S, self._tick, ReentrantCallbackGroup())
+
+    def _tick(self) -> None:
+        job = current_job()
+        if job is not None:
+            self.late.append(self.clock() - job.release_ns)
+
+    def result(self) -> dict[str, float]:
+        """Return quantiles in us."""
+        ordered = sorted(self.late) or [0]
+        return {'p50': quantile(ordered, 0.5) / 1e3, 'p99': quantile(ordered, 0.99) / 1e3,
+                'max': ordered[-1] / 1e3}
+
+
+@contextmanager
+def spinning(**arguments: Any) -> Iterator[MultiDeadlineExecutor]:
+    """Give an executor that spins in a thread."""
+    executor = MultiDeadlineExecutor(**arguments)
+    try:
+        yield executor
+    finally:
+        executor.shutdown(5.0)
+
+
+def start(executor: MultiDeadlineExecutor) -> None:
+    """Let an executor spin in a thread."""
+    threading.Thread(target=executor.spin, daemon=True).start()
+
+
+def throughput(body: Body, workers: int, seconds: float) -> float:
+    """Return how many bodies a second a pool runs that always has enough of them."""
+    done = [0] * (2 * workers)
+    ending = threading.Event()
+    with spinning(num_workers=workers) as executor:
+        def run(i: int) -> None:
+            body()
+            done[i] += 1
+            if not ending.is_set():
+                executor.create_task(run, i)
+
+        start(executor)
+        for i in range(len(done)):
+            executor.create_task(run, i)
+        time.sleep(0.2)
+        before, begin = sum(done), time.monotonic()
+        time.sleep(seconds)
+        rate = (sum(done) - before) / (time.monotonic() - begin)
+        ending.set()
+        time.sleep(4 * BODY_S)
+    return rate
+
+
+def lateness(
+    seconds: float, workers: int, body: Body | None = None, **arguments: Any
+) -> dict[str, float]:
+    """Return how late an empty timer runs (us) while all workers but one run bodies."""
+    ending = threading.Event()
+    watched = Lateness()
+    try:
+        with spinning(graph=loads(GRAPH), num_workers=workers, **arguments) as executor:
+            watched.clock = executor._dispatcher.now
+
+            def run() -> None:
+                assert body is not None
+                body()
+                if not ending.is_set():
+                    executor.create_task(run)
+
+            executor.add_node(watched.node)
+            start(executor)
+            for _ in range(workers - 1 if body is not None else 0):
+                executor.create_task(run)
+            time.sleep(0.3)
+            watched.late.clear()
+            time.sleep(seconds)
+            ending.set()
+            return watched.result()
+    finally:
+        watched.node.destroy_node()
+
+
+def measure_gil(seconds: float, workers: int) -> list[dict[str, Any]]:
+    """Measure what workers give to each kind of body."""
+    rows = []
+    for name, make in BODIES.items():
+        body = make()
+        rates = {n: throughput(body, n, seconds) for n in (1, 2, workers)}
+        rows.append({
+            'callbacks': name, **{f'{n} workers /s': round(r) for n, r in rates.items()},
+            'speed-up': round(rates[workers] / rates[1], 2),
+            **{f'timer late {k} us': round(v) for k, v in lateness(
+                seconds, workers, body).items()}})
+    return rows
+
+
+class GcWatch:
+    """Notes how long each garbage collection takes, ns, while it is entered."""
+
+    def __init__(self) -> None:
+        self.pauses: list[int] = []
+        self._begun = 0
+
+    def __call__(self, phase: str, info: dict[str, int]) -> None:
+        """Take in what the collector tells."""
+        if phase == 'start':
+            self._begun = time.monotonic_ns()
+        else:
+            self.pauses.append(time.monotonic_ns() - self._begun)
+
+    def __enter__(self) -> GcWatch:
+        gc.callbacks.append(self)
+        return self
+
+    def __exit__(self, *args: object) -> None:
+        gc.callbacks.remove(self)
+
+
+def measure_gc(seconds: float, workers: int) -> list[dict[str, Any]]:
+    """Measure the pauses of a program with many objects, which makes more all the time."""
+    kept = [(str(i), [i]) for i in range(OBJECTS // 2)]
+    garbage: list[list[Any]] = []
+
+    def body() -> None:
+        time.sleep(BODY_S / 5)
+        garbage.extend([] for _ in range(500))
+        if len(garbage) > 100_000:
+            garbage.clear()
+
+    rows = []
+    for freeze in (False, True):
+        with GcWatch() as watch:
+            late = lateness(seconds, workers, body, freeze_gc=freeze)
+            if freeze:
+                del watch.pauses[0]  # that of freeze_gc itself, before anything runs
+            longest = max(watch.pauses, default=0)
+            gc.collect()
+        rows.append({
+            'freeze_gc': str(freeze), 'full collection ms': round(watch.pauses[-1] / 1e6, 1),
+            'longest ms': round(longest / 1e6, 1),
+            **{f'timer late {k} us': round(v) for k, v in late.items()}})
+    gc.unfreeze()
+    del kept
+    return rows
+
+
+def measure_policy(seconds: float, workers: int) -> list[dict[str, Any]]:
+    """Measure lateness beside busy processes under each policy that this process may use."""
+    busy = [subprocess.Popen([sys.executable, '-c', 'while True: pass'])
+            for _ in range(os.cpu_count() or 1)]
+    rows = []
+    try:
+        for name, threads, process in (
+            ('all SCHED_OTHER', None, None), ('workers SCHED_FIFO', 'SCHED_FIFO', None),
+            ('whole process SCHED_FIFO', None, os.SCHED_FIFO),
+        ):
+            arguments: dict[str, Any] = {}
+            if threads is not None:
+                arguments = {'worker_policy': threads, 'worker_priority': PRIORITY}
+            if process is not None:  # threads made from here on inherit it
+                _set_policy(process, PRIORITY)
+            try:
+                late = lateness(seconds, workers, **arguments)
+            finally:
+                if process is not None:
+                    _set_policy(os.SCHED_OTHER, 0)
+            rows.append({'setting': name, **{f'timer late {k} us': round(v)
+                                             for k, v in late.items()}})
+    finally:
+        for each in busy:
+            each.kill()
+            each.wait()
+    return rows
+
+
+def _set_policy(policy: int, priority: int) -> None:
+    try:
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
+    except OSError as error:
+        raise UsageError(
+            f'policy: this process may not use SCHED_FIFO {PRIORITY} ({error}): raise its rtprio '
+            'limit (ulimit -r) or run it with CAP_SYS_NICE') from None
+
+
+MEASUREMENTS = {'gil': measure_gil, 'gc': measure_gc, 'policy': measure_policy}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description='Measure what Python and the system allow.')
+    parser.add_argument('what', choices=MEASUREMENTS)
+    parser.add_argument('--seconds', type=float, default=2.0)
+    parser.add_argument('--workers', type=int, default=7)
+    parser.add_argument('--json', action='store_true', help='print JSON')
+    args = parser.parse_args(arguments)
+    rclpy.init(args=[])
+    try:
+        rows = MEASUREMENTS[args.what](args.seconds, args.workers)
+    except MddagError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    finally:
+        try_shutdown()
+    if args.json:
+        print(json.dumps(rows, indent=1))
+    else:
+        for row in rows:
+            print(', '.join(f'{key}: {value}' for key, value in row.items()))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,334 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Endurance: a declared workload under one executor for as long as it takes, with random faults.
+
+    python -m mddag_executor.live.bench.soak config/autoware.yaml --seconds 600
+
+Theory of operation
+-------------------
+The nodes are made from the declaration, much as ``synthetic`` makes them, but each can be
+destroyed and made again by itself, and nothing is kept for each message.  After a warm-up there is
+one fault after the other, chosen at random, and after each of them a second to recover and a
+*clean* window:
+
+* ``destroy``: a node is destroyed while its callbacks run, and made again;
+* ``raise``: a callback raises, which ends ``spin``; it is called again;
+* ``stop``: a source stops for a second;
+* ``burst``: a source releases ten times as often for a second;
+* ``clock``: the simulated time, which a node beside the workload follows, jumps to and fro.
+
+At the end these have to hold: memory within 5 % of what it was after the warm-up; as many threads
+and file handles; every execution that became ready ran, was dropped, or is one of those that wait;
+every job ended or is open; and no deadline is missed by a job that was released in a clean window.
+Sinks whose critical path is longer than their deadline in this draw are left out of that last one,
+and so are windows in which the machine itself stood still: a process beside this one, which does
+nothing but sleep, tells when it was woken more than ``STALL_S`` late.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+import json
+import os
+from pathlib import Path
+import random
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+from mddag_executor.live import DeadlineMiss
+from mddag_executor.live.bench.soak_nodes import SimulatedTime, SoakFault, SoakNodes
+from mddag_executor.live.execution import ExecutionPlan
+from mddag_executor.live.executor import MultiDeadlineExecutor
+from msg_graph import load, TaskSet
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.utilities import try_shutdown
+
+FAULTS = ('destroy', 'raise', 'stop', 'burst', 'clock')
+FAULT_S, RECOVERY_S, CLEAN_S = 1.0, 1.0, 1.5
+BURST = 10
+DRAIN_S = 3.0
+MEMORY_RATIO = 0.05
+MATCH_S = 30.0
+STALL_S = 0.01
+
+_SLEEPER = f"""
+import time
+while True:
+    before = time.monotonic()
+    time.sleep(0.002)
+    if time.monotonic() - before > 0.002 + {STALL_S}:
+        print(time.time_ns(), flush=True)
+"""
+
+
+class StallWatch:
+    """Notes when a process that only sleeps was woken late, ns since the epoch."""
+
+    def __init__(self) -> None:
+        self.stalls: list[int] = []
+        self._process = subprocess.Popen(
+            [sys.executable, '-c', _SLEEPER], stdout=subprocess.PIPE, text=True)
+        self._thread = threading.Thread(target=self._read, daemon=True, name='soak-stalls')
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self.stalls.append(int(line))
+
+    def within(self, start: int, end: int) -> bool:
+        """Tell whether there was one between two times."""
+        return any(start <= stall < end for stall in self.stalls)
+
+    def stop(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.wait()
+        self._thread.join()
+
+
+def usage() -> dict[str, int]:
+    """Return the process' memory (bytes), threads and file handles."""
+    pages = int(Path('/proc/self/statm').read_text().split()[1])
+    return {
+        'memory': pages * os.sysconf('SC_PAGE_SIZE'),
+        'threads': len(os.listdir('/proc/self/task')), 'handles': len(os.listdir('/proc/self/fd'))}
+
+
+class Soak:
+    """
+    One endurance run.
+
+    :param say: told what happens, one line each.
+    """
+
+    def __init__(
+        self, task_set: TaskSet, seconds: float, *, utilisation: float = 0.8, workers: int = 7,
+        seed: int = 0, intake: str = 'auto', say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self._seconds = seconds
+        self._say = say
+        self._random = random.Random(seed)
+        plan = ExecutionPlan(task_set, seed, utilisation, workers, 'sleep')
+        self._infeasible = {sink.vertex for sink in plan.infeasible()}
+        self._missed: list[tuple[int, str]] = []
+        self.executor = MultiDeadlineExecutor(
+            task_set, num_workers=workers, on_deadline_miss=self._on_miss, intake=intake)
+        self.nodes = SoakNodes(task_set, plan)
+        self._simulated = SimulatedTime()
+        self._stalls = StallWatch()
+        self.counts = dict.fromkeys((*FAULTS, 'raised'), 0)
+        self._errors: list[str] = []
+        self._clean: list[tuple[int, int]] = []
+        self._ending = False
+        self._thread = threading.Thread(target=self._spin, name='soak-spin', daemon=True)
+
+    def _on_miss(self, miss: DeadlineMiss) -> None:
+        if miss.vertex not in self._infeasible:
+            self._missed.append((miss.release_ns, miss.vertex))
+            if len(self._missed) > 200_000:
+                del self._missed[:100_000]
+
+    def _spin(self) -> None:
+        while not self._ending:
+            try:
+                self.executor.spin()
+            except SoakFault:
+                self.counts['raised'] += 1
+            except ExternalShutdownException:
+                return
+            except BaseException as error:
+                self._errors.append(f'{type(error).__name__}: {error}')
+                if len(self._errors) > 100:
+                    return
+
+    def run(self) -> dict[str, Any]:
+        """Run, and return what came of it; ``failed`` has what should not be, one line each."""
+        for node in (*self.nodes.nodes.values(), self._simulated.node):
+            self.executor.add_node(node)
+        self._thread.start()
+        end = time.monotonic() + MATCH_S
+        while not self.nodes.matched() and time.monotonic() < end:
+            time.sleep(0.05)
+        begin = time.monotonic()
+        warm_up = min(20.0, self._seconds / 3)
+        time.sleep(warm_up)
+        self._misuse_once()
+        before = usage()
+        self._say(f'warm after {warm_up:.0f} s: {before}')
+        slot = FAULT_S + RECOVERY_S + CLEAN_S
+        while time.monotonic() - begin + slot <= self._seconds:
+            self._one_fault()
+        after = usage()
+        return self._end(before, after, time.monotonic() - begin)
+
+    def _misuse_once(self) -> None:
+        """Have each fault once before the first measurement: what it loads stays loaded."""
+        for fault in FAULTS:
+            self._inject(fault, 0.1)
+        time.sleep(RECOVERY_S)
+
+    def _one_fault(self) -> None:
+        fault = self._random.choice(FAULTS)
+        self.counts[fault] += 1
+        self._inject(fault, FAULT_S)
+        time.sleep(RECOVERY_S)
+        start = time.time_ns()
+        missed = len(self._missed)
+        time.sleep(CLEAN_S)
+        self._clean.append((start, time.time_ns()))
+        self._say(f'{fault}: {len(self._missed) - missed} misses noticed in the clean window, '
+                  f'{usage()["memory"] / 1e6:.1f} MB')
+
+    def _inject(self, fault: str, seconds: float) -> None:
+        getattr(self, f'_{fault}')(seconds)
+
+    def _destroy(self, seconds: float) -> None:
+        name = self._random.choice(list(self.nodes.nodes))
+        self.nodes.nodes[name].destroy_node()
+        self.executor.remove_node(self.nodes.nodes[name])
+        time.sleep(seconds / 4)
+        self.executor.add_node(self.nodes.make(name))
+        time.sleep(seconds * 3 / 4)
+
+    def _raise(self, seconds: float) -> None:
+        self.nodes.raise_next = True
+        time.sleep(seconds)
+
+    def _stop(self, seconds: float) -> None:
+        timer = self.nodes.timers[self._random.choice(self.nodes.sources())]
+        timer.cancel()
+        time.sleep(seconds)
+        timer.reset()
+        self.executor.wake()
+
+    def _burst(self, seconds: float) -> None:
+        timer = self.nodes.timers[self._random.choice(self.nodes.sources())]
+        period = timer.timer_period_ns
+        timer.timer_period_ns = max(1_000_000, period // BURST)
+        timer.reset()
+        time.sleep(seconds)
+        timer.timer_period_ns = period
+        timer.reset()
+
+    def _clock(self, seconds: float) -> None:
+        for _ in range(4):
+            self._simulated.jump(self._random.choice((-1, 1)) * self._random.randrange(10 ** 11))
+            time.sleep(seconds / 4)
+
+    def _end(
+        self, before: dict[str, int], after: dict[str, int], elapsed: float
+    ) -> dict[str, Any]:
+        ticks = self._simulated.ticks
+        time.sleep(0.5)
+        simulated_goes_on = self._simulated.ticks > ticks
+        for timer in self.nodes.timers.values():
+            timer.cancel()
+        time.sleep(DRAIN_S)
+        n_open = list(self.executor._dispatcher.scheduler.state.n_open)
+        self._ending = True
+        ended = self.executor.shutdown(10.0)
+        self._thread.join(10.0)
+        statistics = self.executor.statistics()
+        self._simulated.stop()
+        for node in self.nodes.nodes.values():
+            node.destroy_node()
+        self._stalls.stop()
+        # what is released last in a window runs on beyond it, and may wait for what was before
+        judged = [(start, stop) for start, stop in self._clean if not self._stalls.within(
+            start - 500_000_000, stop + 200_000_000)]
+        clean_misses = [
+            vertex for release, vertex in self._missed
+            if any(start <= release < stop for start, stop in judged)]
+        result = {
+            'seconds': elapsed, 'faults': self.counts, 'before': before, 'after': after,
+            'jobs': sum(d['jobs'] for d in statistics['dags'].values()),
+            'executions': _sum(statistics, 'ready'), 'ran': _sum(statistics, 'ran'),
+            'dropped': _sum(statistics, 'dropped'), 'skipped': _sum(statistics, 'skipped'),
+            'unattributed': _sum(statistics, 'unattributed'),
+            'clean_windows': len(self._clean), 'disturbed_windows': len(self._clean) - len(judged),
+            'stalls': len(self._stalls.stalls), 'clean_misses': len(clean_misses),
+            'clean_missed_sinks': sorted(set(clean_misses)),
+            'infeasible_sinks': sorted(self._infeasible), 'simulated_ticks': ticks}
+        result['failed'] = [*self._failures(result, statistics, n_open)]
+        if not simulated_goes_on:
+            result['failed'].append('the timer on simulated time has stopped')
+        if not ended or self._thread.is_alive():
+            result['failed'].append('the executor did not end')
+        result['failed'] += self._errors
+        return result
+
+    def _failures(
+        self, result: dict[str, Any], statistics: dict[str, Any], n_open: list[int]
+    ) -> list[str]:
+        before, after = result['before'], result['after']
+        failed = []
+        growth = after['memory'] / before['memory'] - 1
+        if growth > MEMORY_RATIO:
+            failed.append(f'memory grew by {growth:.1%}')
+        for what in ('threads', 'handles'):
+            if after[what] > before[what]:
+                failed.append(f'{what}: {before[what]} before, {after[what]} after')
+        for name, counts in statistics['callbacks'].items():
+            left = counts['ready'] - counts['ran'] - counts['dropped'] - counts['waiting']
+            if left:
+                failed.append(f'{name}: {left} executions are unaccounted for')
+        declared = sum(c['ran'] for c in statistics['callbacks'].values() if c['declared'])
+        if declared != self.nodes.started:
+            failed.append(f'{declared} executions counted, {self.nodes.started} callbacks ran')
+        for (name, dag), still_open in zip(statistics['dags'].items(), n_open):
+            if dag['jobs'] != sum(dag['ends'].values()) + still_open:
+                failed.append(f'{name}: {dag["jobs"]} jobs, {dag["ends"]}, {still_open} open')
+        if result['clean_misses']:
+            failed.append(
+                f'{result["clean_misses"]} deadlines missed in clean windows, more than '
+                f'{RECOVERY_S:g} s after the fault: {", ".join(result["clean_missed_sinks"][:5])}')
+        return failed
+
+
+def _sum(statistics: dict[str, Any], key: str) -> int:
+    return sum(counts[key] for counts in statistics['callbacks'].values())
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run from the command line; return 1 when something does not hold."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
+    parser.add_argument('graph', help='the declaration')
+    parser.add_argument('--seconds', type=float, default=600.0)
+    parser.add_argument('--utilisation', type=float, default=0.8)
+    parser.add_argument('--workers', type=int, default=7)
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--intake', choices=('auto', 'events', 'waitset'), default='auto')
+    args = parser.parse_args(arguments)
+    rclpy.init(args=[])
+    try:
+        result = Soak(
+            load(args.graph), args.seconds, utilisation=args.utilisation, workers=args.workers,
+            seed=args.seed, intake=args.intake,
+            say=lambda text: print(text, file=sys.stderr, flush=True)).run()
+    finally:
+        try_shutdown()
+    print(json.dumps(result, indent=1))
+    return 1 if result['failed'] else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,167 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+DAGs over several processes: find the job that a message from another process belongs to.
+
+Theory of operation
+-------------------
+In a process of its own every executor sees only the publications of its own callbacks.  Across
+processes and machines the message itself must say which job it belongs to, and it does where the
+DAG's source declares ``release_from: header_stamp``: nodes pass the stamp of the sensor's message
+on from the source to the sinks, and that stamp is the release of the job.  These are the rules,
+for such DAGs only:
+
+1.  A vertex is *here* when an entity of this executor is bound to its callback now.  A job has in
+    this process the vertices that are here when it is released here; its sinks elsewhere are
+    judged there (rule 10 of ``core.rules``).
+2.  A message whose publication is known here belongs to that publication's job, as always.
+3.  Any other message on a topic *enters* when exactly one vertex that is not here publishes the
+    topic to it (to one leg of one vertex, should there be several), and its header has a stamp
+    that is not zero.  It belongs to the open job of that stamp; if there is none yet, it starts
+    one, whose release is the stamp.
+4.  The job of a stamp is the one that a source's message or an entering message with that stamp
+    has started here, or one of whose callbacks here has published a message with that stamp.  So a
+    DAG may leave a process and come back.
+5.  Whatever leaves a doubt (two vertices elsewhere that publish the topic, no stamp, a job that
+    has ended, a second message for the same vertex of the same job) runs as undeclared, and is
+    counted as unattributed.
+
+A stamp is a time of the system's clock: between machines these have to be synchronised (PTP,
+NTP), and what they differ by shows in the response times.  A timer that is a source has its
+nominal due time as release where it runs, and elsewhere the stamp that its node gave the message:
+with a stamp taken from the clock in the callback it is later there by the dispatch latency.
+
+Two executors in one process that share a graph are to each other as two processes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+import threading
+from typing import Any
+
+from mddag_executor.core import Scheduler, Tables
+from mddag_executor.live.attribution import Attribution, Origin
+from mddag_executor.live.entries import Entry
+from mddag_executor.live.verdicts import Record
+from msg_graph import TaskSet
+
+KEEP = 4096
+"""The jobs of so many stamps are remembered."""
+
+
+def header_stamp(message: Any) -> int:
+    """Return the stamp of a message's header (or of a Header), system time in ns; -1 for none."""
+    stamp = getattr(getattr(message, 'header', message), 'stamp', None)
+    if stamp is None:
+        return -1
+    try:
+        return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or -1
+    except (AttributeError, TypeError, ValueError):
+        return -1  # something else is called so
+
+
+class Crossings:
+    """
+    The DAGs that may reach beyond this process, and the jobs of their stamps.
+
+    ``update`` and ``find`` are called under the dispatcher's lock; ``note`` from any thread.
+    """
+
+    def __init__(
+        self, task_set: TaskSet, tables: Tables, scheduler: Scheduler, attribution: Attribution,
+    ) -> None:
+        self._dags = [d for d in task_set.dags if d.release_from == 'header_stamp']
+        self._crossing = {d.index for d in self._dags}
+        self._tables = tables
+        self._scheduler = scheduler
+        self._attribution = attribution
+        self._callbacks = [v.callback.key for d in task_set.dags for v in d.vertices]
+        self._here: dict[int, list[int]] = {}
+        self._jobs: dict[tuple[int, int], Origin] = {}
+        self._kept: deque[tuple[int, int]] = deque()
+
+    @staticmethod
+    def of(
+        task_set: TaskSet | None, tables: Tables, scheduler: Scheduler, attribution: Attribution,
+    ) -> Crossings | None:
+        """Return the crossings of a declaration, None where no DAG has any."""
+        if task_set is None or all(d.release_from != 'header_stamp' for d in task_set.dags):
+            return None
+        return Crossings(task_set, tables, scheduler, attribution)
+
+    def update(self, hosted: set[str], entries: Iterable[Entry]) -> list[tuple[int, list[int]]]:
+        """
+        Take in which callbacks are here now (rules 1 and 3).
+
+        :param hosted: the keys of the callbacks.
+        :return: for each DAG of which that has changed, which vertices are here.
+        """
+        changes = []
+        leaving: set[str] = set()
+        for dag in self._dags:
+            here = [int(v.callback.key in hosted) for v in dag.vertices]
+            if here != self._here.get(dag.index):
+                self._here[dag.index] = here
+                self._scheduler.expect(dag.index, here)
+                changes.append((dag.index, here))
+            if not all(here):
+                leaving.update(
+                    t for v in dag.vertices if here[v.index] for t in v.callback.publishes)
+        self._attribution.tell(self._published, leaving)
+        for entry in entries:
+            entry.enters = self._entrance(entry, hosted)
+        return changes
+
+    def host(
+        self, hosted: set[str], entries: Iterable[Entry], record: Record | None, now: int
+    ) -> None:
+        """Take in which callbacks are here now, as ``update`` does, and record what changes."""
+        for dag, here in self.update(hosted, entries):
+            if record is not None:
+                vertices = ','.join(str(i) for i, is_here in enumerate(here) if is_here)
+                record('hosted', now, threading.get_native_id(), dag, vertices)
+
+    def _entrance(self, entry: Entry, hosted: set[str]) -> int:
+        """Return the vertex elsewhere from which messages enter at an entity, -1 for none."""
+        remote = [v for v in entry.targets if self._callbacks[v] not in hosted]
+        if not remote or len({entry.targets[v] for v in remote}) > 1:
+            return -1
+        crossing = all(self._tables.dag_of[v] in self._crossing for v in remote)
+        return remote[0] if crossing else -1
+
+    def _published(self, message: Any, origin: Origin) -> None:
+        self.note(header_stamp(message), origin)
+
+    def elsewhere(self) -> set[str]:
+        """Return the callbacks of these DAGs that are not here."""
+        return {v.callback.key for dag in self._dags for v in dag.vertices
+                if not self._here.get(dag.index, [0] * len(dag.vertices))[v.index]}
+
+    def note(self, stamp: int, origin: Origin) -> None:
+        """Note the job of a stamp (rule 4)."""
+        if stamp < 0 or origin.dag not in self._crossing:
+            return
+        key = (origin.dag, stamp)
+        if key not in self._jobs:
+            self._kept.append(key)
+            if len(self._kept) > KEEP:
+                self._jobs.pop(self._kept.popleft(), None)
+        self._jobs[key] = origin
+
+    def find(self, dag: int, stamp: int) -> Origin | None:
+        """Return the job of a stamp, also one that has ended; None for a new one."""
+        return self._jobs.get((dag, stamp))

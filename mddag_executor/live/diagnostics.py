@@ -1,0 +1,350 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What an executor tells on ``/diagnostics``, the topic that ROS's own tools look at.
+
+Theory of operation
+-------------------
+Once a period a thread of its own reads the executor's counters and publishes one
+``DiagnosticArray``: a status for each DAG that has a callback in this process, and one for the
+pool.  It takes no lock and touches nothing that a callback's way goes through: counters are read
+as they stand (a count that moves on while others are read shows one period later), so neither
+workers nor intake ever wait for it.
+
+A DAG's status says what came of its results (jobs of its sinks) lately.  STALE: nothing has been
+released for a while.  ERROR, WARN: see ``Thresholds``.  The pool's status says WARN when something
+was lost: messages beyond a queue's depth, releases of timers, messages whose job was not found,
+events of the trace.
+
+By the conventions of diagnostics names are ``NAME: DAG`` and ``NAME: workers``, the hardware_id is
+the host's name and the process, and values are texts whose units stand in their keys.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+import os
+import socket
+import threading
+import time
+from typing import NamedTuple, TYPE_CHECKING
+
+from mddag_executor.core import quantile
+from mddag_executor.core.tally import SinkTally, Tally
+from mddag_executor.live.settings import Thresholds
+from rclpy.logging import get_logger
+
+if TYPE_CHECKING:
+    from mddag_executor.live.dispatcher import Dispatcher
+    from mddag_executor.live.pool import Pool
+    from mddag_executor.live.recorder import Recorder
+    from mddag_executor.live.registry import Registry
+    from msg_graph import TaskSet
+    from rclpy.context import Context
+
+TOPIC = '/diagnostics'
+WORKERS = 'workers'
+NODE_NAME = 'mddag_diagnostics'
+OK, WARN, ERROR, STALE = range(4)
+END_TIMEOUT_S = 2.0
+
+
+@dataclass(frozen=True)
+class Status:
+    """One status: name, level (OK, WARN, ERROR, STALE), message, values by key."""
+
+    name: str
+    level: int
+    message: str
+    values: dict[str, str]
+
+
+class Results(NamedTuple):
+    """What came of the results of a DAG: counts since the start, or differences of two."""
+
+    jobs: int
+    completed: int
+    late: int
+    expired: int
+    aborted: int
+
+    @property
+    def missed(self) -> int:
+        """Return how many were not in time."""
+        return self.late + self.expired + self.aborted
+
+    @property
+    def due(self) -> int:
+        """Return how many have been judged."""
+        return self.completed + self.expired + self.aborted
+
+    def minus(self, earlier: Results) -> Results:
+        """Return what has come since."""
+        return Results(*(a - b for a, b in zip(self, earlier)))
+
+
+def read_results(tally: Tally, dag: int, sinks: list[SinkTally]) -> Results:
+    """Read the counters of a DAG as they stand; those overdue at the run's end are left out."""
+    return Results(
+        tally.jobs[dag], sum(s.completed for s in sinks),
+        sum(s.late - s.overdue for s in sinks), sum(s.expired for s in sinks),
+        sum(s.aborted for s in sinks))
+
+
+def last_responses(sink: SinkTally, count: int) -> list[int]:
+    """Return the last response times, ns; while others are added, one may be there twice."""
+    kept = sink.responses
+    return [kept[-i] for i in range(1, min(count, len(kept)) + 1)]
+
+
+class DagWatch:
+    """
+    Judges the state of one DAG, period by period.
+
+    :param dag: its index.
+    :param period_ns: the period of its source.
+    :param every_ns: the period of the diagnostics.
+    """
+
+    def __init__(
+        self, tally: Tally, dag: int, name: str, period_ns: int, sinks: list[SinkTally],
+        thresholds: Thresholds, every_ns: int,
+    ) -> None:
+        self._tally = tally
+        self._dag = dag
+        self._name = name
+        self._period_ns = period_ns
+        self._sinks = sinks
+        self._thresholds = thresholds
+        self._stale_after = max(thresholds.stale_periods * period_ns, every_ns)
+        self._last = read_results(tally, dag, sinks)
+        self._completed = [s.completed for s in sinks]
+        self._window: deque[Results] = deque(maxlen=thresholds.window)
+        self._released_at: int | None = None
+
+    def status(self, now: int) -> Status:
+        """Return the state of things; to be called once a period (``now``: monotonic ns)."""
+        results = read_results(self._tally, self._dag, self._sinks)
+        step = results.minus(self._last)
+        self._last = results
+        self._window.append(step)
+        if step.jobs:
+            self._released_at = now
+        window = Results(*(sum(column) for column in zip(*self._window)))
+        level, message = self._level(step, window, now)
+        ratio = window.missed / window.due if window.due else 0.0
+        values = {
+            'period_ms': _ms(self._period_ns), 'jobs': str(results.jobs),
+            'results': str(results.due), 'missed': str(results.missed),
+            'late': str(results.late), 'expired': str(results.expired),
+            'aborted': str(results.aborted),
+            'window_results': str(window.due), 'window_missed': str(window.missed),
+            'window_missed_ratio': f'{ratio:.4f}', **self._response_times()}
+        return Status(f'{self._thresholds.name}: {self._name}', level, message, values)
+
+    def _level(self, step: Results, window: Results, now: int) -> tuple[int, str]:
+        limits = self._thresholds
+        if self._released_at is None:
+            return STALE, 'nothing has been released yet'
+        silent = now - self._released_at
+        if silent >= self._stale_after:
+            return STALE, f'nothing has been released for {silent / 1e9:.1f} s'
+        if not window.missed:
+            return OK, f'{window.due} results in time'
+        message = f'{window.missed} of {window.due} results missed their deadlines'
+        if window.missed >= max(
+                limits.warn_burst, limits.error_ratio * window.due):
+            return ERROR, message
+        if step.missed >= limits.warn_burst or window.missed >= limits.warn_ratio * window.due:
+            return WARN, message
+        return OK, message
+
+    def _response_times(self) -> dict[str, str]:
+        """Return the response times of the last period, in parts of their deadlines and in ms."""
+        times: list[int] = []
+        used: list[float] = []
+        for i, sink in enumerate(self._sinks):
+            completed = sink.completed
+            found = last_responses(sink, completed - self._completed[i])
+            self._completed[i] = completed
+            times += found
+            if found:
+                used.append(max(found) / sink.relative_deadline_ns)
+        if not times:
+            return {}
+        times.sort()
+        return {
+            'response_p50_ms': _ms(quantile(times, 0.5)),
+            'response_p99_ms': _ms(quantile(times, 0.99)), 'response_max_ms': _ms(times[-1]),
+            'deadline_used_max': f'{max(used):.2f}'}
+
+
+def _ms(nanoseconds: int) -> str:
+    return f'{nanoseconds / 1e6:.3f}'
+
+
+class PoolWatch:
+    """Judges the state of the workers and of what everybody shares, period by period."""
+
+    def __init__(
+        self, dispatcher: Dispatcher, pool: Pool, registry: Registry, recorder: Recorder | None,
+        thresholds: Thresholds,
+    ) -> None:
+        self._dispatcher = dispatcher
+        self._pool = pool
+        self._registry = registry
+        self._recorder = recorder
+        self._thresholds = thresholds
+        self._last = self._read()
+        self._at = time.monotonic_ns(), time.process_time_ns()
+
+    def _read(self) -> dict[str, int]:
+        attribution = self._dispatcher.attribution
+        return {
+            **self._registry.totals(), 'doubtful': attribution.doubtful,
+            'trace_lost': 0 if self._recorder is None else self._recorder.writer.dropped}
+
+    def status(self, now: int) -> Status:
+        """Return the state of things; to be called once a period (``now``: monotonic ns)."""
+        counts = self._read()
+        step = {key: max(0, n - self._last[key]) for key, n in counts.items()}
+        cpu = time.process_time_ns()
+        passed, cpu_used = max(1, now - self._at[0]), cpu - self._at[1]
+        self._last, self._at = counts, (now, cpu)
+        workers = self._dispatcher.n_workers
+        lost = [f'{step[key]} {what}' for key, what in (
+            ('dropped', 'dropped'), ('skipped', 'timer releases skipped'),
+            ('unattributed', 'messages without a job'), ('trace_lost', 'trace events lost'),
+        ) if step[key]]
+        failed = self._recorder is not None and self._recorder.writer.error is not None
+        if failed:
+            lost.append('the trace can not be written')
+        scheduler = self._dispatcher.scheduler
+        values = {
+            'policy': scheduler.policy.name, 'workers': str(workers),
+            'idle_workers': str(scheduler.idle_workers), 'lent': str(self._pool.lent),
+            'queue': str(scheduler.queue_length),
+            'callbacks_per_s': f'{step["ran"] * 1e9 / passed:.1f}',
+            'busy_ratio': f'{step["busy_ns"] / passed / workers:.3f}',
+            'cpu_ratio': f'{cpu_used / passed:.3f}',
+            'cpu_us_per_callback': f'{cpu_used / 1e3 / step["ran"]:.1f}' if step['ran'] else '',
+            **{key: str(counts[key]) for key in (
+                'ran', 'dropped', 'skipped', 'unattributed', 'doubtful', 'trace_lost')}}
+        return Status(
+            f'{self._thresholds.name}: {WORKERS}',
+            ERROR if failed else WARN if lost else OK,
+            ', '.join(lost) or f'{step["ran"]} callbacks ran', values)
+
+
+class Diagnostics:
+    """
+    Publishes the state of an executor, from a thread of its own.
+
+    :param period_ns: how often.
+    """
+
+    def __init__(
+        self, context: Context, task_set: TaskSet | None, dispatcher: Dispatcher, pool: Pool,
+        registry: Registry, recorder: Recorder | None, period_ns: int, thresholds: Thresholds,
+    ) -> None:
+        self._context = context
+        self._registry = registry
+        self._period_ns = period_ns
+        self._hardware_id = f'{socket.gethostname()}/{os.getpid()}'
+        tally, tables = dispatcher.verdicts.tally, dispatcher.tables
+        self._dags = []
+        for dag in task_set.dags if task_set is not None else ():
+            sinks = tables.sinks[tables.first_sink[dag.index]:tables.first_sink[dag.index + 1]]
+            self._dags.append((
+                {vertex.callback.key for vertex in dag.vertices},
+                DagWatch(tally, dag.index, dag.name, dag.period_ns,
+                         [tally.sinks[v] for v in sinks], thresholds, period_ns)))
+        self._pool = PoolWatch(dispatcher, pool, registry, recorder, thresholds)
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def statuses(self) -> list[Status]:
+        """Return a status for each DAG that has a callback here, and the pool's."""
+        now = time.monotonic_ns()
+        hosted = self._registry.hosted()
+        found = [watch.status(now) for keys, watch in self._dags if not keys.isdisjoint(hosted)]
+        return [*found, self._pool.status(now)]
+
+    def start(self) -> None:
+        """Begin to publish; nothing happens when it has begun before."""
+        if self._thread is None:
+            self._thread = threading.Thread(
+                target=self._run, name='mddag-diagnostics', daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """End publishing; nothing happens when it has never begun."""
+        self._ending.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(END_TIMEOUT_S)
+
+    def _run(self) -> None:
+        try:
+            publisher = _Publisher(self._context, self._hardware_id)
+            try:
+                due = time.monotonic_ns() + self._period_ns
+                while not self._ending.wait(max(0, due - time.monotonic_ns()) / 1e9):
+                    if not self._context.ok():
+                        return
+                    publisher.publish(self.statuses())
+                    # a period that was missed (the machine slept) is not made up for
+                    due = max(due + self._period_ns, time.monotonic_ns())
+            finally:
+                publisher.destroy()
+        except Exception as error:
+            if self._context.ok():
+                get_logger('mddag_executor').error(f'there will be no diagnostics: {error}')
+
+
+class _Publisher:
+    """A node that publishes statuses; no executor runs it, since it has nothing to run."""
+
+    def __init__(self, context: Context, hardware_id: str) -> None:
+        from diagnostic_msgs.msg import DiagnosticArray
+        from rclpy.node import Node
+        from rclpy.parameter import Parameter
+        self._hardware_id = hardware_id
+        # Its own arguments go before those of the process, which name the process' nodes.
+        self._node = Node(
+            NODE_NAME, context=context, enable_rosout=False, start_parameter_services=False,
+            cli_args=['--ros-args', '-r', f'__node:={NODE_NAME}_{os.getpid()}'],
+            parameter_overrides=[Parameter('start_type_description_service', value=False)])
+        self._publisher = self._node.create_publisher(DiagnosticArray, TOPIC, 10)
+
+    def publish(self, statuses: list[Status]) -> None:
+        from builtin_interfaces.msg import Time
+        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+        message = DiagnosticArray()
+        # of the system's clock: simulated time may stand still, and this is about the process
+        seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
+        message.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
+        for status in statuses:
+            message.status.append(DiagnosticStatus(
+                level=bytes([status.level]), name=status.name, message=status.message,
+                hardware_id=self._hardware_id,
+                values=[KeyValue(key=key, value=value) for key, value in status.values.items()]))
+        self._publisher.publish(message)
+
+    def destroy(self) -> None:
+        try:
+            self._node.destroy_node()
+        except Exception:
+            pass  # the context has ended meanwhile

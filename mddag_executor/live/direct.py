@@ -1,0 +1,294 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Messages between callbacks of one process are taken by the thread that publishes them.
+
+Theory of operation
+-------------------
+A middleware that delivers within a process does so inside of ``publish``: when it returns, the
+message is there to be taken.  Who has just published may then as well take it, with warm caches;
+to wake an intake thread for it costs two switches of threads and a fight for the interpreter
+lock.  So a subscription all of whose publishers belong to this executor's nodes is *direct*: the
+intake does not look after it, and each ``publish`` of one of these publishers takes from it.
+
+Nothing may get lost or wait by that:
+
+1.  Who publishes from elsewhere is counted by the middleware: the subscription is direct only
+    while it has exactly as many publishers as these nodes have with a compatible QoS.  A
+    *watch* on the middleware's event "matched" tells when that number changes; then it is chosen
+    anew.
+2.  A message that is not there when ``publish`` returns (the middleware delivers in a thread of
+    its own, or filters) shows that the assumption is wrong here: the intake takes over for good.
+3.  Whoever starts to look after a subscription, the intake or this one, first takes what is there
+    already.
+4.  Each publication takes at least once, after its message has arrived, so as often as messages
+    arrive, whichever of several threads gets which.  One lock for each subscription keeps the
+    messages in order.
+
+Subscriptions with durability other than volatile get messages from the past at some later time,
+so they are not direct; neither are those of which a user watches the same event, of which the
+middleware tells only one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+import threading
+from typing import Any
+
+from mddag_executor.live.attribution import PublisherState
+from mddag_executor.live.entities import EntitySet, Receiver
+from mddag_executor.live.hooks import install, publisher_state
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import (
+    EventHandler,
+    QoSSubscriptionEventType,
+    UnsupportedEventTypeError,
+)
+from rclpy.exceptions import InvalidHandle
+from rclpy.qos import DurabilityPolicy, qos_check_compatible, QoSCompatibility
+from rclpy.subscription import Subscription
+
+MATCHED = QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED
+MOST_AT_ONCE = 64
+
+
+class Watch(EventHandler):
+    """
+    Tells when the number of a subscription's publishers changes.
+
+    It belongs to no node, and its callback runs in the intake's thread.
+    """
+
+    def __init__(self, subscription: Subscription, on_change: Callable[[], None]) -> None:
+        super().__init__(
+            callback_group=ReentrantCallbackGroup(), callback=self.look, event_type=MATCHED,
+            parent_impl=subscription.handle)
+        self._subscription = subscription
+        self._on_change = on_change
+        self.expected = 0
+
+    def close(self) -> None:
+        """Let go of it."""
+        super().destroy()  # type: ignore[no-untyped-call]
+
+    def look(self, _: Any = None) -> None:
+        """Compare the number with what was expected."""
+        try:
+            if self._subscription.get_publisher_count() != self.expected:
+                self._on_change()
+        except InvalidHandle:
+            self._on_change()
+
+
+class Direct:
+    """
+    A subscription that publishers of the process may take from.
+
+    :param on_miss: called when a message is not there that was published.
+    """
+
+    __slots__ = ('subscription', 'watch', 'refused', '_lock', '_newest', '_receiver', '_on_miss')
+
+    def __init__(
+        self, subscription: Subscription, watch: Watch, receiver: Receiver,
+        on_miss: Callable[[], None],
+    ) -> None:
+        self.subscription = subscription
+        self.watch = watch
+        self.refused = False
+        self._lock = threading.Lock()
+        self._newest = 0
+        self._receiver = receiver
+        self._on_miss = on_miss
+
+    def take(self, begin: int) -> None:
+        """
+        Hand over what is there, at least up to a message that was just published.
+
+        :param begin: system time (ns) before that was published; 0: take what there is.
+        """
+        subscription, receiver = self.subscription, self._receiver
+        handle = subscription.handle
+        missed = False
+        try:
+            with self._lock, handle:
+                for _ in range(MOST_AT_ONCE):
+                    taken = handle.take_message(subscription.msg_type, subscription.raw)
+                    if taken is None:
+                        break
+                    stamp: int = taken[1]['source_timestamp']
+                    self._newest = max(stamp, self._newest)
+                    receiver.on_message(subscription, taken[0], taken[1])
+                    if stamp >= begin > 0:
+                        break
+                if self._newest < begin and not self.refused:
+                    missed = self.refused = True
+        except InvalidHandle:
+            pass  # destroyed
+        except Exception as error:
+            receiver.on_intake_error(error)
+        if missed:
+            self._on_miss()
+
+
+class Several:
+    """All that one publisher takes from; RAD is to choose among all that a message starts."""
+
+    __slots__ = ('_directs', '_receiver')
+
+    def __init__(self, directs: list[Direct], receiver: Receiver) -> None:
+        self._directs = directs
+        self._receiver = receiver
+
+    def take(self, begin: int) -> None:
+        """Hand over what is there of each (see ``Direct.take``)."""
+        self._receiver.hold()
+        try:
+            for direct in self._directs:
+                direct.take(begin)
+        finally:
+            self._receiver.let_go()
+
+
+class DirectTakes:
+    """
+    Which subscriptions are taken from directly.
+
+    Not thread-safe: the intake calls it under a lock of its own.
+
+    :param on_change: called from any thread when it has to be chosen anew.
+    """
+
+    def __init__(self, receiver: Receiver, on_change: Callable[[], None]) -> None:
+        install()
+        self._receiver = receiver
+        self._on_change = on_change
+        self._known: dict[int, Direct] = {}
+        self._refused: dict[int, Subscription] = {}
+        self._states: dict[int, PublisherState] = {}
+        self._chosen: frozenset[int] = frozenset()
+        self._watched: frozenset[int] = frozenset()
+        self._before: EntitySet | None = None
+        self._left: EntitySet | None = None
+
+    def choose(self, entities: EntitySet) -> EntitySet:
+        """
+        Choose the direct subscriptions; return what is left for the intake to look after.
+
+        Publishers begin to take at once.  The caller tells the intake, then calls ``settle``.
+        """
+        publishers: dict[str, list[Any]] = {}
+        for node in entities.nodes:
+            for publisher in list(node.publishers):
+                publishers.setdefault(publisher.topic_name, []).append(publisher)
+        takes: dict[int, list[Direct]] = {}
+        states: dict[int, PublisherState] = {}
+        chosen: list[Direct] = []
+        for subscription in entities.subscriptions:
+            try:
+                locals_ = publishers.get(subscription.topic_name)
+                direct = self._direct(subscription) if locals_ else None
+                if direct is None or locals_ is None:
+                    continue
+                matching = [p for p in locals_ if _compatible(p, subscription)]
+                direct.watch.expected = subscription.get_publisher_count()
+            except InvalidHandle:
+                continue  # destroyed meanwhile
+            if not matching or direct.watch.expected != len(matching):
+                continue
+            chosen.append(direct)
+            for publisher in matching:
+                takes.setdefault(id(publisher), []).append(direct)
+                states[id(publisher)] = publisher_state(publisher)
+        self._set_takes(takes, states)
+        self._forget(entities)
+        return self._rest(entities, chosen)
+
+    def settle(self) -> None:
+        """Take what has arrived before the publishers took."""
+        for key in self._chosen:
+            direct = self._known.get(key)
+            if direct is not None:
+                direct.take(0)
+
+    def stop(self) -> None:
+        """Have publishers take no more; the intake has been stopped, or looks after all."""
+        self._set_takes({}, {})
+        for direct in self._known.values():
+            direct.watch.close()
+        self._known = {}
+        self._before = self._left = None
+
+    def _direct(self, subscription: Subscription) -> Direct | None:
+        key = id(subscription)
+        direct = self._known.get(key)
+        if direct is not None and direct.refused:
+            self._refused[key] = subscription
+            self._known.pop(key).watch.close()
+        if self._refused.get(key) is subscription:
+            return None
+        if direct is None:
+            handlers: Any = subscription.event_handlers
+            if (subscription.qos_profile.durability != DurabilityPolicy.VOLATILE
+                    or any(e.event_type == MATCHED for e in handlers)):
+                return None
+            try:
+                watch = Watch(subscription, self._on_change)
+            except UnsupportedEventTypeError:
+                self._refused[key] = subscription
+                return None
+            direct = self._known[key] = Direct(
+                subscription, watch, self._receiver, self._on_change)
+        return direct
+
+    def _set_takes(
+        self, takes: dict[int, list[Direct]], states: dict[int, PublisherState]
+    ) -> None:
+        for key, state in self._states.items():
+            if states.get(key) is not state:
+                state.takes = None
+        for key, state in states.items():
+            mine = takes[key]
+            state.takes = mine[0] if len(mine) == 1 else Several(mine, self._receiver)
+        self._states = states
+
+    def _forget(self, entities: EntitySet) -> None:
+        """Let go of subscriptions that are there no more."""
+        present = {id(s): s for s in entities.subscriptions}
+        for key, direct in list(self._known.items()):
+            if present.get(key) is not direct.subscription:
+                self._known.pop(key).watch.close()
+        self._refused = {
+            key: s for key, s in self._refused.items() if present.get(key) is s}
+
+    def _rest(self, entities: EntitySet, chosen: list[Direct]) -> EntitySet:
+        keys = frozenset(id(direct.subscription) for direct in chosen)
+        known = frozenset(self._known)
+        if (self._left is not None and entities is self._before and keys == self._chosen
+                and known == self._watched):
+            return self._left
+        self._before, self._chosen, self._watched = entities, keys, known
+        self._left = replace(
+            entities,
+            subscriptions=[s for s in entities.subscriptions if id(s) not in keys],
+            events=[*entities.events, *(direct.watch for direct in self._known.values())])
+        return self._left
+
+
+def _compatible(publisher: Any, subscription: Subscription) -> bool:
+    found, _ = qos_check_compatible(publisher.qos_profile, subscription.qos_profile)
+    return bool(found != QoSCompatibility.ERROR)

@@ -1,0 +1,276 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A sketch of the system that runs now, from the ROS graph and from the rates of its topics.
+
+Theory of operation
+-------------------
+The ROS graph tells which node publishes, subscribes and serves what. It does not tell of timers,
+of callback groups, nor which callback publishes a topic. So the probe listens to every topic for
+a while, without looking into the messages, and supposes:
+
+1. A node that subscribes a topic has a callback for it, and so for a service.
+2. A topic comes from the callbacks of its node that run as often (``TOLERANCE``), from each of
+   them perhaps; from a timer of its node where none does. Topics of one node that come as often
+   share the timer.
+3. A topic of which no message came may come from any callback of its node; where there is none,
+   from a timer of unknown period.
+
+A topic's rate is that of its messages' source timestamps, divided by the number of its publishers.
+So nothing needs to spin: messages are taken by polling, of all topics alike. What every node has
+anyway is left out, and so are hidden nodes (``_…``).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import import_module
+import time
+from typing import Any
+
+from msg_graph.drift import TOLERANCE
+from msg_graph.fields import check_node, check_service, check_topic
+from msg_graph.sketch import is_background, Sketch, SketchCallback, SketchNode
+import rclpy
+from rclpy.context import Context
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import try_shutdown
+
+SETTLE_S = 0.3
+"""The graph counts as found when it has not changed for so long."""
+
+_LEAST_MESSAGES = 3
+_STEP_S = 0.1
+_POLL_S = 0.02
+_DEPTH = 200  # so up to 10,000 messages a second of one topic
+
+
+@dataclass
+class Endpoints:
+    """What a node publishes, subscribes and serves: names with their types."""
+
+    publishes: dict[str, str] = field(default_factory=dict)
+    subscribes: dict[str, str] = field(default_factory=dict)
+    serves: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class Seen:
+    """The messages of a topic: how many, and their first and last source timestamp, ns."""
+
+    count: int = 0
+    first: int = 0
+    last: int = 0
+
+    def message(self, stamp: int) -> None:
+        """Count a message."""
+        self.first = min(self.first, stamp) if self.count else stamp
+        self.last = max(self.last, stamp)
+        self.count += 1
+
+    @property
+    def interval_ns(self) -> int | None:
+        """Return the mean time between two messages; None with too few of them."""
+        if self.count < _LEAST_MESSAGES or self.last <= self.first:
+            return None
+        return (self.last - self.first) // (self.count - 1)
+
+
+@dataclass
+class Probe:
+    """
+    What was found.
+
+    :ivar nodes: endpoints by node.
+    :ivar seen: messages by topic.
+    :ivar publishers: number of publishers by topic.
+    :ivar warnings: what could not be found out, one line each.
+    """
+
+    nodes: dict[str, Endpoints] = field(default_factory=dict)
+    seen: dict[str, Seen] = field(default_factory=dict)
+    publishers: Counter[str] = field(default_factory=Counter)
+    warnings: list[str] = field(default_factory=list)
+
+
+def probe(seconds: float, tick: Callable[[float], None] | None = None) -> Probe:
+    """
+    Look at the ROS graph of this domain.
+
+    :param seconds: how long; most of it goes to measuring rates.
+    :param tick: told now and then for how many seconds it has been looking.
+    """
+    context = Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = Node(
+            '_mddag_graph_probe', context=context, use_global_arguments=False,
+            enable_rosout=False, start_parameter_services=False)
+        try:
+            return _look(node, context, seconds, tick or (lambda _: None))
+        finally:
+            node.destroy_node()
+    finally:
+        try_shutdown(context=context)
+
+
+def _look(node: Node, context: Context, seconds: float, tick: Callable[[float], None]) -> Probe:
+    begin = time.monotonic()
+    found, changed = _nodes(node), begin
+    while time.monotonic() - begin < seconds / 2:
+        time.sleep(_STEP_S)
+        now, before = time.monotonic(), found
+        found = _nodes(node)
+        if found != before or not found.nodes:
+            changed = now
+        elif now - changed >= SETTLE_S:
+            break
+        tick(now - begin)
+    subscriptions = _listen(node, found)
+    while (left := begin + seconds - time.monotonic()) > 0:
+        time.sleep(min(left, _POLL_S))
+        for subscription, seen in subscriptions:
+            _take(subscription, seen)
+        tick(time.monotonic() - begin)
+    return found
+
+
+def _take(subscription: Any, seen: Seen) -> None:
+    """Count what has come; nothing is deserialised."""
+    with subscription.handle:
+        for _ in range(_DEPTH):
+            taken = subscription.handle.take_message(subscription.msg_type, True)
+            if taken is None:
+                return
+            seen.message(taken[1]['source_timestamp'] or taken[1]['received_timestamp'])
+
+
+def _nodes(node: Node) -> Probe:
+    """Return which nodes there are, and what they publish, subscribe and serve."""
+    found = Probe()
+    names = [f'{namespace.rstrip("/")}/{name}'
+             for name, namespace in node.get_node_names_and_namespaces()
+             if not name.startswith('_')]
+    for full, count in sorted(Counter(names).items()):
+        if check_node(full) is not None:
+            found.warnings.append(f'{full}: left out, this is no valid node name')
+            continue
+        if count > 1:
+            found.warnings.append(
+                f'{full}: {count} nodes have this name; they are taken for one: rename them')
+        namespace, _, name = full.rpartition('/')
+        found.nodes[full] = endpoints = Endpoints()
+        for get, target, check in (
+            (node.get_publisher_names_and_types_by_node, endpoints.publishes, check_topic),
+            (node.get_subscriber_names_and_types_by_node, endpoints.subscribes, check_topic),
+            (node.get_service_names_and_types_by_node, endpoints.serves, check_service),
+        ):
+            try:
+                listed = get(name, namespace or '/')
+            except Exception as error:  # rclpy raises several kinds where the node has just ended
+                found.warnings.append(f'{full}: {error}')
+                continue
+            target.update((each, types[0]) for each, types in listed
+                          if types and not is_background(each) and check(each) is None)
+        for topic in endpoints.publishes:
+            found.publishers[topic] += 1
+    return found
+
+
+def _listen(node: Node, found: Probe) -> list[tuple[Any, Seen]]:
+    """Subscribe every topic, as best effort, which any publisher serves."""
+    qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT,
+                     durability=DurabilityPolicy.VOLATILE)
+    types = {topic: kind for endpoints in found.nodes.values()
+             for topic, kind in endpoints.publishes.items()}
+    subscriptions = []
+    for topic, kind in sorted(types.items()):
+        seen = found.seen[topic] = Seen()
+        try:
+            subscription = node.create_subscription(
+                _message_type(kind), topic, lambda _: None, qos, raw=True,
+                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+        except Exception as error:  # whatever the package of the type raises when it is imported
+            found.warnings.append(
+                f'{topic}: its rate is not known: its type {kind} cannot be used here ({error})')
+        else:
+            subscriptions.append((subscription, seen))
+    return subscriptions
+
+
+def _message_type(kind: str) -> Any:
+    """Return the class of a type as `std_msgs/msg/String`."""
+    package, _, name = kind.replace('/', '.').rpartition('.')
+    return getattr(import_module(package), name)
+
+
+def sketch_of(found: Probe) -> Sketch:
+    """Return what is known of the system, and what is supposed."""
+    intervals = {topic: None if seen.interval_ns is None else seen.interval_ns
+                 for topic, seen in found.seen.items()}
+    nodes = []
+    for name, endpoints in found.nodes.items():
+        node = SketchNode(name)
+        for topic in endpoints.subscribes:
+            _add(node, 'subscription', [topic], intervals.get(topic))
+        for service in endpoints.serves:
+            _add(node, 'service', [service], None)
+        for topic in endpoints.publishes:
+            whole = intervals.get(topic)
+            _publisher(node, topic, None if whole is None else whole * found.publishers[topic])
+        if node.callbacks:
+            nodes.append(node)
+    return Sketch('the nodes that ran', nodes)
+
+
+def _add(node: SketchNode, kind: str, starts: list[str], interval: int | None) -> SketchCallback:
+    name = f'callback_{len(node.callbacks)}'
+    callback = SketchCallback(node.name, name, kind, starts, interval_ns=interval)
+    node.callbacks[name] = callback
+    return callback
+
+
+def _publisher(node: SketchNode, topic: str, interval: int | None) -> None:
+    """Suppose which callbacks of a node publish a topic (rules 2 and 3)."""
+    if interval is None:
+        real = [c for c in node.callbacks.values() if not c.guessed]
+        for callback in real or [_timer(node, None)]:
+            callback.maybe.append(topic)
+        return
+    fits = [c for c in node.callbacks.values()
+            if c.interval_ns is not None and abs(c.interval_ns - interval) <= TOLERANCE * interval]
+    timers = [c for c in fits if c.guessed]
+    if timers:
+        timers[0].publishes.append(topic)
+    elif fits:
+        for callback in fits:
+            callback.maybe.append(topic)
+    else:
+        _timer(node, interval).publishes.append(topic)
+
+
+def _timer(node: SketchNode, interval: int | None) -> SketchCallback:
+    """Return the timer of a node that is supposed to have this period, a new one if need be."""
+    for callback in node.callbacks.values():
+        if callback.guessed and callback.interval_ns is None and interval is None:
+            return callback
+    timer = _add(node, 'timer', [], interval)
+    timer.guessed = True
+    return timer

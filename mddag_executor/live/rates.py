@@ -1,0 +1,107 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Warnings about timers that can not keep their rate (rclpy#1126).
+
+Theory of operation
+-------------------
+A timer that becomes due while its callback still waits or runs (as often as its queue holds)
+releases nothing: the period is skipped and counted, and the phase is kept, so that there are no
+bursts afterwards.  Who spins looks at these counts now and then, not the intake: on the way of a
+timer there is nothing more to do.  A timer that has skipped a share of ``LEAST`` of its periods
+lately is warned of, at once the first time, then after ``AGAIN_S`` at the earliest and each time
+twice as long, up to ``RARELY_S``.  (One that skips a period now and then is only counted.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import time
+from typing import Any
+
+from mddag_executor.live.entries import Entry
+from mddag_executor.live.registry import Registry
+from rclpy.logging import get_logger
+
+LOOK_S = 0.5
+AGAIN_S, RARELY_S = 10.0, 640.0
+LEAST = 0.05
+
+
+class _Known:
+    """What was seen of a timer when it was looked at, or warned of, last."""
+
+    __slots__ = ('skipped', 'ran', 'busy_ns', 'at', 'next', 'pause')
+
+    def __init__(self, at: float) -> None:
+        self.skipped = self.ran = self.busy_ns = 0
+        self.at = at
+        self.next = 0.0
+        self.pause = AGAIN_S
+
+    def begin(self, entry: Entry, now: float) -> None:
+        """Look from here on."""
+        self.skipped, self.ran, self.busy_ns, self.at = (
+            entry.skipped, entry.ran, entry.busy_ns, now)
+
+
+class RateWatch:
+    """
+    Warns of timers that can not keep their rate.
+
+    :param warn: takes a warning; None: it goes to the log.
+    """
+
+    def __init__(
+        self, registry: Registry, warn: Callable[[str], Any] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._registry = registry
+        self._warn = warn
+        self._clock = clock
+        self._next = 0.0
+        self._known: dict[Entry, _Known] = {}
+
+    def look(self) -> None:
+        """Look at all timers, unless that was done just now."""
+        now = self._clock()
+        if now < self._next:
+            return
+        self._next = now + LOOK_S
+        before = self._known
+        self._known = {
+            entry: before.get(entry) or _Known(now) for entry in self._registry.timers()}
+        for entry, known in self._known.items():
+            if now < known.next:
+                continue
+            skipped, ran = entry.skipped - known.skipped, entry.ran - known.ran
+            if skipped and skipped >= LEAST * (skipped + ran):
+                self._tell(entry, known, now)
+            elif now - known.at >= AGAIN_S:
+                known.begin(entry, now)
+
+    def _tell(self, entry: Entry, known: _Known, now: float) -> None:
+        skipped = entry.skipped - known.skipped
+        ran, busy = entry.ran - known.ran, entry.busy_ns - known.busy_ns
+        text = (
+            f'the timer of {entry.node} with a period of '
+            f'{entry.entity.timer_period_ns / 1e6:g} ms can not keep its rate: {skipped} of '
+            f'{skipped + ran} periods were skipped within {max(0.0, now - known.at):.1f} s')
+        if ran > 0:
+            text += f', its callback takes {busy / ran / 1e6:.3g} ms'
+        (self._warn or get_logger('mddag_executor').warning)(text)
+        known.begin(entry, now)
+        known.next = now + known.pause
+        known.pause = min(2 * known.pause, RARELY_S)

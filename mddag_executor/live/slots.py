@@ -1,0 +1,99 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A timer with its phase grid, on which its nominal due times lie (see ``timers``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import time
+from typing import Any
+
+from rclpy.clock_type import ClockType
+from rclpy.timer import Timer
+
+TOLERANCE_NS = 20_000
+"""How far a due time may be off the phase grid before the grid is anchored anew."""
+
+# An interval wider than this comes from a preempted thread and is measured again.
+WIDE_NS = 50_000
+
+_now = time.monotonic_ns
+
+
+class Slot:
+    """A timer with its phase grid; ``entry`` is the number of its one valid heap entry, or 0."""
+
+    __slots__ = (
+        'timer', 'handle', 'until', 'call', 'get_period', 'overridden',
+        'period', 'anchor', 'due', 'entry', 'cancelled', 'simulated', 'missed')
+
+    def __init__(self, timer: Timer) -> None:
+        handle = timer.handle
+        self.timer = timer
+        self.handle: Any = handle
+        self.until: Callable[[], int | None] = handle.time_until_next_call
+        self.call: Callable[[], None] = handle.call_timer
+        self.get_period: Callable[[], int] = handle.get_timer_period
+        clock = timer.clock
+        self.overridden: Callable[[], bool] | None = None
+        if clock.clock_type == ClockType.ROS_TIME:
+            self.overridden = clock.handle.get_ros_time_override_is_enabled
+        self.period = self.get_period()
+        self.anchor = 0
+        self.due = 0
+        self.entry = 0
+        self.cancelled = False
+        self.simulated = False
+        self.missed = 0
+
+    def measure(self) -> tuple[int, int] | None:
+        """Return an interval that holds the next call time, or None when cancelled."""
+        best: tuple[int, int] | None = None
+        for _ in range(4):
+            before = _now()
+            until = self.until()
+            after = _now()
+            if until is None:
+                return None
+            if best is None or after - before < best[1] - best[0]:
+                best = before + until, after + until
+            if after - before < WIDE_NS:
+                break
+        return best
+
+    def take_anchor(self) -> bool:
+        """Anchor the phase grid at the next call time; False when cancelled."""
+        self.period = self.get_period()
+        best: tuple[int, int] | None = None
+        for _ in range(5):
+            interval = self.measure()
+            if interval is None:
+                return False
+            if best is None or interval[1] - interval[0] < best[1] - best[0]:
+                best = interval
+        assert best is not None
+        self.anchor = self.due = (best[0] + best[1]) // 2
+        return True
+
+    def grid_point(self, low: int, high: int) -> int | None:
+        """Return the point of the phase grid in an interval, or None if there is none."""
+        period = self.period
+        if period <= 0:
+            return None
+        middle = (low + high) // 2
+        point: int = self.anchor + (middle - self.anchor + period // 2) // period * period
+        if low - TOLERANCE_NS <= point <= high + TOLERANCE_NS:
+            return point
+        return None

@@ -1,0 +1,122 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+One callback at a time: ``spin_once``.
+
+It uses no thread at all: one wait set over everything hands over what is ready, and the calling
+thread runs the one callback that the core puts first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import sys
+import threading
+import time
+from typing import Any
+
+from mddag_executor.live.entries import AtOnce
+from mddag_executor.live.pool import Pool
+from mddag_executor.live.receiver import Receiver
+from mddag_executor.live.upkeep import Upkeep
+from mddag_executor.live.waitset import ALL_KINDS, WaitSetIntake
+import rclpy
+from rclpy.executors import TimeoutObject
+from rclpy.task import Future
+
+
+class Stepping(Upkeep):
+    """The part of the executor that runs one callback in the calling thread."""
+
+    _pool: Pool
+    _receiver: Receiver
+    _spinning: threading.Lock
+    _is_shutdown: bool
+
+    def _check_context(self) -> None:
+        raise NotImplementedError
+
+    def _raise_error(self) -> None:
+        raise NotImplementedError
+
+    def _look_after(self) -> None:
+        raise NotImplementedError
+
+    def _submit_tasks(self) -> None:
+        raise NotImplementedError
+
+    def _guards(self) -> tuple[Any, ...]:
+        raise NotImplementedError
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """
+        Wait for one callback and run it in the calling thread.
+
+        Called by ``rclpy.spin``, which would otherwise run one callback at a time, it does what
+        ``spin`` does.
+
+        :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
+        """
+        if timeout_sec is None and sys._getframe(1).f_code is rclpy.spin.__code__:
+            self.spin()
+            return
+        self._spin_once(timeout_sec, lambda: False)
+
+    def spin_once_until_future_complete(
+        self, future: Future, timeout_sec: float | TimeoutObject | None = None
+    ) -> None:
+        """Wait for one callback, or until a future is done, and run it."""
+        seconds = timeout_sec.timeout if isinstance(timeout_sec, TimeoutObject) else timeout_sec
+        future.add_done_callback(AtOnce(self.wake))
+        self._spin_once(seconds, lambda: future.done() or future.cancelled())
+
+    def _spin_once(self, timeout_sec: float | None, done: Callable[[], bool]) -> None:
+        if not self._spinning.acquire(blocking=False):
+            raise RuntimeError('Executor is already spinning')
+        deadline = None
+        if timeout_sec is not None and timeout_sec >= 0:
+            deadline = time.monotonic() + timeout_sec
+        try:
+            while not self._is_shutdown:
+                self._check_context()
+                self._look_after()
+                if self._one_step(deadline) or done():
+                    return
+                if deadline is not None and time.monotonic() >= deadline:
+                    return
+        finally:
+            self._spinning.release()
+
+    def _one_step(self, deadline: float | None) -> bool:
+        """Take in what is ready, waiting where nothing is; run one callback if there is one."""
+        self._raise_error()
+        if self._inline is None:
+            self._inline = WaitSetIntake(
+                self._context, self._receiver, self._guards(), ALL_KINDS)
+            self._changed = True
+        self._refresh()
+        self._pool.resume_polled()
+        self._inline.poll(0.0)
+        self._submit_tasks()
+        if not self._pool.run_one():
+            left = None if deadline is None else max(0.0, deadline - time.monotonic())
+            self._inline.poll(left)
+            self._refresh()
+            self._submit_tasks()
+            if not self._pool.run_one():
+                self._raise_error()
+                return False
+        self._raise_error()
+        return True

@@ -1,0 +1,62 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What the drift rules need to know of a live run.
+
+``Watch`` is told each release. Everything else the executor keeps anyway: its statistics, and on
+which topics each callback has published. The rules are in ``msg_graph.drift``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mddag_executor.live.executor import MultiDeadlineExecutor
+from msg_graph import TaskSet
+from msg_graph.drift import Drift, drift, Observed, Releases
+
+
+class Watch:
+    """
+    Watches an executor from here on.
+
+    :param task_set: the declaration that the executor was made with.
+    """
+
+    def __init__(self, executor: MultiDeadlineExecutor, task_set: TaskSet) -> None:
+        self._executor = executor
+        self._task_set = task_set
+        dispatcher = executor._dispatcher
+        self._now = dispatcher.now
+        self._begin = dispatcher.now()
+        self._releases = [Releases() for _ in task_set.dags]
+        dispatcher.verdicts.on_release = self._released
+
+    def _released(self, dag: int, release: int) -> None:
+        if dag < len(self._releases):
+            self._releases[dag].add(release)
+
+    def drift(self, statistics: dict[str, Any]) -> list[Drift]:
+        """Return where the run and the declaration disagree; ``statistics`` are its counts."""
+        first = min((r.first for r in self._releases if r.count), default=self._begin)
+        counts = statistics['callbacks']
+        sources = (dag.vertices[dag.source].callback.key for dag in self._task_set.dags)
+        return drift(self._task_set, Observed(
+            duration_ns=max(0, self._now() - first),
+            releases=dict(zip(sources, self._releases)),
+            got={key: count['ready'] for key, count in counts.items()},
+            ran={key: count['ran'] for key, count in counts.items()},
+            publishes={**self._executor._registry.publishes()},
+            nodes={key.rpartition(':')[0] for key in counts}))

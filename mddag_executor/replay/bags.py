@@ -1,0 +1,352 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The stamps in ordinary rosbag2 recordings: when which message came, and what its header says.
+
+Theory of operation
+-------------------
+* A bag is a folder with `metadata.yaml` and the files that it names, or one such file.  What kind
+  a file is of its first bytes say, not its name: MCAP (read with ``trace.MessageReader``), SQLite
+  (read with rosbags) or zstd around one of them (a file-compressed bag; it is unpacked to a
+  temporary file).
+* Of each message there are its arrival (log time), its publication where the recorder kept that
+  apart, and the stamp at the beginning of its content, where its type begins with a
+  `std_msgs/Header` or a time.  Nothing else is decoded.
+* Damage costs what comes after it in that file, and is said.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+import io
+import os
+from pathlib import Path
+import re
+import shutil
+import struct
+import tempfile
+from typing import Any
+
+from mddag_executor.errors import InputError
+from mddag_executor.trace import MessageReader, TraceError, TraceReader
+from mddag_executor.trace.messages import Topic
+import zstandard
+
+_METADATA_LIMIT = 4 * 1024 * 1024
+_MCAP, _SQLITE, _ZSTD = b'\x89MCAP0\r\n', b'SQLite format 3\0', b'\x28\xb5\x2f\xfd'
+_REMEDY = 'give a folder with metadata.yaml that ros2 bag record wrote, or one of its files'
+_SPARE = 1 << 30            # bytes of the disk that unpacking leaves free
+_MOST_TIMES = 1000
+_PIECE = 1 << 20
+_BAG_FILE = re.compile(r'metadata\.yaml|.*\.(mcap|db3)(\.zstd)?')
+_STAMP = 12                 # bytes: encapsulation, seconds, nanoseconds
+_WINDOW = 128 * 1024 * 1024
+_STAMPED = {
+    'std_msgs/Header', 'std_msgs/msg/Header', 'Header', 'builtin_interfaces/Time',
+    'builtin_interfaces/msg/Time'}
+UNKNOWN = -1
+"""Stands for a stamp that a message does not have."""
+
+
+class BagError(InputError):
+    """A bag that can not be used; its text is `FILE: what is wrong: what to do`."""
+
+
+class Stamps:
+    """The messages of a topic, in the order of the bag: times in ns, `UNKNOWN` where none."""
+
+    def __init__(self) -> None:
+        self.arrival = array('q')
+        self.published = array('q')
+        self.header = array('q')
+        self.type = ''
+
+
+class Bag:
+    """
+    What a bag says about some topics.
+
+    :ivar topics: every topic in it.
+    :ivar stamps: by topic that was asked for and is in it.
+    :ivar start: the first and ``end`` the last arrival of any message, ns; None without any.
+    :ivar warnings: what is missing or doubtful, one line each.
+    :raises BagError: where there is no bag, or nothing of it can be used.
+    :raises mddag_executor.trace.TraceError: where a file of it can not be read.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], topics: Collection[str], name: str | None = None
+    ) -> None:
+        self.path = os.fspath(path)
+        self.name = name or self.path
+        self.count = 0
+        self.topics: set[str] = set()
+        self.stamps: dict[str, Stamps] = {}
+        self.start: int | None = None
+        self.end: int | None = None
+        self.warnings: list[str] = []
+        self._stamped: dict[tuple[str, str], bool] = {}
+        self._stated: int | None = None     # messages that metadata.yaml counts
+        files = self._files()
+        for file in files:
+            self._read(file, topics, len(files) == 1)
+        if self._stated is not None and self._stated != self.count and not self.warnings:
+            self.warnings.append(
+                f'{self.name}: metadata.yaml says that there are {self._stated} messages, but '
+                f'there are {self.count}')
+
+    def _files(self) -> list[Path]:
+        path = Path(self.path)
+        if not path.is_dir():
+            return [path]
+        metadata = path / 'metadata.yaml'
+        if not metadata.is_file():
+            found = sorted(
+                (p for p in path.iterdir() if _BAG_FILE.fullmatch(p.name)), key=_natural)
+            found = [p for p in found if p.name != 'metadata.yaml']
+            if not found:
+                raise BagError(self.name, 'there is neither metadata.yaml nor a bag file', _REMEDY)
+            self.warnings.append(
+                f'{self.name}: metadata.yaml is missing (the recorder was killed): used the '
+                f'{len(found)} bag files that are there')
+            return found
+        names, self._stated = _named_files(metadata)
+        there = [path / name for name in names if (path / name).is_file()]
+        if not there:
+            raise BagError(
+                str(metadata), 'none of the bag files that it names is there', 'copy them, too')
+        if len(there) < len(names):
+            self.warnings.append(
+                f'{self.name}: {len(names) - len(there)} of its {len(names)} files are missing: '
+                'what they held is not replayed')
+        return there
+
+    def _read(self, file: Path, topics: Collection[str], only: bool) -> None:
+        try:
+            with _unpacked(file) as (unpacked, kind):
+                if kind == _MCAP:
+                    self._read_mcap(unpacked, file, topics)
+                elif kind == _SQLITE:
+                    self._read_sqlite(unpacked, file, topics)
+                else:
+                    raise BagError(str(file), 'is no rosbag2 recording', _REMEDY)
+        except (BagError, TraceError) as error:
+            if only:
+                raise type(error)(
+                    self.name if error.file == self.path else error.file, error.problem,
+                    error.remedy) from None
+            self.warnings.append(f'{file}: {error.problem}: it is left out')
+
+    def _read_mcap(self, unpacked: Path, file: Path, topics: Collection[str]) -> None:
+        reader = MessageReader(unpacked)
+        try:
+            for topic, log_time, publish_time, data in reader.messages(topics):
+                self._add(topic, log_time, publish_time, data)
+        except TraceError as error:
+            raise BagError(str(file), error.problem, error.remedy) from None
+        self.warnings += [self._called(file) + text[len(reader.path):]
+                          for text in reader.warnings]
+        self.topics |= reader.topics
+        self.count += reader.count
+        if reader.start is not None and reader.end is not None:
+            self._within(reader.start, reader.end)
+
+    def _read_sqlite(self, unpacked: Path, file: Path, topics: Collection[str]) -> None:
+        from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+        used = 0
+        try:
+            reader = Sqlite3Reader(unpacked)
+            reader.open()
+            try:
+                self.topics |= {connection.topic for connection in reader.connections}
+                count = reader.metadata.message_count
+                self.count += count
+                if count:
+                    self._within(reader.metadata.start_time, reader.metadata.end_time - 1)
+                known = {c.id: _topic_of(c) for c in reader.connections if c.topic in topics}
+                wanted = [c for c in reader.connections if c.id in known]
+                for connection, time, data in reader.messages(wanted) if wanted else ():
+                    self._add(known[connection.id], time, UNKNOWN, memoryview(data))
+                    used += 1
+            finally:
+                reader.close()
+        except Exception as error:      # of SQLite, of rosbags, or of what a damaged file gave
+            what = f'its SQLite storage can not be read ({" ".join(str(error).split())})'
+            if not used:
+                raise BagError(str(file), what, _REMEDY) from None
+            self.warnings.append(
+                f'{self._called(file)}: {what}: used {used} messages before that')
+
+    def _called(self, file: Path) -> str:
+        return self.name if str(file) == self.path else str(file)
+
+    def _within(self, start: int, end: int) -> None:
+        self.start = start if self.start is None else min(self.start, start)
+        self.end = end if self.end is None else max(self.end, end)
+
+    def _add(self, topic: Topic, arrival: int, published: int, data: memoryview) -> None:
+        if not 0 <= arrival < 2**62:
+            return
+        stamps = self.stamps.get(topic.name)
+        if stamps is None:
+            stamps = self.stamps[topic.name] = Stamps()
+            stamps.type = topic.message_type
+        stamps.arrival.append(arrival)
+        different = 0 < published < 2**62 and published != arrival
+        stamps.published.append(published if different else UNKNOWN)
+        stamps.header.append(self._header(topic, data))
+
+    def _header(self, topic: Topic, data: memoryview) -> int:
+        key = (topic.message_type, topic.definition)
+        stamped = self._stamped.get(key)
+        if stamped is None:
+            stamped = self._stamped[key] = topic.encoding == 'cdr' and _is_stamped(topic)
+        if not stamped:
+            return UNKNOWN
+        head = bytes(data[:_STAMP])
+        if head.startswith(_ZSTD):      # compressed message by message
+            head = _beginning(bytes(data))
+        if len(head) < _STAMP or head[0] or head[1] > 1:
+            return UNKNOWN
+        seconds, nanoseconds = struct.unpack('<iI' if head[1] else '>iI', head[4:])
+        if seconds < 0 or nanoseconds >= 1_000_000_000:
+            return UNKNOWN
+        return int(seconds * 1_000_000_000 + nanoseconds)
+
+
+def is_ordinary(path: str) -> bool:
+    """Tell whether a path is a bag in which nothing was traced, so that it holds no jobs."""
+    try:
+        if os.path.isdir(path):
+            return any(_BAG_FILE.fullmatch(name) for name in os.listdir(path))
+        kind = _kind(Path(path))
+        if kind != _MCAP:
+            return kind != b''
+        return not TraceReader(path).has_events()
+    except (InputError, OSError):
+        return False        # whoever reads it says why
+
+
+def _natural(path: Path) -> list[Any]:
+    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
+
+
+def _named_files(metadata: Path) -> tuple[list[str], int | None]:
+    """
+    Return the names of a bag's files and the number of messages in them.
+
+    Only what lies in its folder counts, whatever is written.
+    """
+    import yaml
+    try:
+        if metadata.stat().st_size > _METADATA_LIMIT:
+            raise ValueError('it is too large')
+        about = yaml.safe_load(metadata.read_text(encoding='utf-8'))
+        about = about['rosbag2_bagfile_information']
+        names = [os.path.basename(name) for name in about['relative_file_paths']]
+        if not names:
+            raise ValueError('it names no file')
+        count = about.get('message_count')
+        return names, count if isinstance(count, int) else None
+    except (OSError, ValueError, TypeError, KeyError, AttributeError,
+            RecursionError, yaml.YAMLError) as error:
+        what = ' '.join(str(error).split())[:200]
+        raise BagError(str(metadata), f'this is no metadata of a bag ({what})', _REMEDY) from None
+
+
+@contextmanager
+def _unpacked(file: Path) -> Iterator[tuple[Path, bytes]]:
+    """Give a file and the first bytes of its kind; one in zstd is unpacked first."""
+    kind = _kind(file)
+    if kind != _ZSTD:
+        yield file, kind
+        return
+    with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
+        target = Path(folder, 'bag')
+        try:
+            with open(file, 'rb') as packed, open(target, 'wb') as out:
+                reader = zstandard.ZstdDecompressor(max_window_size=_WINDOW).stream_reader(packed)
+                while piece := reader.read(_PIECE):
+                    if out.tell() > _SPARE and out.tell() > _MOST_TIMES * packed.tell():
+                        raise BagError(
+                            str(file), f'it unpacks to more than {_MOST_TIMES} times its size',
+                            'unpack it yourself if you trust it')
+                    if shutil.disk_usage(folder).free < _SPARE + len(piece):
+                        raise BagError(
+                            str(file), f'unpacked it does not fit into {tempfile.gettempdir()}',
+                            'free space, or name another folder in TMPDIR')
+                    out.write(piece)
+        except zstandard.ZstdError as error:
+            raise BagError(str(file), f'can not be unpacked ({error})', _REMEDY) from None
+        except OSError as error:
+            raise BagError(
+                str(file), f'can not be unpacked ({error.strerror})', 'free space') from None
+        yield target, _kind(target)
+
+
+def _kind(file: Path) -> bytes:
+    """Return the first bytes of a file if they are those of a known kind."""
+    try:
+        if not file.is_file():
+            raise BagError(str(file), 'is no file', _REMEDY)
+        with open(file, 'rb') as stream:
+            head = stream.read(16)
+    except OSError as error:
+        raise BagError(str(file), f'cannot be read ({error.strerror})', _REMEDY) from None
+    except ValueError:
+        raise BagError(str(file), 'is no file name', _REMEDY) from None
+    return next((kind for kind in (_MCAP, _SQLITE, _ZSTD) if head.startswith(kind)), b'')
+
+
+def _beginning(data: bytes) -> bytes:
+    """Return the first bytes of a compressed message."""
+    try:
+        packed = zstandard.ZstdDecompressor(max_window_size=_WINDOW)
+        return bytes(packed.stream_reader(io.BytesIO(data)).read(_STAMP))
+    except zstandard.ZstdError:
+        return b''
+
+
+def _topic_of(connection: Any) -> Topic:
+    definition = connection.msgdef
+    encoding = {'MSG': 'ros2msg', 'IDL': 'ros2idl'}.get(definition.format.name, '')
+    return Topic(
+        connection.topic, connection.ext.serialization_format, connection.msgtype, encoding,
+        definition.data)
+
+
+def _is_stamped(topic: Topic) -> bool:
+    """Tell whether messages of a type begin with a header or a time."""
+    if topic.definition_encoding == 'ros2msg' and topic.definition.strip():
+        for line in topic.definition.splitlines():
+            words = line.split('#')[0].split()
+            if words[:1] and words[0].startswith('==='):
+                return False
+            if len(words) == 2 and '=' not in words[1]:
+                return words[0] in _STAMPED
+            if len(words) > 2 and '=' not in line:
+                return words[0] in _STAMPED     # with a default value
+        return False
+    try:
+        from rosbags.typesys import get_types_from_idl, get_typestore, Stores
+        if topic.definition_encoding == 'ros2idl':
+            fields = get_types_from_idl(topic.definition)[topic.message_type][1]
+        else:
+            fields = get_typestore(Stores.ROS2_JAZZY).fielddefs[topic.message_type][1]
+        return bool(fields) and fields[0][1][1] in _STAMPED
+    except Exception:   # a type that rosbags does not know, or a definition that it can not read
+        return False

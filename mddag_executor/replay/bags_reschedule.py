@@ -1,0 +1,263 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Ordinary bags rescheduled: recorded sensor messages as releases, declared execution times.
+
+Theory of operation
+-------------------
+* A DAG whose source is a subscription has a job for each message of its topic in the bag, ready
+  when the message came.  Its release is what the declaration's `release_from` says: the arrival,
+  the stamp in the message's header, or its publication, where the recorder kept that.  Where a
+  message has no such stamp, or one later than its arrival, it is released at its arrival.
+* A DAG whose source is a timer has jobs at k * T from the bag's first message on: when the timers
+  really ran is not in a bag.
+* Execution times are drawn for each execution from the declared quantiles (seeded), or come from a
+  table, fixed for the whole run.
+* What is not in a bag is left out and said: transport, dispatch, what else the machine did.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import os
+import random
+from typing import Any, NamedTuple
+
+from mddag_executor.core import NEVER, Tables
+from mddag_executor.core import policy as find_policy
+from mddag_executor.core.jobs import finish
+from mddag_executor.core.state import Decision, new_state
+from mddag_executor.replay.bags import Bag, BagError, UNKNOWN
+from mddag_executor.replay.timed import busy_times, Engine, Transports
+from mddag_executor.replay.tolerances import MissTally
+from mddag_executor.replay.usage import share
+from mddag_executor.simulate import Load, LogEntry, SimulationError
+from msg_graph import Dag, TaskSet
+
+DEFAULT_WORKERS = 7
+_LONGEST_LIST = 5
+_MOST_JOBS = 20_000_000
+_STAMP_OF = {'header_stamp': 'header', 'source_timestamp': 'published'}
+_CALLED = {'header_stamp': 'header stamp', 'source_timestamp': 'publication time'}
+
+
+class Source(NamedTuple):
+    """What became of a DAG's source: jobs as pairs (ready, release), ns, and what to say of it."""
+
+    jobs: list[tuple[int, int]]
+    note: str
+
+
+class BagReschedule:
+    """
+    What the core makes of a bag.
+
+    :ivar log: every start, end and preemption, on the bag's clock.
+    :ivar notes: what was assumed, one line each; ``warnings``: what is missing or doubtful.
+    """
+
+    def __init__(
+        self, bag: Bag, task_set: TaskSet, *, policy: str, workers: int, preemptive: bool,
+        times: Sequence[Sequence[int]] | None, seed: int, dispatch_overhead: int,
+    ) -> None:
+        self._bag = bag
+        self.task_set = task_set
+        self.policy = policy
+        self.workers = workers
+        self.preemptive = preemptive
+        self.dispatch_overhead = dispatch_overhead
+        self.start, self.end = bag.start or 0, (bag.end or 0) + 1
+        self.warnings = bag.warnings
+        self.notes: list[str] = []
+        self.tables = Tables.build(task_set, max_active_jobs=NEVER)
+        self.tally = MissTally(task_set, self.tables)
+        self.load = load = self._load(times, seed)
+        self.demand = sum(load.costs)
+        self.executions = len(load.costs)
+        self.decisions: list[Decision]
+        self.log: list[LogEntry] = self._run(load)
+
+    def _load(self, times: Sequence[Sequence[int]] | None, seed: int) -> Load:
+        generator = random.Random(seed)
+        releases: list[tuple[int, int, int, int]] = []
+        costs: list[int] = []
+        bases: list[int] = []
+        for dag in self.task_set.dags:
+            source = self._source(dag)
+            self.notes.append(f'{dag.name}: {source.note}')
+            bases.append(len(costs))
+            if len(releases) + len(source.jobs) > _MOST_JOBS:
+                raise BagError(
+                    self._bag.name, f'there are more than {_MOST_JOBS} jobs in it',
+                    'give a shorter bag')
+            for job, (ready, release) in enumerate(source.jobs):
+                releases.append((ready, dag.index, job, release))
+                costs.extend(_costs(dag, times, generator))
+        bases.append(len(costs))
+        if not releases:
+            raise BagError(
+                self._bag.name, f'none of the sources of {self.task_set.file} is in it: it has '
+                + (_listed(sorted(self._bag.topics)) or 'no topics'),
+                'give the graph of the nodes that were recorded')
+        releases.sort()
+        return Load(
+            [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases], costs,
+            bases, [*(len(dag.vertices) for dag in self.task_set.dags), 1],
+            [r[3] for r in releases])
+
+    def _source(self, dag: Dag) -> Source:
+        callback = dag.vertices[dag.source].callback
+        if callback.kind == 'timer':
+            period = dag.period_ns
+            jobs = [(t, t) for t in range(self.start, self.end, period)] \
+                if (self.end - self.start) // period < _MOST_JOBS else []
+            return Source(
+                jobs, f'{len(jobs)} jobs of its timer at its nominal period, from the first '
+                'message on: a bag does not tell when timers ran')
+        if not callback.topics:
+            self.warnings.append(
+                f'{self._bag.name}: {dag.name} starts with a service call, which a bag does not '
+                'have: there are no jobs of it')
+            return Source([], 'no jobs: its source is a service')
+        topic = callback.topics[0]
+        stamps = self._bag.stamps.get(topic)
+        if stamps is None:
+            self.warnings.append(
+                f'{self._bag.name}: topic {topic} is not in it, so there are no jobs of '
+                f'{dag.name}')
+            return Source([], f'no jobs: {topic} is not in the bag')
+        arrivals = list(stamps.arrival)
+        if dag.release_from == 'arrival':
+            jobs = [(arrival, arrival) for arrival in arrivals]
+            return Source(sorted(jobs), f'{len(jobs)} jobs from the arrival of {topic}')
+        column = getattr(stamps, _STAMP_OF[dag.release_from])
+        jobs = [(arrival, stamp if 0 < stamp <= arrival else arrival)
+                for arrival, stamp in zip(arrivals, column)]
+        what = _CALLED[dag.release_from]
+        without = sum(stamp in (UNKNOWN, 0) for stamp in column)
+        later = sum(stamp > arrival for arrival, stamp in zip(arrivals, column))
+        for count, why in ((without, f'have no {what}'), (later, f'have a {what} after it')):
+            if count:
+                self.warnings.append(
+                    f'{self._bag.name}: {count} of the {len(jobs)} messages of {topic} '
+                    f'({stamps.type}) {why}: they are released at their arrival')
+        return Source(sorted(jobs), f'{len(jobs)} jobs from the {what} of {topic}')
+
+    def _run(self, load: Load) -> list[LogEntry]:
+        policy = find_policy(self.policy)
+        state = new_state(
+            self.tables, self.workers, preemptive=policy.mode(self.preemptive), propagate=2,
+            dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
+        engine = Engine(
+            self.tables, state, policy.key, load, Transports.none(self.tables))
+        engine.run(self.end)
+        finish(self.tables, state, self.end)
+        for dag in load.dags:
+            self.tally.released(dag)
+        self.tally.add(state.decisions)
+        self.decisions = state.decisions
+        return engine.log
+
+    @property
+    def duration_ns(self) -> int:
+        """Return the time from the first to the last message of the bag."""
+        return self.end - self.start
+
+    def worker_busy(self) -> list[int]:
+        """Return for each worker how long it was busy, ns."""
+        return busy_times(self.log, self.workers, self.end)
+
+    def result(self) -> dict[str, Any]:
+        """Return the result format of ``replay --json``."""
+        busy = self.worker_busy()
+        return {
+            'policy': self.policy, 'workers': self.workers, 'preemptive': self.preemptive,
+            'duration_ns': self.duration_ns,
+            'utilisation': share(self.demand, self.workers, self.duration_ns),
+            **self.tally.result(), 'rescheduled': True,
+            'executions': self.executions, 'estimated_executions': 0,
+            'overheads': {
+                'included': False, 'added_ns': self.dispatch_overhead,
+                'dispatch_median_ns': None, 'transport_median_ns': None},
+            'worker_use': {
+                'busy_ns': {str(w): took for w, took in enumerate(busy)},
+                'use': share(sum(busy), self.workers, self.duration_ns)},
+            'recorded': None,
+            'recording': {
+                'trace': self._bag.name, 'declaration': self.task_set.file,
+                'start_ns': self.start, 'end_ns': self.end, 'messages': self._bag.count},
+            'notes': self.notes, 'warnings': self.warnings}
+
+
+def _costs(
+    dag: Dag, times: Sequence[Sequence[int]] | None, generator: random.Random
+) -> Sequence[int]:
+    if times is not None:
+        return times[dag.index]
+    row = []
+    for vertex in dag.vertices:
+        declared = vertex.callback.execution_time
+        assert declared is not None     # checked before
+        row.append(declared.draw(generator.random()))
+    return row
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _LONGEST_LIST
+    return ', '.join(names[:_LONGEST_LIST]) + (f', … ({more} more)' if more > 0 else '')
+
+
+def reschedule_bag(
+    path: str | os.PathLike[str],
+    task_set: TaskSet,
+    *,
+    policy: str | None = None,
+    workers: int | None = None,
+    preemptive: bool = False,
+    times: Sequence[Sequence[int]] | None = None,
+    seed: int = 0,
+    dispatch_overhead: int = 0,
+    name: str | None = None,
+) -> BagReschedule:
+    """
+    Run the core over the messages of an ordinary bag.
+
+    :param path: a bag's folder, or one of its files.
+    :param policy: a row of ``mddag_executor.core.POLICIES``; None: `rad`.
+    :param workers: size of the pool; None: as declared, else 7.
+    :param times: execution times by DAG and vertex, ns; None: drawn from the declared ones.
+    :param dispatch_overhead: added to each execution, ns.
+    :param name: what messages call the bag, where that is not its path.
+    :raises BagError: where there is no bag, or none of the sources is in it.
+    :raises mddag_executor.simulate.SimulationError: where an execution time is not known.
+    :raises mddag_executor.errors.MddagError: on a policy that can not be.
+    """
+    policy = policy or 'rad'
+    find_policy(policy).mode(preemptive)
+    if times is None:
+        missing = [c for c in (v.callback for v in task_set.vertices) if c.execution_time is None]
+        if missing:
+            raise SimulationError(
+                f'{task_set.file}:{missing[0].line}: {missing[0].key} declares no execution_time: '
+                'add one, or give --execution-times FILE')
+    sources = (dag.vertices[dag.source].callback for dag in task_set.dags)
+    topics = {topic for source in sources if source.kind != 'timer' for topic in source.topics}
+    bag = Bag(path, topics, name)
+    if bag.start is None:
+        what = '; '.join(bag.warnings) or 'there are no messages in it'
+        raise BagError(bag.name, what.removeprefix(f'{bag.name}: '), 'record one anew')
+    return BagReschedule(
+        bag, task_set, policy=policy, workers=workers or task_set.workers or DEFAULT_WORKERS,
+        preemptive=preemptive, times=times, seed=seed, dispatch_overhead=dispatch_overhead)

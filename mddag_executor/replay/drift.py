@@ -1,0 +1,152 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What the drift rules need to know of a recorded run, collected while it is replayed.
+
+Theory of operation
+-------------------
+``WatchedRecording`` is a recording that looks at its own events as they pass to whoever replays
+it, so that a trace is read only once. The rules are in ``msg_graph.drift``.
+
+A callback's declared key is that of the vertices that it was dispatched as, and where it never ran
+as a vertex (its messages fitted nothing), what the declaration has for its node and what starts
+it (``msg_graph.binding``). Runs in another declaration's terms are matched by that key.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+import os
+
+from mddag_executor.replay.recording import Recording, TASK_SET
+from mddag_executor.trace.census import Address, Census, Event
+from msg_graph import TaskSet
+from msg_graph.binding import Binder
+from msg_graph.drift import Drift, drift, Observed, Releases
+
+_RELEASE, _DISPATCH, _DROP = 'mddag:job_release', 'mddag:dispatch', 'mddag:drop'
+
+
+class WatchedRecording(Recording):
+    """A recording that can tell, once its events have passed, what drifted."""
+
+    def __init__(self, path: str | os.PathLike[str], name: str | None = None) -> None:
+        super().__init__(path, name)
+        self._census = Census()
+        self._observed = Observed()
+        self._key: dict[Address, str] = {}
+        self._executions: Counter[Address] = Counter()
+        self._dropped: Counter[Address] = Counter()
+        self._first: int | None = None
+        self._last = 0
+        self._sources = [dag.vertices[dag.source].callback.key for dag in self.task_set.dags]
+        self._keys = [[v.callback.key for v in dag.vertices] for dag in self.task_set.dags]
+
+    def events(self, names: Iterable[str]) -> Iterator[Event]:
+        """Yield the named events in the order of time; look at these and at others."""
+        wanted = set(names)
+        handlers = self._census.handlers
+        for event in super().events({*wanted, *handlers, _RELEASE, _DISPATCH, _DROP}):
+            name = event[0]
+            if None not in event:
+                handler = handlers.get(name)
+                if handler is not None:
+                    handler(event)
+                elif name == _RELEASE:
+                    self._released(event)
+                elif name == _DISPATCH:
+                    self._dispatched(event)
+                elif name == _DROP:
+                    self._dropped[event[2], event[4]] += 1
+                if name != TASK_SET and event[1] > self._last:
+                    self._last = event[1]
+            if name in wanted:
+                yield event
+
+    def _released(self, event: Event) -> None:
+        dag = event[4]
+        if 0 <= dag < len(self._sources):
+            self._observed.releases.setdefault(self._sources[dag], Releases()).add(event[6])
+            if self._first is None:
+                self._first = event[1]
+
+    def _dispatched(self, event: Event) -> None:
+        callback, dag, vertex = (event[2], event[4]), event[5], event[6]
+        self._executions[callback] += 1
+        if 0 <= dag < len(self._keys) and 0 <= vertex < len(self._keys[dag]):
+            self._key[callback] = self._keys[dag][vertex]
+        if self._first is None:
+            self._first = event[1]
+
+    def drift(self, judge: TaskSet) -> list[Drift]:
+        """
+        Return where the run and a declaration disagree; all events have passed.
+
+        :param judge: the declaration, the recorded one or another.
+        """
+        observed, publishes = self._observed, dict[str, set[str]]()
+        keys = {**declared_keys(self._census, self.task_set), **self._key}
+        got, ran = Counter[str](), Counter[str]()
+        for callback, key in keys.items():
+            ran[key] += self._executions[callback]
+            got[key] += self._executions[callback] + self._dropped[callback]
+            runs = self._census.runs.get(callback)
+            publishes.setdefault(key, set()).update(runs.publishes if runs else ())
+        observed.duration_ns = 0 if self._first is None else max(0, self._last - self._first)
+        observed.got, observed.ran = dict(got), dict(ran)
+        observed.publishes = dict(publishes)
+        observed.nodes = set(self._census.publishers) or None
+        return drift(judge, observed)
+
+
+def declared_keys(census: Census, task_set: TaskSet) -> dict[Address, str]:
+    """Return the declared keys of callbacks, by what starts them."""
+    binder = Binder(task_set)
+    found: dict[Address, str] = {}
+    for entity in census.entities():
+        if entity.kind == 'timer':
+            callback = binder.bind_timer(entity.node, entity.period_ns or 0)
+        elif entity.kind == 'subscription':
+            callback = binder.bind_subscription(entity.node, entity.start)
+        else:
+            callback = binder.bind_service(entity.node, entity.start)
+        if callback is not None and entity.callback is not None:
+            found[entity.callback] = callback.key
+    return found
+
+
+def drift_of_import(census: Census, judge: TaskSet) -> list[Drift]:
+    """
+    Return where a recording of another executor and a declaration disagree.
+
+    Such a recording has no jobs; the starts of a source's callback count as its releases.
+    """
+    observed = Observed(nodes=set(census.publishers))
+    first, last = [], []
+    sources = {dag.vertices[dag.source].callback.key for dag in judge.dags}
+    for address, key in declared_keys(census, judge).items():
+        runs = census.runs.get(address)
+        if runs is None:
+            continue
+        observed.ran[key] = observed.ran.get(key, 0) + runs.count
+        observed.got[key] = observed.ran[key]
+        observed.publishes[key] = {*observed.publishes.get(key, ()), *runs.publishes}
+        if key in sources:
+            observed.releases[key] = Releases(runs.count, runs.first, runs.last)
+        first.append(runs.first)
+        last.append(runs.last)
+    observed.duration_ns = max(last) - min(first) if first else 0
+    return drift(judge, observed)

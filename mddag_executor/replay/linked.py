@@ -1,0 +1,152 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the linker finds in a recording: executions, publications, and what was lost."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Protocol
+
+from mddag_executor.replay.entities import Callback, Publisher
+
+Thread = tuple[int, int]        # process and thread
+
+
+class Run:
+    """
+    An execution of a callback.
+
+    :ivar thread: process and thread.
+    :ivar end: -1 while it runs, or where its end was lost.
+    :ivar stamp: source timestamp of the message that it runs for; 0: none is known.
+    :ivar stated: the message's header stamp, where the recording has it; else 0.
+    :ivar taken: when the message was taken, ns; 0: that is not recorded.
+    :ivar ready: for those who use it: when it became ready, ns.
+    :ivar of: for those who use it: DAG, vertex and job that it belongs to.
+    :ivar leg: for those who use it: which leg of the vertex it is.
+    :ivar places: for those who use it: its places in paths.
+    """
+
+    __slots__ = ('callback', 'thread', 'start', 'end', 'stamp', 'stated', 'taken', 'message',
+                 'ready', 'of', 'leg', 'places')
+
+    def __init__(self, callback: Callback, thread: Thread, start: int) -> None:
+        self.callback = callback
+        self.thread = thread
+        self.start = start
+        self.end = -1
+        self.stamp = 0
+        self.stated = 0
+        self.taken = 0
+        self.message: Publication | None = None
+        self.ready = start
+        self.of: tuple[int, int, int] | None = None
+        self.leg = 0
+        self.places: dict[tuple[int, int], int] = {}
+
+
+class Publication:
+    """
+    A message that was published; times in ns, 0 where they are not recorded.
+
+    :ivar run: the execution that published it, None: none did.
+    :ivar places: for those who use it: its places in paths.
+    """
+
+    __slots__ = ('publisher', 'run', 'rclcpp', 'rcl', 'dds', 'stamp', 'message', 'within',
+                 'places')
+
+    def __init__(self, publisher: Publisher | None, run: Run | None, message: int) -> None:
+        self.publisher = publisher
+        self.run = run
+        self.rclcpp = 0
+        self.rcl = 0
+        self.dds = 0
+        self.stamp = 0
+        self.message = message
+        self.within = False     # so far only within the process
+        self.places: dict[tuple[int, int], int] = {}
+
+    @property
+    def time(self) -> int:
+        """Return when it was published."""
+        return self.rclcpp or self.rcl
+
+    @property
+    def topic(self) -> str:
+        """Return its topic, empty where that is not known."""
+        return self.publisher.topic if self.publisher is not None else ''
+
+
+class Sink(Protocol):
+    """Is told what happened, in the order of time."""
+
+    def started(self, run: Run, message: Publication | None) -> None:
+        """Take in that an execution has begun, with the message that it runs for."""
+
+    def published(self, message: Publication) -> None:
+        """Take in that a message was published."""
+
+    def took(self, run: Run, message: Publication) -> None:
+        """Take in that a running callback took a message itself."""
+
+    def ended(self, run: Run) -> None:
+        """Take in that an execution has ended."""
+
+
+class Losses:
+    """What was lost in a recording, by what it affects."""
+
+    def __init__(self) -> None:
+        self.ends: Counter[str] = Counter()
+        self.starts: Counter[str] = Counter()
+        self.messages: Counter[str] = Counter()
+        self.untold: Counter[str] = Counter()
+        self.partial: Counter[str] = Counter()
+        self.ambiguous: Counter[str] = Counter()
+        self.overwritten: Counter[str] = Counter()
+        self.unknown: Counter[str] = Counter()
+        #: What the tracer itself says that it discarded.
+        self.discarded = 0
+
+    def lines(self) -> list[str]:
+        """Return what to say about it."""
+        said = (
+            (self.ends, 'executions have no end in it (the events were lost): they count as not '
+             'completed'),
+            (self.starts, 'executions have no start in it (the events were lost): they are left '
+             'out'),
+            (self.messages, 'executions ran for messages whose publication is not in it: they '
+             'belong to no job and no path'),
+            (self.untold, 'executions of subscriptions have no message in it (its taking is not '
+             'recorded): they belong to no job and no path'),
+            (self.partial, 'publications lack the tracepoint rclcpp_publish that others of their '
+             'publisher have: they count from rcl_publish on'),
+            (self.ambiguous, 'executions ran for messages with the topic and source timestamp of '
+             'another one: they belong to no job and no path'),
+            (self.overwritten, 'messages were overwritten in a ring buffer before they were '
+             'taken'),
+            (self.unknown, 'executions are of callbacks whose initialisation is not in it'))
+        lines = [f'{sum(counts.values())} {text}: {_most(counts)}' for counts, text in said
+                 if counts]
+        if self.discarded:
+            lines.insert(0, f'the tracer discarded {self.discarded} events or more: executions '
+                         'and messages may be missing, and jobs count as late that were not')
+        return lines
+
+
+def _most(counts: Counter[str]) -> str:
+    named = ', '.join(f'{name} ({n})' for name, n in counts.most_common(3))
+    return named + (f', … ({len(counts) - 3} more)' if len(counts) > 3 else '')

@@ -1,0 +1,339 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What belongs together in a recording of CARET or ros2_tracing: executions and their messages.
+
+Theory of operation
+-------------------
+Two stages go through the events in the order of time.  The first keeps what each thread does; the
+second, `LAG_NS` of recorded time later, tells the sink, also in the order of time: a subscriber
+may run before the tracer has recorded the stamp of the message that it runs for.
+
+1. *Executions*: `callback_start` to the next `callback_end` of the same callback in the same
+   thread (CARET: of the same address; that is the same, except where a callback runs in several
+   threads at once).  A callback may run inside another (one that spins); what ends before what
+   began inside it shows that an end was lost.
+2. *Publications*, within a thread: `rclcpp_publish`, then `rcl_publish` of the same publisher (in
+   rclpy the only one; from Iron on the only one with the publisher's handle), then `dds_write`,
+   then `dds_bind_addr_to_stamp` (CARET) or `rmw_publish` (ros2_tracing from Jazzy on) with the
+   source timestamp.  `rclcpp_intra_publish` before `rclcpp_publish` of the same publisher is the
+   same publication, as of then.
+3. *Messages between processes*: `dispatch_subscription_callback` (Galactic, Humble) names the
+   callback and the source timestamp; later formats have `rmw_take` in the same thread before the
+   `callback_start`.  The publication is the one on the same topic with that source timestamp.
+4. *Messages within a process*: in Humble by the message's address, followed through the copies
+   (`message_construct`) to `dispatch_intra_process_subscription_callback`; from Iron on by buffer
+   and index of the ring buffer that it went through (`rclcpp_ring_buffer_enqueue`, `_dequeue`).
+5. `rmw_take` inside an execution is a message that the callback took itself (a queue edge).
+6. What does not fit (an end without a start, a start without an end, a message whose publication
+   is not in the recording, a publisher's that lacks a tracepoint) is counted by callback or topic.
+
+Publications are kept until `KEEP` newer ones of their topic have come.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable as Function
+from typing import Any
+
+from mddag_executor.replay.entities import Callback, Entities, Publisher
+from mddag_executor.replay.linked import Losses, Publication, Run, Sink, Thread
+from mddag_executor.trace.channels import Layout
+
+LAG_NS = 200_000_000
+KEEP = 16_384
+_DEEPEST = 32
+
+Event = tuple[Any, ...]
+Handler = Function[[Event, Thread, '_Thread'], None]
+
+
+class _Thread:
+    """What a thread does."""
+
+    __slots__ = ('stack', 'last', 'take', 'fresh')
+
+    def __init__(self) -> None:
+        self.stack: list[Run] = []
+        self.last: Publication | None = None
+        # (callback it names or None, its subscription's callbacks or None, stamp, stated, message,
+        # time)
+        self.take: tuple[Callback | None, list[Callback] | None, int, int, Publication | None,
+                         int] | None = None
+        self.fresh = True       # nothing has started in it so far
+
+
+class Linker:
+    """Links the events of a recording."""
+
+    def __init__(self, entities: Entities, sink: Sink) -> None:
+        self.losses = Losses()
+        self._entities = entities
+        self._sink = sink
+        self._threads: dict[Thread, _Thread] = {}
+        self._queue: deque[tuple[int, Function[..., None], tuple[Any, ...]]] = deque()
+        self._by_stamp: dict[str, dict[int, Publication | None]] = {}
+        self._by_address: dict[tuple[int, int], Publication] = {}
+        self._by_slot: dict[tuple[int, int, int], tuple[Publication, bool]] = {}
+        self._by_rclcpp: set[Publisher] = set()
+        self._by_rcl: Counter[Publisher] = Counter()        # publications by rcl alone
+        # by the identity of a layout, which is kept so that no other gets it
+        self._known: dict[int, tuple[Layout, Handler, dict[str, int]]] = {}
+        self._fields: dict[str, int] = {}       # of the event that is being taken in
+        self._handlers: dict[str, Handler] = {
+            'ros2:callback_start': self._start,
+            'ros2:callback_end': self._end,
+            'ros2:rclcpp_publish': self._rclcpp_publish,
+            'ros2:rclcpp_intra_publish': self._intra_publish,
+            'ros2:rcl_publish': self._rcl_publish,
+            'ros2_caret:dds_write': self._dds_write,
+            'ros2_caret:dds_bind_addr_to_stamp': self._bind,
+            'ros2:rmw_publish': self._rmw_publish,
+            'ros2:dispatch_subscription_callback': self._dispatch,
+            'ros2:rmw_take': self._take,
+            'ros2:dispatch_intra_process_subscription_callback': self._dispatch_within,
+            'ros2:message_construct': self._copy,
+            'ros2:rclcpp_ring_buffer_enqueue': self._enqueue,
+            'ros2:rclcpp_ring_buffer_dequeue': self._dequeue,
+            'mddag:lost': self._lost,
+        }
+        #: Full names of the events that it needs.
+        self.events = frozenset(self._handlers)
+
+    def take(self, event: Event) -> None:
+        """Take in an event as ``TraceReader.layout_events`` has it; times never decrease."""
+        layout, now, pid, tid = event[:4]
+        queue = self._queue
+        while queue and queue[0][0] < now - LAG_NS:
+            _, tell, arguments = queue.popleft()
+            tell(*arguments)
+        thread = (pid, tid)
+        state = self._threads.get(thread)
+        if state is None:
+            state = self._threads[thread] = _Thread()
+        known = self._known.get(id(layout))
+        if known is None:
+            fields = {name: place for place, name in enumerate(layout.fields, 4)}
+            known = self._known[id(layout)] = layout, self._handlers[layout.name], fields
+        self._fields = known[2]
+        known[1](event, thread, state)
+
+    def finish(self) -> None:
+        """Tell what is left; what runs has no end."""
+        while self._queue:
+            _, tell, arguments = self._queue.popleft()
+            tell(*arguments)
+        for publisher in self._by_rclcpp & set(self._by_rcl):
+            self.losses.partial[publisher.topic] += self._by_rcl.pop(publisher)
+
+    @property
+    def running(self) -> list[Run]:
+        """Return what runs now."""
+        return [run for state in self._threads.values() for run in state.stack]
+
+    def _get(self, event: Event, field: str) -> int:
+        """Return a field of an event; 0 where it has none."""
+        place = self._fields.get(field)
+        value = None if place is None else event[place]
+        return value if isinstance(value, int) else 0
+
+    # --- executions ------------------------------------------------------------------------------
+
+    def _start(self, event: Event, thread: Thread, state: _Thread) -> None:
+        now = event[1]
+        callback = self._entities.callback(thread[0], self._get(event, 'callback'), now)
+        if callback.kind == 'unknown':
+            self.losses.unknown[callback.label] += 1
+        if any(run.callback is callback for run in state.stack) or len(state.stack) > _DEEPEST:
+            while state.stack:
+                run = state.stack.pop()
+                self.losses.ends[run.callback.label] += 1
+                if run.callback is callback:
+                    break
+        run = Run(callback, thread, now)
+        take, state.take = state.take, None
+        if take is not None:
+            named, possible, run.stamp, run.stated, run.message, run.taken = take
+            if (named is not None and named is not callback
+                    or possible is not None and callback not in possible
+                    or callback.kind in ('timer', 'service')):
+                run.stamp = run.stated = run.taken = 0      # it was taken for something else
+                run.message = None
+        state.stack.append(run)
+        state.fresh = False
+        state.last = None
+        self._queue.append((now, self._tell_start, (run,)))
+
+    def _tell_start(self, run: Run) -> None:
+        message, run.message = run.message, None
+        if message is None and run.stamp:
+            topic = run.callback.start
+            message = self._find(topic, run.stamp)
+            if message is None:
+                twice = run.stamp in self._by_stamp.get(topic, ())
+                (self.losses.ambiguous if twice else self.losses.messages)[
+                    run.callback.label] += 1
+        elif message is None and run.callback.kind == 'subscription' and not run.taken:
+            self.losses.untold[run.callback.label] += 1
+        self._sink.started(run, message)
+
+    def _find(self, topic: str, stamp: int) -> Publication | None:
+        found = self._by_stamp.get(topic, {}).get(stamp)
+        return found if found is not None else self._by_stamp.get('', {}).get(stamp)
+
+    def _end(self, event: Event, thread: Thread, state: _Thread) -> None:
+        now = event[1]
+        callback = self._entities.callback(thread[0], self._get(event, 'callback'), now)
+        state.last = None
+        if not any(run.callback is callback for run in state.stack):
+            # else it began before the recording did
+            if not state.fresh or callback.made >= self._entities.begin:
+                self.losses.starts[callback.label] += 1
+            state.fresh = False
+            return
+        while True:
+            run = state.stack.pop()
+            if run.callback is callback:
+                break
+            self.losses.ends[run.callback.label] += 1
+        run.end = now
+        self._queue.append((now, self._sink.ended, (run,)))
+
+    # --- publications ----------------------------------------------------------------------------
+
+    def _publication(self, event: Event, thread: Thread, state: _Thread) -> Publication:
+        """Begin a publication."""
+        handle = self._get(event, 'publisher_handle')
+        publisher = None
+        if handle:
+            publisher = self._entities.publishers.latest(thread[0], handle, event[1])
+        run = state.stack[-1] if state.stack else None
+        message = Publication(publisher, run, self._get(event, 'message'))
+        state.last = message
+        self._queue.append((event[1], self._sink.published, (message,)))
+        return message
+
+    def _intra_publish(self, event: Event, thread: Thread, state: _Thread) -> None:
+        message = self._publication(event, thread, state)
+        message.rclcpp = event[1]
+        message.within = True
+        self._by_address[(thread[0], message.message)] = message
+
+    def _rclcpp_publish(self, event: Event, thread: Thread, state: _Thread) -> None:
+        last = state.last
+        handle = self._get(event, 'publisher_handle')
+        if last is not None and last.within and (not handle or (
+                self._entities.publishers.latest(thread[0], handle, event[1]) is last.publisher)):
+            last.within = False     # the same one, to other processes, too
+            last.message = self._get(event, 'message')
+            return
+        self._publication(event, thread, state).rclcpp = event[1]
+
+    def _rcl_publish(self, event: Event, thread: Thread, state: _Thread) -> None:
+        last = state.last
+        publisher = self._entities.publishers.latest(
+            thread[0], self._get(event, 'publisher_handle'), event[1])
+        if last is None or last.rcl or last.within or (
+                last.publisher is not None and last.publisher is not publisher):
+            last = self._publication(event, thread, state)
+            if publisher is not None:
+                self._by_rcl[publisher] += 1
+        elif publisher is not None:
+            self._by_rclcpp.add(publisher)
+        last.publisher = publisher
+        last.rcl = event[1]
+        last.message = self._get(event, 'message')
+
+    def _dds_write(self, event: Event, thread: Thread, state: _Thread) -> None:
+        last = state.last
+        if last is not None and not last.dds and not last.within and (
+                not last.rcl or self._get(event, 'message') == last.message):
+            last.dds = event[1]
+
+    def _bind(self, event: Event, thread: Thread, state: _Thread) -> None:
+        self._stamp(state, self._get(event, 'addr'), self._get(event, 'source_stamp'))
+
+    def _rmw_publish(self, event: Event, thread: Thread, state: _Thread) -> None:
+        stamp = self._get(event, 'timestamp_') or self._get(event, 'source_timestamp')
+        self._stamp(state, self._get(event, 'message'), stamp)
+
+    def _stamp(self, state: _Thread, address: int, stamp: int) -> None:
+        last = state.last
+        if last is None or last.stamp or last.within or not stamp or (
+                last.rcl and address != last.message):
+            return
+        last.stamp = stamp
+        known = self._by_stamp.setdefault(last.topic, {})
+        known[stamp] = None if stamp in known else last
+        if len(known) > KEEP:
+            del known[next(iter(known))]
+
+    # --- messages that arrive --------------------------------------------------------------------
+
+    def _dispatch(self, event: Event, thread: Thread, state: _Thread) -> None:
+        callback = self._entities.callback(thread[0], self._get(event, 'callback'), event[1])
+        stamp, stated = self._get(event, 'source_stamp'), self._get(event, 'message_timestamp')
+        state.take = callback, None, stamp, stated, None, event[1]
+
+    def _take(self, event: Event, thread: Thread, state: _Thread) -> None:
+        stamp = self._get(event, 'source_timestamp')
+        if not self._get(event, 'taken') or not stamp:
+            return
+        callbacks = self._entities.taken.latest(
+            thread[0], self._get(event, 'rmw_subscription_handle'), event[1])
+        if state.stack and callbacks:
+            topic = callbacks[0].start
+            self._queue.append((event[1], self._tell_take, (state.stack[-1], topic, stamp)))
+        state.take = None, callbacks, stamp, 0, None, event[1]
+
+    def _tell_take(self, run: Run, topic: str, stamp: int) -> None:
+        message = self._find(topic, stamp)
+        if message is not None:
+            self._sink.took(run, message)
+
+    def _dispatch_within(self, event: Event, thread: Thread, state: _Thread) -> None:
+        callback = self._entities.callback(thread[0], self._get(event, 'callback'), event[1])
+        message = self._by_address.get((thread[0], self._get(event, 'message')))
+        if message is None:
+            self.losses.messages[callback.label] += 1
+        state.take = callback, None, 0, 0, message, event[1]
+
+    def _copy(self, event: Event, thread: Thread, state: _Thread) -> None:
+        pid = thread[0]
+        message = self._by_address.get((pid, self._get(event, 'original_message')))
+        if message is not None:
+            self._by_address[(pid, self._get(event, 'constructed_message'))] = message
+
+    def _enqueue(self, event: Event, thread: Thread, state: _Thread) -> None:
+        place = thread[0], self._get(event, 'buffer'), self._get(event, 'index')
+        if state.last is None:
+            self._by_slot.pop(place, None)      # the publication was lost: never the older one
+            return
+        if self._get(event, 'overwritten'):
+            before = self._by_slot.get(place)
+            if before is not None and before[1]:
+                self.losses.overwritten[before[0].topic or 'unknown topic'] += 1
+        self._by_slot[place] = state.last, True
+
+    def _dequeue(self, event: Event, thread: Thread, state: _Thread) -> None:
+        place = thread[0], self._get(event, 'buffer'), self._get(event, 'index')
+        found = self._by_slot.pop(place, None)
+        state.take = None, None, 0, 0, None if found is None else found[0], event[1]
+        if found is None and not state.fresh:
+            self.losses.messages['a ring buffer'] += 1
+
+    def _lost(self, event: Event, thread: Thread, state: _Thread) -> None:
+        self.losses.discarded += self._get(event, 'count')

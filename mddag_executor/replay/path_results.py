@@ -1,0 +1,78 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The end-to-end part of a replay's result: the figures of each declared path."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mddag_executor.replay.path_cases import cases, Record, statistics
+from mddag_executor.replay.paths import Flow, PathBook
+
+
+def path_results(book: PathBook) -> dict[str, Any]:
+    """
+    Return by path its figures, all times in ns.
+
+    ``flows`` counts the inputs and ``arrived`` those whose flow reached the last callback.
+    ``response_time`` has CARET's cases (see ``path_cases``) from the first publication to the
+    start of the last callback, ``whole`` those from the start of the first to the end of the last.
+    ``reaction_time`` is the worst case with external latency, ``data_age`` that of every output.
+    """
+    return {path.name: _result(book, number) for number, path in enumerate(book.paths)}
+
+
+def _result(book: PathBook, number: int) -> dict[str, Any]:
+    flows = book.flows(number)
+    response = cases(inner_records(flows))
+    whole = cases(whole_records(flows))
+    return {
+        'callbacks': list(book.paths[number].callbacks),
+        'hops': [hop.kind for hop in book.hops(number)],
+        'flows': len(flows), 'arrived': sum(_arrival(flow) is not None for flow in flows),
+        'response_time': _cases(response), 'reaction_time':
+            statistics(response.worst_with_external_latency),
+        'data_age': statistics(response.data_age),
+        'whole': {
+            'response_time': _cases(whole),
+            'reaction_time': statistics(whole.worst_with_external_latency),
+            'data_age': statistics(whole.data_age)}}
+
+
+def _cases(found: Any) -> dict[str, Any]:
+    return {
+        'all': statistics(found.every), 'best': statistics(found.best),
+        'worst': statistics(found.worst),
+        'worst_with_external_latency': statistics(found.worst_with_external_latency)}
+
+
+def _arrival(flow: Flow) -> int | None:
+    """Return the start of the last callback's execution."""
+    return flow.columns[-1][3]
+
+
+def inner_records(flows: list[Flow]) -> list[Record]:
+    """Return the records from the first publication to the start of the last callback."""
+    records: list[Record] = []
+    for flow in flows:
+        first = flow.columns[0][0] or flow.columns[0][3]
+        if first is not None:
+            records.append((first, _arrival(flow)))
+    return records
+
+
+def whole_records(flows: list[Flow]) -> list[Record]:
+    """Return the records from the start of the first callback to the end of the last."""
+    return [(flow.begin, flow.end) for flow in flows if flow.begin is not None]

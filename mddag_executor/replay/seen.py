@@ -1,0 +1,99 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What can be said of an imported recording without a graph: callbacks and communication."""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+from mddag_executor.replay.entities import Callback, Publisher
+from mddag_executor.replay.linked import Publication, Run
+from mddag_executor.replay.path_cases import statistics
+
+
+class _Executions:
+    """Counts and sums of a recorded callback's executions, ns."""
+
+    __slots__ = ('callback', 'started', 'finished', 'busy', 'shortest', 'longest')
+
+    def __init__(self, callback: Callback) -> None:
+        self.callback = callback
+        self.started = 0
+        self.finished = 0
+        self.busy = 0
+        self.shortest = 0
+        self.longest = 0
+
+
+class Seen:
+    """Collects while a linker tells what happened."""
+
+    def __init__(self) -> None:
+        self._executions: dict[int, _Executions] = {}
+        self._sent: dict[int, tuple[Publisher, int]] = {}
+        self._arrived: dict[tuple[int, int], tuple[Callback, array[int]]] = {}
+
+    def started(self, run: Run, message: Publication | None) -> None:
+        """Take in that an execution has begun."""
+        callback = run.callback
+        use = self._executions.get(callback.number)
+        if use is None:
+            use = self._executions[callback.number] = _Executions(callback)
+        use.started += 1
+        if message is not None and message.publisher is not None and message.time:
+            key = (message.publisher.number, callback.number)
+            found = self._arrived.get(key)
+            if found is None:
+                found = self._arrived[key] = callback, array('q')
+            found[1].append(run.start - message.time)
+
+    def ended(self, run: Run) -> None:
+        """Take in that an execution has ended."""
+        use = self._executions[run.callback.number]
+        took = run.end - run.start
+        use.shortest = took if not use.finished else min(use.shortest, took)
+        use.longest = max(use.longest, took)
+        use.finished += 1
+        use.busy += took
+
+    def published(self, message: Publication) -> None:
+        """Take in that a message was published."""
+        publisher = message.publisher
+        if publisher is not None:
+            _, count = self._sent.get(publisher.number, (publisher, 0))
+            self._sent[publisher.number] = publisher, count + 1
+
+    def callbacks(self) -> dict[str, dict[str, int]]:
+        """Return counts and times (ns) of each recorded callback that ran."""
+        return {
+            use.callback.label: {
+                'executions': use.finished, 'unfinished': use.started - use.finished,
+                'busy_ns': use.busy, 'shortest_ns': use.shortest, 'longest_ns': use.longest}
+            for use in sorted(self._executions.values(), key=lambda u: u.callback.label)}
+
+    def communications(self) -> list[dict[str, Any]]:
+        """Return for each pair of publisher and callback messages, and publication to start."""
+        found = []
+        for (number, _), (callback, latencies) in self._arrived.items():
+            publisher, sent = self._sent.get(number, (None, 0))
+            if publisher is None:
+                continue
+            found.append({
+                'topic': publisher.topic,
+                'publisher': publisher.node.name if publisher.node is not None else None,
+                'callback': callback.label, 'sent': sent, 'arrived': len(latencies),
+                'latency_ns': statistics([(0, latency) for latency in latencies])})
+        return sorted(found, key=lambda each: (each['topic'], each['callback']))

@@ -1,0 +1,220 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Sketches of systems from traces: nodes, callbacks, what each publishes, rates, execution times.
+
+Theory of operation
+-------------------
+1. ``Census`` tells who there is. What every node has anyway (parameter services and their like) is
+   left out, and with it nodes that have nothing else.
+2. A callback that the recorded declaration names keeps its name, and what was declared of it that
+   a trace does not show: deadline, queue edges, period, sync, group, name of the DAG.  Others are
+   called ``callback_0``, ``callback_1``, … by node, in the order in which they were made.
+3. A topic of a node is published by the callbacks that were seen to publish it. Where none was,
+   each callback of the node may; where the node has no callback, there is supposed to be a timer.
+4. Execution times are the quantiles of ``PERCENT``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+import os
+
+from mddag_executor.core import quantile
+from mddag_executor.errors import InputError
+from mddag_executor.trace import TraceReader
+from mddag_executor.trace.census import Address, Census, Entity, Event, Runs
+from msg_graph import Callback, ExecutionTime, GraphError, loads, TaskSet
+from msg_graph.fields import check_node, check_service, check_topic
+from msg_graph.sketch import is_background, Sketch, SketchCallback, SketchNode
+
+PERCENT = (0.0, 50.0, 90.0, 99.0, 100.0)
+_STEP = 4096
+_TASK_SET, _DISPATCH = 'mddag:task_set', 'mddag:dispatch'
+
+
+class System:
+    """
+    What a trace tells of the system that was recorded.
+
+    :param path: a trace of this executor, or an imported recording of CARET or ros2_tracing.
+    :param name: what messages call it.
+    :raises mddag_executor.trace.TraceError: when it is no trace.
+    :raises InputError: when no callback is in it.
+    :ivar warnings: what is missing of the trace, one line each.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], name: str | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> None:
+        self.name = name or os.fspath(path)
+        self.census = Census()
+        self.task_set: TaskSet | None = None
+        self.workers: int | None = None
+        self._declared: dict[Address, Callback] = {}
+        reader = TraceReader(path)
+        wanted = {*self.census.handlers, _TASK_SET, _DISPATCH}
+        for count, event in enumerate(reader.events(wanted, sorted=True)):
+            if event[0] == _DISPATCH:
+                self._dispatch(event)
+            elif event[0] == _TASK_SET:
+                self._recorded(event)
+            else:
+                self.census.take(event)
+            if progress is not None and count % _STEP == 0:
+                progress(count)
+        self.warnings = list(reader.warnings)
+        self._entities = [entity for entity in self.census.entities() if _is_shown(entity)]
+        if not self._entities:
+            raise InputError(
+                self.name, 'no timer, subscription or service of a node is recorded in it',
+                'record the start of the nodes, too')
+
+    def _recorded(self, event: Event) -> None:
+        if None in event or self.task_set is not None or not event[4].strip():
+            return
+        try:
+            self.task_set = loads(event[4], event[5] or self.name)
+        except GraphError:
+            return  # what it declares is of no use, but who is who still is
+        self.workers = event[7]
+
+    def _dispatch(self, event: Event) -> None:
+        if self.task_set is None or None in event:
+            return
+        dag, vertex = event[5], event[6]
+        if (0 <= dag < len(self.task_set.dags)
+                and 0 <= vertex < len(self.task_set.dags[dag].vertices)):
+            callback = self.task_set.dags[dag].vertices[vertex].callback
+            self._declared[event[2], event[4]] = callback
+
+    def sketch(self) -> Sketch:
+        """Return the whole system."""
+        nodes: dict[str, SketchNode] = {}
+        for entity in self._entities:
+            node = nodes.setdefault(entity.node, SketchNode(entity.node))
+            callback = self._callback(entity, node)
+            node.callbacks.setdefault(callback.name, callback)
+        for name, topics in self.census.publishers.items():
+            unseen = [t for t, seen in topics.items()
+                      if not seen and not is_background(t) and check_topic(t) is None]
+            if unseen and name not in nodes and check_node(name) is None:
+                timer = SketchCallback(name, 'callback_0', 'timer', guessed=True)
+                nodes[name] = SketchNode(name, {timer.name: timer})
+            if unseen:
+                for callback in nodes[name].callbacks.values() if name in nodes else ():
+                    callback.maybe.extend(t for t in unseen if t not in callback.publishes)
+        return Sketch(f'the trace {self.name}', self._ordered(nodes), workers=self.workers)
+
+    def _ordered(self, nodes: dict[str, SketchNode]) -> list[SketchNode]:
+        """Return the nodes in the order of the recorded declaration, which counts for ties."""
+        if self.task_set is None:
+            return list(nodes.values())
+        place = {c.key: i for i, c in enumerate(self.task_set.callbacks)}
+        every = [callback for node in nodes.values() for callback in node.callbacks.values()]
+        found: list[SketchNode] = []
+        for callback in sorted(every, key=lambda c: place.get(c.key, len(place))):
+            if not found or found[-1].name != callback.node:
+                found.append(SketchNode(callback.node))  # a node may have several entries
+            found[-1].callbacks[callback.name] = callback
+        return found
+
+    def _callback(self, entity: Entity, node: SketchNode) -> SketchCallback:
+        declared = None if entity.callback is None else self._declared.get(entity.callback)
+        if declared is not None and declared.node == entity.node:
+            known = node.callbacks.get(declared.name)
+            callback = known or _from_declared(declared)
+        else:
+            number = len(node.callbacks)
+            while f'callback_{number}' in node.callbacks:
+                number += 1
+            callback = SketchCallback(
+                entity.node, f'callback_{number}', entity.kind,
+                [entity.start] if entity.start else [], entity.period_ns)
+            if entity.group is not None:
+                callback.group = self._group_name(entity)
+        self._measure(callback, [entity])
+        return callback
+
+    def _group_name(self, entity: Entity) -> str | None:
+        """Return a name for a group that several callbacks of the node share."""
+        groups = [e.group for e in self._entities if e.node == entity.node]
+        if groups.count(entity.group) < 2:
+            return None
+        known = [group for group in dict.fromkeys(groups) if group is not None]
+        return f'callback_group_{known.index(entity.group)}' if entity.group in known else None
+
+    def _measure(self, callback: SketchCallback, entities: Iterable[Entity]) -> bool:
+        """Fill in what was measured of a callback; return whether anything was."""
+        found = [self.census.runs[e.callback] for e in entities
+                 if e.callback is not None and e.callback in self.census.runs]
+        if not found:
+            return False
+        runs = found[0]
+        for each in found:
+            callback.publishes.extend(
+                t for t in each.publishes if t not in callback.publishes and not is_background(t)
+                and check_topic(t) is None)
+        callback.maybe = [t for t in callback.maybe if t not in callback.publishes]
+        if callback.kind != 'sync':
+            callback.interval_ns = runs.interval_ns
+            callback.times = execution_time(runs)
+        return True
+
+    def measure(self, sketch: Sketch) -> int:
+        """
+        Fill what was measured into a sketch of the same system; return of how many callbacks.
+
+        Callbacks are the same if node and what starts them are; of several that are started
+        alike the first is the one that was made first.
+        """
+        waiting: dict[tuple[str, str, str], list[Entity]] = {}
+        for entity in self._entities:
+            start = str(entity.period_ns) if entity.kind == 'timer' else entity.start
+            waiting.setdefault((entity.node, entity.kind, start), []).append(entity)
+        count = 0
+        for callback in sketch.callbacks():
+            start = callback.starts[0] if callback.starts else str(callback.period_ns)
+            fits = waiting.get((callback.node, callback.kind, start))
+            if fits:
+                count += self._measure(callback, [fits.pop(0)])
+        return count
+
+
+def execution_time(runs: Runs) -> tuple[ExecutionTime, int] | None:
+    """Return the execution time of a callback and of how many executions it is; None of none."""
+    times = sorted(max(1, time) for time in runs.times)
+    if not times:
+        return None
+    quantiles = tuple(quantile(times, share / 100) for share in PERCENT)
+    return ExecutionTime(quantiles, PERCENT), len(times)
+
+
+def _is_shown(entity: Entity) -> bool:
+    if check_node(entity.node) is not None:
+        return False
+    if entity.kind == 'timer':
+        return entity.period_ns is not None and entity.period_ns >= 1_000
+    check = check_topic if entity.kind == 'subscription' else check_service
+    return not is_background(entity.start) and check(entity.start) is None
+
+
+def _from_declared(declared: Callback) -> SketchCallback:
+    starts = [declared.service] if declared.service else list(declared.topics)
+    return SketchCallback(
+        declared.node, declared.name, declared.kind, starts, declared.period_ns, [], [],
+        list(declared.reads), declared.group, declared.dag, declared.deadline_ns,
+        declared.release_from)

@@ -1,0 +1,118 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How many missed deadlines are tolerated, and whether a run keeps within that.
+
+Theory of operation
+-------------------
+As in CARET's report (its callback validation), each sink is judged by two measures, and both have
+to hold:
+
+* *ratio*: of the sink's jobs that were due, the share that missed the deadline is at most R;
+* *burst*: the longest run of consecutive jobs that missed it is at most B.
+
+A job was due at a sink when it completed there, expired, was aborted, or was past its deadline at
+the end of the run.  Jobs are consecutive by their number; a job that is not in the trace ends a
+burst.  Where only one of the two is given, only that one is asked for; where neither is, no miss
+is tolerated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from mddag_executor.core import Tables, Tally
+from mddag_executor.core.state import SINK_DONE
+from msg_graph import TaskSet
+
+
+class MissTally(Tally):
+    """A tally that keeps which jobs missed at each sink."""
+
+    def __init__(self, task_set: TaskSet, tables: Tables, keep: int | None = None) -> None:
+        super().__init__(task_set, tables, keep)
+        #: By global vertex of each sink: the jobs that missed, as they became known.
+        self.missed_jobs: dict[int, list[int]] = {vertex: [] for vertex in self.sinks}
+
+    def _add_sink(
+        self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
+    ) -> None:
+        super()._add_sink(kind, dag, vertex, job, deadline, time)
+        if kind != SINK_DONE or time > deadline:
+            self.missed_jobs[vertex].append(job)
+
+    def add_bursts(self, dags: Mapping[str, Any]) -> None:
+        """Add to each sink of a result its longest burst of misses, as `longest_burst`."""
+        for v, jobs in self.missed_jobs.items():
+            dag = self._dags[self._tables.dag_of[v]].name
+            dags[dag]['sinks'][self.vertex_name(v)]['longest_burst'] = longest_burst(jobs)
+
+
+def longest_burst(jobs: Iterable[int]) -> int:
+    """Return the length of the longest run of consecutive numbers."""
+    longest = length = 0
+    before: int | None = None
+    for job in sorted(set(jobs)):
+        length = length + 1 if before is not None and job == before + 1 else 1
+        longest = max(longest, length)
+        before = job
+    return longest
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What is tolerated of each sink; None: not asked for."""
+
+    ratio: float | None = None
+    burst: int | None = None
+
+    def broken_by(self, sink: Mapping[str, Any]) -> str | None:
+        """
+        Return why a sink is not within the tolerance, None where it is.
+
+        :param sink: its part of a result, with its `longest_burst`.
+        """
+        due, missed = due_and_missed(sink)
+        if not missed:
+            return None
+        if self.ratio is None and self.burst is None:
+            return f'{missed} of {due} jobs missed the deadline'
+        broken = []
+        if self.ratio is not None and missed > self.ratio * due:
+            broken.append(f'{missed} of {due} jobs missed the deadline ({missed / due:.4%}), '
+                          f'at most {self.ratio:.4%} are tolerated')
+        if self.burst is not None and sink['longest_burst'] > self.burst:
+            broken.append(f'{sink["longest_burst"]} jobs in a row missed the deadline, at most '
+                          f'{self.burst} are tolerated')
+        return '; '.join(broken) or None
+
+    def verdicts(self, dags: Mapping[str, Any]) -> dict[tuple[str, str], str]:
+        """Return by DAG and sink why it is not within the tolerance; empty: all are."""
+        found = {}
+        for dag_name, dag in dags.items():
+            for name, sink in dag['sinks'].items():
+                why = self.broken_by(sink)
+                if why is not None:
+                    found[dag_name, name] = why
+        return found
+
+
+def due_and_missed(sink: Mapping[str, Any]) -> tuple[int, int]:
+    """Return how many jobs were due at a sink, and how many of them missed its deadline."""
+    never = sink['overdue'] + sink['expired'] + sink['aborted']
+    missed = sink['late'] + sink['expired'] + sink['aborted']     # late: with the overdue
+    return sink['completed'] + never, missed

@@ -1,0 +1,176 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Two runs side by side, sink by sink and callback by callback.
+
+Sinks and callbacks are the same where their names are.  What only one run has is told with the
+other side empty.  A sink is *worse* in the second run if a larger share of its deadlines was
+missed there or, with a tolerance, if its p99 response time grew by more than that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from mddag_executor.report.tables import counts, percent, short_names, total
+from mddag_executor.report.text import Cell, format_ns, printable, table
+
+_KEYS = ('min', 'median', 'p99', 'max')
+_HEADER = ('DAG', 'sink', 'due', 'then', 'in time', 'then', 'late', 'then', 'median', 'change',
+           'p99', 'change', 'max', 'change', '')
+
+
+def compare(
+    before: Mapping[str, Any], after: Mapping[str, Any], tolerance: float | None = None
+) -> dict[str, Any]:
+    """
+    Compare the results of two replays.
+
+    :param tolerance: how much a p99 response time may grow, as a share (0.1 is 10 %).
+    :returns: for JSON: ``sinks`` by DAG and name with both sides (``a``, ``b``; null where a run
+        lacks it), ``change_ns`` and ``change`` (share) of response times and ``worse``;
+        ``callbacks`` with both sides' executions and mean times; ``worse`` of the whole.
+    """
+    dags: dict[str, Any] = {}
+    for name in _union(before['dags'], after['dags']):
+        sides = [side['dags'].get(name, {'sinks': {}}) for side in (before, after)]
+        dags[name] = {'sinks': {
+            sink: _sink(sides[0]['sinks'].get(sink), sides[1]['sinks'].get(sink), tolerance)
+            for sink in _union(sides[0]['sinks'], sides[1]['sinks'])}}
+    callbacks = {
+        key: {'a': _callback(before['callbacks'].get(key)),
+              'b': _callback(after['callbacks'].get(key))}
+        for key in _union(before['callbacks'], after['callbacks'])}
+    return {
+        'a': _run(before), 'b': _run(after), 'tolerance': tolerance,
+        'worse': any(sink['worse'] for dag in dags.values() for sink in dag['sinks'].values()),
+        'dags': dags, 'callbacks': callbacks}
+
+
+def _union(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    return list(dict.fromkeys([*one, *other]))
+
+
+def _run(result: Mapping[str, Any]) -> dict[str, Any]:
+    every = total(result['dags'])
+    return {
+        'trace': result['recording']['trace'], 'policy': result['policy'],
+        'workers': result['workers'], 'duration_ns': result['duration_ns'],
+        'utilisation': result['utilisation'], **every._asdict()}
+
+
+def _side(sink: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    if sink is None:
+        return None
+    return {'relative_deadline_ns': sink['relative_deadline_ns'], **counts(sink)._asdict(),
+            'response_ns': sink['response_ns']}
+
+
+def _sink(
+    before: Mapping[str, Any] | None, after: Mapping[str, Any] | None, tolerance: float | None
+) -> dict[str, Any]:
+    a, b = _side(before), _side(after)
+    change_ns: dict[str, int] | None = None
+    change: dict[str, float | None] | None = None
+    worse = False
+    if a is not None and b is not None:
+        worse = (b['due'] - b['in_time']) * a['due'] > (a['due'] - a['in_time']) * b['due'] \
+            or (a['due'] == 0 and b['in_time'] < b['due'])
+        if a['response_ns'] is not None and b['response_ns'] is not None:
+            change_ns = {key: b['response_ns'][key] - a['response_ns'][key] for key in _KEYS}
+            change = {key: grown / a['response_ns'][key] if a['response_ns'][key] else None
+                      for key, grown in change_ns.items()}
+            if tolerance is not None:
+                worse |= change_ns['p99'] > tolerance * a['response_ns']['p99']
+    return {'a': a, 'b': b, 'change_ns': change_ns, 'change': change, 'worse': worse}
+
+
+def _callback(use: Mapping[str, int] | None) -> dict[str, Any] | None:
+    if use is None:
+        return None
+    n = use['executions']
+    return {
+        'executions': n, 'mean_ns': use['busy_ns'] // n if n else None,
+        'longest_ns': use['longest_ns'], 'mean_wait_ns': use['waiting_ns'] // n if n else None}
+
+
+def sinks_table(difference: Mapping[str, Any]) -> str:
+    """Return the table of sinks: the first run's figure, then the second's or how it changed."""
+    dags = difference['dags']
+    short = short_names(name for dag in dags.values() for name in dag['sinks'])
+    rows: list[list[Cell]] = []
+    for dag_name, dag in dags.items():
+        shown = dag_name
+        for name, sink in dag['sinks'].items():
+            row: list[Cell] = [shown, short[name]]
+            for key in ('due', 'in_time', 'late'):
+                row.extend(None if side is None else side[key]
+                           for side in (sink['a'], sink['b']))
+            for key in _KEYS[1:]:
+                row.extend(_response(sink, key))
+            rows.append([*row, _remark(sink)])
+            shown = ''
+    return table(_HEADER, rows)
+
+
+def _response(sink: Mapping[str, Any], key: str) -> list[Cell]:
+    side = sink['a']
+    value = None if side is None or side['response_ns'] is None \
+        else format_ns(side['response_ns'][key])
+    if sink['change'] is None:
+        return [value, None]
+    share = sink['change'][key]
+    return [value, '-' if share is None else f'{100 * share:+.1f} %']
+
+
+def _remark(sink: Mapping[str, Any]) -> str:
+    if sink['a'] is None:
+        return 'only in the second'
+    if sink['b'] is None:
+        return 'only in the first'
+    if sink['a']['relative_deadline_ns'] != sink['b']['relative_deadline_ns']:
+        other = format_ns(sink['b']['relative_deadline_ns'])
+        return ('worse, ' if sink['worse'] else '') + f'deadline then {other}'
+    return 'worse' if sink['worse'] else ''
+
+
+def callbacks_table(difference: Mapping[str, Any]) -> str:
+    """Return a table of the callbacks' executions and times in both runs."""
+    rows: list[list[Cell]] = []
+    for key, sides in difference['callbacks'].items():
+        row: list[Cell] = [key]
+        for what in ('executions', 'mean_ns', 'longest_ns', 'mean_wait_ns'):
+            for side in (sides['a'], sides['b']):
+                value = None if side is None else side[what]
+                row.append(value if value is None or what == 'executions' else format_ns(value))
+        rows.append(row)
+    return table(('callback', 'executions', 'then', 'mean', 'then', 'longest', 'then',
+                  'mean wait', 'then'), rows)
+
+
+def summary(difference: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the lines below the tables: one for each run, and the verdict."""
+    for mark in ('a', 'b'):
+        run = difference[mark]
+        yield (f'{"first" if mark == "a" else "then"}: {printable(run["trace"])}: '
+               f'{run["due"]} sink jobs due, {run["in_time"]} in time '
+               f'({percent(run["in_time"], run["due"])}), {run["late"]} late, '
+               f'{run["expired"]} expired; policy {printable(run["policy"])}, '
+               f'{run["workers"]} workers, {format_ns(run["duration_ns"])}')
+    n = sum(sink['worse'] for dag in difference['dags'].values()
+            for sink in dag['sinks'].values())
+    yield f'{n} sinks are worse in the second run' if n != 1 \
+        else '1 sink is worse in the second run'

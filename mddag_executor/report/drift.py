@@ -1,0 +1,39 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Lines that tell where a run and its declaration disagree (see ``msg_graph.drift``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from mddag_executor.report.text import printable
+
+MOST_LINES = 12
+
+
+def drift_lines(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """
+    Yield a line for each disagreement, and none where there is none.
+
+    :param found: what ``drift`` holds in a result for machines.
+    """
+    if not found:
+        return
+    yield f'the run and the declaration disagree in {len(found)} point{"s" * (len(found) > 1)}:'
+    for each in found[:MOST_LINES]:
+        yield f'  {printable(each["text"])}'
+    if len(found) > MOST_LINES:
+        yield f'  … ({len(found) - MOST_LINES} more)'

@@ -1,0 +1,379 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Rows of a run for spreadsheets and data frames: one for each execution, or for each sink's job.
+
+Theory of operation
+-------------------
+The exporter observes a replay and hands out rows while it goes on; what it keeps are the jobs that
+are open and, because a callback may still run when its job has ended, the last few that were, and
+executions that have ended until it is known what they completed.
+
+Executions (``ExecutionRow``), in the order in which they were completed.  A row is one run of a
+callback on a worker; a coroutine that was suspended has several, ``first`` tells the first.  What
+no DAG declares has neither DAG nor job.
+
+Jobs (``JobRow``), in the order in which they were judged.  A row is the verdict about one job at
+one sink: ``in_time``, ``late``, ``overdue`` (not completed when the run ended past its deadline),
+``expired`` or ``aborted``; the last three have no completion.
+
+Columns that end in ``_ns`` are whole nanoseconds: times on the trace's clock, or durations.
+``start_s`` and ``release_s`` are seconds since the run's first release.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+import csv
+import io
+from typing import Any, BinaryIO, get_args, get_type_hints, NamedTuple, Protocol
+
+from mddag_executor.core import Tables
+from mddag_executor.core.state import (
+    Decision,
+    DROP,
+    JOB_END,
+    SINK_ABORTED,
+    SINK_DONE,
+    SINK_EXPIRED,
+    SINK_MISSED,
+)
+from mddag_executor.errors import MddagError
+from mddag_executor.replay.follower import Event, Execution, Observer, Piece
+from mddag_executor.replay.judge import Judge
+from mddag_executor.report.text import printable
+from msg_graph import TaskSet
+
+KEEP_ENDED = 4096
+MOST_HELD = 1024
+BATCH = 65536
+
+_VERDICTS = {SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired', SINK_ABORTED: 'aborted'}
+
+
+class ExecutionRow(NamedTuple):
+    """
+    One run of a callback on a worker.
+
+    ``reference_deadline_ns`` is the vertex's (RAD); ``slack_ns`` what was left of it at the end.
+    ``worker`` -1 is a spare thread beside the pool.  ``waiting_ns`` is only in the first of
+    several rows of one execution.
+    """
+
+    dag: str | None
+    job: int | None
+    vertex: str
+    worker: int
+    first: bool
+    start_s: float
+    release_ns: int | None
+    ready_ns: int
+    start_ns: int
+    end_ns: int
+    waiting_ns: int | None
+    executing_ns: int
+    reference_deadline_ns: int | None
+    slack_ns: int | None
+
+
+class JobRow(NamedTuple):
+    """The verdict about one job at one sink."""
+
+    dag: str
+    job: int
+    sink: str
+    release_s: float
+    release_ns: int
+    deadline_ns: int
+    completed_ns: int | None
+    response_ns: int | None
+    slack_ns: int | None
+    verdict: str
+
+
+class Ran(NamedTuple):
+    """
+    An execution that is to be told.
+
+    ``legs`` are those of its vertex that it completed (none: it was not its last piece, or never
+    did), ``whole`` whether it completed the vertex, which then publishes.
+    """
+
+    row: ExecutionRow
+    piece: Piece
+    legs: tuple[int, ...] = ()
+    whole: bool = False
+
+
+class Target(Protocol):
+    """Where rows go."""
+
+    def begin(self, task_set: TaskSet, tables: Tables) -> None:
+        """Take in what the run is of."""
+
+    def execution(self, ran: Ran) -> None:
+        """Take in an execution."""
+
+    def verdict(self, row: JobRow, vertex: int) -> None:
+        """Take in a verdict; the vertex is the global index of the sink."""
+
+    def finish(self) -> None:
+        """Write what is left."""
+
+
+class Exporter(Observer):
+    """Makes rows of a replay that it watches."""
+
+    def __init__(self, target: Target) -> None:
+        self.target = target
+        self._symbols: dict[int, str] = {}
+        self._jobs: dict[tuple[int, int], int] = {}
+        # by vertex, job and ready time: what has ended, until it is known what it completed
+        self._held: dict[tuple[int, int, int], Ran] = {}
+        self._legs: dict[tuple[int, int], tuple[int, ...]] = {}
+        self._completed: tuple[Execution, tuple[int, int, int]] | None = None
+        self._ended: deque[tuple[int, int]] = deque()
+        self._origin: int | None = None
+
+    def observers(self, task_set: TaskSet, judge: Judge) -> Sequence[Observer]:
+        """Return what is told of the run, after the judge."""
+        self._tables = judge.tables
+        self._names = [vertex.name for vertex in task_set.vertices]
+        self._dags = [dag.name for dag in task_set.dags]
+        judge.listeners.append(self._decided)
+        self.target.begin(task_set, judge.tables)
+        return [self]
+
+    def handlers(self) -> dict[str, Callable[[Event], None]]:
+        """Return what else the follower is to tell: names of callbacks."""
+        return {'ros2:rclcpp_callback_register': self._registered}
+
+    def _registered(self, event: Event) -> None:
+        self._symbols[event[4]] = event[5]
+
+    def released(self, dag: int, job: int, release: int, now: int) -> None:
+        """Open a job."""
+        self._jobs[dag, job] = release
+        if self._origin is None:
+            self._origin = release
+
+    def ran(self, piece: Piece) -> None:
+        """Take in an execution, and hand it out or hold it back."""
+        self._hand_out_completed()
+        callback, dag, vertex, job, worker, ready, start, end, first = piece
+        release = self._jobs.get((dag, job)) if vertex >= 0 else None
+        reference = None if release is None else release + self._tables.rad_offset[vertex]
+        row = ExecutionRow(
+            self._dags[dag] if vertex >= 0 else None, job if vertex >= 0 else None,
+            self._names[vertex] if vertex >= 0 else self._undeclared(callback), worker, first,
+            self._seconds(start), release, ready, start, end, start - ready if first else None,
+            end - start, reference, None if reference is None else reference - end)
+        if vertex < 0:
+            self.target.execution(Ran(row, piece))
+            return
+        key = (vertex, job, ready)
+        self._hand_out(key)     # a piece before it, of a coroutine
+        self._held[key] = Ran(row, piece, self._legs.pop((vertex, job), ()))
+        if len(self._held) > MOST_HELD:
+            self._hand_out(next(iter(self._held)))
+
+    def completed(
+        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
+        execution: Execution | None,
+    ) -> None:
+        """Note what an execution completed; one may complete several legs, one after the other."""
+        if self._completed is not None and self._completed[0] is not execution:
+            self._hand_out_completed()
+        if execution is None:       # of a simulated sync callback, which runs once for all legs
+            self._legs[vertex, job] = (*self._legs.get((vertex, job), ()), leg)
+            if len(self._legs) > MOST_HELD:
+                del self._legs[next(iter(self._legs))]
+            return
+        key = (vertex, job, execution.ready)
+        ran = self._held.get(key)
+        if ran is not None:
+            self._held[key] = ran._replace(legs=(*ran.legs, leg), whole=whole)
+            self._completed = (execution, key)
+
+    def _hand_out_completed(self) -> None:
+        if self._completed is not None:
+            self._hand_out(self._completed[1])
+            self._completed = None
+
+    def _hand_out(self, key: tuple[int, int, int]) -> None:
+        ran = self._held.pop(key, None)
+        if ran is not None:
+            self.target.execution(ran)
+
+    def finish(self) -> None:
+        """Hand out what is left, once the run is over."""
+        for key in list(self._held):
+            self._hand_out(key)
+        self.target.finish()
+
+    def _undeclared(self, callback: int) -> str:
+        return self._symbols.get(callback) or f'callback {callback:#x}'
+
+    def _seconds(self, time: int) -> float:
+        if self._origin is None:
+            self._origin = time
+        return (time - self._origin) / 1e9
+
+    def _decided(self, decisions: Sequence[Decision]) -> None:
+        for kind, dag, vertex, job, deadline, time in decisions:
+            if kind == JOB_END:
+                self._ended.append((dag, job))
+                if len(self._ended) > KEEP_ENDED:
+                    self._jobs.pop(self._ended.popleft(), None)
+            elif kind != DROP:
+                self._verdict(kind, dag, vertex, job, deadline, time)
+
+    def _verdict(
+        self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
+    ) -> None:
+        release = deadline - self._tables.sink_deadline[vertex]
+        completed = time if kind == SINK_DONE else None
+        if completed is None:
+            verdict = _VERDICTS[kind]
+        else:
+            verdict = 'in_time' if completed <= deadline else 'late'
+        self.target.verdict(JobRow(
+            self._dags[dag], job, self._names[vertex], self._seconds(release), release, deadline,
+            completed, None if completed is None else completed - release,
+            None if completed is None else deadline - completed, verdict), vertex)
+
+
+class _Rows:
+    """A target that takes rows of one kind, in batches."""
+
+    def __init__(self, jobs: bool) -> None:
+        self._jobs = jobs
+        self._batch: list[tuple[Any, ...]] = []
+        self.kind: type[ExecutionRow] | type[JobRow] = JobRow if jobs else ExecutionRow
+
+    def begin(self, task_set: TaskSet, tables: Tables) -> None:
+        """Take in what the run is of."""
+
+    def execution(self, ran: Ran) -> None:
+        """Take in an execution."""
+        if not self._jobs:
+            self._add(ran.row)
+
+    def verdict(self, row: JobRow, vertex: int) -> None:
+        """Take in a verdict."""
+        if self._jobs:
+            self._add(row)
+
+    def _add(self, row: tuple[Any, ...]) -> None:
+        self._batch.append(row)
+        if len(self._batch) >= BATCH:
+            self._flush()
+
+    def _flush(self) -> None:
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """Write what is left."""
+        self._flush()
+
+
+class CsvRows(_Rows):
+    """Writes rows as CSV (RFC 4180, UTF-8) below a line of titles; no value is an empty cell."""
+
+    def __init__(self, file: BinaryIO, jobs: bool) -> None:
+        super().__init__(jobs)
+        self._text = io.TextIOWrapper(file, 'utf-8', 'backslashreplace', newline='')
+        self._writer = csv.writer(self._text)
+        self._writer.writerow(self.kind._fields)
+
+    def _flush(self) -> None:
+        self._writer.writerows([[_cell(value) for value in row] for row in self._batch])
+        self._batch.clear()
+
+    def finish(self) -> None:
+        """Write what is left, and leave the file to its owner."""
+        super().finish()
+        self._text.flush()
+        self._text.detach()
+
+
+def _cell(value: Any) -> Any:
+    """Return a value as CSV has it; a name is harmless for terminals and spreadsheets."""
+    if isinstance(value, str):
+        text = printable(value)
+        return f"'{text}" if text[:1] in ('=', '+', '-', '@') else text
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    return f'{value:.9f}' if isinstance(value, float) else value
+
+
+class ParquetRows(_Rows):
+    """Writes rows as Parquet, names as dictionaries."""
+
+    def __init__(self, file: BinaryIO, jobs: bool) -> None:
+        super().__init__(jobs)
+        import pyarrow
+        import pyarrow.parquet
+        types = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64(),
+                 bool: pyarrow.bool_()}
+        fields = []
+        for name, hint in get_type_hints(self.kind).items():
+            kinds = get_args(hint) or (hint,)       # `int | None`
+            fields.append(pyarrow.field(name, types[kinds[0]], nullable=len(kinds) > 1))
+        self._schema: Any = pyarrow.schema(fields)
+        self._arrow: Any = pyarrow
+        self._writer: Any = pyarrow.parquet.ParquetWriter(
+            file, self._schema, compression='zstd')
+
+    def _flush(self) -> None:
+        if not self._batch:
+            return
+        columns = [self._arrow.array(column, type=field.type)
+                   for column, field in zip(zip(*self._batch), self._schema)]
+        self._writer.write_table(self._arrow.table(columns, schema=self._schema))
+        self._batch.clear()
+
+    def finish(self) -> None:
+        """Write what is left, and the footer."""
+        super().finish()
+        self._writer.close()
+
+
+def check_available(form: str) -> None:
+    """
+    Find out whether a format can be written, before long work starts.
+
+    :raises mddag_executor.errors.MddagError: when a package is missing.
+    """
+    module = {'parquet': 'pyarrow', 'pftrace': 'perfetto'}.get(form)
+    if module is None:
+        return
+    try:
+        __import__(module)
+    except ImportError:
+        raise MddagError(
+            f'-o *.{form}: {module} is not installed: '
+            "pip install 'mddag_executor[export]'") from None
+
+
+def target(form: str, file: BinaryIO, jobs: bool) -> Target:
+    """Return what writes a format: ``csv``, ``parquet`` or ``pftrace``."""
+    if form == 'csv':
+        return CsvRows(file, jobs)
+    if form == 'parquet':
+        return ParquetRows(file, jobs)
+    from mddag_executor.report.perfetto import PerfettoTarget
+    return PerfettoTarget(file)

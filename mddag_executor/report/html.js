@@ -1,0 +1,437 @@
+// What draws the pictures of a report while they are zoomed and moved.
+//
+// Theory of operation: the page holds every execution in compressed columns (see html_data.py).
+// Whenever a range changes, the executions in view are looked up by binary search. Few of them are
+// drawn as they are; many are added up by line and interval, and a bar is as high as the line was
+// busy, in the colour of the least slack in it. So what is drawn never grows with the run.
+// Times are in units of 100 ns, in pictures in seconds.
+'use strict';
+(() => {
+  const EXACT = 4000;                   // executions drawn one by one at most
+  const CELLS = 24000;                  // lines times intervals otherwise
+  const KINDS = ['late', 'not completed when the run ended', 'expired', 'aborted'];
+  const CLASSES = [                     // by slack over deadline: less than, colour
+    [0, '#d7191c'], [0.1, '#fd8d3c'], [0.25, '#fec44f'], [0.5, '#9ecae1'], [Infinity, '#3182bd']];
+  const UNKNOWN = 5, COLOURS = [...CLASSES.map((c) => c[1]), '#969696'];
+  const element = (id) => document.getElementById(id);
+  const meta = JSON.parse(element('mddag-meta').textContent);
+  const SECOND = 1e9 / meta.unit_ns;
+  let c = null;                         // columns by name
+  let longest = 0, slack = null, ratio = null, least = null, released = null, missed = [];
+  let shown = null;                     // when each miss is shown, ascending
+
+  // --- data --------------------------------------------------------------------------------------
+
+  async function unpack() {
+    const text = atob(element('mddag-data').textContent);
+    const packed = new Uint8Array(text.length);
+    for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
+    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('deflate'));
+    const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
+    const columns = {};
+    let at = 0;
+    for (const column of meta.columns) {
+      const values = new Float64Array(column.n);
+      for (let plane = 0, weight = 1; plane < column.width; plane++, weight *= 256) {
+        for (let i = 0; i < column.n; i++) values[i] += bytes[at++] * weight;
+      }
+      let before = 0;
+      for (let i = 0; i < column.n; i++) {
+        const u = values[i], v = u % 2 ? -(u + 1) / 2 : u / 2;
+        values[i] = before = column.delta ? before + v : v;
+      }
+      columns[column.name] = values;
+    }
+    return columns;
+  }
+
+  function lower(values, wanted, from = 0, to = values.length) {
+    while (from < to) {
+      const middle = (from + to) >> 1;
+      if (values[middle] < wanted) from = middle + 1; else to = middle;
+    }
+    return from;
+  }
+
+  function spans(values, count) {       // of equal numbers in ascending order: [from, to]
+    const found = [];
+    for (let n = 0; n < count; n++) found.push([lower(values, n), lower(values, n + 1)]);
+    return found;
+  }
+
+  function prepare() {
+    const n = c.start.length, last = new Float64Array(meta.rows.length);
+    for (let i = 0; i < n; i++) {
+      c.job[i] = last[c.row[i]] += c.job[i];
+      if (c.took[i] > longest) longest = c.took[i];
+    }
+    const ofDag = spans(c.release_dag, meta.dags.length);
+    released = (dag, job) => {
+      const at = lower(c.release_job, job, ...ofDag[dag]);
+      return at < ofDag[dag][1] && c.release_job[at] === job ? c.release_time[at] : NaN;
+    };
+    const ofSink = spans(c.verdict_sink, meta.sinks.length);
+    const verdict = (sink, job) => {
+      const at = lower(c.verdict_job, job, ...ofSink[sink]);
+      return at < ofSink[sink][1] && c.verdict_job[at] === job ? at : -1;
+    };
+    slack = new Float64Array(n).fill(NaN);
+    ratio = new Uint8Array(n).fill(UNKNOWN);
+    least = new Int32Array(n).fill(-1);
+    for (let i = 0; i < n; i++) {
+      for (const sink of meta.rows[c.row[i]].sinks) {
+        const at = verdict(sink, c.job[i]);
+        if (at < 0) continue;
+        const value = c.verdict_kind[at] ? -Infinity : c.verdict_slack[at];
+        if (value >= slack[i]) continue;
+        slack[i] = value;
+        least[i] = at;
+        ratio[i] = classOf(value, meta.sinks[sink].deadline);
+      }
+    }
+    for (let i = 0; i < c.verdict_job.length; i++) {
+      if (c.verdict_kind[i] || c.verdict_slack[i] < 0) missed.push(jobOf(i));
+    }
+    missed = missed.filter((m) => !isNaN(m.release)).sort((a, b) => a.shown - b.shown);
+    shown = Float64Array.from(missed, (miss) => miss.shown);
+  }
+
+  function classOf(value, deadline) {
+    return CLASSES.findIndex(([limit]) => value / deadline < limit);
+  }
+
+  function jobOf(at) {                  // what is known of a verdict
+    const sink = meta.sinks[c.verdict_sink[at]], job = c.verdict_job[at];
+    const release = released(sink.dag, job), deadline = release + sink.deadline;
+    const kind = c.verdict_kind[at];
+    const completed = kind ? null : deadline - c.verdict_slack[at];
+    return {at, sink: c.verdict_sink[at], job, release, deadline, completed, kind,
+            row: sink.row, shown: completed === null ? deadline : completed};
+  }
+
+  // --- words -------------------------------------------------------------------------------------
+
+  function time(units) {
+    const ns = Math.abs(units) * meta.unit_ns, sign = units < 0 ? '-' : '';
+    for (const [scale, unit] of [[1e9, 's'], [1e6, 'ms'], [1e3, 'us']]) {
+      if (ns >= scale) return `${sign}${+(ns / scale).toPrecision(5)} ${unit}`;
+    }
+    return `${sign}${ns} ns`;
+  }
+
+  const instant = (units) => `${(units / SECOND).toFixed(6)} s`;
+
+  function verdictText(at) {
+    const job = jobOf(at), name = meta.sinks[job.sink].name;
+    const due = `deadline ${time(meta.sinks[job.sink].deadline)}`;
+    if (job.kind) return `MISSED at ${name}: ${KINDS[job.kind]} (${due})`;
+    const left = c.verdict_slack[at];
+    return `${left < 0 ? 'MISSED' : 'in time'} at ${name}: response ` +
+      `${time(job.completed - job.release)}, ${left < 0 ? time(-left) + ' late' :
+        time(left) + ' of slack'} (${due})`;
+  }
+
+  function facts(i) {
+    const row = meta.rows[c.row[i]], dag = row.dag < 0 ? null : meta.dags[row.dag];
+    const release = dag === null ? NaN : released(row.dag, c.job[i]);
+    return [
+      row.name,
+      dag === null ? 'declared by no DAG' : `job ${c.job[i]} of ${dag}` +
+        (isNaN(release) ? '' : `, released at ${instant(release)}`),
+      `ready ${instant(c.start[i] - c.wait[i])}, started ${instant(c.start[i])}, ` +
+        (c.worker[i] < 0 ? 'on a spare thread' : `worker ${c.worker[i]}`),
+      `waited ${time(c.wait[i])}, ran ${time(c.took[i])}`,
+      least[i] < 0 ? (dag === null ? '' : 'no verdict known') : verdictText(least[i])];
+  }
+
+  // --- pictures ----------------------------------------------------------------------------------
+
+  const COLUMNS = ['left', 'right', 'bottom', 'top', 'colour', 'edge', 'a', 'b', 'd', 'e', 'f'];
+  const empty = (names) => Object.fromEntries(names.map((name) => [name, []]));
+
+  function bar(data, left, right, middle, height, colour, edge, lines) {
+    const values = [left / SECOND, right / SECOND, middle - height / 2, middle + height / 2,
+                    colour, edge, ...lines];
+    COLUMNS.forEach((name, i) => data[name].push(values[i]));
+  }
+
+  function inView(x0, x1) {
+    return [lower(c.start, x0 - longest), lower(c.start, x1)];
+  }
+
+  function exact(view, x0, x1) {        // null when there are too many
+    const data = empty(COLUMNS), [from, to] = inView(x0, x1);
+    const found = [];
+    for (let i = from; i < to; i++) {
+      if (c.start[i] + c.took[i] < x0) continue;
+      if (found.length >= EXACT) return null;
+      found.push(i);
+    }
+    const pixel = (x1 - x0) / 1200;
+    for (const i of found) {
+      const colour = COLOURS[ratio[i]];     // a frame would hide what is narrow
+      bar(data, c.start[i], c.start[i] + Math.max(c.took[i], pixel), view.y(i), 0.8, colour,
+          c.took[i] > 5 * pixel ? '#444444' : colour, facts(i));
+    }
+    return data;
+  }
+
+  function sums(view, x0, x1) {
+    const [from, to] = inView(x0, x1);
+    const n = Math.max(60, Math.min(600, Math.floor(CELLS / view.lines)));
+    const width = (x1 - x0) / n, size = view.lines * n;
+    const busy = new Float64Array(size), count = new Uint32Array(size);
+    const worst = new Uint8Array(size).fill(UNKNOWN);
+    for (let i = from; i < to; i++) {
+      const start = Math.max(c.start[i], x0), end = Math.min(c.start[i] + c.took[i], x1);
+      if (end < start) continue;
+      const base = view.y(i) * n, last = Math.min(n - 1, Math.floor((end - x0) / width));
+      for (let b = Math.floor((start - x0) / width); b <= last; b++) {
+        busy[base + b] += Math.min(end, x0 + (b + 1) * width) - Math.max(start, x0 + b * width);
+        count[base + b]++;
+        if (ratio[i] < worst[base + b]) worst[base + b] = ratio[i];
+      }
+    }
+    const data = empty(COLUMNS);
+    for (let y = 0; y < view.lines; y++) {
+      for (let b = 0; b < n; b++) {
+        const at = y * n + b;
+        if (!count[at]) continue;
+        const share = Math.min(1, busy[at] / width);
+        bar(data, x0 + b * width, x0 + (b + 1) * width, y, 0.12 + 0.72 * share,
+            COLOURS[worst[at]], 'rgba(0,0,0,0)',
+            [`${count[at]} executions in ${time(width)}`, `busy ${(100 * share).toFixed(1)} %`,
+             worst[at] === 0 ? 'with a missed deadline' : '', 'zoom in to see each', '']);
+      }
+    }
+    return data;
+  }
+
+  function marks(view, x0, x1) {
+    const data = empty(['x', 'y', 'a', 'b', 'd', 'e', 'f']);
+    const seen = missed.slice(lower(shown, x0), lower(shown, x1 + 1));
+    const step = Math.max(1, Math.ceil(seen.length / 1500));
+    for (let i = 0; i < seen.length; i += step) {
+      const miss = seen[i];
+      [miss.shown / SECOND, view.markY(miss), meta.rows[miss.row].name,
+       `job ${miss.job} of ${meta.dags[meta.rows[miss.row].dag]}, released at ` +
+       instant(miss.release), verdictText(miss.at), '', '']
+        .forEach((value, k) => data[Object.keys(data)[k]].push(value));
+    }
+    return data;
+  }
+
+  function draw(view) {
+    const x0 = view.range.start * SECOND, x1 = view.range.end * SECOND;
+    if (!(x1 > x0)) return;
+    const one = exact(view, x0, x1);
+    view.bars.data = one || sums(view, x0, x1);
+    view.marks.data = marks(view, x0, x1);
+    view.exact = one !== null;
+    element('mddag-detail').textContent = one !== null ?
+      'Each bar is one execution, in the colour of the least slack that it leads to.' :
+      'Many executions are in view: a bar is as high as its line was busy, in the colour of the ' +
+      'least slack in it. Zoom in to see each execution.';
+  }
+
+  // --- the flow of messages along a path -----------------------------------------------------------
+
+  function flow(view, path) {
+    const x0 = view.range.start * SECOND, x1 = view.range.end * SECOND;
+    const bars = empty(COLUMNS), lines = empty(['x0', 'y0', 'x1', 'y1', 'colour', 'width']);
+    const steps = path.steps.map((rows) => new Set(rows)), runs = steps.map(() => []);
+    const y = (step) => path.steps.length - 1 - step;
+    const line = (xa, ya, xb, yb, colour, width) => [xa / SECOND, ya, xb / SECOND, yb, colour, width]
+      .forEach((value, k) => lines[Object.keys(lines)[k]].push(value));
+    const [from, to] = inView(x0 - (x1 - x0), x1);
+    let drawn = 0, left = 0;
+    for (let i = from; i < to; i++) {
+      steps.forEach((rows, step) => {
+        if (!rows.has(c.row[i])) return;
+        if (drawn++ >= EXACT) left++; else runs[step].push(i);
+      });
+    }
+    runs.forEach((found, step) => found.forEach((i) => {
+      bar(bars, c.start[i] - c.wait[i], c.start[i], y(step), 0.08, '#bbbbbb', '#bbbbbb', facts(i));
+      bar(bars, c.start[i], c.start[i] + c.took[i], y(step), 0.4, COLOURS[ratio[i]], '#444444',
+          facts(i));
+      if (!step) return;
+      const before = sender(runs[step - 1], i);
+      if (before >= 0) {
+        line(Math.min(c.start[before] + c.took[before], c.start[i] - c.wait[i]), y(step - 1),
+             c.start[i] - c.wait[i], y(step), COLOURS[ratio[i]], 1.2);
+      }
+    }));
+    if (path.worst) {
+      path.worst.steps.forEach(([ready, start, end], step) => {
+        line(ready, y(step), start, y(step), '#000000', 2.5);
+        line(start, y(step), end, y(step), '#000000', 5);
+        if (!step) return;              // a callback may publish before its end
+        line(Math.min(path.worst.steps[step - 1][2], ready), y(step - 1), ready, y(step),
+             '#000000', 2.5);
+      });
+    }
+    view.bars.data = bars;
+    view.lines.data = lines;
+    element('mddag-flow-note').textContent = (path.worst ?
+      `The worst job, ${path.worst.job}, in black: response ` +
+      `${time(path.worst.completed - path.worst.release)}, deadline ` +
+      `${time(path.worst.deadline - path.worst.release)}. ` : '') +
+      (left ? `${left} executions are left out: zoom in.` : '');
+  }
+
+  function sender(before, i) {          // of the same job, or else the latest that had ended
+    const ready = c.start[i] - c.wait[i], dag = meta.rows[c.row[i]].dag;
+    let found = -1, latest = -1;
+    for (const k of before) {
+      if (c.start[k] > c.start[i]) break;
+      if (meta.rows[c.row[k]].dag === dag) {
+        if (c.job[k] === c.job[i] && c.start[k] <= ready) found = k;
+      } else if (c.start[k] + c.took[k] <= c.start[i]) {
+        latest = k;
+      }
+    }
+    return found >= 0 ? found : latest;
+  }
+
+  // --- putting it together -----------------------------------------------------------------------
+
+  function start(doc) {
+    const model = (name) => doc.get_model_by_name(name);
+    const later = (work) => {           // once for each frame, however often it is asked for
+      let asked = false;
+      return () => {
+        if (asked) return;
+        asked = true;
+        requestAnimationFrame(() => { asked = false; work(); });
+      };
+    };
+    const follow = (range, work) => {
+      const again = later(work);
+      range.properties.start.change.connect(again);
+      range.properties.end.change.connect(again);
+      work();
+    };
+    const range = model('timeline_range');
+    const ys = meta.rows.map((row) => row.y);
+    const workerLine = (worker) => meta.worker_lines[
+      worker < 0 || worker >= meta.workers ? meta.workers : worker];
+    const views = [
+      {name: 'workers', lines: Math.max(...meta.worker_lines) + 1, y: (i) => workerLine(c.worker[i]),
+       markY: () => 0},
+      {name: 'callbacks', lines: Math.max(0, ...ys) + 1, y: (i) => ys[c.row[i]],
+       markY: (miss) => ys[miss.row]}];
+    for (const view of views) {
+      Object.assign(view, {range, bars: model(`${view.name}_bars`),
+                           marks: model(`${view.name}_marks`)});
+    }
+    const flowView = {range: model('flow_range'), bars: model('flow_bars'),
+                      lines: model('flow_lines')};
+    const boxes = ['job', 'late'].map((kind) =>
+      ['workers', 'callbacks'].map((name) => model(`${name}_${kind}`)));
+    const flowDue = model('flow_due'), choice = element('mddag-path');
+    let path = null;
+
+    function show(from, to) {
+      const margin = Math.max(1, to - from) * 0.15;
+      range.setv({start: (from - margin) / SECOND, end: (to + margin) / SECOND});
+    }
+
+    function showMiss(miss) {
+      const deadline = miss.deadline / SECOND, end = miss.shown / SECOND;
+      for (const box of boxes[0]) {
+        box.setv({left: miss.release / SECOND, right: deadline, visible: true});
+      }
+      for (const box of boxes[1]) {
+        box.setv({left: deadline, right: end, visible: end > deadline});
+      }
+      element('mddag-status').textContent =
+        `job ${miss.job} of ${meta.dags[meta.sinks[miss.sink].dag]}: ${verdictText(miss.at)}`;
+      show(miss.release, Math.max(miss.shown, miss.deadline));
+      const at = meta.paths.findIndex((each) => each.sink === miss.sink);
+      if (at >= 0) choosePath(at, miss.release, miss.deadline, miss.shown);
+    }
+
+    function choosePath(at, release, deadline, end) {
+      path = meta.paths[at];
+      choice.value = String(at);
+      const labels = new Map(path.labels.map((text, i) => [path.labels.length - 1 - i, text]));
+      model('flow_ticks').ticks = [...labels.keys()];
+      model('flow_axis').major_label_overrides = labels;
+      model('flow').height = 110 + 34 * path.labels.length;
+      model('flow_lines_range').setv({start: -0.7, end: path.labels.length - 0.3});
+      const margin = (Math.max(end, deadline) - release) * 0.1 + 1;
+      flowDue.setv({location: deadline / SECOND, visible: deadline > release});
+      flowView.range.setv({start: (release - margin) / SECOND,
+                           end: (Math.max(end, deadline) + margin) / SECOND});
+      drawFlow();
+    }
+
+    const drawFlow = later(() => path && flow(flowView, path));
+    const chooseByNumber = (at) => {
+      const worst = meta.paths[at].worst;
+      if (worst) return choosePath(at, worst.release, worst.deadline, worst.completed);
+      const now = range.start * SECOND;
+      const span = Math.min(meta.duration, Math.max(1, range.end * SECOND - now));
+      return choosePath(at, now, now, now + Math.min(span, 1.5 * SECOND));
+    };
+
+    const later2 = () => views.forEach(draw);
+    follow(range, later2);
+    if (meta.paths.length) {
+      choice.addEventListener('change', () => chooseByNumber(Number(choice.value)));
+      chooseByNumber(meta.first_path);
+      follow(flowView.range, drawFlow);
+    }
+    function step(forward) {
+      let now = (range.start + range.end) / 2 * SECOND;
+      if ((range.end - range.start) * SECOND > 0.9 * meta.duration) {
+        now = forward ? -Infinity : Infinity;
+      }
+      const times = missed.map((m) =>
+        (m.release + Math.max(m.shown, m.deadline)) / 2);
+      const near = SECOND / 1e6;
+      let best = null;
+      missed.forEach((miss, i) => {
+        const ahead = forward ? times[i] - now : now - times[i];
+        if (ahead > near && (best === null || ahead < best.ahead)) best = {ahead, miss};
+      });
+      if (best) showMiss(best.miss);
+      else element('mddag-status').textContent = 'there is no further missed deadline';
+    }
+    element('mddag-next').addEventListener('click', () => step(true));
+    element('mddag-previous').addEventListener('click', () => step(false));
+    element('mddag-whole').addEventListener('click', () =>
+      range.setv({start: 0, end: Math.max(1, meta.duration) / SECOND}));
+    const find = ([sink, job]) => missed.find((m) => m.sink === sink && m.job === job);
+    document.querySelectorAll('[data-miss]').forEach((line) =>
+      line.addEventListener('click', () => {
+        const miss = find(meta.misses[Number(line.dataset.miss)]);
+        if (miss) showMiss(miss);
+        else element('mddag-status').textContent = 'the detail around this miss was left out';
+        element('mddag-timeline').scrollIntoView({behavior: 'smooth'});
+      }));
+    window.mddag = {meta, columns: c, missed, views, range, step, ready: true};
+  }
+
+  async function main() {
+    if (typeof DecompressionStream === 'undefined') {
+      throw new Error('this browser is too old: use one of 2023 or newer');
+    }
+    c = await unpack();
+    prepare();
+    const wait = () => {
+      const doc = window.Bokeh && Bokeh.documents.find((d) => d.get_model_by_name('timeline_range'));
+      if (!doc || !Bokeh.index || !document.querySelector('.mddag-plot *')) {
+        return setTimeout(wait, 30);
+      }
+      return start(doc);
+    };
+    wait();
+  }
+
+  main().catch((error) => {
+    element('mddag-status').textContent = `The pictures cannot be drawn: ${error.message}`;
+    throw error;
+  });
+})();

@@ -1,0 +1,278 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The HTML report of a run: one file with tables and pictures that needs no network.
+
+``Watch`` is what a replay is given to collect what the report shows; ``of_replay`` and
+``of_schedule`` make a report's data of it, ``write`` writes the page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mddag_executor import __version__
+from mddag_executor.core import Tally
+from mddag_executor.errors import MddagError
+from mddag_executor.replay import Replay, Reschedule
+from mddag_executor.replay.bags_reschedule import BagReschedule
+from mddag_executor.replay.follower import Event, Observer
+from mddag_executor.replay.judge import Judge
+from mddag_executor.replay.usage import Usage
+from mddag_executor.report.html_data import (
+    json_for_html,
+    prepare,
+    Prepared,
+    ReportData,
+)
+from mddag_executor.report.html_tables import (
+    callbacks_html,
+    misses_html,
+    paths_html,
+    sinks_html,
+    worst_html,
+)
+from mddag_executor.report.tables import percent, total
+from mddag_executor.report.text import format_ns, printable
+from mddag_executor.report.timeline import MOST_EXECUTIONS, Timeline
+from mddag_executor.report.timeline_log import Schedule, tell
+from mddag_executor.simulate import Load, Run
+from msg_graph import TaskSet
+
+_SCRIPT = Path(__file__).with_name('html.js')
+_STYLE = Path(__file__).with_name('html.css')
+_LEGEND = (
+    ('#d7191c', 'deadline missed'), ('#fd8d3c', 'slack below 10 % of the deadline'),
+    ('#fec44f', 'below 25 %'), ('#9ecae1', 'below 50 %'), ('#3182bd', '50 % and more'),
+    ('#969696', 'no deadline, or no verdict'))
+
+
+class Watch:
+    """Collects what a report shows while a run is replayed."""
+
+    def __init__(self, most: int = MOST_EXECUTIONS) -> None:
+        self.timeline = Timeline(most)
+        self.judge: Judge
+        self.usage: Usage
+
+    def observers(self, task_set: TaskSet, judge: Judge) -> Sequence[Observer]:
+        """Return observers; they are told after the judge."""
+        self.judge = judge
+        self.usage = Usage(task_set)
+        judge.listeners.append(self.timeline.decided)
+        return [self.timeline, self.usage]
+
+    def handlers(self) -> dict[str, Callable[[Event], None]]:
+        """Return what else the follower is to tell."""
+        return self.timeline.handlers()
+
+    def data(
+        self, title: str, facts: list[tuple[str, str]], task_set: TaskSet, workers: int,
+        duration_ns: int, warnings: list[str], tally: Tally | None = None,
+    ) -> ReportData:
+        """Return a report's data, once the run is over; ``tally`` None is the judge's."""
+        return ReportData(
+            title, facts, task_set, self.judge.tables, tally or self.judge.tally,
+            self.judge.chains, self.usage, self.timeline, workers, duration_ns, warnings)
+
+
+def check_available() -> None:
+    """
+    Find out whether reports can be made, before long work starts.
+
+    :raises mddag_executor.errors.MddagError: when Bokeh is not installed.
+    """
+    try:
+        import bokeh  # noqa: F401
+    except ImportError:
+        raise MddagError(
+            "--report: Bokeh is not installed: pip install 'mddag_executor[report]'") from None
+
+
+def of_outcome(
+    outcome: Replay | Reschedule | BagReschedule, watch: Watch | None
+) -> ReportData:
+    """Return the data of a report about a recorded run; ``watch`` was there if as recorded."""
+    if isinstance(outcome, Reschedule):
+        return of_reschedule(outcome)
+    if isinstance(outcome, BagReschedule):
+        return of_bag(outcome)
+    assert watch is not None
+    return of_replay(outcome, watch)
+
+
+def of_replay(outcome: Replay, watch: Watch) -> ReportData:
+    """Return the data of a report about a recorded run that was replayed with a watch."""
+    result = outcome.result()
+    facts = [('recording', result['recording']['trace']), *_facts(result)]
+    data = watch.data('Replay as recorded', facts, outcome.task_set, result['workers'],
+                      outcome.duration_ns, outcome.warnings)
+    return data._replace(paths=result.get('paths', {}))
+
+
+def of_reschedule(outcome: Reschedule) -> ReportData:
+    """Return the data of a report about a recorded run that was rescheduled."""
+    work = outcome.work
+    transports = work.transports
+    tables = outcome.tables
+    edges = {
+        (v, tables.successors[i]): i - tables.first_successor[tables.first_vertex[dag]]
+        for v, dag in enumerate(tables.dag_of[:len(outcome.task_set.vertices)])
+        for i in range(tables.first_successor[v], tables.first_successor[v + 1])}
+
+    def delay(dag: int, job: int, before: int, after: int) -> int:
+        return int(transports.delays[
+            transports.base[dag] + job * transports.stride[dag] + edges[before, after]])
+
+    watch = _told(Schedule(
+        outcome.task_set, work.load, outcome.log, outcome.decisions, outcome.end_ns,
+        outcome.end_ns, True, work.jobs, delay))
+    result = outcome.result()
+    facts = [('recording', result['recording']['trace']), *_facts(result)]
+    return watch.data('Replay, rescheduled', facts, outcome.task_set, outcome.workers,
+                      result['duration_ns'], outcome.warnings)
+
+
+def of_bag(outcome: BagReschedule) -> ReportData:
+    """Return the data of a report about an ordinary bag that was rescheduled."""
+    watch = _told(Schedule(
+        outcome.task_set, outcome.load, outcome.log, outcome.decisions, outcome.end, outcome.end))
+    result = outcome.result()
+    facts = [('bag', result['recording']['trace']), *_facts(result),
+             *(('assumed', note) for note in outcome.notes)]
+    return watch.data('Bag, rescheduled', facts, outcome.task_set, outcome.workers,
+                      outcome.duration_ns, outcome.warnings)
+
+
+def of_run(task_set: TaskSet, load: Load, run: Run) -> ReportData:
+    """Return the data of a report about a run that was simulated with its log."""
+    stopped = run.settings.stop_at_first_miss and run.ended_ns < run.settings.duration_ns
+    judged = run.settings.judge == 'horizon' and not stopped
+    watch = _told(Schedule(
+        task_set, load, run.log, run.decisions, run.settings.duration_ns, run.ended_ns, judged))
+    facts = [('declaration', task_set.file), *_facts(run.result())]
+    return watch.data(
+        'Simulation', facts, task_set, run.settings.workers, run.ended_ns, [], run.tally)
+
+
+def _told(schedule: Schedule) -> Watch:
+    """Return a watch that was told of a schedule."""
+    watch = Watch()
+    judge = Judge(schedule.task_set, compare=False)
+    tell(schedule, [judge, *watch.observers(schedule.task_set, judge)])
+    return watch
+
+
+def _facts(result: dict[str, Any]) -> list[tuple[str, str]]:
+    utilisation = result['utilisation']
+    return [
+        ('policy', str(result['policy']) + (', preemptive' if result['preemptive'] else '')),
+        ('workers', str(result['workers'])), ('duration', format_ns(result['duration_ns'])),
+        ('utilisation', '-' if utilisation is None else f'{utilisation:.3f}')]
+
+
+def write(file: BinaryIO, data: ReportData) -> None:
+    """Write a report."""
+    from bokeh.embed import components
+    from bokeh.resources import Resources
+    from mddag_executor.report.html_plots import figures
+    prepared = prepare(data)
+    drawn = figures(data, prepared)
+    roots = (drawn.overview, drawn.workers, drawn.callbacks, drawn.flow, *drawn.histograms)
+    script, divisions = components(roots)
+    library = Resources(mode='inline', components=['bokeh']).render_js()
+    for part in _page(data, prepared, library, script, list(divisions)):
+        file.write(part.encode('utf-8', 'backslashreplace'))
+
+
+def _page(
+    data: ReportData, prepared: Prepared, library: str, script: str, divisions: list[str]
+) -> Iterator[str]:
+    plots = [f'<div class="mddag-plot">{division}</div>' for division in divisions]
+    title = escape(printable(f'{data.title}: {data.task_set.file or data.facts[0][1]}'))
+    yield (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n<title>{title}</title>'
+           '\n<meta name="viewport" content="width=device-width">\n'
+           '<link rel="icon" href="data:,">\n'
+           f'<style>{_STYLE.read_text(encoding="utf-8")}</style>\n')
+    yield library
+    yield f'</head><body>\n<h1>{title}</h1>\n'
+    yield from _head(data)
+    if data.task_set.dags:
+        yield f'<h2>Sinks</h2>\n{sinks_html(data)}\n'
+        yield misses_html(data, prepared)
+    else:
+        yield '<p class="note">No DAG is declared: give a GRAPH to judge deadlines.</p>\n'
+    yield ('<h2 id="mddag-timeline">Timeline</h2>\n<p class="legend">' + ''.join(
+        f'<span><i style="background:{colour}"></i>{text}</span>' for colour, text in _LEGEND)
+        + '<span><b class="miss">&#9660;</b>where a deadline was missed</span></p>\n')
+    yield ('<p class="note">Drag to move, Ctrl and the wheel (or the tools above a picture) to '
+           'zoom, point at a bar for its facts.</p>\n')
+    yield ('<p class="buttons"><button id="mddag-previous">&#9664; previous miss</button> '
+           '<button id="mddag-next">next miss &#9654;</button> '
+           '<button id="mddag-whole">whole run</button> <span id="mddag-status"></span></p>\n')
+    yield f'{plots[0]}\n<p class="note" id="mddag-detail"></p>\n'
+    yield f'<h3>By worker</h3>\n{plots[1]}\n<h3>By callback</h3>\n{plots[2]}\n'
+    yield from _flow(prepared, plots[3])
+    if data.paths:
+        yield ('<h2>End to end</h2>\n<p class="note">From the first publication to the start of '
+               f'the last callback.</p>\n{paths_html(data)}\n')
+    if plots[4:]:
+        yield '<h2>Response times against deadlines</h2>\n'
+        yield ('<p class="note">Nearest to its deadline, or furthest past it, first. What never '
+               'completed is in the table of sinks only.</p>\n')
+        yield '<div class="grid">' + ''.join(plots[4:]) + '</div>\n'
+        yield f'<h2>Where the time of the worst jobs went</h2>\n{worst_html(data)}\n'
+    yield f'<h2>Callbacks</h2>\n{callbacks_html(data)}\n'
+    yield f'<footer>mddag_executor {escape(__version__)}</footer>\n'
+    yield f'<script id="mddag-meta" type="application/json">{json_for_html(prepared.meta)}'
+    yield '</script>\n<script id="mddag-data" type="application/octet-stream;base64">'
+    yield prepared.blob
+    yield f'</script>\n{script}\n<script>{_SCRIPT.read_text(encoding="utf-8")}</script>\n'
+    yield '</body></html>\n'
+
+
+def _head(data: ReportData) -> Iterator[str]:
+    every = total(data.tally.result()['dags'])
+    yield '<p class="facts">' + ' '.join(
+        f'<span><b>{escape(printable(word))}</b> {escape(printable(text))}</span>'
+        for word, text in data.facts) + '</p>\n'
+    missed = every.due - every.in_time
+    yield (f'<p class="verdict {"bad" if missed else "good"}">{every.due} sink jobs due, '
+           f'{every.in_time} in time ({percent(every.in_time, every.due)}), {every.late} late, '
+           f'{every.expired} expired'
+           + (f', {every.aborted} aborted' if every.aborted else '') + '</p>\n')
+    for warning in data.warnings:
+        yield f'<p class="warning">{escape(printable(warning))}</p>\n'
+    timeline = data.timeline
+    if timeline.kept < timeline.n_executions:
+        yield (f'<p class="warning">The timelines show {timeline.kept} of the '
+               f'{timeline.n_executions} executions: around missed deadlines, and evenly spread '
+               'over the run elsewhere. Tables and histograms are of all.</p>\n')
+
+
+def _flow(prepared: Prepared, plot: str) -> Iterator[str]:
+    paths = prepared.meta['paths']
+    if paths:
+        yield '<h2>Message flow along a path</h2>\n'
+    hidden = '' if paths else ' style="display:none"'
+    options = ''.join(
+        f'<option value="{i}">{escape(path["name"])}</option>' for i, path in enumerate(paths))
+    yield (f'<div{hidden}><p><label>Path <select id="mddag-path">{options}</select></label> '
+           '<span class="note" id="mddag-flow-note"></span></p>\n'
+           '<p class="note">Thin grey: waiting; bars: executing; slanted lines: messages, in the '
+           f'colour of the slack of what they start.</p>\n{plot}</div>\n')

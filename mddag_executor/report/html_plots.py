@@ -1,0 +1,265 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The figures of an HTML report, made with Bokeh.
+
+Those that are zoomed (timelines, message flow) hold nothing yet: ``html.js`` fills them with what
+is in view.  Overview and histograms are whole.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from bokeh.models import (
+    BasicTickFormatter,
+    ColumnDataSource,
+    FixedTicker,
+    HoverTool,
+    Range1d,
+    RangeTool,
+    WheelZoomTool,
+)
+from bokeh.models.annotations import BoxAnnotation, Span
+from bokeh.plotting import figure
+from mddag_executor.report.html_data import label, Line, Prepared, ReportData, UNIT_NS
+from mddag_executor.report.tables import short_names
+from mddag_executor.report.text import format_ns
+from mddag_executor.report.timeline import Bins
+import numpy as np
+
+MOST_HISTOGRAMS = 30
+_BAR_COLUMNS = ('left', 'right', 'bottom', 'top', 'colour', 'edge', 'a', 'b', 'd', 'e', 'f')
+_LEFT = 270             # room for the labels, the same in all timelines, so that they align
+_LINE = 16              # height of a line of a timeline, pixels
+_TOOLTIP = ('<div style="max-width:46em"><b>@a</b><br>@b<br>@d<br>@e<br>@f</div>')
+_FONT = '11px'
+_ZOOM = 'xpan,xbox_zoom,xzoom_in,xzoom_out,reset,save'
+_RED, _BLUE, _GREY = '#d7191c', '#3182bd', '#969696'
+
+
+class Figures(NamedTuple):
+    """The figures of a report; ``histograms`` by what stands above each."""
+
+    overview: Any
+    workers: Any
+    callbacks: Any
+    flow: Any
+    histograms: list[Any]
+
+
+def figures(data: ReportData, prepared: Prepared) -> Figures:
+    """Return the figures of a report."""
+    duration = max(1, data.duration_ns) / 1e9
+    time = Range1d(
+        start=0, end=duration, bounds=(-0.2 * duration, 1.2 * duration), name='timeline_range')
+    workers = [Line('spare threads' if w == data.workers else f'worker {w}', y, False)
+               for w, y in enumerate(prepared.meta['worker_lines']) if y]
+    workers.append(Line('missed deadlines', 0, False))
+    gaps = prepared.meta['gaps']
+    return Figures(
+        _overview(data, prepared, time), _timeline('workers', workers, time, gaps),
+        _timeline('callbacks', prepared.lines, time, gaps), _flow(), _histograms(data))
+
+
+def _style(plot: Any, grid: bool = True) -> None:
+    plot.toolbar.logo = None
+    plot.outline_line_color = '#bbbbbb'
+    for axis in (*plot.xaxis, *plot.yaxis):
+        axis.axis_label_text_font_style = 'normal'
+        axis.axis_label_text_font_size = '12px'
+        axis.major_label_text_font_size = _FONT
+        axis.minor_tick_line_color = None
+    plot.title.text_font_size = '12px'
+    if not grid:
+        plot.ygrid.grid_line_color = None
+
+
+def _seconds(plot: Any, what: str) -> None:
+    plot.xaxis.axis_label = what
+    plot.xaxis.formatter = BasicTickFormatter(use_scientific=False)
+
+
+def _overview(data: ReportData, prepared: Prepared, time: Range1d) -> Any:
+    """Return the use of the pool over the whole run, with a window that can be moved."""
+    duration = max(1, data.duration_ns) / 1e9
+    plot: Any = figure(
+        height=150, sizing_mode='stretch_width', tools='', toolbar_location=None,
+        x_range=Range1d(start=0, end=duration), y_range=Range1d(start=0, end=data.workers * 1.08),
+        min_border_left=_LEFT, name='overview')
+    bins = data.timeline.bins
+    if bins.origin is not None:
+        edges, busy, missed = _over_time(bins, prepared.origin)
+        plot.quad(left=edges[:-1], right=edges[1:], bottom=0, top=busy,
+                  fill_color=_BLUE, line_color=None)
+        late = missed > 0
+        plot.quad(left=edges[:-1][late], right=edges[1:][late], bottom=data.workers * 1.02,
+                  top=data.workers * 1.08, fill_color=_RED, line_color=_RED, line_width=1.5)
+    plot.yaxis.axis_label = 'busy workers'
+    _seconds(plot, 'time since the first release (s): drag the window or its edges')
+    tool = RangeTool(x_range=time)
+    tool.overlay.fill_color = '#000000'
+    tool.overlay.fill_alpha = 0.08
+    plot.add_tools(tool)
+    _style(plot)
+    return plot
+
+
+def _over_time(bins: Bins, origin: int) -> tuple[Any, Any, Any]:
+    """Return edges (s), mean number of busy workers and missed deadlines, in at most 600 bins."""
+    step = max(1, -(-bins.used // 600))
+    used = -(-bins.used // step) * step
+    width = bins.width * step
+    assert bins.origin is not None
+    edges = (bins.origin - origin + width * np.arange(used // step + 1)) / 1e9
+    busy = np.array(bins.busy[:bins.used] + [0] * (used - bins.used), dtype=np.float64)
+    missed = np.array(bins.missed[:bins.used] + [0] * (used - bins.used))
+    return (edges, busy.reshape(-1, step).sum(axis=1) / width,
+            missed.reshape(-1, step).sum(axis=1))
+
+
+def _timeline(name: str, lines: list[Line], time: Range1d, gaps: list[list[int]]) -> Any:
+    """Return an empty timeline with a line for each worker or callback."""
+    count = len(lines)
+    plot: Any = figure(
+        height=count * _LINE + 94, sizing_mode='stretch_width', x_range=time,
+        y_range=Range1d(start=-0.7, end=count - 0.3), tools=_ZOOM, active_drag='xpan',
+        toolbar_location='above', min_border_left=_LEFT, name=name)
+    for line in lines:
+        if line.heading:
+            plot.add_layout(BoxAnnotation(
+                bottom=line.y - 0.5, top=line.y + 0.5, fill_color='#eeeeee', fill_alpha=1,
+                line_color=None, level='underlay'))
+    for left, right in gaps:
+        plot.add_layout(BoxAnnotation(
+            left=left * UNIT_NS / 1e9, right=right * UNIT_NS / 1e9, hatch_pattern='/',
+            hatch_color='#cccccc', fill_color=None, line_color=None, level='underlay'))
+    for kind, colour in (('job', '#ffe08a'), ('late', '#f4a6a0')):
+        plot.add_layout(BoxAnnotation(
+            left=0, right=0, fill_color=colour, fill_alpha=0.35, line_color=None,
+            level='underlay', visible=False, name=f'{name}_{kind}'))
+    _wheel(plot)
+    _bars(plot, f'{name}_bars')
+    marks = ColumnDataSource({key: [] for key in ('x', 'y', 'a', 'b', 'd', 'e', 'f')},
+                             name=f'{name}_marks')
+    marked = plot.scatter('x', 'y', source=marks, marker='inverted_triangle', size=9,
+                          fill_color=_RED, line_color='#ffffff')
+    plot.add_tools(HoverTool(renderers=[marked], tooltips=_TOOLTIP))
+    _lines(plot, lines)
+    _seconds(plot, 'time since the first release (s)')
+    _style(plot, grid=False)
+    return plot
+
+
+def _wheel(plot: Any) -> None:
+    """Zoom with Ctrl and the wheel; the wheel alone moves the page."""
+    tool = WheelZoomTool(dimensions='width', modifiers='ctrl')
+    plot.add_tools(tool)
+    plot.toolbar.active_scroll = tool
+
+
+def _bars(plot: Any, name: str) -> None:
+    source = ColumnDataSource({key: [] for key in _BAR_COLUMNS}, name=name)
+    bars = plot.quad(
+        left='left', right='right', bottom='bottom', top='top', source=source,
+        fill_color='colour', line_color='edge', line_width=0.5)
+    plot.add_tools(HoverTool(renderers=[bars], tooltips=_TOOLTIP, point_policy='follow_mouse'))
+
+
+def _lines(plot: Any, lines: list[Line]) -> None:
+    plot.yaxis.ticker = FixedTicker(ticks=[line.y for line in lines])
+    plot.yaxis.major_label_overrides = {line.y: line.label for line in lines}
+    plot.yaxis.major_tick_line_color = None
+
+
+def _flow() -> Any:
+    """Return the empty picture of messages along a path."""
+    plot: Any = figure(
+        height=420, sizing_mode='stretch_width',
+        x_range=Range1d(start=0, end=1, name='flow_range'),
+        y_range=Range1d(start=-0.7, end=0.7, name='flow_lines_range'), tools=_ZOOM,
+        active_drag='xpan', toolbar_location='above', min_border_left=_LEFT, name='flow')
+    lines = ColumnDataSource(
+        {key: [] for key in ('x0', 'y0', 'x1', 'y1', 'colour', 'width')}, name='flow_lines')
+    _wheel(plot)
+    _bars(plot, 'flow_bars')
+    plot.segment('x0', 'y0', 'x1', 'y1', source=lines, line_color='colour', line_width='width',
+                 line_alpha=0.8)
+    plot.add_layout(Span(
+        location=0, dimension='height', line_color=_RED, line_dash='dashed', line_width=2,
+        visible=False, name='flow_due'))
+    _lines(plot, [])
+    plot.yaxis[0].ticker.name = 'flow_ticks'
+    plot.yaxis[0].name = 'flow_axis'
+    _seconds(plot, 'time since the first release (s); the red line is the deadline')
+    _style(plot)
+    return plot
+
+
+def _histograms(data: ReportData) -> list[Any]:
+    """Return response-time histograms, the sinks nearest to or furthest past their deadline."""
+    names = {vertex: data.tally.vertex_name(vertex) for vertex in data.tables.sinks}
+    short = short_names(names.values())
+    sinks = [vertex for vertex in data.tables.sinks if data.tally.sinks[vertex].responses]
+
+    def near(vertex: int) -> float:
+        tally = data.tally.sinks[vertex]
+        return -(tally.longest or 0) / max(1, tally.relative_deadline_ns)
+
+    sinks.sort(key=near)
+    return [_histogram(label(short[names[vertex]], 46), data.tally.sinks[vertex])
+            for vertex in sinks[:MOST_HISTOGRAMS]]
+
+
+def _histogram(title: str, tally: Any) -> Any:
+    deadline = tally.relative_deadline_ns
+    responses = np.fromiter(tally.responses, dtype=np.int64, count=len(tally.responses))
+    scale, unit = _scale(max(deadline, int(responses.max())))
+    # a width of which the deadline is a multiple, so that no bar is half late
+    width = deadline / max(1, round(40 * deadline / max(deadline, int(responses.max()))))
+    places = np.floor(np.maximum(responses - 1, 0) / width).astype(np.int64)
+    if int(places.max()) > 400:     # a few very late ones: all of those in the last bar
+        places = np.minimum(places, 400)
+    counts = np.bincount(places)
+    left = np.flatnonzero(counts) * width
+    late = left >= deadline * (1 - 1e-9)
+    plot: Any = figure(
+        height=210, sizing_mode='stretch_width', tools='xwheel_zoom,xpan,reset',
+        active_scroll=None, active_drag=None, toolbar_location=None,
+        title=f'{title}: deadline {format_ns(deadline)}', min_border_left=50)
+    plot.y_range.start = 0
+    source = ColumnDataSource({
+        'left': left / scale, 'right': (left + width) / scale, 'top': counts[counts > 0],
+        'colour': np.where(late, _RED, _BLUE).tolist()})
+    bars = plot.quad(left='left', right='right', bottom=0, top='top', source=source,
+                     fill_color='colour', line_color='#ffffff', line_width=0.5)
+    plot.add_tools(HoverTool(renderers=[bars], tooltips=[
+        ('response', f'@left{{0.[000]}} to @right{{0.[000]}} {unit}'), ('jobs', '@top')]))
+    plot.add_layout(Span(location=deadline / scale, dimension='height', line_color=_RED,
+                         line_dash='dashed', line_width=2))
+    plot.x_range.start = 0
+    plot.x_range.end = max(deadline * 1.06, float((left + width).max()) * 1.02) / scale
+    plot.xaxis.axis_label = f'response time ({unit})'
+    plot.yaxis.axis_label = 'jobs'
+    plot.yaxis.formatter = BasicTickFormatter(use_scientific=False)
+    _style(plot)
+    return plot
+
+
+def _scale(largest: int) -> tuple[float, str]:
+    for scale, unit in ((1e9, 's'), (1e6, 'ms'), (1e3, 'us')):
+        if largest >= 2 * scale:
+            return scale, unit
+    return 1.0, 'ns'

@@ -1,0 +1,168 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The tables of an HTML report; every name in them is escaped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+
+from mddag_executor.replay.chains import Breakdown
+from mddag_executor.report.html_data import Prepared, ReportData
+from mddag_executor.report.replays import (
+    CALLBACKS_HEADER,
+    callbacks_rows,
+    PATHS_HEADER,
+    paths_rows,
+)
+from mddag_executor.report.tables import counts, response_cells, short_names
+from mddag_executor.report.text import format_ns, printable
+from mddag_executor.report.timeline import ABORTED, DONE, EXPIRED, OVERDUE
+
+_KINDS = {
+    DONE: 'late', OVERDUE: 'not completed at the end', EXPIRED: 'expired', ABORTED: 'aborted'}
+_COLOURS = {
+    'release_lag_ns': '#c7c7c7', 'waiting_ns': '#fd8d3c', 'executing_ns': '#3182bd',
+    'suspended_ns': '#9e9ac8', 'transport_ns': '#74c476', 'unknown_ns': '#636363'}
+_PARTS = [(name.removesuffix('_ns').replace('_', ' '), _COLOURS.get(name, '#8c6d31'))
+          for name in Breakdown._fields]
+
+
+class Html(str):
+    """Text that is markup already."""
+
+    __slots__ = ()
+
+
+def html_table(
+    header: Sequence[str], rows: Iterable[Sequence[object]], texts: int, bad: int = -1,
+    attributes: Iterable[str] | None = None,
+) -> str:
+    """
+    Return a table.
+
+    :param texts: how many columns on the left hold text; the others are aligned to the right.
+    :param bad: a column that stands out where it is neither 0 nor empty.
+    :param attributes: of each row, markup already.
+    """
+    extra = iter(attributes) if attributes is not None else None
+    lines = ['<table><thead><tr>', *(
+        f'<th{_text(i < texts)}>{escape(title)}</th>' for i, title in enumerate(header)),
+        '</tr></thead><tbody>\n']
+    for row in rows:
+        lines.append(f'<tr{" " + next(extra) if extra is not None else ""}>')
+        for i, cell in enumerate(row):
+            shown = cell if isinstance(cell, Html) else escape(
+                '-' if cell is None else printable(str(cell)))
+            mark = ' class="bad"' if i == bad and cell else _text(i < texts)
+            lines.append(f'<td{mark}>{shown}</td>')
+        lines.append('</tr>\n')
+    return ''.join([*lines, '</tbody></table>'])
+
+
+def _text(is_text: bool) -> str:
+    return ' class="text"' if is_text else ''
+
+
+def sinks_html(data: ReportData) -> str:
+    """Return the table of sinks: verdicts, and response times by the deadline."""
+    result = data.tally.result()['dags']
+    short = short_names(name for dag in result.values() for name in dag['sinks'])
+    header = ('DAG', 'sink', 'due', 'in time', 'missed', 'late', 'expired', 'aborted', 'median',
+              'p99', 'max', 'deadline')
+    rows = []
+    for dag_name, dag in result.items():
+        for name, sink in dag['sinks'].items():
+            verdicts = counts(sink)
+            rows.append((
+                dag_name, short[name], verdicts.due, verdicts.in_time,
+                verdicts.due - verdicts.in_time, verdicts.late, verdicts.expired,
+                verdicts.aborted, *response_cells(sink['response_ns']),
+                format_ns(sink['relative_deadline_ns'])))
+    return f'<div class="wide">{html_table(header, rows, 2, bad=4)}</div>'
+
+
+def misses_html(data: ReportData, prepared: Prepared) -> str:
+    """Return the table of the worst misses."""
+    if not data.timeline.n_missed:
+        return '<p class="note">No deadline was missed.</p>\n'
+    short = short_names(vertex.name for vertex in data.task_set.vertices)
+    rows = []
+    for miss in prepared.misses:
+        vertex = data.task_set.vertices[data.tables.sinks[miss.sink]]
+        dag = data.task_set.dags[vertex.dag]
+        release = miss.deadline - data.tables.sink_deadline[data.tables.sinks[miss.sink]]
+        late = None if miss.completed is None else format_ns(miss.completed - miss.deadline)
+        response = None if miss.completed is None else format_ns(miss.completed - release)
+        rows.append((dag.name, short[vertex.name], _KINDS[miss.kind], miss.job,
+                     f'{release / 1e9:.6f} s', response, late))
+    header = ('DAG', 'sink', 'what', 'job', 'released at', 'response', 'late by')
+    shown = len(prepared.misses)
+    what = f'The {shown} worst of {data.timeline.n_missed}' if shown < data.timeline.n_missed \
+        else 'All'
+    attributes = (f'data-miss="{i}"' for i in range(shown))
+    return (f'<h2>Missed deadlines</h2>\n<p class="note">{what}; click on one to see it in the '
+            f'timeline.</p>\n<div class="scroll">'
+            f'{html_table(header, rows, 3, attributes=attributes)}</div>\n')
+
+
+def worst_html(data: ReportData) -> str:
+    """Return a table with a bar for each sink: where the time of its worst job went."""
+    short = short_names(vertex.name for vertex in data.task_set.vertices)
+    rows = []
+    used = [any(times.worst is not None and times.worst.breakdown[i]
+                for times in data.chains.sinks.values()) for i in range(len(_PARTS))]
+    for vertex, times in data.chains.sinks.items():
+        worst = times.worst
+        if worst is None:
+            continue
+        one = data.task_set.vertices[vertex]
+        response = worst.completed - worst.release
+        deadline = data.tables.sink_deadline[vertex]
+        rows.append((
+            data.task_set.dags[one.dag].name, short[one.name],
+            _stack(worst.breakdown, response, deadline), worst.job, format_ns(response),
+            *(format_ns(part, 3) for part, shown in zip(worst.breakdown, used) if shown),
+            format_ns(deadline)))
+    parts = [part for part, shown in zip(_PARTS, used) if shown]
+    legend = ''.join(f'<span><i style="background:{colour}"></i>{name}</span>'
+                     for name, colour in parts)
+    header = ('DAG', 'sink', 'worst job (the red line is the deadline)', 'job', 'response',
+              *(name for name, _ in parts), 'deadline')
+    return (f'<p class="legend">{legend}</p>\n'
+            f'<div class="wide">{html_table(header, rows, 3)}</div>')
+
+
+def _stack(parts: Breakdown, response: int, deadline: int) -> Html:
+    whole = max(response, deadline, 1)
+    bars = ''.join(
+        f'<i style="width:{100 * max(0, part) / whole:.3f}%;background:{colour}"></i>'
+        for part, (_, colour) in zip(parts, _PARTS))
+    return Html(f'<div class="stack">{bars}<u style="left:{100 * deadline / whole:.3f}%"></u>'
+                '</div>')
+
+
+def paths_html(data: ReportData) -> str:
+    """Return the table of the declared paths' end-to-end times."""
+    return f'<div class="wide">{html_table(PATHS_HEADER, paths_rows(data.paths), 3)}</div>'
+
+
+def callbacks_html(data: ReportData) -> str:
+    """Return the table of callbacks: how often each ran, how long, how long it waited."""
+    rows = list(callbacks_rows(data.usage.callbacks()))
+    undeclared = data.usage.undeclared.result()
+    if undeclared['executions']:
+        rows += callbacks_rows({'undeclared callbacks': undeclared})
+    return f'<div class="scroll">{html_table(CALLBACKS_HEADER, rows, 1)}</div>'

@@ -1,0 +1,269 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What ran when, kept for pictures: every execution while there is room, and sums of all of them.
+
+Theory of operation
+-------------------
+``Timeline`` is told what the judge of a replay is told, and needs as much memory however long the
+run was:
+
+1. *Detail.*  Executions, releases and verdicts go into blocks of ``BLOCK`` executions, in the
+   order in which they ended.  When there are more than ``most`` executions, whole blocks go: first
+   those with the fewest missed deadlines, and of equal ones every second, then every second of the
+   rest, and so on.  So the misses stay, and what stays of the rest is spread over the run.
+2. *Sums.*  How busy the workers were and how many deadlines were missed is added up in at most
+   ``BINS`` intervals; when the run outgrows them, each two become one.
+
+A *row* says which line of a picture an execution belongs to: the global vertex of the declaration,
+or -1-k for the k-th undeclared callback.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from mddag_executor.core.state import (
+    Decision,
+    DROP,
+    JOB_END,
+    SINK_ABORTED,
+    SINK_DONE,
+    SINK_EXPIRED,
+    SINK_MISSED,
+)
+from mddag_executor.replay.follower import Observer, Piece
+import numpy as np
+import numpy.typing as npt
+
+MOST_EXECUTIONS = 1_000_000
+BLOCK = 8192
+BINS = 2048
+MOST_UNDECLARED = 200
+OTHERS = 'other undeclared callbacks'
+
+# What came of a sink's job, as the pictures and exports call it.
+DONE, OVERDUE, EXPIRED, ABORTED = range(4)
+_KINDS = {SINK_DONE: DONE, SINK_MISSED: OVERDUE, SINK_EXPIRED: EXPIRED, SINK_ABORTED: ABORTED}
+
+_FIRST_WIDTH = 1 << 16      # of a bin, ns
+
+Ints = npt.NDArray[np.int64]
+
+
+class Columns(NamedTuple):
+    """
+    The detail that was kept; times in ns on the trace's clock.
+
+    ``executions`` has the rows ROW, JOB, WORKER, READY, START, END (indices below), in order of
+    start; ``releases`` DAG, job, release; ``verdicts`` global vertex, job, deadline, completion
+    (-1: never), kind.
+    """
+
+    executions: Ints
+    releases: Ints
+    verdicts: Ints
+
+
+ROW, JOB, WORKER, READY, START, END = range(6)
+
+
+class _Block:
+    """A stretch of the run."""
+
+    __slots__ = ('executions', 'releases', 'verdicts', 'number', 'missed')
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self.executions = array('q')
+        self.releases = array('q')
+        self.verdicts = array('q')
+        self.missed = 0
+
+    def worth(self) -> tuple[int, int]:
+        """Return what blocks are chosen by: misses, then how even the number is."""
+        return self.missed, self.number & -self.number if self.number else 1 << 62
+
+
+class Bins:
+    """
+    Sums over time: ``busy`` ns of declared workers, ``lent`` beside them, ``missed`` deadlines.
+
+    What was before the first stretch that is added is left out.
+
+    :ivar width: of a bin, ns; bin 0 begins at ``origin``.
+    """
+
+    def __init__(self) -> None:
+        self.origin: int | None = None
+        self.width = _FIRST_WIDTH
+        self.busy = [0] * BINS
+        self.lent = [0] * BINS
+        self.missed = [0] * BINS
+        self.used = 0
+
+    def place(self, time: int) -> int:
+        """Return the bin of a time, after making room for it."""
+        if self.origin is None:
+            self.origin = time
+        place = max(0, time - self.origin) // self.width
+        while place >= BINS:
+            self._double()
+            place //= 2
+        if place >= self.used:
+            self.used = place + 1
+        return place
+
+    def _double(self) -> None:
+        self.width *= 2
+        self.used = (self.used + 1) // 2
+        for sums in (self.busy, self.lent, self.missed):
+            sums[:] = [a + b for a, b in zip(sums[::2], sums[1::2])] + [0] * (BINS // 2)
+
+    def add(self, lent: bool, start: int, end: int) -> None:
+        """Add a stretch in which a worker was busy."""
+        sums = self.lent if lent else self.busy
+        if self.origin is None:
+            self.origin = start
+        last = (end - self.origin) // self.width
+        if last < self.used and self.origin <= self.origin + last * self.width <= start:
+            sums[last] += end - start       # mostly it is within one of the bins in use
+            return
+        start = max(start, self.origin)
+        last = self.place(end)      # first: it may change the width
+        for i in range(self.place(start), last + 1):
+            right = min(end, self.origin + (i + 1) * self.width)
+            sums[i] += max(0, right - start)
+            start = right
+
+
+class Timeline(Observer):
+    """
+    Collects what ran when.
+
+    :param most: how many executions are kept at most.
+    :ivar n_executions: how many there were; ``n_missed`` the deadlines missed.
+    """
+
+    def __init__(self, most: int = MOST_EXECUTIONS, block: int = BLOCK) -> None:
+        self.bins = Bins()
+        self.n_executions = 0
+        self.n_missed = 0
+        self.workers: set[int] = set()
+        self._block_size = block
+        self._most_blocks = max(2, most // block)
+        self._open = _Block(0)
+        self._blocks: list[_Block] = [self._open]
+        self._numbers = 1
+        self._undeclared: dict[int, int] = {}
+        self._symbols: dict[int, str] = {}
+
+    # --- what is told ----------------------------------------------------------------------------
+
+    def released(self, dag: int, job: int, release: int, now: int) -> None:
+        """Keep a release."""
+        self._open.releases.extend((dag, job, release))
+
+    def ran(self, piece: Piece) -> None:
+        """Keep an execution, or a piece of one."""
+        callback, _, row, job, worker, ready, start, end, _ = piece
+        if row < 0:
+            row, job = self._undeclared_row(callback), -1
+        self.n_executions += 1
+        self.workers.add(worker)
+        self.bins.add(worker < 0, start, end)
+        block = self._open
+        block.executions.extend((row, job, worker, ready, start, end))
+        if len(block.executions) >= 6 * self._block_size:
+            self._next_block()
+
+    def decided(self, decisions: Sequence[Decision]) -> None:
+        """Keep verdicts; to be told what the judge's core decides."""
+        block = self._open
+        for kind, _, vertex, job, deadline, time in decisions:
+            if kind == JOB_END or kind == DROP:
+                continue
+            verdict = _KINDS[kind]
+            block.verdicts.extend((vertex, job, deadline, time, verdict))
+            if verdict != DONE or time > deadline:
+                block.missed += 1
+                if len(block.executions) < self._block_size and len(self._blocks) > 1:
+                    self._blocks[-2].missed += 1    # where much of the job ran
+                self.n_missed += 1
+                self.bins.missed[self.bins.place(max(time, deadline))] += 1
+
+    def handlers(self) -> dict[str, Callable[[tuple[Any, ...]], None]]:
+        """Return what else a follower of events is to tell: names of callbacks."""
+        return {'ros2:rclcpp_callback_register': self._registered}
+
+    def _registered(self, event: tuple[Any, ...]) -> None:
+        if len(self._symbols) < BLOCK:
+            self._symbols[event[4]] = event[5]
+
+    def _undeclared_row(self, callback: int) -> int:
+        row = self._undeclared.get(callback)
+        if row is None:
+            if len(self._undeclared) >= MOST_UNDECLARED:
+                callback = -1       # all others are one
+                row = self._undeclared.get(callback)
+            if row is None:
+                row = self._undeclared[callback] = -1 - len(self._undeclared)
+        return row
+
+    def _next_block(self) -> None:
+        if len(self._blocks) >= self._most_blocks:
+            self._blocks.remove(min(self._blocks, key=_Block.worth))
+        self._open = _Block(self._numbers)
+        self._numbers += 1
+        self._blocks.append(self._open)
+
+    # --- what is asked ---------------------------------------------------------------------------
+
+    @property
+    def kept(self) -> int:
+        """Return of how many executions there is detail."""
+        return sum(len(block.executions) for block in self._blocks) // 6
+
+    def undeclared_names(self) -> list[str]:
+        """Return the names of undeclared callbacks: of row -1, of row -2, and so on."""
+        return [OTHERS if callback == -1 and place == MOST_UNDECLARED
+                else self._symbols.get(callback) or (
+                    'undeclared callbacks' if callback <= 0 else f'callback {callback:#x}')
+                for place, callback in enumerate(self._undeclared)]
+
+    def columns(self) -> Columns:
+        """Return the detail that was kept."""
+        executions = self._gather('executions', 6)
+        return Columns(
+            executions[:, np.argsort(executions[START], kind='stable')],
+            self._gather('releases', 3), self._gather('verdicts', 5))
+
+    def gaps(self) -> list[tuple[int, int]]:
+        """Return the stretches of time (ns) without detail: between blocks that are not next."""
+        found = []
+        before: _Block | None = None
+        for block in self._blocks:
+            if not block.executions:
+                continue
+            if before is not None and block.number != before.number + 1:
+                found.append((before.executions[-1], block.executions[5]))
+            before = block
+        return found
+
+    def _gather(self, name: str, width: int) -> Ints:
+        parts = [np.frombuffer(getattr(block, name), dtype=np.int64) for block in self._blocks]
+        return np.concatenate(parts).reshape(-1, width).T

@@ -1,0 +1,195 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A schedule that was computed, told to the observers of a replay as if it had been recorded.
+
+Theory of operation
+-------------------
+The simulator and the rescheduler keep a log: which worker began, ended or preempted what, and
+when.  Together with the load and with the ends of jobs that the core decided that is all that a
+recording has, so whoever is told of it finds the same verdicts again and, as with a recording,
+where the time went.
+
+At one instant the ends of executions come first, then jobs that are given up, then releases, then
+starts.  A vertex is ready when the last message that it needs has arrived: at the end of the
+execution that publishes it, or as much later (or earlier) as ``delays`` says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END
+from mddag_executor.replay.follower import Execution, Observer, Piece
+from mddag_executor.simulate import END, Load, LogEntry, START
+from msg_graph import TaskSet
+
+Delay = Callable[[int, int, int, int], int]
+"""Time (ns) from the end of an execution to its message: DAG, job in the load, edge's ends."""
+
+Id = tuple[int, int, int]
+"""DAG, global vertex, job in the load."""
+
+
+class Schedule(NamedTuple):
+    """
+    A schedule that was computed.
+
+    :ivar horizon: no job is released from then on, ns.
+    :ivar end: when it ended, ns; what is open then is judged if ``judged``.
+    :ivar numbers: by DAG, what a job of the load is called; None: as in the load.
+    :ivar delay: how long messages take; None: no time.
+    """
+
+    task_set: TaskSet
+    load: Load
+    log: list[LogEntry]
+    decisions: Sequence[Decision]
+    horizon: int
+    end: int
+    judged: bool = True
+    numbers: list[list[int]] | None = None
+    delay: Delay | None = None
+
+
+def tell(schedule: Schedule, observers: Sequence[Observer]) -> None:
+    """Tell observers of a schedule, in the order of time."""
+    _Teller(schedule, observers).run()
+
+
+class _Running(NamedTuple):
+    """What a worker runs, and since when; `busy` is the time of the pieces before."""
+
+    since: int
+    ready: int
+    first: int
+    busy: int
+
+
+class _Teller:
+    """Goes through a schedule once."""
+
+    def __init__(self, schedule: Schedule, observers: Sequence[Observer]) -> None:
+        task_set = schedule.task_set
+        self._schedule = schedule
+        self._observers = observers
+        self._vertices = task_set.vertices
+        self._n_dags = len(task_set.dags)
+        self._first = [0]
+        for dag in task_set.dags:
+            self._first.append(self._first[-1] + len(dag.vertices))
+        self._sources = [self._first[dag.index] + dag.source for dag in task_set.dags]
+        places = {callback.key: i for i, callback in enumerate(task_set.callbacks, 1)}
+        self._callback = [places[vertex.callback.key] for vertex in self._vertices]
+        self._next = 0
+        self._ends = self._job_ends()
+        self._next_end = next(self._ends, None)
+        self._ready: dict[Id, int] = {}
+        self._running: dict[Id, _Running] = {}
+
+    def run(self) -> None:
+        schedule = self._schedule
+        for entry in schedule.log:
+            # what ends at an instant does so before anything is released or given up there
+            self._until(entry[0] - 1 if entry[1] == END else entry[0])
+            self._change(entry)
+        self._until(schedule.end)
+        if schedule.judged:
+            for observer in self._observers:
+                observer.finished(schedule.end)
+
+    def _number(self, dag: int, job: int) -> int:
+        numbers = self._schedule.numbers
+        return job if numbers is None or dag >= self._n_dags else numbers[dag][job]
+
+    def _job_ends(self) -> Iterator[tuple[int, int, int, bool]]:
+        for kind, dag, _, job, how, time in self._schedule.decisions:
+            if kind == JOB_END and how in (ABORTED, EXPIRED) and dag < self._n_dags:
+                yield time, dag, job, how == ABORTED
+
+    def _until(self, now: int) -> None:
+        """Tell what is released and given up to an instant."""
+        load, schedule = self._schedule.load, self._schedule
+        while True:
+            release = load.times[self._next] if self._next < len(load.times) else now + 1
+            if release >= schedule.horizon:
+                release = now + 1
+            end = self._next_end
+            if end is not None and end[0] <= min(now, release):
+                for observer in self._observers:
+                    observer.ended(end[1], self._number(end[1], end[2]), end[3], end[0])
+                self._next_end = next(self._ends, None)
+            elif release <= now:
+                self._release(self._next, release)
+                self._next += 1
+            else:
+                return
+
+    def _release(self, i: int, now: int) -> None:
+        load = self._schedule.load
+        dag, job = load.dags[i], load.jobs[i]
+        if dag >= self._n_dags:
+            self._ready[dag, len(self._vertices), job] = now
+            return
+        self._ready[dag, self._sources[dag], job] = now
+        release = load.releases[i] if load.releases else now
+        for observer in self._observers:
+            observer.released(dag, self._number(dag, job), release, now)
+
+    def _change(self, entry: LogEntry) -> None:
+        now, kind, worker, dag, v, job = entry
+        declared = dag < self._n_dags
+        number = self._number(dag, job)
+        what = (dag, v, job)
+        before = self._running.get(what)
+        if kind == START:
+            if before is None:
+                ready = min(now, self._ready.pop(what, now))
+                before = _Running(now, ready, now, 0)
+            self._running[what] = before._replace(since=now)
+            for observer in self._observers if declared else ():
+                observer.started(dag, v, number, before.ready, now)
+            return
+        assert before is not None, 'what ends has begun'
+        busy = before.busy + now - before.since
+        self._running[what] = before._replace(busy=busy)
+        piece = Piece(
+            self._callback[v] if declared else 0, dag if declared else -1, v if declared else -1,
+            number, worker, before.ready, before.since, now, before.busy == 0)
+        last = 0
+        if kind == END and declared and self._vertices[v].predecessors:
+            last = max(1, len(self._vertices[v].callback.topics)) - 1
+        for leg in range(last):     # they took no time: the execution is the last one's
+            for observer in self._observers:
+                observer.completed(dag, v, number, leg, False, now, None)
+        for observer in self._observers:
+            observer.ran(piece)
+        if kind == END:
+            del self._running[what]
+            if declared:
+                self._complete(what, last, Execution(before.ready, before.first, now, busy))
+
+    def _complete(self, what: Id, leg: int, execution: Execution) -> None:
+        dag, v, job = what
+        vertex, number, now = self._vertices[v], self._number(dag, job), execution.end
+        for observer in self._observers:
+            observer.completed(dag, v, number, leg, True, now, execution)
+        delay = self._schedule.delay
+        for local in vertex.successors:
+            after = (dag, self._first[dag] + local, job)
+            arrival = now if delay is None else \
+                max(execution.start, now + delay(dag, job, v, after[1]))
+            self._ready[after] = max(arrival, self._ready.get(after, arrival))

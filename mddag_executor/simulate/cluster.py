@@ -1,0 +1,297 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Runs on more than one machine: chunks as tasks of a Dask cluster.
+
+Theory of operation
+-------------------
+The experiments travel once to each worker, in a plugin, which the scheduler also gives to workers
+that come later or come back.  A task is just place and number of its runs, so when a worker is
+lost the scheduler hands its tasks to others, and nothing else is lost.  A worker uses the compiled
+core if this machine would and numba is there; the results are the same.
+
+Dask (the extra ``dask``) is imported when a cluster is asked for.  Its own log is silenced: what
+concerns the user becomes one error.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError, Future
+from importlib.util import find_spec
+import logging
+import threading
+import time
+from types import TracebackType
+from typing import Any
+import uuid
+import warnings
+
+from mddag_executor import __version__
+from mddag_executor.errors import MddagError
+from mddag_executor.simulate.experiment import Chunk, Evaluator, Experiment
+from mddag_executor.simulate.pools import Pool
+from mddag_executor.simulate.run import SimulationError
+
+LOCAL = 'local'
+CONNECT_S = 3.0
+"""So long an address has to answer."""
+
+_WORKER_S = 10.0  # so long the first worker may take to come
+_ALONE_S = 60.0  # so long an evaluation waits without any
+_REMEDY = 'check the address, and that the scheduler runs'
+
+
+class ClusterError(SimulationError):
+    """A Dask cluster that cannot be used."""
+
+
+class Cluster:
+    """
+    A connection to a Dask cluster; a context manager.
+
+    :param address: the scheduler's, as ``tcp://host:8786``, or ``local`` for processes of this
+        machine.
+    :param jobs: number of processes if it is local.
+    :raises ClusterError: it cannot be reached or used.
+    """
+
+    def __init__(self, address: str, jobs: int) -> None:
+        if find_spec('distributed') is None:
+            raise ClusterError(
+                "--dask: Dask is not there: install 'mddag_executor[dask]' with pip")
+        for name in ('distributed', 'tornado.application', 'asyncio'):
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+        self.address = address
+        self._local: Any = None
+        self._client: Any = None
+        try:
+            self._connect(jobs)
+        except BaseException:
+            self.close()
+            raise
+
+    def _connect(self, jobs: int) -> None:
+        from distributed import Client, LocalCluster
+        target: Any = self.address
+        if self.address == LOCAL:
+            target = self._local = LocalCluster(
+                n_workers=jobs, threads_per_worker=1, processes=True,
+                dashboard_address='127.0.0.1:0',  # not the usual port, which may be in use
+                silence_logs=logging.CRITICAL)
+        else:
+            self._probe()
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')  # of versions; what matters is checked on the workers
+            self._client = Client(target, timeout=CONNECT_S, set_as_default=False)
+        try:
+            self._client.wait_for_workers(1, timeout=_WORKER_S)
+        except TimeoutError:
+            raise ClusterError(
+                f"--dask {self.address}: the cluster has no workers: start some, as 'dask worker "
+                f"{self.address}'") from None
+
+    def _probe(self) -> None:
+        """Ask who listens there; a Dask client that cannot connect leaves threads and noise."""
+        try:
+            kind = asyncio.run(asyncio.wait_for(_identity(self.address), 2 * CONNECT_S))
+        except Exception as error:  # noqa: B902 - whatever a foreign server's answer causes
+            why = 'no Dask scheduler answers there'
+            if isinstance(error, ValueError) and str(error):
+                why = f'this is no usable address ({_said(error)})'
+            raise ClusterError(f'--dask {self.address}: {why}: {_REMEDY}') from None
+        if kind != 'Scheduler':
+            raise ClusterError(
+                f'--dask {self.address}: this is no Dask scheduler: give the address of one')
+
+    def __enter__(self) -> Cluster:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the cluster; one of this machine's ends."""
+        for each in (self._client, self._local):
+            if each is not None:
+                each.close(timeout=CONNECT_S)
+        self._client = self._local = None
+
+    @property
+    def jobs(self) -> int:
+        """Count the threads that the workers have now."""
+        return sum(self._client.nthreads().values())
+
+    def pool(self, experiments: Sequence[Experiment], runs: int, compiled: bool) -> Pool:
+        """Return a pool that lets the cluster do the runs."""
+        return _ClusterPool(self._client, self.address, experiments, runs, compiled)
+
+
+class _ClusterPool(Pool):
+
+    chunk_s = 0.5
+
+    def __init__(
+        self, client: Any, address: str, experiments: Sequence[Experiment], runs: int,
+        compiled: bool,
+    ) -> None:
+        self._client = client
+        self._address = address
+        self._plugin = _plugin_class()(
+            _Doer(tuple(experiments), runs, compiled, __version__, address == LOCAL))
+        self._executor = client.get_executor(pure=False)
+        self._seen_s = self._looked_s = time.monotonic()
+        self.jobs = max(1, sum(client.nthreads().values()))
+
+    def __enter__(self) -> Pool:
+        try:
+            self._client.register_plugin(self._plugin, self._plugin.name)
+        except MddagError:
+            raise
+        except Exception as error:
+            raise ClusterError(
+                f'--dask {self._address}: its workers cannot run mddag ({_said(error)}): install '
+                f'mddag_executor {__version__} and the same Python there') from None
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self._executor.shutdown(wait=False)
+        try:
+            self._client.unregister_worker_plugin(self._plugin.name)
+        except Exception:  # noqa: B902 - the cluster is gone, or its last worker is
+            pass
+
+    def start(self, compiling: Callable[[], None]) -> None:
+        """Do nothing: workers compile with their first chunk."""
+
+    def submit(self, first: int, count: int) -> Future[Chunk]:
+        """Let a worker do runs."""
+        future: Future[Chunk] = self._executor.submit(_work, self._plugin.name, first, count)
+        return future
+
+    def failure(self, error: BaseException) -> MddagError | None:
+        """Tell of a cluster that is gone, or that kills what it is given."""
+        from distributed import KilledWorker
+        if isinstance(error, KilledWorker):
+            return ClusterError(
+                f'--dask {self._address}: several workers died on the same runs: give them more '
+                'memory')
+        lost = 'CancelledError' in type(error).__name__  # Dask has one of its own
+        if lost or isinstance(error, (CancelledError, OSError)):
+            return ClusterError(
+                f'--dask {self._address}: the connection to the scheduler was lost: {_REMEDY}')
+        return None
+
+    def check(self) -> None:
+        """Count the threads; fail when no worker has been there for long."""
+        now = time.monotonic()
+        if now < self._looked_s + 1.0:
+            return
+        self._looked_s = now
+        threads = sum(self._client.nthreads().values())
+        if threads:
+            self.jobs, self._seen_s = threads, now
+        elif now > self._seen_s + _ALONE_S:
+            raise ClusterError(
+                f'--dask {self._address}: all workers are gone: start some, and go on from what '
+                'is kept with --resume')
+
+
+async def _identity(address: str) -> object:
+    """Return what a Dask server calls itself: Scheduler, Worker, Nanny."""
+    from distributed import Security
+    from distributed.comm import connect
+    comm = await connect(
+        address, timeout=CONNECT_S, **Security().get_connection_args('client'))
+    try:
+        await comm.write({'op': 'identity', 'reply': True})
+        answer = await asyncio.wait_for(comm.read(), CONNECT_S)
+        return answer.get('type') if isinstance(answer, dict) else None
+    finally:
+        comm.abort()
+
+
+def _said(error: BaseException) -> str:
+    text = f'{type(error).__name__}: {error}'
+    return ' '.join(text.split())[:160]
+
+
+class _Doer:
+    """What a worker needs to do chunks; made here, used there."""
+
+    def __init__(
+        self, experiments: tuple[Experiment, ...], runs: int, compiled: bool, version: str,
+        is_local: bool,
+    ) -> None:
+        self._experiments = experiments
+        self._runs = runs
+        self._compiled = compiled
+        self._version = version
+        self._is_local = is_local
+        self._evaluator: Evaluator | None = None
+        self._is_ready = False
+
+    def set_up(self) -> None:
+        """Do what a worker does when it gets this."""
+        if self._version != __version__:
+            raise ClusterError(
+                f'--dask: a worker has mddag_executor {__version__}, and this is {self._version}: '
+                'install the same version there')
+        if self._is_local and threading.current_thread() is threading.main_thread():
+            # The terminal's Ctrl-C is the first process's to handle.
+            import signal
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        compiled = self._compiled
+        if compiled:
+            from mddag_executor.simulate.compiled import available
+            compiled = available()
+        self._evaluator = Evaluator(self._experiments, self._runs, compiled)
+        self._prepare = threading.Lock()
+
+    def __call__(self, first: int, count: int) -> Chunk:
+        assert self._evaluator is not None
+        with self._prepare:  # the first one compiles, not the worker's event loop
+            if not self._is_ready:
+                self._evaluator.prepare()
+                self._is_ready = True
+        return self._evaluator(first, count)
+
+
+def _plugin_class() -> Any:
+    """Return the class of the plugin, whose base is Dask's."""
+    from distributed import WorkerPlugin
+
+    class DoerPlugin(WorkerPlugin):  # type: ignore[misc, unused-ignore]
+        """Brings the experiments to a worker."""
+
+        def __init__(self, doer: _Doer) -> None:
+            self.name = f'mddag-{uuid.uuid4().hex}'
+            self.doer = doer
+
+        def setup(self, worker: Any) -> None:
+            """Make the worker ready."""
+            self.doer.set_up()
+
+    return DoerPlugin
+
+
+def _work(name: str, first: int, count: int) -> Chunk:
+    """Do a chunk; this is what runs on a worker."""
+    from distributed import get_worker
+    doer: _Doer = get_worker().plugins[name].doer
+    return doer(first, count)

@@ -1,0 +1,219 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What an evaluation consists of: experiments, and the chunks of numbered runs that they are done in.
+
+Theory of operation
+-------------------
+Each run draws one execution time for each vertex (see ``draws``) and simulates its task set under
+every policy with these same times, until the first miss.  A run without a miss is accepted.  As in
+the paper only completions are judged, unless told otherwise.
+
+An evaluation has one task set or many (random ones, say), each with the same number of runs.  A
+run has a *place*, task set by task set, and a *number*, which its draw depends on (and on the
+seed): the task set's index times ``STRIDE`` plus the run's index there.  So a run is the same
+however many there are of them, in whichever process it is done, and whatever was done before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+import time
+from typing import NamedTuple, Protocol
+
+from mddag_executor.core import policy as find_policy
+from mddag_executor.core import Tables
+from mddag_executor.core.jobs import finish
+from mddag_executor.core.state import new_state
+from mddag_executor.simulate.acceptance import Bools
+from mddag_executor.simulate.draws import Draws, feasible, Floats, Samples, Times, utilisations
+from mddag_executor.simulate.engine import any_missed, run
+from mddag_executor.simulate.run import check, periodic_load, Settings
+from msg_graph import TaskSet
+import numpy as np
+
+DEFAULT_POLICIES = ('rad', 'rm', 'wc', 'fifo')
+STRIDE = 2 ** 40
+"""So far apart are the numbers of the first runs of two task sets."""
+
+_MOST_AT_HAND = 64  # evaluators of task sets that are kept
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """
+    What to evaluate; it is sent to worker processes as a whole.
+
+    :param policies: names of policies.
+    :param preemptive: None runs each policy in its own mode of the paper's experiment.
+    :param samples: measured values of each callback (ns); None draws from the quantile tables.
+    :param overhead_ns: added to an execution each time it is dispatched.
+    """
+
+    task_set: TaskSet
+    policies: tuple[str, ...] = DEFAULT_POLICIES
+    workers: int = 7
+    duration_ns: int = 3_000_000_000
+    seed: int = 0
+    samples: Samples | None = None
+    preemptive: bool | None = None
+    overhead_ns: int = 0
+    judge: str = 'completions'
+
+    def settings(self, policy: str) -> Settings:
+        """Return how to simulate a run under a policy."""
+        preemptive = find_policy(policy).mode(self.preemptive)
+        return Settings(
+            policy=policy, workers=self.workers, duration_ns=self.duration_ns,
+            preemptive=preemptive, judge=self.judge, stop_at_first_miss=True,
+            dispatch_overhead_ns=self.overhead_ns)
+
+
+class Chunk(NamedTuple):
+    """
+    What came of some consecutive runs.
+
+    ``accepted`` has a row for each policy, a column for each run.
+    """
+
+    first: int
+    utilisation: Floats
+    possible: Bools
+    accepted: Bools
+    took_s: float
+
+    def size_for(self, seconds: float) -> int:
+        """Return how many runs like these take about that long."""
+        return max(1, round(len(self.utilisation) * seconds / max(self.took_s, 1e-6)))
+
+
+class Judge(Protocol):
+    """Simulates runs of a task set."""
+
+    def warm_up(self) -> None:
+        """Do what has to be done once."""
+
+    def __call__(self, settings: Settings, times: Times) -> Bools:
+        """Tell which of the runs with these execution times met every deadline."""
+
+
+class Evaluator:
+    """
+    Evaluates chunks of experiments; each worker process has one, its threads share it.
+
+    :param runs: of each experiment.
+    :raises SimulationError: on settings that make no sense.
+    :raises mddag_executor.core.PolicyError: when there is no such policy.
+    """
+
+    def __init__(
+        self, experiments: Sequence[Experiment], runs: int, compiled: bool = False
+    ) -> None:
+        self._experiments = experiments
+        self._runs = runs
+        self._compiled = compiled
+        self._one = lru_cache(_MOST_AT_HAND)(self._make)
+
+    def _make(self, index: int) -> _One:
+        return _One(self._experiments[index], self._compiled)
+
+    def check(self) -> None:
+        """
+        Find out whether all experiments can be done.
+
+        :raises InputError: when a callback declares no execution time.
+        """
+        for experiment in self._experiments:
+            for name in experiment.policies:
+                check(experiment.settings(name))
+            Draws(experiment.task_set, experiment.seed, experiment.samples)
+
+    def prepare(self) -> None:
+        """Do what has to be done once, before the first run."""
+        self._one(0).judge.warm_up()
+
+    def __call__(self, first: int, count: int) -> Chunk:
+        """Evaluate ``count`` runs from the place ``first`` on."""
+        begin = time.monotonic()
+        parts = []
+        at, end = first, first + count
+        while at < end:
+            index, run_index = divmod(at, self._runs)
+            some = min(end - at, self._runs - run_index)
+            parts.append(self._one(index)(index * STRIDE + run_index, some))
+            at += some
+        utilisation, possible, accepted = zip(*parts)
+        return Chunk(
+            first, np.concatenate(utilisation), np.concatenate(possible),
+            np.concatenate(accepted, axis=1), time.monotonic() - begin)
+
+
+class _One:
+    """Evaluates runs of one experiment, by their numbers."""
+
+    def __init__(self, experiment: Experiment, compiled: bool) -> None:
+        self._experiment = experiment
+        self._settings = [experiment.settings(name) for name in experiment.policies]
+        self._draws = Draws(experiment.task_set, experiment.seed, experiment.samples)
+        self.judge: Judge
+        if compiled:
+            from mddag_executor.simulate.compiled import CompiledJudge
+            self.judge = CompiledJudge(experiment.task_set, experiment.duration_ns)
+        else:
+            self.judge = PlainJudge(experiment.task_set, experiment.duration_ns)
+
+    def __call__(self, first: int, count: int) -> tuple[Floats, Bools, Bools]:
+        experiment = self._experiment
+        times = self._draws.times(first, count)
+        accepted = np.array([self.judge(settings, times) for settings in self._settings])
+        return (
+            utilisations(experiment.task_set, times, experiment.workers),
+            feasible(
+                experiment.task_set, times, experiment.workers, experiment.duration_ns),
+            accepted)
+
+
+class PlainJudge:
+    """Simulates runs in plain Python."""
+
+    def __init__(self, task_set: TaskSet, duration_ns: int) -> None:
+        self._tables = Tables.build(task_set)
+        load = periodic_load(
+            task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
+        self._load = load._replace(
+            cost_base=[self._tables.first_vertex[dag.index] for dag in task_set.dags])
+
+    def warm_up(self) -> None:
+        """Do nothing."""
+
+    def __call__(self, settings: Settings, times: Times) -> Bools:
+        """Tell which of the runs met every deadline."""
+        tables, policy = self._tables, find_policy(settings.policy)
+        accepted = np.zeros(len(times), dtype=np.bool_)
+        for row in range(len(times)):
+            state = new_state(
+                tables, settings.workers, preemptive=policy.mode(settings.preemptive),
+                dispatch_overhead=settings.dispatch_overhead_ns,
+                switch_overhead=settings.switch_overhead_ns, polling=policy.polling)
+            load = self._load._replace(costs=times[row].tolist())
+            ended = run(
+                tables, state, policy.key, load, settings.duration_ns,
+                settings.stop_at_first_miss)
+            if settings.judge == 'horizon':
+                finish(tables, state, ended)
+            accepted[row] = not any_missed(state, 0)
+        return accepted

@@ -1,0 +1,134 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Who does the chunks of an evaluation: threads or processes of this machine.
+
+With the compiled core (see ``compiled``) the workers are threads, as it runs without the
+interpreter's lock; without it they are processes.  ``cluster`` has those of other machines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+import multiprocessing
+import signal
+from types import TracebackType
+
+from mddag_executor.errors import MddagError
+from mddag_executor.simulate.experiment import Chunk, Evaluator, Experiment
+from mddag_executor.simulate.run import SimulationError
+
+
+class Pool:
+    """
+    Does chunks; a context manager, whose end waits for those that are under way.
+
+    :ivar jobs: how many chunks it does at a time; it may change.
+    :ivar chunk_s: about how long a chunk should take: short enough for Ctrl-C and progress, long
+        enough to be worth handing over.
+    """
+
+    jobs: int
+    chunk_s = 0.25
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        pass
+
+    def start(self, compiling: Callable[[], None]) -> None:
+        """Do what has to be done once; ``compiling`` is called now and then meanwhile."""
+
+    def submit(self, first: int, count: int) -> Future[Chunk]:
+        """Let someone do ``count`` runs from the place ``first`` on."""
+        raise NotImplementedError
+
+    def failure(self, error: BaseException) -> MddagError | None:
+        """Return the error that tells the user what an exception of a chunk means, if any."""
+        return None
+
+    def check(self) -> None:
+        """
+        Look after the pool; called about every second.
+
+        :raises SimulationError: when nobody is left to do the chunks.
+        """
+
+
+class _LocalPool(Pool):
+
+    def __init__(self, executor: Executor, jobs: int) -> None:
+        self._executor = executor
+        self.jobs = jobs
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self._executor.shutdown()
+
+
+class ThreadPool(_LocalPool):
+    """Threads of this process."""
+
+    def __init__(self, evaluator: Evaluator, jobs: int) -> None:
+        super().__init__(ThreadPoolExecutor(jobs), jobs)
+        self._evaluator = evaluator
+
+    def start(self, compiling: Callable[[], None]) -> None:
+        """Compile the core, if that is what the evaluator uses."""
+        future = self._executor.submit(self._evaluator.prepare)
+        while not wait((future,), timeout=0.2).done:
+            compiling()
+        future.result()
+
+    def submit(self, first: int, count: int) -> Future[Chunk]:
+        """Let a thread do runs."""
+        return self._executor.submit(self._evaluator, first, count)
+
+
+class ProcessPool(_LocalPool):
+    """Processes of this machine, with the plain core."""
+
+    def __init__(self, experiments: Sequence[Experiment], runs: int, jobs: int) -> None:
+        super().__init__(ProcessPoolExecutor(
+            jobs, multiprocessing.get_context('spawn'), _start_worker, (experiments, runs)), jobs)
+
+    def submit(self, first: int, count: int) -> Future[Chunk]:
+        """Let a process do runs."""
+        return self._executor.submit(_work, first, count)
+
+    def failure(self, error: BaseException) -> MddagError | None:
+        """Tell of a worker process that is gone."""
+        if not isinstance(error, BrokenProcessPool):
+            return None
+        return SimulationError(
+            'jobs: a worker process was killed: free some memory, or give fewer --jobs')
+
+
+_evaluator: Evaluator | None = None  # of this process, if it is a worker
+
+
+def _start_worker(experiments: Sequence[Experiment], runs: int) -> None:
+    global _evaluator
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the first process's to handle
+    _evaluator = Evaluator(experiments, runs)
+
+
+def _work(first: int, count: int) -> Chunk:
+    assert _evaluator is not None
+    return _evaluator(first, count)

@@ -1,0 +1,215 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Who is who in a trace, and what each callback did: for traces of this executor and of CARET.
+
+Theory of operation
+-------------------
+The events of ros2_tracing name things by address, so everything is kept by process and address.
+An address that is used again stands for the newer thing.
+
+1. A node has timers, subscriptions and services, in the order in which they were made; each leads
+   to a callback. rclcpp makes a subscription in two steps, so links are followed only when asked.
+2. A callback runs in a thread from ``callback_start`` to ``callback_end``; the runs of a thread
+   nest, as a callback may spin. What a thread publishes meanwhile, the innermost callback
+   publishes.
+3. Of each callback the number of runs, the first and the last start, and the times that runs took
+   are kept; of the latter ``KEEP_TIMES`` at most, in ns.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+KEEP_TIMES = 100_000
+
+Event = tuple[Any, ...]
+Address = tuple[int, int]
+"""Process and address."""
+
+
+@dataclass
+class Entity:
+    """
+    A timer, subscription or service.
+
+    :ivar kind: ``timer``, ``subscription`` or ``service``.
+    :ivar start: the topic or service, as its name; empty for a timer.
+    :ivar period_ns: the timer's period.
+    :ivar callback: its callback's address; None where the trace does not tell.
+    :ivar group: its mutually exclusive callback group, or None.
+    """
+
+    kind: str
+    node: str
+    start: str
+    period_ns: int | None
+    callback: Address | None
+    group: Address | None
+
+
+@dataclass
+class Runs:
+    """What a callback did."""
+
+    count: int = 0
+    first: int = 0
+    last: int = 0
+    times: array[int] = field(default_factory=lambda: array('q'))
+    publishes: dict[str, None] = field(default_factory=dict)
+
+    @property
+    def interval_ns(self) -> int | None:
+        """Return the mean time between two of its starts; None with fewer than two."""
+        return (self.last - self.first) // (self.count - 1) if self.count > 1 else None
+
+
+class Census:
+    """
+    Takes in events (tuples as ``TraceReader.events`` yields them) in the order of time.
+
+    ``handlers`` has what takes in which event, by full name.
+    """
+
+    def __init__(self) -> None:
+        self.runs: dict[Address, Runs] = {}
+        #: By node its publishers' topics; by topic whether some callback was seen to publish it.
+        self.publishers: dict[str, dict[str, bool]] = {}
+        self._nodes: dict[Address, str] = {}
+        self._topic: dict[Address, tuple[str, str]] = {}
+        self._made: dict[Address, tuple[str, Address | None, str, int | None]] = {}
+        self._node_of_timer: dict[Address, Address] = {}
+        self._links: dict[Address, list[Address]] = {}
+        self._exclusive: set[Address] = set()
+        self._group: dict[Address, Address] = {}
+        self._running: dict[tuple[int, int], list[tuple[Address, int]]] = {}
+        self.handlers: dict[str, Callable[[Event], None]] = {
+            'ros2:rcl_node_init': self._node,
+            'ros2:rcl_publisher_init': self._publisher,
+            'ros2:rcl_subscription_init': self._subscription,
+            'ros2:rcl_service_init': self._service,
+            'ros2:rcl_timer_init': self._timer,
+            'ros2:rclcpp_timer_link_node': self._timer_node,
+            'ros2:rclcpp_subscription_init': self._link,
+            'ros2:rclcpp_subscription_callback_added': self._link,
+            'ros2:rclcpp_timer_callback_added': self._link,
+            'ros2:rclcpp_service_callback_added': self._link,
+            'ros2_caret:add_callback_group': self._new_group,
+            'ros2_caret:callback_group_add_timer': self._in_group,
+            'ros2_caret:callback_group_add_subscription': self._in_group,
+            'ros2_caret:callback_group_add_service': self._in_group,
+            'ros2:callback_start': self._start,
+            'ros2:callback_end': self._end,
+            'ros2:rclcpp_publish': self._publish,
+            'ros2:rcl_publish': self._publish,
+        }
+
+    def take(self, event: Event) -> None:
+        """Take in an event; one without some of its fields, or of another kind, is left out."""
+        handler = self.handlers.get(event[0])
+        if handler is not None and None not in event:
+            handler(event)
+
+    def _node(self, event: Event) -> None:
+        name = f'{event[7].rstrip("/")}/{event[6]}'
+        self._nodes[event[2], event[4]] = name
+        self.publishers.setdefault(name, {})
+
+    def _publisher(self, event: Event) -> None:
+        node = self._nodes.get((event[2], event[5]))
+        if node is not None:
+            self._topic[event[2], event[4]] = (node, event[7])
+            self.publishers[node].setdefault(event[7], False)
+
+    def _add(self, kind: str, event: Event, node: int | None, start: str, period: int | None
+             ) -> None:
+        address = (event[2], event[4])
+        self._made.pop(address, None)  # a new thing has a new place
+        self._made[address] = (kind, None if node is None else (event[2], node), start, period)
+
+    def _subscription(self, event: Event) -> None:
+        self._add('subscription', event, event[5], event[7], None)
+
+    def _service(self, event: Event) -> None:
+        self._add('service', event, event[5], event[7], None)
+
+    def _timer(self, event: Event) -> None:
+        self._add('timer', event, None, '', event[5])
+
+    def _timer_node(self, event: Event) -> None:
+        self._node_of_timer[event[2], event[4]] = (event[2], event[5])
+
+    def _link(self, event: Event) -> None:
+        self._links.setdefault((event[2], event[4]), []).append((event[2], event[5]))
+
+    def _new_group(self, event: Event) -> None:
+        if event[6] == 'mutually_exclusive':
+            self._exclusive.add((event[2], event[5]))
+
+    def _in_group(self, event: Event) -> None:
+        self._group[event[2], event[5]] = (event[2], event[4])
+
+    def _start(self, event: Event) -> None:
+        callback = (event[2], event[4])
+        self._running.setdefault((event[2], event[3]), []).append((callback, event[1]))
+        runs = self.runs.get(callback)
+        if runs is None:
+            runs = self.runs[callback] = Runs(first=event[1])
+        runs.count += 1
+        runs.last = event[1]
+
+    def _end(self, event: Event) -> None:
+        stack = self._running.get((event[2], event[3]), [])
+        while stack:
+            callback, start = stack.pop()
+            if callback == (event[2], event[4]):
+                times = self.runs[callback].times
+                if len(times) < KEEP_TIMES:
+                    times.append(event[1] - start)
+                return
+
+    def _publish(self, event: Event) -> None:
+        stack = self._running.get((event[2], event[3]))
+        publisher = self._topic.get((event[2], event[4]))
+        if stack and publisher is not None:
+            node, topic = publisher
+            self.runs[stack[-1][0]].publishes[topic] = None
+            self.publishers[node][topic] = True
+
+    def entities(self) -> Iterator[Entity]:
+        """Yield the timers, subscriptions and services, as they were made."""
+        for address, (kind, node, start, period) in self._made.items():
+            if node is None:
+                node = self._node_of_timer.get(address)
+            name = None if node is None else self._nodes.get(node)
+            if name is None:
+                continue
+            group = self._group.get(address)
+            yield Entity(kind, name, start, period, self._callback(address),
+                         group if group in self._exclusive else None)
+
+    def _callback(self, address: Address) -> Address | None:
+        """Return what the links from a handle end in."""
+        seen = {address}
+        while address in self._links:
+            after = self._links[address][-1]
+            if after in seen:
+                break
+            seen.add(after)
+            address = after
+        return address if len(seen) > 1 else None

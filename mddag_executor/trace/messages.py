@@ -1,0 +1,159 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The messages of any MCAP recording, of the topics that are asked for.
+
+Theory of operation: as in `reading`, in the order of the file: block by block, and nothing after
+damage. Messages are not decoded; whoever wants a part of one gets its bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+import os
+from typing import NamedTuple
+
+from mddag_executor.trace import records
+from mddag_executor.trace.blocks import Block, Damage, load, open_data, read_summary, scan
+from mddag_executor.trace.reader import open_trace
+
+_DEFINITIONS_LIMIT = 64 * 1024 * 1024       # bytes of all schemas and channels
+
+
+class Topic(NamedTuple):
+    """A channel: its topic, how its messages are encoded, and their type with its definition."""
+
+    name: str
+    encoding: str
+    message_type: str
+    definition_encoding: str
+    definition: str
+
+
+class Message(NamedTuple):
+    """A message: its channel, its times (ns) and its bytes."""
+
+    topic: Topic
+    log_time: int
+    publish_time: int
+    data: memoryview
+
+
+class MessageReader:
+    """
+    Reads messages of an MCAP file, once.
+
+    :ivar warnings: what was found to be missing, one line, once the reading has come to its end.
+    :ivar count: messages so far, of all topics.
+    :ivar topics: the topics met so far, also those not asked for.
+    :ivar start: the least and `end` the greatest log time of all messages, None before any.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = os.fspath(path)
+        self.warnings: list[str] = []
+        self.count = 0
+        self.topics: set[str] = set()
+        self.start: int | None = None
+        self.end: int | None = None
+        self._schemas: dict[int, tuple[str, str, str]] = {}
+        self._channels: dict[int, Topic] = {}
+        self._wanted: dict[int, Topic] = {}
+        self._size = 0
+
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """
+        Yield the messages of some topics, in the order of the file.
+
+        :raises TraceError: where the file can not be read or is no MCAP file
+        """
+        with open_trace(self.path) as (stream, size):
+            try:
+                _, summary = read_summary(stream, size)
+                stream.seek(0)
+                for block in scan(stream, open_data(stream, self.path, size), size):
+                    yield from self._messages(load(stream, block), block, topics)
+            except Damage as damage:
+                self.warnings.append(
+                    f'{self.path}: {damage.what} (at byte {damage.offset}): used {self.count} '
+                    f'messages before it, not the {size - damage.offset} bytes from there on')
+                return
+        if summary is not None and summary.messages != self.count:
+            self.warnings.append(
+                f'{self.path}: its summary counts {summary.messages} messages, but there are '
+                f'{self.count}')
+
+    def _messages(
+        self, data: bytes, block: Block, topics: Collection[str]
+    ) -> Iterator[Message]:
+        view = memoryview(data)
+        position, end = 0, len(data)
+        wanted = self._wanted
+        head_size = records.RECORD.size + records.MESSAGE_HEAD.size
+        while position < end:
+            if position + records.RECORD.size > end:
+                raise Damage('the records of a chunk do not fit into it', block.offset)
+            opcode, length = records.RECORD.unpack_from(data, position)
+            content = position + records.RECORD.size
+            after = content + length
+            if after > end:
+                raise Damage('the records of a chunk do not fit into it', block.offset)
+            if opcode == records.MESSAGE:
+                if position + head_size > after:
+                    raise Damage('a message is shorter than its head', block.offset)
+                channel, _, log_time, publish_time = records.MESSAGE_HEAD.unpack_from(
+                    data, content)
+                self._note(channel, log_time, block)
+                topic = wanted.get(channel)
+                if topic is not None:
+                    yield Message(topic, log_time, publish_time, view[position + head_size:after])
+            elif opcode in (records.SCHEMA, records.CHANNEL):
+                try:
+                    self._define(opcode, data[content:after], topics)
+                except ValueError as error:
+                    raise Damage(str(error), block.offset) from None
+            position = after
+
+    def _note(self, channel: int, log_time: int, block: Block) -> None:
+        if channel not in self._channels:
+            raise Damage('a message is of no channel', block.offset)
+        self.count += 1
+        if self.start is None or self.end is None:
+            self.start = self.end = log_time
+        elif log_time > self.end:
+            self.end = log_time
+        elif log_time < self.start:
+            self.start = log_time
+
+    def _define(self, opcode: int, content: bytes, topics: Collection[str]) -> None:
+        self._size += len(content)
+        if self._size > _DEFINITIONS_LIMIT:
+            raise ValueError('the schemas are too large')
+        cursor = records.Cursor(content)
+        number = cursor.uint16()
+        if opcode == records.SCHEMA:
+            name, encoding = cursor.string(), cursor.string()
+            schema = (name, encoding, cursor.block().decode(errors='replace'))
+            if self._schemas.setdefault(number, schema) != schema:
+                raise ValueError('a schema or channel changes its meaning')
+            return
+        schema = self._schemas.get(cursor.uint16(), ('', '', ''))
+        name = cursor.string()
+        topic = Topic(name, cursor.string(), *schema)
+        if self._channels.setdefault(number, topic) != topic:
+            raise ValueError('a schema or channel changes its meaning')
+        self.topics.add(name)
+        if name in topics:
+            self._wanted[number] = topic

@@ -1,0 +1,160 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Deadlines of a declaration's sinks: given anew, in the text with its comments and in the task set.
+
+Theory of operation
+-------------------
+1. Deadlines belong to callbacks: where a callback is several vertices, all have its deadline.
+2. In the text only the values of ``deadline:`` change, in their places; a callback that has none
+   gets a line of its own, or an entry in its braces.  So comments, order and layout stay.
+3. The new text must give the task set with just those deadlines changed; else it is refused.
+   (It can, where a value is an alias of one that stands elsewhere.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+from msg_graph.duration import MICROSECOND, MILLISECOND
+from msg_graph.errors import GraphError
+from msg_graph.layout import refused, without_lines
+from msg_graph.model import TaskSet
+import yaml
+
+_LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+_PLACEHOLDER_NS = 1_000_000_000
+
+
+def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, str]:
+    """
+    Return the task set of a declaration whose sinks may lack deadlines.
+
+    :return: the task set and the text that it was read from, where deadlines that were missing
+        are a placeholder.
+    :raises GraphError: anything else is wrong.
+    """
+    from msg_graph import loads
+    try:
+        return loads(text, name), text
+    except GraphError as error:
+        first = error
+    try:
+        filled = _changed(text, dict.fromkeys(_without_deadline(text), _PLACEHOLDER_NS))
+        return loads(filled, name), filled
+    except (GraphError, yaml.YAMLError, RecursionError, KeyError, TypeError, ValueError,
+            AttributeError, IndexError):  # it is wrong in other ways, which the first error tells
+        raise first from None
+
+
+def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Mapping[str, int]) -> str:
+    """
+    Return a declaration with other deadlines; comments, order and all else stay.
+
+    :param task_set: what the text declares.
+    :param deadlines: by the callback's key, ns.
+    :raises GraphError: the text cannot be written anew without another change of its meaning.
+    """
+    from msg_graph import loads
+    result = _changed(text, deadlines)
+    try:
+        after = loads(result, task_set.file)
+    except GraphError:
+        raise refused(task_set.file) from None
+    if without_lines(after) != without_lines(with_deadlines(task_set, deadlines)):
+        raise refused(task_set.file)
+    return result
+
+
+def _callbacks(text: str) -> Iterator[tuple[str, Any, dict[str, Any]]]:
+    """Yield the key of each callback, its YAML node, and the nodes of its values."""
+    for node in _entries(yaml.compose(text, _LOADER))['nodes'].value:
+        of_node = _entries(node)
+        for callback in of_node['callbacks'].value:
+            entries = _entries(callback)
+            yield f'{of_node["node"].value}:{entries["name"].value}', callback, entries
+
+
+def _entries(node: Any) -> dict[str, Any]:
+    return {key.value: value for key, value in node.value}
+
+
+def _without_deadline(text: str) -> list[str]:
+    """Return the keys of the callbacks that start no other and have no deadline."""
+    every = list(_callbacks(text))
+    starting = {
+        topic for _, _, entries in every for trigger in ('subscription', 'sync')
+        for topic in _texts(entries.get(trigger))}
+    return [key for key, _, entries in every
+            if 'deadline' not in entries
+            and not starting.intersection(_texts(entries.get('publishes')))]
+
+
+def _texts(node: Any) -> list[str]:
+    if node is None:
+        return []
+    return [node.value] if isinstance(node.value, str) else [each.value for each in node.value]
+
+
+def _changed(text: str, deadlines: Mapping[str, int]) -> str:
+    """Return a text with other or additional deadlines."""
+    lines = text.splitlines(keepends=True)
+    edits: list[tuple[int, int, int, str]] = []  # line, from column, to column, new text
+    for key, callback, entries in _callbacks(text):
+        if key not in deadlines:
+            continue
+        value = _exactly(deadlines[key])
+        if 'deadline' in entries:
+            begin, end = entries['deadline'].start_mark, entries['deadline'].end_mark
+            edits.append((begin.line, begin.column, end.column, value))
+        elif callback.flow_style:
+            end = callback.value[0][1].end_mark  # after the first entry
+            edits.append((end.line, end.column, end.column, f', deadline: {value}'))
+        else:
+            # Before the second key, which begins a line; better, before one that comes later.
+            begin = callback.value[min(2, len(callback.value) - 1)][0].start_mark
+            line = ' ' * begin.column + f'deadline: {value}\n'
+            edits.append((begin.line, 0, 0, line))
+    for row, first, last, new in sorted(edits, reverse=True):
+        lines[row] = lines[row][:first] + new + lines[row][last:]
+    return ''.join(lines)
+
+
+def _exactly(ns: int) -> str:
+    """Return a time in the largest of ms, us, ns that needs three decimals at most."""
+    for unit, factor in (('ms', MILLISECOND), ('us', MICROSECOND)):
+        if ns >= factor and ns % (factor // 1000) == 0:
+            whole, part = divmod(ns // (factor // 1000), 1000)
+            return f'{whole}.{part:03d}'.rstrip('0').rstrip('.') + unit
+    return f'{ns}ns'
+
+
+def with_deadlines(task_set: TaskSet, deadlines: Mapping[str, int]) -> TaskSet:
+    """
+    Return a task set with other deadlines.
+
+    :param deadlines: by the callback's key, ns; of sinks only.
+    """
+    callbacks = {
+        callback.key: replace(callback, deadline_ns=deadlines[callback.key])
+        if callback.key in deadlines else callback for callback in task_set.callbacks}
+    return replace(
+        task_set, callbacks=tuple(callbacks.values()),
+        dags=tuple(replace(dag, vertices=tuple(
+            replace(vertex, callback=callbacks[vertex.callback.key],
+                    deadline_ns=callbacks[vertex.callback.key].deadline_ns)
+            for vertex in dag.vertices)) for dag in task_set.dags))

@@ -1,0 +1,202 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Drift: where a system that ran and its declaration disagree.
+
+Theory of operation
+-------------------
+The rules, for live runs and for recordings alike. What was seen comes as counts by callback.
+
+1. *publishes*: a callback published a topic that it does not declare. What every node publishes
+   anyway does not count.
+2. *rate* of a source: the mean time between two releases is not the declared period, by more than
+   ``TOLERANCE`` of it. It takes ``LEAST`` releases to say so.
+3. *rate* of a subscription: it got messages more or less often than the jobs of its DAGs were
+   released, by more than ``TOLERANCE``. It takes ``LEAST`` expected ones. Dropped messages count
+   as got: losing them is no fault of the declaration. A sync is not judged by this rule, as how
+   its messages come together is not declared.
+4. *never ran*: a callback never ran, while it should have done so at least twice.
+5. Where all DAGs of a callback may span processes (``release_from: header_stamp``) and its node
+   was not seen here, it may well run elsewhere, and nothing is said of it.
+6. Of callbacks that follow each other only the first that disagrees by rule 2, 3 or 4 is
+   reported: what comes after it has no messages because of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Set
+from dataclasses import dataclass, field
+from typing import Any
+
+from msg_graph.analysis import topological_order
+from msg_graph.duration import format_duration
+from msg_graph.errors import printable
+from msg_graph.model import Callback, Dag, TaskSet
+from msg_graph.sketch import is_background
+
+TOLERANCE = 0.2
+LEAST = 10
+
+
+@dataclass
+class Releases:
+    """The releases of a DAG: how many, and the first and the last one, ns."""
+
+    count: int = 0
+    first: int = 0
+    last: int = 0
+
+    def add(self, release: int) -> None:
+        """Take in a release."""
+        self.first = min(self.first, release) if self.count else release
+        self.last = max(self.last, release)
+        self.count += 1
+
+
+@dataclass
+class Observed:
+    """
+    What was seen of a system.
+
+    :ivar duration_ns: how long it was watched.
+    :ivar releases: by the key of its source callback, the releases of a DAG.
+    :ivar got: by callback how many messages it got or how often its timer released it.
+    :ivar ran: by callback how often it ran.
+    :ivar publishes: by callback the topics that it published, declared or not.
+    :ivar nodes: the nodes that were seen; None where that is not known.
+    """
+
+    duration_ns: int = 0
+    releases: dict[str, Releases] = field(default_factory=dict)
+    got: dict[str, int] = field(default_factory=dict)
+    ran: dict[str, int] = field(default_factory=dict)
+    publishes: dict[str, Set[str]] = field(default_factory=dict)
+    nodes: Set[str] | None = None
+
+
+@dataclass(frozen=True)
+class Drift:
+    """
+    One disagreement.
+
+    :ivar kind: ``publishes``, ``rate`` or ``never ran``.
+    :ivar topic: the topic that is published and not declared, or None.
+    :ivar declared: what the declaration says: a period in ns, or a number of messages; or None.
+    :ivar observed: the same as it was seen, or None.
+    """
+
+    kind: str
+    callback: str
+    topic: str | None
+    declared: int | None
+    observed: int | None
+    text: str
+
+    def result(self) -> dict[str, Any]:
+        """Return its form in results for machines."""
+        return {'kind': self.kind, 'callback': self.callback, 'topic': self.topic,
+                'declared': self.declared, 'observed': self.observed, 'text': self.text}
+
+
+def drift(task_set: TaskSet, observed: Observed) -> list[Drift]:
+    """Return where a system and its declaration disagree, in the order of the declaration."""
+    found: dict[str, list[Drift]] = {}
+    for callback in task_set.callbacks:
+        extra = [topic for topic in sorted(observed.publishes.get(callback.key, ()))
+                 if topic not in callback.publishes and not is_background(topic)]
+        found[callback.key] = [
+            Drift('publishes', callback.key, topic, None, None,
+                  printable(f'{callback.key} publishes {topic}, which it does not declare'))
+            for topic in extra]
+    suspects = _suspects(task_set, observed)
+    for key in _first(task_set, suspects):
+        found[key].append(suspects[key])
+    return [each for callback in task_set.callbacks for each in found[callback.key]]
+
+
+def _suspects(task_set: TaskSet, observed: Observed) -> dict[str, Drift]:
+    """Return what disagrees by rules 2, 3 and 4, by callback."""
+    dags: dict[str, list[Dag]] = {}
+    for vertex in task_set.vertices:
+        dags.setdefault(vertex.callback.key, []).append(task_set.dags[vertex.dag])
+    suspects = {}
+    for callback in task_set.callbacks:
+        of_callback = dags.get(callback.key, [])
+        if (observed.nodes is not None and callback.node not in observed.nodes
+                and all(dag.release_from == 'header_stamp' for dag in of_callback)):
+            continue
+        why = _never_ran(callback, of_callback, observed)
+        if why is None:
+            if callback.period_ns is not None:
+                why = _source_rate(callback, callback.period_ns, observed)
+            elif callback.kind == 'subscription':
+                why = _message_rate(callback, of_callback, observed)
+        if why is not None:
+            suspects[callback.key] = why
+    return suspects
+
+
+def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift | None:
+    if observed.ran.get(callback.key, 0) or not dags:
+        return None
+    slowest = min(dag.period_ns for dag in dags)
+    latest = max((dag.vertices[sink].deadline_ns or 0 for dag in dags for sink in dag.sinks),
+                 default=0)
+    if observed.duration_ns < 2 * slowest + latest:
+        return None
+    return Drift('never ran', callback.key, None, None, 0,
+                 printable(f'{callback.key} never ran in '
+                           f'{format_duration(observed.duration_ns)}'))
+
+
+def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift | None:
+    releases = observed.releases.get(callback.key, Releases())
+    if releases.count < LEAST:
+        return None
+    mean = (releases.last - releases.first) // (releases.count - 1)
+    if abs(mean - period) <= TOLERANCE * period:
+        return None
+    return Drift('rate', callback.key, None, period, mean,
+                 printable(f'{callback.key} was released every {format_duration(mean)}, and '
+                           f'{format_duration(period)} is declared'))
+
+
+def _message_rate(callback: Callback, dags: list[Dag], observed: Observed) -> Drift | None:
+    expected = 0
+    for dag in dags:
+        source = dag.vertices[dag.source].callback.key
+        expected += observed.releases.get(source, Releases()).count
+    got = observed.got.get(callback.key, 0)
+    # What was released last may still be under way.
+    if expected < LEAST or expected * (1 - TOLERANCE) - len(dags) <= got <= expected * (
+            1 + TOLERANCE) + len(dags):
+        return None
+    return Drift('rate', callback.key, None, expected, got,
+                 printable(f'{callback.key} got {got} messages, and by the declaration '
+                           f'{expected} were due'))
+
+
+def _first(task_set: TaskSet, suspects: Mapping[str, Drift]) -> list[str]:
+    """Return the suspects with no suspect before them in any of their DAGs (rule 6)."""
+    explained: set[str] = set()
+    for dag in task_set.dags:
+        behind = [False] * len(dag.vertices)
+        for index in topological_order(dag):
+            key = dag.vertices[index].callback.key
+            if behind[index] and key in suspects:
+                explained.add(key)
+            for after in dag.vertices[index].successors:
+                behind[after] = behind[after] or behind[index] or key in suspects
+    return [key for key in suspects if key not in explained]

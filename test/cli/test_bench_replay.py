@@ -1,0 +1,155 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `bench replay`: what it measures, on small files; no figure of speed is judged."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.cli import bench_replay
+from mddag_executor.cli import main as program
+from mddag_executor.errors import MddagError
+from mddag_executor.replay import replay
+from mddag_executor.replay.measure import measure, READERS, write_long_trace
+from mddag_executor.resources import find
+from mddag_executor.trace import TraceReader
+from msg_graph import load
+import pytest
+
+SMALL = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /a
+    callbacks: [{name: a, timer: 100ms, publishes: [/x, /y], execution_time: 9ms}]
+  - node: /b
+    callbacks: [{name: b, subscription: /x, publishes: [/z], execution_time: 8ms}]
+  - node: /c
+    callbacks: [{name: c, sync: [/y, /z], deadline: 90ms, execution_time: 7ms}]
+"""
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Path:
+    path = tmp_path / 'graph.yaml'
+    path.write_text(SMALL)
+    return path
+
+
+def test_the_long_trace_is_what_an_executor_records(tmp_path: Path) -> None:
+    """A replay of it has no doubts: every job complete, every path closed, no warning."""
+    path = tmp_path / 'long.mcap'
+    count = write_long_trace(str(path), load(find('config/autoware.yaml')), 100_000)
+    reader = TraceReader(path)
+    assert reader.message_count == count >= 100_000
+    outcome = replay(path)
+    assert outcome.warnings == []
+    for dag in outcome.result()['dags'].values():
+        assert dag['jobs'] == sum(dag['ends'].values()) > 0
+
+
+def test_jobs_go_on_from_one_repetition_to_the_next(tmp_path: Path, graph: Path) -> None:
+    path = tmp_path / 'long.mcap'
+    write_long_trace(str(path), load(graph), 5000, workers=2)
+    jobs = [event[5] for event in TraceReader(path).events({'mddag:job_release'})]
+    assert jobs == list(range(len(jobs))) and len(jobs) > 200
+    result = replay(path).result()
+    response = result['dags']['/a']['sinks']['/c:c']['response_ns']
+    assert response['min'] == response['max']
+
+
+@pytest.mark.parametrize('name', READERS)
+def test_every_reader_reads_all(tmp_path: Path, graph: Path, name: str) -> None:
+    path = tmp_path / 'long.mcap'
+    count = write_long_trace(str(path), load(graph), 1000, workers=2)
+    found = measure(name, str(path), 10**9)
+    assert found.events == count
+    assert 0 < found.peak_mb < 300 and found.per_s > 0
+    path.write_bytes(b'nonsense')
+    if name.startswith(('events', 'read', 'replayed')):
+        with pytest.raises(MddagError, match='is no MCAP file'):
+            measure(name, str(path), 10)
+
+
+def test_speed_on_the_command_line(
+    tmp_path: Path, graph: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / 'out.json'
+    assert program.main(['bench', 'replay', '--events', '2000', '--repeat', '1', '--others', '100',
+                         '--graph', str(graph), '--json', str(out)]) == 0
+    shown = capsys.readouterr().out
+    result = json.loads(out.read_text())
+    assert list(result['readers']) == list(READERS)
+    assert result['readers']['read and linked']['events'] == result['events'] >= 2000
+    assert result['readers']['mcap, undecoded']['events'] == 100
+    assert all(name in shown for name in READERS)
+
+
+def test_accuracy_on_the_command_line(
+    tmp_path: Path, graph: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With simulated runs instead of live ones, which are predicted exactly."""
+    def record(graph: str, args: Any, utilisation: float, workers: int, path: str) -> None:
+        write_long_trace(path, load(graph), 2000, workers, utilisation)
+
+    monkeypatch.setattr(bench_replay, '_record', record)
+    out = tmp_path / 'out.json'
+    arguments = ['bench', 'replay', '--accuracy', '--graph', str(graph), '--repeat', '2',
+                 '--utilisation', '0.1', '--workers', '2,3', '--json', str(out)]
+    assert program.main(arguments) == 0
+    shown = capsys.readouterr().out
+    result = json.loads(out.read_text())
+    assert [(run['utilisation'], run['workers']) for run in result['runs']] == [
+        (0.1, 2), (0.1, 3)] * 2
+    same, other = result['summary']
+    assert (same['median_error'], same['p99_error'], same['within']) == (0, 0, True)
+    # the same utilisation of three workers is more work than was recorded with two
+    assert other['median_error'] == pytest.approx(-1 / 3, abs=0.001) and not other['within']
+    assert '1 of 1 sinks within 5% of the median and 15% of the p99' in shown
+    assert '0 of 1 sinks' in shown and 'predicted from a recording with 2 workers' in shown
+
+
+def test_a_live_run_is_predicted(tmp_path: Path, graph: Path) -> None:
+    """Much nearer than without overheads, which are about as long as these callbacks."""
+    graph.write_text(SMALL.replace('100ms', '20ms').replace('9ms,', '1ms,').replace(
+        'execution_time: 9ms', 'execution_time: 200us').replace(
+        'execution_time: 8ms', 'execution_time: 200us').replace(
+        'execution_time: 7ms', 'execution_time: 200us'))
+    out = tmp_path / 'out.json'
+    assert program.main([
+        'bench', 'replay', '--accuracy', '--graph', str(graph), '--repeat', '1', '--seconds', '2',
+        '--utilisation', '0.02', '--workers', '3', '--json', str(out)]) == 0
+    sink, = json.loads(out.read_text())['summary']
+    assert sink['jobs'] > 50
+    assert abs(sink['median_error']) < 0.25
+    assert sink['ideal_median'] < sink['recorded_median']
+
+
+@pytest.mark.parametrize(('options', 'says'), [
+    (['--accuracy', '--trace', 'a.mcap'], '--accuracy: it records its own runs'),
+    (['--trace', 'gone.mcap'], 'gone.mcap: cannot be read'),
+    (['--events', '0'], "'0' is no whole number"),
+    (['--utilisation', '0.3,x'], "'x' is no number above zero"),
+    (['--json', '/gone/a.json'], 'there is no directory /gone'),
+])
+def test_wrong_options(
+    options: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert program.main(['bench', 'replay', *options]) == 2
+    output = capsys.readouterr()
+    assert output.out == '' and says in output.err and output.err.count('\n') == 1

@@ -1,0 +1,216 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verbs `export` and `diff`, and `--report`: files, exit status, bad input in one line."""
+
+from __future__ import annotations
+
+from contextlib import redirect_stdout
+import io
+import json
+from pathlib import Path
+import sys
+from typing import Any
+
+from mddag_executor.cli import main as program
+import pytest
+
+DEMO = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: t, timer: 10ms, publishes: [/a], execution_time: 2ms}
+      - {name: s, subscription: /a, deadline: 5ms, execution_time: %s}
+"""
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    status = program.main([*map(str, arguments)])
+    output = capsys.readouterr()
+    return status, output.out, output.err
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Path:
+    path = tmp_path / 'graph.yaml'
+    path.write_text(GRAPH % '4ms')
+    return path
+
+
+@pytest.fixture
+def trace(graph: Path, tmp_path: Path) -> Path:
+    path = tmp_path / 'run.mcap'
+    with redirect_stdout(io.StringIO()):
+        assert program.main(['simulate', str(graph), '--duration', '100ms', '--workers', '1',
+                             '--trace', str(path)]) == 0
+    return path
+
+
+@pytest.mark.parametrize(('name', 'start'), [
+    ('out.csv', b'dag,job,vertex,worker'), ('out.CSV', b'dag,'), ('out.parquet', b'PAR1'),
+    ('out.pftrace', b'\x0a')])
+def test_a_file_of_each_form(
+    trace: Path, tmp_path: Path, name: str, start: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if name.endswith('parquet'):
+        pytest.importorskip('pyarrow', reason='pyarrow is not installed')
+    if name.endswith('pftrace'):
+        pytest.importorskip('perfetto', reason='perfetto is not installed')
+    out = tmp_path / name
+    assert call(capsys, 'export', trace, '-o', out) == (0, f'exported: {out}\n', '')
+    assert out.read_bytes().startswith(start)
+
+
+def test_csv_to_standard_output_and_a_trace_from_standard_input(
+    trace: Path, capfdbinary: pytest.CaptureFixture[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, 'stdin', io.TextIOWrapper(io.BytesIO(trace.read_bytes())))
+    assert program.main(['export', '-', '-o', '-', '--rows', 'jobs']) == 0
+    lines = capfdbinary.readouterr().out.decode().splitlines()
+    assert lines[0].startswith('dag,job,sink,release_s') and len(lines) == 11
+    assert lines[1].endswith(',6000000,-1000000,late')
+
+
+def test_another_graph_judges(
+    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wide = tmp_path / 'wide.yaml'
+    wide.write_text(GRAPH.replace('5ms', '9ms') % '4ms')
+    out = tmp_path / 'out.csv'
+    assert call(capsys, 'export', trace, wide, '-o', out, '--rows', 'jobs')[0] == 0
+    lines = out.read_text().splitlines()
+    assert all(line.endswith('in_time') for line in lines[1:])
+
+
+@pytest.mark.parametrize(('arguments', 'error'), [
+    (['export', 'TRACE', '-o', 'out.xlsx'], 'it is not known what to write'),
+    (['export', 'TRACE', '-o', 'out'], 'let the name end in .pftrace, .csv or .parquet'),
+    (['export', 'TRACE', '-o', 'out.pftrace', '--rows', 'jobs'], '--rows: '),
+    (['export', '-', '-', '-o', 'out.csv'], 'standard input can be only one'),
+    (['export', 'GRAPH', '-o', 'out.csv'], 'error: '),
+    (['export', 'missing.mcap', '-o', 'out.csv'], 'missing.mcap'),
+    (['export', 'TRACE', '-o', 'no/such/out.csv'], 'there is no directory'),
+    (['diff', 'TRACE', 'missing.mcap'], 'missing.mcap'),
+    (['diff', '-', '-'], 'standard input can be only one'),
+    (['diff', 'TRACE', 'TRACE', '--tolerance', '5'], "'5' is no share"),
+    (['diff', 'TRACE', 'TRACE', '--tolerance', '-5%'], 'error: '),
+    (['replay', 'TRACE', '--report', 'no/such/out.html'], 'there is no directory'),
+    (['replay', 'GRAPH', '--report', 'out.html'], 'error: '),
+])
+def test_bad_input(
+    arguments: list[str], error: str, graph: Path, trace: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = {path.name for path in tmp_path.iterdir()}
+    places = {'TRACE': str(trace), 'GRAPH': str(graph)}
+    status, out, err = call(capsys, *(places.get(word, word) for word in arguments))
+    assert (status, out, err.count('\n')) == (2, '', 1)
+    assert err.startswith('error: ') and error in err
+    assert {path.name for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize(('package', 'arguments', 'extra'), [
+    ('pyarrow', ['export', 'TRACE', '-o', 'out.parquet'], 'export'),
+    ('perfetto', ['export', 'TRACE', '-o', 'out.pftrace'], 'export'),
+    ('bokeh', ['replay', 'TRACE', '--report', 'out.html'], 'report'),
+    ('bokeh', ['simulate', 'GRAPH', '--report', 'out.html'], 'report')])
+def test_a_missing_package_is_named(
+    package: str, arguments: list[str], extra: str, graph: Path, trace: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, package, None)
+    places = {'TRACE': str(trace), 'GRAPH': str(graph)}
+    status, out, err = call(capsys, *(places.get(word, word) for word in arguments))
+    assert (status, out, err.count('\n')) == (2, '', 1)
+    assert f"pip install 'mddag_executor[{extra}]'" in err
+    assert not list(tmp_path.glob('out.*'))
+
+
+def test_a_report_of_each_kind(
+    graph: Path, trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip('bokeh', reason='Bokeh is not installed')
+    for name, arguments in (
+            ('Replay as recorded', ['replay', trace]),
+            ('Replay, rescheduled', ['replay', trace, graph, '--reschedule', '--workers', 3]),
+            ('Simulation', ['simulate', graph, '--duration', '50ms'])):
+        out = tmp_path / 'out.html'
+        status, text, err = call(capsys, *arguments, '--report', out)
+        assert (status, err) == (0, '') and 'sink jobs due' in text
+        page = out.read_text()
+        assert f'<h1>{name}: ' in page and page.endswith('</html>\n')
+        assert not list(tmp_path.glob('.*.part'))
+
+
+def test_a_report_does_not_change_what_is_told(
+    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip('bokeh', reason='Bokeh is not installed')
+    plain = call(capsys, 'replay', trace, '--fail-on-miss', '--json', '-')
+    assert plain[0] == 1
+    assert call(capsys, 'replay', trace, '--fail-on-miss', '--json', '-',
+                '--report', tmp_path / 'out.html') == plain
+
+
+def test_a_report_that_fails_leaves_the_old_file(
+    trace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    html = pytest.importorskip('mddag_executor.report.html')
+    pytest.importorskip('bokeh', reason='Bokeh is not installed')
+    out = tmp_path / 'out.html'
+    out.write_text('old')
+
+    def failing(file: Any, data: Any) -> None:
+        file.write(b'half')
+        raise OSError(28, 'No space left on device', str(out))
+
+    monkeypatch.setattr(html, 'write', failing)
+    status, _, err = call(capsys, 'replay', trace, '--report', out)
+    assert status == 2 and 'no space left' in err
+    assert out.read_text() == 'old' and not list(tmp_path.glob('.*.part'))
+
+
+def test_diff(
+    graph: Path, trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quick = tmp_path / 'quick.yaml'
+    quick.write_text(GRAPH % '1ms')
+    after = tmp_path / 'after.mcap'
+    call(capsys, 'simulate', quick, '--duration', '100ms', '--workers', 1, '--trace', after)
+    status, out, err = call(capsys, 'diff', trace, after, '--fail-on-worse', '--callbacks')
+    assert (status, err) == (0, '')
+    assert ['/n', 'n:s', '10', '10', '0', '10', '10', '0', '6', 'ms', '-50.0', '%', '6', 'ms',
+            '-50.0', '%', '6', 'ms', '-50.0', '%'] in [line.split() for line in out.splitlines()]
+    assert '/n:t' in out and '0 sinks are worse in the second run' in out
+    status, out, _ = call(capsys, 'diff', after, trace, '--fail-on-worse')
+    assert status == 1 and '1 sink is worse in the second run' in out
+    assert call(capsys, 'diff', after, trace)[0] == 0
+    status, out, _ = call(capsys, 'diff', after, trace, '--json', '-')
+    result = json.loads(out)
+    assert status == 0 and result['worse'] is True
+    sink = result['dags']['/n']['sinks']['/n:s']
+    assert sink['change_ns']['median'] == 3_000_000 and sink['change']['median'] == 1.0
+    # by another declaration nothing is late in either run, but one is slower
+    wide = tmp_path / 'wide.yaml'
+    wide.write_text(GRAPH.replace('5ms', '9ms') % '4ms')
+    assert call(capsys, 'diff', after, trace, wide, '--fail-on-worse')[0] == 0
+    assert call(capsys, 'diff', after, trace, wide, '--fail-on-worse', '--tolerance', '50%')[0] \
+        == 1
+    assert call(capsys, 'diff', after, trace, wide, '--fail-on-worse', '--tolerance', '100%')[0] \
+        == 0

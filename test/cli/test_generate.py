@@ -1,0 +1,117 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `generate`: one file or a folder, the same for the same seed, bad input in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mddag_executor.cli import main as program
+from msg_graph import load, loads
+from msg_graph.analysis import utilisation
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give the working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    status = program.main(['generate', *map(str, arguments)])
+    output = capsys.readouterr()
+    return status, output.out, output.err
+
+
+def test_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = call(
+        capsys, '--utilisation', 0.6, '--workers', 2, '--dags', 3, '--vertices', '4:6',
+        '--sinks', 2, '--periods', '10ms, 25ms', '--tightness', '0.4:0.9', '--seed', 5)
+    assert (status, err) == (0, '')
+    task_set = loads(out)
+    assert (task_set.workers, len(task_set.dags)) == (2, 3)
+    assert sum(utilisation(dag) or 0 for dag in task_set.dags) == pytest.approx(1.2, abs=1e-5)
+    assert {dag.period_ns for dag in task_set.dags} <= {10_000_000, 25_000_000}
+    assert all(len(dag.sinks) == 2 for dag in task_set.dags)
+    assert '\n# tightness: 0.4 to 0.9\n# deadline_of: period\n' in out
+
+
+def test_it_passes_the_check(capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(capsys, '-o', 'random.yaml', '--or-share', 0.5, '--method', 'uunifast') == (
+        0, '', '')
+    assert program.main(['graph', 'check', 'random.yaml']) == 0
+    assert '8 DAGs' in capsys.readouterr().out
+
+
+def test_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / 'again').mkdir()  # an empty one is taken
+    for name in ('sets', 'again'):
+        status, out, err = call(
+            capsys, '--sets', 5, '--utilisation', '0.2:0.6', '--workers', 3, '-o', name)
+        assert (status, out, err) == (0, '', '')
+    files = sorted((folder / 'sets').iterdir())
+    assert [file.name for file in files] == [f'set_{i:04d}.yaml' for i in range(5)]
+    for i, file in enumerate(files):
+        task_set = load(file)
+        total = sum(utilisation(dag) or 0 for dag in task_set.dags)
+        assert total / 3 == pytest.approx(0.2 + 0.1 * i, abs=1e-5)
+        assert file.read_bytes() == (folder / 'again' / file.name).read_bytes()
+    assert len({file.read_text() for file in files}) == 5
+    assert sorted(path.name for path in folder.iterdir()) == ['again', 'sets']
+
+
+@pytest.mark.parametrize(('arguments', 'line'), [
+    (['--sets', '0'], "mddag generate: argument --sets: '0' is no whole number from 1 up: "),
+    (['--sets', '3'], '--sets: several declarations make a folder: name one with -o OUT'),
+    (['--sets', '9999999', '-o', 'x'], '--sets 9999999: it is too many: '),
+    (['--sets', '3', '-o', 'full'], 'full: it is there already, and no empty folder: name'),
+    (['--sets', '3', '-o', 'full/file'], 'full/file: it is there already, and no empty folder: '),
+    (['--sets', '3', '-o', 'none/x'], 'none/x: there is no directory none'),
+    (['-o', 'full'], 'full: this is a directory: name a file'),
+    (['--utilisation', '0.2:0.6'], '--utilisation: one task set has one: give a number'),
+    (['--utilisation', '0.6:0.2', '--sets', '3', '-o', 'x'], '--utilisation 0.6:0.2: the first'),
+    (['--utilisation', '-1'], '--utilisation -1: it is out of range: give above 0 to 100'),
+    (['--utilisation', 'a'], "mddag generate: argument --utilisation: 'a' is no number: "),
+    (['--utilisation', '0.1:3', '--sets', '9', '-o', 'x'], '--utilisation 3: 8 DAGs of at most '),
+    (['--utilisation', '1e-7'], '--utilisation 1e-07: it leaves a callback less than 1 us: '),
+    (['--sinks', '5', '--vertices', '5'], '--sinks 5: a DAG of 5 vertices has at most 4: '),
+    (['--dags', '3:1'], '--dags 3:1: the first is larger: write the smaller one first'),
+    (['--dags', '0'], "mddag generate: argument --dags: '0' is no whole number from 1 up: "),
+    (['--workers', '0'], "mddag generate: argument --workers: '0' is no whole number from 1 up"),
+    (['--periods', '10'], 'mddag generate: argument --periods: '),
+    (['--method', 'best'], "mddag generate: argument --method: invalid choice: 'best' "),
+    (['--edge-probability', '2'], '--edge-probability 2: it is out of range: give from 0 to 1'),
+    (['--spread', 'nan'], "mddag generate: argument --spread: 'nan' is no number: "),
+    (['--seed', 'x'], "mddag generate: argument --seed: invalid int value: 'x': "),
+])
+def test_bad_input(
+    folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], line: str
+) -> None:
+    (folder / 'full').mkdir()
+    (folder / 'full' / 'file').write_text('mine')
+    before = sorted(folder.rglob('*'))
+    status, out, err = call(capsys, *arguments)
+    assert (status, out) == (2, '')
+    assert err.startswith(f'error: {line}') and err.count('\n') == 1
+    assert sorted(folder.rglob('*')) == before
+
+
+def test_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        program.main(['generate', '--help'])
+    assert caught.value.code == 0
+    assert 'mddag generate --utilisation 0.6 --seed 7 -o random.yaml' in capsys.readouterr().out

@@ -1,0 +1,130 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `graph assign-deadlines`."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+from mddag_executor.cli import main as program
+from msg_graph import load
+import pytest
+
+GRAPH = """\
+# Mine.
+mddag: 1
+workers: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: t, timer: 20ms, publishes: [/a, /b], dag: one, execution_time: 1ms}
+      - {name: x, subscription: /a, deadline: 5ms, execution_time: 1ms}  # urgent
+      - {name: y, subscription: /b, execution_time: 9ms}  # no deadline yet
+"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give the working directory, with a declaration."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'g.yaml').write_text(GRAPH)
+    return tmp_path
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    status = program.main(['graph', 'assign-deadlines', *map(str, arguments)])
+    output = capsys.readouterr()
+    return status, output.out, output.err
+
+
+def test_by_path(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = call(
+        capsys, 'g.yaml', '-o', 'o.yaml', '--runs', 20, '--duration', '200ms', '--json', 'o.json')
+    assert (status, err) == (0, '')
+    assert (folder / 'o.yaml').read_text() == GRAPH.replace('5ms', '4ms').replace(
+        'subscription: /b,', 'subscription: /b, deadline: 20ms,').replace(
+            '{name: y, subscription: /b, deadline: 20ms', '{name: y, deadline: 20ms, '
+            'subscription: /b')
+    assert [line.split()[-4:] for line in out.splitlines()[1:3]] == [
+        ['20', 'ms', '4', 'ms'], ['20', 'ms', '20', 'ms']]
+    assert out.splitlines()[-1] == (
+        'rad accepts 100.0 % (95 % confidence: 83.9 to 100.0 %) of 20 runs of seed 0')
+    result = json.loads((folder / 'o.json').read_text())
+    assert result['deadlines_ns'] == {'/n:x': 4_000_000, '/n:y': 20_000_000}
+    assert result['acceptance']['runs'] == 20 and result['acceptance']['ratio'] == 1.0
+
+
+def test_by_search(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = call(
+        capsys, 'g.yaml', '-o', 'o.yaml', '--by', 'search', '--target', 0.9, '--runs', 40,
+        '--seed', 7, '--duration', '200ms', '--budget', 'max', '--json', 'o.json')
+    assert (status, err) == (0, '')
+    result = json.loads((folder / 'o.json').read_text())
+    # x runs first: 1 + 1 of 2 ms; y has to wait for it: 1 + 1 + 9 of 10 ms.
+    assert 1.1 <= result['scale'] <= 1.112
+    assert result['target'] == 0.9 and len(result['tried']) > 4
+    assert result['acceptance']['seed'] == 8
+    deadlines = {c.key: c.deadline_ns for c in load('o.yaml').callbacks if c.deadline_ns}
+    assert deadlines == result['deadlines_ns']
+    assert deadlines['/n:y'] == pytest.approx(11_050_000, rel=0.01)
+    assert 'of 40 runs of seed 8, which took no part in the search' in out
+    assert 'scales tried' in out
+
+
+def test_standard_input_and_output(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Stdin:
+        buffer = io.BytesIO(GRAPH.encode())
+
+    monkeypatch.setattr('sys.stdin', Stdin())
+    status, out, err = call(capsys, '-', '--runs', 5, '--factor', 0.5)
+    assert status == 0
+    assert out.startswith('# Mine.\n') and 'deadline: 2ms, execution_time: 1ms}  # urgent' in out
+    assert 'rad accepts' in err
+
+
+@pytest.mark.parametrize(('arguments', 'line'), [
+    (['none.yaml'], 'none.yaml: no such file or directory: check the path'),
+    (['g.yaml', '--by', 'luck'], 'mddag graph assign-deadlines: argument --by: invalid choice'),
+    (['g.yaml', '--target', '0.9'], "--target: '--by path' has none: give --by search"),
+    (['g.yaml', '--by', 'search', '--factor', '2'], "--factor: '--by search' has none: "),
+    (['g.yaml', '--by', 'search', '--base', 'period'], "--base: '--by search' has none: "),
+    (['g.yaml', '--by', 'search', '--target', '1'], '--target 1: it is out of range: '),
+    (['g.yaml', '--by', 'search', '--target', '0.99', '--runs', '9'], '--target 0.99: 9 runs '),
+    (['g.yaml', '--base', 'deadline'], 'g.yaml: a sink has no deadline, on which --base '),
+    (['g.yaml', '--policy', 'edf'], "policy 'edf': there is no such policy: choose one of rad"),
+    (['g.yaml', '--runs', '0'], "mddag graph assign-deadlines: argument --runs: '0' is no whole "),
+    (['g.yaml', '--workers', '0'], "mddag graph assign-deadlines: argument --workers: '0' is no "),
+    (['g.yaml', '-o', 'x/y'], 'x/y: there is no directory x: make it first'),
+    (['g.yaml', '--json', '-'], '-: standard output can take only one of -o and --json: '),
+    (['no_times.yaml'], 'no_times.yaml:7: /n:t (and 1 more callbacks) declares no '),
+    (['wrong.yaml'], "wrong.yaml:7: callback '/n:t': nothing says what starts the callback: "),
+    (['busy.yaml', '--by', 'search', '--duration', '200ms', '--runs', '100', '--workers', '1'],
+     '--target 0.95: no scale with deadlines up to half of a run reaches it (the best'),
+])
+def test_bad_input(
+    folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], line: str
+) -> None:
+    (folder / 'no_times.yaml').write_text(GRAPH.replace(', execution_time: 1ms', ''))
+    (folder / 'wrong.yaml').write_text(GRAPH.replace('timer: 20ms, ', ''))
+    (folder / 'busy.yaml').write_text(GRAPH.replace('9ms', '90ms'))
+    before = sorted(folder.iterdir())
+    status, out, err = call(capsys, *arguments)
+    assert status == 2
+    assert err.startswith(f'error: {line}') and err.count('\n') == 1
+    assert sorted(folder.iterdir()) == before

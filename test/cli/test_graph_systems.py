@@ -1,0 +1,144 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verbs `graph from-trace` and `graph from-ros`, `--trace` of `from-caret`, and drift."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import json
+from pathlib import Path
+import re
+import subprocess
+
+from mddag_executor.report.drift import drift_lines, MOST_LINES
+import msg_graph
+import pytest
+
+Mddag = Callable[..., subprocess.CompletedProcess[str]]
+
+BAG = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'
+ARCHITECTURE = """\
+nodes:
+- node_name: /sensing/imu/imu_corrector
+  callbacks:
+  - {callback_name: /sensing/imu/imu_corrector/callback_0, callback_type: timer_callback,
+     period_ns: 33000000}
+- node_name: /nobody
+  callbacks:
+  - {callback_name: /nobody/callback_0, callback_type: timer_callback, period_ns: 5000000}
+"""
+
+
+def test_from_trace(mddag: Mddag, tmp_path: Path) -> None:
+    done = mddag('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, 'no blank left to fill in\n', '')
+    task_set = msg_graph.load(tmp_path / 'g.yaml')
+    assert len(task_set.dags) == 11 and len(task_set.vertices) == 86
+    with BAG.open('rb') as stream:
+        done = mddag('graph', 'from-trace', '-', stdin=stream)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout.splitlines()[1:] == (tmp_path / 'g.yaml').read_text().splitlines()[1:]
+
+
+def test_from_trace_of_something_else(mddag: Mddag, tmp_path: Path) -> None:
+    (tmp_path / 'x').write_text('no trace')
+    for name in ('x', 'none', str(tmp_path)):
+        done = mddag('graph', 'from-trace', name, '-o', 'g.yaml', cwd=tmp_path)
+        assert (done.returncode, done.stdout) == (2, '')
+        assert done.stderr.startswith(f'error: {name}: ') and done.stderr.count('\n') == 1
+    assert not (tmp_path / 'g.yaml').exists()
+
+
+def test_from_caret_with_a_trace(mddag: Mddag, tmp_path: Path) -> None:
+    (tmp_path / 'a.yaml').write_text(ARCHITECTURE)
+    done = mddag('graph', 'from-caret', 'a.yaml', '--trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (0, "2 blanks to fill in, marked 'FILL IN'\n")
+    assert done.stderr == f'warning: {BAG}: 1 of 2 callbacks did not run in it\n'
+    text = (tmp_path / 'g.yaml').read_text()
+    assert len(re.findall(r'# measured in \d+ executions\n        execution_time: {quant', text)
+               ) == 1
+    done = mddag('graph', 'from-caret', '-', '--trace', '-', input=ARCHITECTURE)
+    assert (done.returncode, done.stdout) == (2, '')
+
+
+def test_from_ros_where_nothing_runs(mddag: Mddag, tmp_path: Path) -> None:
+    pytest.importorskip('rclpy')
+    done = mddag('graph', 'from-ros', '--timeout', '0.3', '-o', 'g.yaml', cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith('error: ROS graph: no node ')
+    assert not (tmp_path / 'g.yaml').exists()
+    done = mddag('graph', 'from-ros', '--timeout', '-1')
+    assert (done.returncode, done.stderr.count('\n')) == (2, 1)
+
+
+def test_replay_tells_of_drift(mddag: Mddag, tmp_path: Path) -> None:
+    done = mddag('replay', BAG, '--json', '-')
+    assert done.returncode == 0
+    assert json.loads(done.stdout)['drift'] == []
+    assert 'disagree' not in mddag('replay', BAG).stdout
+    mddag('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
+    text = (tmp_path / 'g.yaml').read_text()
+    (tmp_path / 'h.yaml').write_text(text.replace('timer: 100ms', 'timer: 200ms'))
+    done = mddag('replay', BAG, 'h.yaml', '--json', 'r.json', cwd=tmp_path)
+    assert done.returncode == 0
+    found = json.loads((tmp_path / 'r.json').read_text())['drift']
+    assert {each['kind'] for each in found} == {'rate'}
+    assert done.stdout.splitlines()[-1 - min(len(found), MOST_LINES)].startswith(
+        f'the run and the declaration disagree in {len(found)} point')
+
+
+def test_drift_lines() -> None:
+    assert list(drift_lines([])) == []
+    assert list(drift_lines([{'text': 'a\x1b'}])) == [
+        'the run and the declaration disagree in 1 point:', '  a\\x1b']
+    many = list(drift_lines([{'text': str(i)} for i in range(MOST_LINES + 3)]))
+    assert (len(many), many[-1]) == (MOST_LINES + 2, '  … (3 more)')
+
+
+def test_includes(mddag: Mddag, tmp_path: Path) -> None:
+    (tmp_path / 'part.yaml').write_text(
+        'mddag: 1\narguments:\n  d:\nnodes:\n  - {node: /n, callbacks: '
+        '[{name: t, timer: 10ms, deadline: $(d)}]}\n')
+    top = tmp_path / 'top.yaml'
+    top.write_text('mddag: 1\ninclude:\n  - {file: part.yaml, namespace: /a, set: {d: 5ms}}\n'
+                   '  - {file: part.yaml, namespace: /b, set: {d: 6}}\n')
+    done = mddag('graph', 'check', 'top.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, '')
+    assert done.stderr.startswith("error: part.yaml:5: callback '/b/n:t': 'deadline': '6' has no")
+    top.write_text(top.read_text().replace('d: 6', 'd: 6ms'))
+    done = mddag('graph', 'check', 'top.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert '2 DAGs, 2 vertices' in done.stdout
+    done = mddag('graph', 'check', '-', input=top.read_text(), cwd=tmp_path)
+    assert done.returncode == 2
+    assert 'not read from a file includes nothing' in done.stderr
+    done = mddag('simulate', 'top.yaml', '--policy', 'rad', '--workers', '1', '--duration',
+                 '100ms', '--trace', 's.mcap', '--execution-times', '-', cwd=tmp_path,
+                 input='{"/a/n": {"/a/n:t": 10}, "/b/n": {"/b/n:t": 10}}')
+    assert (done.returncode, done.stderr) == (0, '')
+    top.unlink()  # the trace holds all of the declaration
+    done = mddag('replay', 's.mcap', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    done = mddag('graph', 'fmt', 'part.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+
+
+@pytest.mark.parametrize(('verb', 'example'), [
+    ('from-trace', 'mddag graph from-trace run.mcap -o graph.yaml'),
+    ('from-ros', 'mddag graph from-ros -o graph.yaml')])
+def test_help_has_an_example(mddag: Mddag, verb: str, example: str) -> None:
+    done = mddag('graph', verb, '--help')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert example in done.stdout

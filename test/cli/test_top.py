@@ -1,0 +1,178 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import json
+import os
+from pathlib import Path
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+from typing import Any
+
+from mddag_executor.cli.top import Board, GONE_AFTER_S, picture, plain
+import pytest
+
+from .test_run import GRAPH
+
+Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+EVIL = 'mddag: \x1b]0;owned\x07\x1b[2J[bold]x[/bold]\nrm'
+
+
+def array(*statuses: tuple[str, str, int, dict[str, str]]) -> Any:
+    return SimpleNamespace(status=[
+        SimpleNamespace(
+            hardware_id=process, name=name, level=bytes([level]), message='fine\x1b[31m',
+            values=[SimpleNamespace(key=k, value=v) for k, v in values.items()])
+        for process, name, level, values in statuses])
+
+
+DAG = {'window_missed_ratio': '0', 'jobs': '7', 'period_ms': '20.000'}
+POOL = {'idle_workers': '5', 'callbacks_per_s': '12.5'}
+
+
+# --- what is shown -------------------------------------------------------------------------------
+
+def test_the_newest_status_of_each_process_is_shown():
+    board = Board()
+    board.take(array(('b/2', 'mddag: x', 0, DAG), ('a/1', 'mddag: x', 1, DAG)))
+    board.take(array(('a/1', 'mddag: x', 2, {**DAG, 'jobs': '8'}), ('a/1', 'mddag: w', 0, POOL)))
+    assert [(s.process, s.level) for s in board.statuses()] == [
+        ('a/1', 'OK'), ('a/1', 'ERROR'), ('b/2', 'OK')]
+    text = plain(board.statuses())
+    assert re.search(r'a/1 +mddag: x +ERROR +20.000 +8 ', text)
+    assert re.search(r'a/1 +mddag +OK +5 +- +12.5 ', text)
+
+
+def test_statuses_of_others_are_left_out():
+    board = Board()
+    board.take(array(('disk', 'smartd: sda', 2, {'temperature': '80'}), ('', 'x', 77, {})))
+    assert board.statuses() == []
+
+
+def test_a_process_that_says_nothing_any_more_is_gone():
+    now = [0.0]
+    board = Board(lambda: now[0])
+    board.take(array(('a/1', 'mddag: x', 0, DAG)))
+    now[0] = GONE_AFTER_S
+    assert board.statuses()[0].level == 'OK'
+    now[0] += 1
+    assert (board.statuses()[0].level, board.statuses()[0].message) == (
+        'GONE', 'nothing heard for 6 s')
+
+
+def test_names_cannot_command_the_terminal():
+    import io
+
+    from rich.console import Console
+    board = Board()
+    board.take(array((EVIL, EVIL, 1, {**DAG, 'jobs': EVIL}), (EVIL, EVIL, 9, POOL)))
+    out = io.StringIO()
+    Console(file=out, width=400, force_terminal=True).print(picture(board.statuses()))
+    coloured = re.sub(r'\x1b\[[0-9;]*m', '', out.getvalue())
+    for text in (plain(board.statuses()), coloured):
+        assert '\x1b' not in text and '\x07' not in text
+        assert '[bold]x[/bold]' in text and '\\x1b]0;owned' in text
+
+
+# --- over ROS ------------------------------------------------------------------------------------
+
+@pytest.fixture
+def running(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """Run a graph in another process; its diagnostics come every 0.2 s."""
+    graph = tmp_path / 'graph.yaml'
+    graph.write_text(GRAPH)
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'run', str(graph), '--synthetic', 'sleep',
+         '--diagnostics', '200ms'], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    yield process
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=20)
+    assert process.returncode == 0
+
+
+def test_once_shows_another_process(running: Any, mddag: Mddag):
+    done = mddag('top', '--once', '--json', '-')
+    assert (done.returncode, done.stderr) == (0, '')
+    found = {s['name']: s for s in json.loads(done.stdout)['statuses']}
+    assert set(found) == {'mddag: main', 'mddag: workers'}
+    assert found['mddag: main']['process'].endswith(f'/{running.pid}')
+    assert found['mddag: main']['values']['period_ms'] == '20.000'
+    done = mddag('top', '--once')
+    assert done.returncode == 0 and re.search(r'/\d+ +mddag: main +\w+ +20.000 ', done.stdout)
+    done = mddag('top', '--duration', '3500ms')
+    assert done.returncode == 0 and done.stdout.count('workers of') >= 2
+
+
+def test_live_in_a_terminal_and_ctrl_c_ends_it(running: Any):
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.environ.update(TERM='xterm-256color', COLUMNS='200', LINES='40')
+        os.execv(sys.executable, [sys.executable, '-m', 'mddag_executor', 'top'])
+    shown = b''
+    end = time.monotonic() + 30
+    interrupted = False
+    while time.monotonic() < end:
+        if select.select([terminal], [], [], 0.2)[0]:
+            try:
+                data = os.read(terminal, 65536)
+            except OSError:
+                break  # how Linux says that the other side is closed
+            if not data:
+                break
+            shown += data
+        if shown.count(b'mddag: main') >= 3 and not interrupted:
+            interrupted = True
+            os.kill(pid, signal.SIGINT)
+    _, status = os.waitpid(pid, 0)
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(status) == 0
+    text = shown.decode()
+    assert '\x1b[?1049h' in text and '\x1b[?1049l' in text  # the terminal is as it was before
+    assert 'workers of' in text and 'Traceback' not in text
+
+
+def test_nobody_to_hear(mddag: Mddag):
+    done = mddag('top', '--once', '--topic', '/nobody', '--timeout', '300ms')
+    assert done.returncode == 2 and done.stdout == ''
+    assert done.stderr.startswith('error: /nobody: no executor has published its state here: ')
+    done = mddag('top', '--duration', '300ms', '--topic', '/nobody')
+    assert done.returncode == 2
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (['--topic', 'a b'], '--topic a b: '),
+    (['--duration', '3'], 'has no unit'),
+    (['--once', '--json', 'no/such/dir/x.json'], 'no directory'),
+])
+def test_bad_input(mddag: Mddag, arguments: list[str], message: str):
+    done = mddag('top', *arguments)
+    assert done.returncode == 2 and done.stdout == ''
+    assert done.stderr.startswith('error: ') and message in done.stderr
+    assert done.stderr.count('\n') == 1
+
+
+def test_run_takes_no_strange_period(mddag: Mddag, tmp_path: Path):
+    (tmp_path / 'graph.yaml').write_text(GRAPH)
+    for value, message in (('1', 'has no unit'), ('1ms', 'too short'), ('never', 'never')):
+        done = mddag('run', str(tmp_path / 'graph.yaml'), '--synthetic', 'sleep',
+                     '--diagnostics', value)
+        assert done.returncode == 2 and message in done.stderr

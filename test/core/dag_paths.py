@@ -1,0 +1,58 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What follows from the graph of a DAG, by going through all its paths: for the slow simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from msg_graph import Dag, Vertex
+
+
+def reachable_sinks(dag: Dag, index: int) -> set[int]:
+    """Return the sinks that a vertex leads to, itself included."""
+    vertex = dag.vertices[index]
+    if not vertex.successors:
+        return {index}
+    return set().union(*(reachable_sinks(dag, after) for after in vertex.successors))
+
+
+def paths(dag: Dag, index: int) -> Iterator[list[Vertex]]:
+    """Yield every path from a vertex to a sink."""
+    vertex = dag.vertices[index]
+    for after in vertex.successors:
+        for path in paths(dag, after):
+            yield [vertex, *path]
+    if not vertex.successors:
+        yield [vertex]
+
+
+def ways_to(dag: Dag, index: int) -> Iterator[list[int]]:
+    """Yield every path from the source to a vertex."""
+    before = dag.vertices[index].predecessors
+    for one in before:
+        for way in ways_to(dag, one):
+            yield [*way, index]
+    if not before:
+        yield [index]
+
+
+def least_laxity(dag: Dag, index: int) -> int:
+    """Return the least of the sinks' deadlines less the mean times of a path to them, in ns."""
+    return min(
+        (path[-1].deadline_ns or 0) - sum(
+            v.callback.execution_time.mean_ns for v in path
+            if v.callback.execution_time is not None)
+        for path in paths(dag, index))

@@ -1,0 +1,254 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The policy ros2: wait-set order and polling rounds, by hand, by property and in the queues."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+from mddag_executor.core import PolicyError, Scheduler, Tables
+from mddag_executor.core.queues import SWEEP_AT
+from mddag_executor.simulate import Settings, simulate, SimulationError
+import pytest
+
+from .task_sets import Case, cases, declaration, examples
+from .test_by_hand import after, case, log, single, source, starts
+
+
+def ros2(callbacks: list[dict[str, Any]], ticks: dict[str, int], **more: Any) -> Case:
+    return case(callbacks, ticks, policy='ros2', **more)
+
+
+# --- order ---------------------------------------------------------------------------------------
+
+def test_timers_then_subscriptions_then_services() -> None:
+    callbacks = [
+        {'node': f'/{name}', 'name': name, 'period': '50us', 'deadline': '50us', kind: f'/{name}'}
+        for name, kind in (
+            ('serve', 'service'), ('sub', 'subscription'), ('sub2', 'subscription'))]
+    callbacks.append(single('timer', 50))
+    ticks = dict.fromkeys(('serve', 'sub', 'sub2', 'timer'), 1)
+    assert starts(ros2(callbacks, ticks), 40) == ['timer.0', 'sub.0', 'sub2.0', 'serve.0']
+
+
+def test_a_sync_is_a_subscription() -> None:
+    """Both get ready at 1, when s ends; the sync stands first in the declaration."""
+    callbacks = [
+        {'node': '/n', 'name': 's', 'timer': '50us', 'publishes': ['/a', '/b'], 'dag': 's'},
+        {'node': '/n', 'name': 'sync', 'sync': ['/a', '/b'], 'deadline': '50us'},
+        {'node': '/n', 'name': 'sub', 'subscription': '/a', 'deadline': '50us'}]
+    assert starts(ros2(callbacks, {'s': 1, 'sync': 1, 'sub': 1}), 40) == ['s.0', 'sync.0', 'sub.0']
+
+
+def test_what_becomes_ready_during_a_round_waits_for_the_next() -> None:
+    """The timer that is due at 4 is first among timers, but b was ready at the poll, at 3."""
+    callbacks = [single('due', 4), source('a', 100), after('a', 'b', 100), after('a', 'c', 100)]
+    of = ros2(callbacks, {'due': 1, 'a': 2, 'b': 2, 'c': 2})
+    # Round 1 at 0: due, a. Round 2 at 3: b, c. Round 3 at 7: due.1. Round 4 at 8: due.2.
+    assert [(now, who) for now, kind, _, who in log(of, 11) if kind == 'start'] == [
+        (0, 'due.0'), (1, 'a.0'), (3, 'b.0'), (5, 'c.0'), (7, 'due.1'), (8, 'due.2')]
+    # Without rounds the timer would go in front.
+    assert starts(case(callbacks, {'due': 1, 'a': 2, 'b': 2, 'c': 2}, policy='picas'), 11)[:4] == [
+        'due.0', 'a.0', 'b.0', 'due.1']
+
+
+def test_a_callback_runs_once_in_a_round() -> None:
+    """Two runs of u wait when the executor polls at 6; b goes between them."""
+    callbacks = [single('u', 3), source('s', 100), after('s', 'b', 100)]
+    of = ros2(callbacks, {'u': 1, 's': 5, 'b': 1})
+    assert starts(of, 10) == ['u.0', 's.0', 'u.1', 'b.0', 'u.2', 'u.3']
+
+
+def test_a_chain_takes_a_round_for_each_link() -> None:
+    """Each link waits for a whole round of the others: the chain ends late, whatever its rank."""
+    callbacks = [source('c0', 100), after('c0', 'c1'), after('c1', 'c2', 9),
+                 *(single(f'o{i}', 7) for i in range(3))]
+    of = ros2(callbacks, dict.fromkeys(('c0', 'c1', 'c2', 'o0', 'o1', 'o2'), 2))
+    assert starts(of, 22) == [
+        'c0.0', 'o0.0', 'o1.0', 'o2.0',    # polled at 0
+        'o0.1', 'o1.1', 'o2.1', 'c1.0',    # at 8
+        'o0.2', 'o1.2', 'o2.2']            # at 16: c1 ends then, and c2 waits behind them
+
+
+def test_workers_share_a_round() -> None:
+    """Two workers take what one of them polled; the round goes on until it is empty."""
+    callbacks = [single('x', 10), *(single(f'r{i}', 50) for i in range(3))]
+    of = ros2(callbacks, {'x': 4, 'r0': 12, 'r1': 3, 'r2': 6}, workers=2)
+    # x.1 is due at 10, when worker 1 runs r2 (7 to 13): worker 0 polls at 12.
+    assert [entry for entry in log(of, 20) if entry[1] == 'start'] == [
+        (0, 'start', 0, 'x.0'), (0, 'start', 1, 'r0.0'), (4, 'start', 0, 'r1.0'),
+        (7, 'start', 0, 'r2.0'), (12, 'start', 1, 'x.1')]
+
+
+def test_nobody_polls_while_all_workers_are_busy() -> None:
+    """What is ready at 4 and at 6 is in one round, in order of places, when the worker polls."""
+    callbacks = [
+        {'node': '/n', 'name': 'late', 'timer': '6us', 'deadline': '99us', 'dag': 'late'},
+        {'node': '/n', 'name': 'soon', 'timer': '4us', 'deadline': '99us', 'dag': 'soon'},
+        single('long', 100)]
+    of = ros2(callbacks, {'late': 1, 'soon': 1, 'long': 5})
+    assert starts(of, 9) == ['late.0', 'soon.0', 'long.0', 'late.1', 'soon.1']
+
+
+# --- callback groups -----------------------------------------------------------------------------
+
+def test_what_is_blocked_is_left_out_of_the_round() -> None:
+    """At 0 b is passed over: a holds the group. At 1 c ends, and a poll finds b blocked again."""
+    group = {'group': 'g'}
+    callbacks = [single('a', 100, **group), single('b', 100, **group), single('c', 100),
+                 single('d', 100), single('e', 2, 100)]
+    of = ros2(callbacks, {'a': 3, 'b': 1, 'c': 1, 'd': 3, 'e': 9}, workers=2)
+    assert [entry for entry in log(of, 12) if entry[1] == 'start'] == [
+        (0, 'start', 0, 'a.0'), (0, 'start', 1, 'c.0'), (1, 'start', 1, 'd.0'),
+        # The group is free at 3, but e was in the round of 0 yet, and b waits for the next poll.
+        (3, 'start', 0, 'e.0'), (4, 'start', 1, 'b.0'), (5, 'start', 1, 'e.1')]
+
+
+def test_a_blocked_one_runs_as_soon_as_its_group_is_free() -> None:
+    callbacks = [single('a', 100, group='g'), single('b', 100, group='g')]
+    of = ros2(callbacks, {'a': 3, 'b': 1}, workers=2)
+    assert log(of, 10)[-2:] == [(3, 'start', 0, 'b.0'), (4, 'end', 0, 'b.0')]
+
+
+def test_what_was_aborted_takes_no_place_in_a_round() -> None:
+    """Two runs of b wait for the poll at 9; that of DAG s, the first, was aborted just then."""
+    callbacks = [
+        {'node': '/n', 'name': 's', 'timer': '99us', 'publishes': ['/mid', '/early'], 'dag': 's',
+         'on_miss': 'abort'},
+        {'node': '/n', 'name': 'z', 'timer': '99us', 'publishes': ['/way'], 'dag': 'z'},
+        {'node': '/n', 'name': 'mid', 'subscription': '/mid', 'publishes': ['/b']},
+        {'node': '/n', 'name': 'way', 'subscription': '/way', 'publishes': ['/b', '/c']},
+        {'node': '/n', 'name': 'early', 'subscription': '/early', 'deadline': '6us'},
+        {'node': '/n', 'name': 'b', 'subscription': '/b', 'deadline': '90us'},
+        {'node': '/n', 'name': 'c', 'subscription': '/c', 'deadline': '90us'}]
+    of = ros2(callbacks, {**dict.fromkeys(('s', 'z', 'mid', 'way', 'b', 'c'), 1), 'early': 5})
+    assert log(of, 80)[-6:] == [
+        (4, 'start', 0, 'early.0'), (9, 'end', 0, 'early.0'), (9, 'start', 0, 'b.0'),
+        (10, 'end', 0, 'b.0'), (10, 'start', 0, 'c.0'), (11, 'end', 0, 'c.0')]
+
+
+# --- properties ----------------------------------------------------------------------------------
+
+@examples(200)
+@given(cases(('ros2',), groups=False, bounds=False), st.integers(20, 80))
+def test_nothing_starves(of: Case, horizon: int) -> None:
+    """Nobody starts three times while another waits: the third is two polls after the first."""
+    dags = of.task_set.dags
+    ready: dict[tuple[int, int, int], int] = {
+        (dag.index, dag.source, job): job * dag.period_ns // 1000
+        for dag in dags for job in range(-(-horizon * 1000 // dag.period_ns))}
+    events = of.events(of.run(horizon))
+    ended: dict[tuple[int, int, int], int] = {}
+    started: dict[tuple[int, int, int], int] = {}
+    for place, (now, kind, _, dag, vertex, job) in enumerate(events):
+        if kind == 'start':
+            started[dag, vertex, job] = place
+        else:
+            ended[dag, vertex, job] = now
+            for successor in dags[dag].vertices[vertex].successors:
+                before = dags[dag].vertices[successor].predecessors
+                if all((dag, each, job) in ended for each in before):
+                    ready[dag, successor, job] = now
+    runs: dict[str, list[int]] = {}
+    for (dag, vertex, _), place in started.items():
+        runs.setdefault(dags[dag].vertices[vertex].callback.key, []).append(place)
+    for (dag, vertex, job), since in ready.items():
+        key = dags[dag].vertices[vertex].callback.key
+        earlier = [each for each in ready if each != (dag, vertex, job)
+                   and dags[each[0]].vertices[each[1]].callback.key == key
+                   and ready[each] <= since]
+        end = started.get((dag, vertex, job), len(events))
+        for other, places in runs.items():
+            if other != key:
+                waited = [p for p in places if events[p][0] > since and p < end]
+                assert len(waited) <= 2 * (1 + len(earlier))
+
+
+# --- the core by itself --------------------------------------------------------------------------
+
+def scheduler(workers: int = 1) -> Scheduler:
+    tables = Tables.build(declaration([
+        {'node': '/n', 'name': 'one', 'subscription': '/x', 'period': '10us', 'dag': 'x',
+         'publishes': ['/a', '/b']},
+        {'node': '/n', 'name': 'join', 'sync': ['/a', '/b'], 'deadline': '10us'},
+        {'node': '/n', 'name': 'tick', 'timer': '10us', 'deadline': '10us', 'dag': 't'}]),
+        legs=True)
+    return Scheduler(tables, workers, 'ros2', propagate=False)
+
+
+def test_places_in_the_wait_set() -> None:
+    """The timer, the subscription, two legs of the sync, and behind them what nobody declares."""
+    tables = scheduler().tables
+    assert tables.entity == [1, 2, 0, 4]
+    assert tables.n_entities == 4
+
+
+def test_legs_are_entities_of_their_own() -> None:
+    core = scheduler(workers=3)
+    slot = core.release(0, 0, 0, 0)
+    first, second = core.execution(slot, 1, 0), core.execution(slot, 1, 1)
+    core.ready(second, 1)
+    core.ready(first, 2)
+    other = core.execution(core.release(0, 1, 0, 2), 1, 1)
+    core.ready(other, 2)
+    assert core.queue_length == 3
+    assert [core.take(0, 3), core.take(1, 3)] == [second, first]  # one round, by arrival
+    assert core.take(2, 3) == other  # of the next one: its entity had one in this round
+
+
+def test_each_undeclared_callback_is_an_entity() -> None:
+    core = scheduler(workers=4)
+    undeclared = [core.undeclared(i, -1, 0) for i in range(3)]
+    slot = core.release(1, 0, 0, 0)
+    core.ready(core.source(slot), 0)
+    assert core.take(0, 1) == core.source(slot)
+    late = core.source(core.release(1, 1, 1, 1))
+    core.ready(late, 1)
+    assert [core.take(worker, 1) for worker in (1, 2, 3)] == undeclared  # before the timer
+    core.complete(undeclared[0], 2)
+    assert core.take(1, 2) == late
+
+
+def test_dropped_ones_leave_the_queues() -> None:
+    """Memory is bounded, the length is right, and the entity is polled once for each round."""
+    core = scheduler()
+    slot = core.release(1, 0, 0, 0)
+    kept = core.source(slot)
+    for i in range(3 * SWEEP_AT):
+        core.drop(core.undeclared(i, -1, 0), 0)
+    core.ready(kept, 1)
+    assert core.queue_length == 1
+    assert sum(map(len, core.state.entity_queue)) <= SWEEP_AT + 2
+    assert len(core.state.unpolled) == len(set(core.state.unpolled)) <= 2
+    assert core.take(0, 2) == kept
+    core.complete(kept, 3)
+    assert core.take(0, 4) == -1
+    assert core.queue_length == 0
+
+
+def test_no_preemption() -> None:
+    task_set = declaration([single('a', 10)])
+    with pytest.raises(PolicyError, match="policy 'ros2': .* preempts no callback: run it"):
+        Scheduler(Tables.build(task_set), 1, 'ros2', preemptive=True)
+    of = ros2([single('a', 10)], {'a': 1})
+    settings = Settings(policy='ros2', workers=1, preemptive=True, duration_ns=10)
+    with pytest.raises(PolicyError, match='preempts no callback'):
+        simulate(task_set, of.load(10), settings)
+    assert not simulate(
+        task_set, of.load(10), Settings(policy='ros2', preemptive=None)).preemptive
+    with pytest.raises(SimulationError, match='workers'):
+        simulate(task_set, of.load(10), Settings(policy='ros2', workers=0))

@@ -1,0 +1,83 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Orders that rclpy's own tests rely on, with seven workers as with one thread."""
+
+from __future__ import annotations
+
+from rclpy.action import ActionClient, ActionServer
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.task import Future
+from test_msgs.action import Fibonacci
+
+from .conftest import wait_for
+
+
+def test_tasks_created_while_nobody_spins_run_newest_first(make_executor):
+    executor, order = make_executor(), []
+    for name in 'abc':
+        executor.create_task(order.append, name)
+    for _ in range(3):
+        executor.spin_once(timeout_sec=0)
+    assert order == ['c', 'b', 'a']
+
+
+def test_tasks_created_while_nobody_spins_run_in_a_spin_too(make_executor):
+    executor, order = make_executor(num_workers=1), []
+    tasks = [executor.create_task(order.append, name) for name in 'abc']
+    executor.spin_until_future_complete(tasks[0], 5.0)
+    assert order == ['c', 'b', 'a']
+
+
+def test_a_coroutine_goes_on_in_the_step_after_its_future_is_done(make_executor):
+    executor = make_executor()
+    future: Future = Future(executor=executor)
+
+    async def wait() -> str:
+        await future
+        return 'done'
+
+    task = executor.create_task(wait)
+    executor.spin_once(timeout_sec=0)
+    assert not task.done()
+    future.set_result(None)
+    executor.spin_once(timeout_sec=1)
+    assert task.done() and task.result() == 'done'
+
+
+def test_feedback_is_handled_before_a_goals_future_ends_the_spin(make_executor, make_node):
+    """The server publishes it before it succeeds, right after it has accepted the goal."""
+    node, feedback = make_node(), []
+    group = ReentrantCallbackGroup()
+
+    def execute(goal_handle):
+        goal_handle.publish_feedback(Fibonacci.Feedback(sequence=[1, 1, 2, 3]))
+        goal_handle.succeed()
+        return Fibonacci.Result()
+
+    server = ActionServer(node, Fibonacci, 'fibonacci', execute, callback_group=group)
+    client = ActionClient(node, Fibonacci, 'fibonacci', callback_group=group)
+    executor = make_executor()
+    executor.add_node(node)
+    assert client.wait_for_server(5.0)
+    # A subscription that has not been matched yet gets nothing, whoever runs its callback.
+    assert wait_for(lambda: node.count_subscribers('/fibonacci/_action/feedback') == 1)
+    for number in range(1, 6):
+        sent = client.send_goal_async(
+            Fibonacci.Goal(), feedback_callback=lambda m: feedback.append(m))
+        executor.spin_until_future_complete(sent, 5.0)
+        assert sent.done() and sent.result().accepted
+        assert len(feedback) == number
+    server.destroy()
+    client.destroy()

@@ -1,0 +1,74 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+import gc
+import json
+import subprocess
+import sys
+import time
+from typing import Any
+
+from mddag_executor.live.bench.limits import BODIES, BODY_S, GcWatch
+import pytest
+
+
+@pytest.mark.parametrize('name', BODIES)
+def test_a_body_takes_about_its_time(name: str):
+    body = BODIES[name]()
+    times = []
+    for _ in range(5):
+        begin = time.perf_counter() if name == 'sleep' else time.thread_time()
+        body()
+        times.append((time.perf_counter() if name == 'sleep' else time.thread_time()) - begin)
+    assert BODY_S / 4 < min(times) < BODY_S * 4
+
+
+def test_collections_are_noticed():
+    with GcWatch() as watch:
+        gc.collect()
+    gc.collect()
+    assert len(watch.pauses) == 1 and watch.pauses[0] > 0
+
+
+def limits(*arguments: str) -> Any:
+    done = subprocess.run(
+        [sys.executable, '-m', 'mddag_executor.live.bench.limits', *arguments, '--json'],
+        capture_output=True, text=True, timeout=60, check=False, stdin=subprocess.DEVNULL)
+    assert 'Traceback' not in done.stderr, done.stderr
+    return done
+
+
+def test_the_gil_measurement_has_all_of_its_figures():
+    rows = json.loads(limits('gil', '--seconds', '0.2', '--workers', '3').stdout)
+    assert [row['callbacks'] for row in rows] == list(BODIES)
+    assert all(row['3 workers /s'] > 0 and row['timer late max us'] > 0 for row in rows)
+    # what waits goes on in all workers at once, whatever else the machine does
+    assert rows[0]['speed-up'] > 1.5
+
+
+def test_the_gc_measurement_shows_what_freezing_takes_away():
+    rows = json.loads(limits('gc', '--seconds', '0.2', '--workers', '2').stdout)
+    thawed, frozen = rows
+    assert (thawed['freeze_gc'], frozen['freeze_gc']) == ('False', 'True')
+    assert frozen['full collection ms'] < thawed['full collection ms'] / 2
+
+
+def test_a_policy_that_is_not_allowed_is_said_in_one_line():
+    done = limits('policy', '--seconds', '0.1', '--workers', '2')
+    if done.returncode == 0:
+        assert len(json.loads(done.stdout)) == 3
+    else:
+        assert done.returncode in (1, 2) and 'may not use SCHED_FIFO' in done.stderr

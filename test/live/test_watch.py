@@ -1,0 +1,88 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a live run tells the drift rules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from mddag_executor.live.watch import Watch
+from msg_graph import loads
+from rclpy.node import Node
+from std_msgs.msg import Empty
+
+from .conftest import Spinning, wait_for
+
+TEXT = """\
+mddag: 1
+nodes:
+  - node: /camera
+    callbacks:
+      - {name: grab, timer: 20ms, publishes: [/image]}
+  - node: /eye
+    callbacks:
+      - {name: see, subscription: /image, deadline: 20ms}
+      - {name: hear, subscription: /sound, period: 50ms, deadline: 50ms, dag: sound}
+"""
+
+
+def test_drift(make_executor: Callable[..., Any], make_node: Callable[..., Node]) -> None:
+    task_set = loads(TEXT)
+    executor = make_executor(task_set, num_workers=2)
+    watch = Watch(executor, task_set)
+    camera, eye = make_node('camera'), make_node('eye')
+    image = camera.create_publisher(Empty, '/image', 10)
+    extra = camera.create_publisher(Empty, '/extra', 10)
+    seen: list[int] = []
+
+    def grab() -> None:
+        image.publish(Empty())
+        image.publish(Empty())
+        extra.publish(Empty())
+
+    camera.create_timer(0.02, grab)
+    eye.create_subscription(Empty, '/image', lambda _: seen.append(1), 10)
+    for node in (camera, eye):
+        executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(seen) > 60, 10.0)
+    found = {(each.kind, each.callback): each
+             for each in watch.drift(executor.statistics())}
+    assert found['publishes', '/camera:grab'].topic == '/extra'
+    assert found['never ran', '/eye:hear'].observed == 0
+    twice = found['rate', '/eye:see']
+    assert twice.declared is not None and twice.observed is not None
+    assert twice.observed > 1.5 * twice.declared
+    assert len(found) == 3
+
+
+def test_no_drift(make_executor: Callable[..., Any], make_node: Callable[..., Node]) -> None:
+    text = TEXT[:TEXT.index('      - {name: hear')]
+    task_set = loads(text)
+    executor = make_executor(task_set, num_workers=2)
+    watch = Watch(executor, task_set)
+    camera, eye = make_node('camera'), make_node('eye')
+    image = camera.create_publisher(Empty, '/image', 10)
+    seen: list[int] = []
+    eye.create_subscription(Empty, '/image', lambda _: seen.append(1), 10)
+    camera.create_timer(0.02, lambda: image.publish(Empty()))
+    for node in (camera, eye):
+        executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(seen) > 30, 10.0)
+    # A busy machine may skip releases; nothing else can differ here.
+    assert {(each.kind, each.callback) for each in watch.drift(executor.statistics())} <= {
+        ('rate', '/camera:grab')}

@@ -1,0 +1,153 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Recordings of rclcpp nodes made by hand, in the formats of the ROS distributions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.trace import EventType, TraceFile
+
+MS = 1_000_000
+US = 1_000
+BEGIN = 1_655_782_980_000_000_000
+_MORE = {
+    'ros2:dispatch_subscription_callback': (
+        'message', 'callback', 'source_stamp', 'message_timestamp'),
+    'ros2:rmw_publish': ('message', 'timestamp_'),
+    'ros2:rclcpp_intra_publish': ('publisher_handle', 'message'),
+    'ros2:message_construct': ('original_message', 'constructed_message'),
+    'ros2:dispatch_intra_process_subscription_callback': (
+        'message', 'callback', 'message_timestamp'),
+    'ros2:rclcpp_ring_buffer_enqueue': ('buffer', 'index', 'size', 'overwritten'),
+    'ros2:rclcpp_ring_buffer_dequeue': ('buffer', 'index', 'size'),
+    'ros2_caret:rcl_timer_init': ('timer_handle', 'period', 'init_timestamp'),
+}
+
+
+class Recorded:
+    """
+    A recording: what happens is added in any order, times are ns since `BEGIN`.
+
+    Handles and callbacks are any numbers that the test picks; `pid` is 1 and threads are as given.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._events: list[tuple[int, int, int, str, tuple[Any, ...]]] = []
+        self._next_message = 0x7000
+
+    def add(self, name: str, time: int, tid: int, *fields: Any, pid: int = 1) -> None:
+        """Add an event by its full name."""
+        self._events.append((BEGIN + time, pid, tid, name, fields))
+
+    def write(self, but: Sequence[int] = (), stop: int | None = None) -> Path:
+        """Write the file, without the events at these places in the order of time."""
+        extra = []
+        for name, fields in _MORE.items():
+            provider, _, short = name.partition(':')
+            extra.append(EventType(provider, short, tuple(
+                (field, 'int64' if field.endswith('stamp') else 'uint64') for field in fields)))
+        with TraceFile(self.path, extra_events=extra) as file:
+            ordered = sorted(self._events, key=lambda event: event[0])
+            for place, (time, pid, tid, name, fields) in enumerate(ordered[:stop]):
+                if place not in but:
+                    file.add(name, time, pid, tid, *fields)
+        return self.path
+
+    def names(self) -> list[str]:
+        """Return the names of the events in the order of time."""
+        return [event[3] for event in sorted(self._events, key=lambda event: event[0])]
+
+    # --- who is who ------------------------------------------------------------------------------
+
+    def node(self, handle: int, name: str, time: int = 0, pid: int = 1) -> None:
+        """Add a node, `name` with its namespace."""
+        namespace, _, short = name.rpartition('/')
+        self.add('ros2:rcl_node_init', time, 1, handle, handle, short, namespace or '/', pid=pid)
+
+    def publisher(self, handle: int, node: int, topic: str, time: int = 0, pid: int = 1) -> None:
+        """Add a publisher."""
+        self.add('ros2:rcl_publisher_init', time, 1, handle, node, handle, topic, 10, pid=pid)
+
+    def timer(self, callback: int, node: int, period: int, time: int = 0, pid: int = 1) -> None:
+        """Add a timer; its handle is its callback's number and 10,000."""
+        handle = callback + 10_000
+        self.add('ros2:rcl_timer_init', time, 1, handle, period, pid=pid)
+        self.add('ros2:rclcpp_timer_callback_added', time, 1, handle, callback, pid=pid)
+        self.add('ros2:rclcpp_timer_link_node', time, 1, handle, node, pid=pid)
+
+    def subscription(self, callback: int, node: int, topic: str, time: int = 0, pid: int = 1,
+                     within: int | None = None) -> None:
+        """Add a subscription: its rmw handle is its callback's number and 30,000."""
+        handle = callback + 10_000
+        self.add('ros2:rcl_subscription_init', time, 1, handle, node, callback + 30_000, topic, 10,
+                 pid=pid)
+        self.add('ros2:rclcpp_subscription_init', time, 1, handle, callback + 20_000, pid=pid)
+        for each in (callback, within):
+            if each is not None:
+                self.add('ros2:rclcpp_subscription_callback_added', time, 1, callback + 20_000,
+                         each, pid=pid)
+
+    def group(self, address: int, kind: str, *callbacks: tuple[str, int], time: int = 0) -> None:
+        """Add a callback group of timers and subscriptions."""
+        self.add('ros2_caret:add_callback_group', time, 1, 5, address, kind)
+        for entity, callback in callbacks:
+            self.add(f'ros2_caret:callback_group_add_{entity}', time, 1, address,
+                     callback + 10_000)
+
+    # --- what happens ----------------------------------------------------------------------------
+
+    def run(self, callback: int, tid: int, start: int, end: int, within: bool = False,
+            pid: int = 1) -> None:
+        """Add an execution."""
+        self.add('ros2:callback_start', start, tid, callback, within, pid=pid)
+        self.add('ros2:callback_end', end, tid, callback, pid=pid)
+
+    def publish(self, handle: int, tid: int, time: int, stamp: int | None = None,
+                style: str = 'caret', pid: int = 1) -> int:
+        """
+        Add a publication and return its source timestamp (ns since `BEGIN`).
+
+        :param style: caret, tracing (ros2_tracing only, from Jazzy on) or rclpy
+        """
+        self._next_message += 8
+        message = self._next_message
+        stamp = time + 10 * US if stamp is None else stamp
+        if style == 'caret':
+            self.add('ros2:rclcpp_publish', time, tid, handle, message, 0, pid=pid)
+        elif style == 'tracing':
+            self.add('ros2:rclcpp_publish', time, tid, 0, message, 0, pid=pid)
+        self.add('ros2:rcl_publish', time + 5 * US, tid, handle, message, pid=pid)
+        if style == 'tracing':
+            self.add('ros2:rmw_publish', time + 6 * US, tid, message, BEGIN + stamp, pid=pid)
+        else:
+            self.add('ros2_caret:dds_write', time + 8 * US, tid, message, pid=pid)
+            self.add('ros2_caret:dds_bind_addr_to_stamp', time + 20 * US, tid, message,
+                     BEGIN + stamp, pid=pid)
+        return stamp
+
+    def receive(self, callback: int, tid: int, start: int, end: int, stamp: int,
+                style: str = 'caret', stated: int = 0, pid: int = 1) -> None:
+        """Add an execution for a message."""
+        if style == 'caret':
+            self.add('ros2:dispatch_subscription_callback', start - 4 * US, tid, 0x99, callback,
+                     BEGIN + stamp, BEGIN + stated if stated else 0, pid=pid)
+        else:
+            self.add('ros2:rmw_take', start - 4 * US, tid, callback + 30_000, 0x99, BEGIN + stamp,
+                     True, pid=pid)
+        self.run(callback, tid, start, end, pid=pid)

@@ -1,0 +1,196 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A real CARET recording, with CARET's own results beside it: equal to the nanosecond."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import csv
+import os
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.replay import replay, reschedule
+from mddag_executor.replay.following import make_follower, map_recording, open_recording
+from mddag_executor.replay.imported_jobs import ImportedFollower
+from mddag_executor.replay.linked import Publication, Run
+from mddag_executor.replay.path_results import inner_records
+from mddag_executor.trace import import_ctf, TraceError
+from msg_graph import loads, TaskSet
+import pytest
+
+from .cases_by_hand import slow_cases
+
+CARET = Path(os.environ.get('MDDAG_CARET_SAMPLE', '/work/shared/caret'))
+SESSION = CARET / 'end_to_end_sample'
+pytestmark = pytest.mark.skipif(not SESSION.is_dir(), reason='the recording is not there')
+
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /actuator_dummy_node
+    callbacks: [{name: callback_0, subscription: /topic4, deadline: 100ms}]
+  - node: /drive_node
+    callbacks: [{name: callback_0, timer: 100ms, publishes: [/drive]}]
+  - node: /filter_node
+    callbacks: [{name: callback_0, subscription: /topic1, publishes: [/topic2]}]
+  - node: /message_driven_node
+    callbacks:
+      - {name: callback_0, subscription: /topic2, deadline: 100ms}
+      - {name: callback_1, subscription: /drive, publishes: [/topic3], reads: [callback_0]}
+  - node: /sensor_dummy_node
+    callbacks: [{name: callback_0, timer: 100ms, publishes: [/topic1]}]
+  - node: /timer_driven_node
+    callbacks:
+      - {name: callback_0, timer: 100ms, publishes: [/topic4], reads: [callback_1]}
+      - {name: callback_1, subscription: /topic3, deadline: 100ms}
+paths:
+  - name: target
+    callbacks:
+      - /sensor_dummy_node:callback_0
+      - /filter_node:callback_0
+      - /message_driven_node:callback_0
+      - /message_driven_node:callback_1
+      - /timer_driven_node:callback_1
+      - /timer_driven_node:callback_0
+      - /actuator_dummy_node:callback_0
+"""
+
+
+@pytest.fixture(scope='module')
+def trace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp('caret') / 'sample.mcap'
+    try:
+        imported = import_ctf(SESSION, path)
+    except TraceError as error:
+        if 'not installed' in str(error):
+            pytest.skip('python3-bt2 is not installed')
+        raise
+    assert (imported.events, imported.warnings) == (2880, [])
+    return path
+
+
+@pytest.fixture(scope='module')
+def graph() -> TaskSet:
+    return loads(GRAPH, 'sample.yaml')
+
+
+class Told:
+    """Keeps what the linker says."""
+
+    def __init__(self) -> None:
+        self.runs: list[Run] = []
+        self.sent: list[Publication] = []
+        self.arrived: dict[tuple[int, str], int] = {}
+
+    def started(self, run: Run, message: Publication | None) -> None:
+        if message is not None:
+            self.arrived[(id(message), run.callback.label)] = run.start
+
+    def ended(self, run: Run) -> None:
+        self.runs.append(run)
+
+    def published(self, message: Publication) -> None:
+        self.sent.append(message)
+
+
+@pytest.fixture(scope='module')
+def told(trace: Path, graph: TaskSet) -> tuple[Told, ImportedFollower]:
+    recording = open_recording(trace)
+    told = Told()
+    follower = make_follower(recording, map_recording(recording, graph), [], sinks=[told])
+    assert isinstance(follower, ImportedFollower)
+    follower.run()
+    assert follower.warnings() == []
+    return told, follower
+
+
+def rows(name: str) -> Iterator[tuple[int | None, ...]]:
+    with open(CARET / name, encoding='utf-8') as stream:
+        lines = csv.reader(stream)
+        next(lines)
+        for line in lines:
+            yield tuple(int(cell) if cell else None for cell in line)
+
+
+def test_callbacks(told: tuple[Told, ImportedFollower]) -> None:
+    found = [(run.start, run.end) for run in told[0].runs
+             if run.callback.label == '/filter_node subscription /topic1']
+    expected = list(rows('cb_filter_node_callback_0.csv'))
+    assert found == expected
+    assert len(found) == 49
+
+
+def test_communication(told: tuple[Told, ImportedFollower]) -> None:
+    found = [(m.rclcpp, m.rcl, m.dds, m.stamp,
+              told[0].arrived.get((id(m), '/filter_node subscription /topic1')))
+             for m in told[0].sent if m.topic == '/topic1']
+    expected = list(rows('comm_topic1.csv'))
+    assert found == expected
+    assert len(found) == 49
+
+
+def test_path(told: tuple[Told, ImportedFollower]) -> None:
+    found = [
+        (*c[0][:3], c[1][3], *c[1][:3], c[2][3], *c[3][:3], c[4][3], *c[5][:3], c[6][3])
+        for c in (flow.columns for flow in told[1].paths.flows(0))]
+    expected = list(rows('demo_target_path.csv'))
+
+    def order(row: tuple[int | None, ...]) -> list[int]:
+        return [time or 0 for time in row]
+
+    assert sorted(found, key=order) == sorted(expected, key=order)
+    assert len(found) == 56
+    response = slow_cases([(row[0] or 0, row[-1]) for row in expected])
+    assert slow_cases(inner_records(told[1].paths.flows(0))) == response
+
+
+def test_the_replay_says_the_same(trace: Path, graph: TaskSet) -> None:
+    outcome = replay(trace, graph)
+    assert outcome.warnings == []
+    result = outcome.result()
+    response = slow_cases([(row[0] or 0, row[-1]) for row in rows('demo_target_path.csv')])
+    target = result['paths']['target']
+    for case, times in target['response_time'].items():
+        expected = sorted(time for _, time in response[case])
+        assert (times['count'], times['min'], times['max']) == (
+            len(expected), expected[0], expected[-1]), case
+        assert times['mean'] == round(sum(expected) / len(expected))
+    assert target['reaction_time'] == target['response_time']['worst_with_external_latency']
+    assert (target['flows'], target['arrived']) == (56, 47)
+    assert result['callbacks']['/filter_node:callback_0']['executions'] == 49
+    assert {name: dag['jobs'] for name, dag in result['dags'].items()} == {
+        '/drive_node': 49, '/sensor_dummy_node': 49, '/timer_driven_node': 49}
+
+
+def test_without_a_graph(trace: Path) -> None:
+    result: dict[str, Any] = replay(trace).result()
+    assert (result['dags'], result['paths'], result['warnings']) == ({}, {}, [])
+    assert sum(use['executions'] for use in result['recorded_callbacks'].values()) == 480
+    assert result['undeclared']['executions'] == 480
+    topic1 = next(each for each in result['communications'] if each['topic'] == '/topic1')
+    latencies = sorted((row[4] or 0) - (row[0] or 0) for row in rows('comm_topic1.csv'))
+    assert (topic1['sent'], topic1['arrived']) == (49, 49)
+    assert (topic1['latency_ns']['min'], topic1['latency_ns']['max']) == (
+        latencies[0], latencies[-1])
+
+
+def test_rescheduled(trace: Path, graph: TaskSet) -> None:
+    result = reschedule(trace, graph, policy='rad', workers=12).result()
+    sink = result['dags']['/timer_driven_node']['sinks']['/actuator_dummy_node:callback_0']
+    recorded = replay(trace, graph).result()['dags']['/timer_driven_node']['sinks'][
+        '/actuator_dummy_node:callback_0']
+    assert sink['response_ns']['median'] == pytest.approx(
+        recorded['response_ns']['median'], rel=0.05)

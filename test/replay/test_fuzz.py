@@ -1,0 +1,251 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A mutation fuzzer: thousands of damaged files through everything that reads them.
+
+`make fuzz` runs it for as long as FUZZ_SECONDS says (ten minutes), with seeds that are printed.  A
+file that failed is kept, and its seed makes it again.
+
+What must hold for each: a result, or an error of one line; soon, and in bounded memory; and where
+what is counted differs from the sound file's, there is a warning, and nothing is counted more
+often than there (unless whole chunks were doubled).  A chunk that was changed under a right CRC
+says something else: of those only the first three are asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import os
+from pathlib import Path
+import random
+import resource
+import struct
+import time
+from typing import Any
+import zlib
+
+from mddag_executor.errors import MddagError
+from mddag_executor.replay import replay, reschedule
+from mddag_executor.replay.bags import Bag
+from mddag_executor.trace import records
+from msg_graph import GraphError
+import pytest
+import zstandard
+
+from .helpers import MS, small, VirtualRun
+from .test_damage import counts, never_above
+from .test_ordinary_bags import FORMATS, write_bag
+
+ROUNDS = 1000
+LONG_S = float(os.environ.get('FUZZ_SECONDS', '0'))
+SLOW_S = 5.0
+MEMORY = 400 << 20
+INTERESTING = (0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1)
+
+
+def rounds(seed: int) -> Iterator[int]:
+    """Yield seeds: a fixed number of fixed ones, or fresh ones for as long as asked."""
+    if not LONG_S:
+        yield from range(seed * ROUNDS, (seed + 1) * ROUNDS)
+        return
+    first = random.SystemRandom().randrange(2**40)
+    print(f'first seed {first}')
+    end = time.monotonic() + LONG_S
+    while time.monotonic() < end:
+        yield first
+        first += 1
+
+
+def spans(data: bytes) -> list[tuple[int, int, int]]:
+    """Return opcode, offset and end of the records of a sound file, and of its last bytes."""
+    found = []
+    position = len(records.MAGIC)
+    while position < len(data) - len(records.MAGIC):
+        opcode, length = records.RECORD.unpack_from(data, position)
+        found.append((opcode, position, position + records.RECORD.size + length))
+        position += records.RECORD.size + length
+    return found
+
+
+def flip(data: bytearray, rng: random.Random) -> None:
+    for _ in range(rng.choice((1, 1, 2, 8))):
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+
+
+def cut(data: bytearray, rng: random.Random) -> None:
+    del data[rng.randrange(len(data)):]
+
+
+def stretch(data: bytearray, rng: random.Random) -> None:
+    """Overwrite, take out, double or move a stretch."""
+    first = rng.randrange(len(data))
+    last = min(len(data), first + rng.choice((1, 2, 4, 8, 64, 1000)))
+    data[first:last] = rng.choice((
+        bytes(last - first), b'\xff' * (last - first), b'', rng.randbytes(last - first),
+        bytes(data[first:last]) * 2, bytes(data[last:last + 64] + data[first:last])))
+
+
+def length(data: bytearray, rng: random.Random) -> None:
+    """Give a record, or a number at any place, a hostile value."""
+    found = spans(bytes(data))
+    _, start, end = rng.choice(found)
+    value = rng.choice((*INTERESTING, end - start, len(data) - start, rng.randrange(len(data))))
+    where = start + 1 if rng.random() < 0.5 else rng.randrange(start, max(start + 1, end - 8))
+    if where + 8 <= len(data):
+        struct.pack_into('<Q', data, where, value % 2**64)
+
+
+def row(data: bytearray, rng: random.Random) -> None:
+    """Take out, double, move or rename whole records."""
+    found = spans(bytes(data))
+    parts = [bytes(data[start:end]) for _, start, end in found]
+    i, j = rng.randrange(len(parts)), rng.randrange(len(parts))
+    what = rng.randrange(4)
+    if what == 0:
+        del parts[i]
+    elif what == 1:
+        parts.insert(j, parts[i])
+    elif what == 2:
+        parts[i], parts[j] = parts[j], parts[i]
+    else:
+        parts[i] = bytes([rng.randrange(256)]) + parts[i][1:]
+    data[:] = records.MAGIC + b''.join(parts) + records.MAGIC
+
+
+def summary(data: bytearray, rng: random.Random) -> None:
+    """Damage what follows the data: the summary and the footer."""
+    start = next(start for opcode, start, _ in spans(bytes(data)) if opcode == records.DATA_END)
+    for _ in range(rng.choice((1, 3))):
+        data[rng.randrange(start, len(data))] = rng.randrange(256)
+
+
+STRUCTURAL: tuple[Callable[[bytearray, random.Random], None], ...] = (
+    flip, flip, cut, stretch, length, row, summary)
+
+
+def inside(data: bytearray, rng: random.Random) -> None:
+    """Change the records in a chunk, and give it the right size, CRC and compression again."""
+    chunks = [span for span in spans(bytes(data)) if span[0] == records.CHUNK]
+    _, start, end = rng.choice(chunks)
+    cursor = records.Cursor(bytes(data[start + records.RECORD.size:end]))
+    begin, last, size, _ = records.CHUNK_HEAD.unpack(cursor.take(records.CHUNK_HEAD.size))
+    cursor.string()
+    content = bytearray(zstandard.decompress(cursor.take(cursor.uint64()), size))
+    for _ in range(rng.choice((1, 1, 4))):
+        where = rng.randrange(len(content))
+        if rng.random() < 0.5:
+            content[where] = rng.randrange(256)
+        elif where + 8 <= len(content):
+            struct.pack_into('<Q', content, where, rng.choice(INTERESTING))
+    packed = zstandard.compress(bytes(content))
+    data[start:end] = records.record(
+        records.CHUNK, records.CHUNK_HEAD.pack(begin, last, len(content), zlib.crc32(content))
+        + records.string('zstd') + records.UINT64.pack(len(packed)) + packed)
+
+
+@pytest.fixture(scope='module')
+def sound(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, dict[str, Any]]:
+    """Give a trace of several chunks, and what it says."""
+    path = tmp_path_factory.mktemp('fuzz') / 'sound.mcap'
+    VirtualRun(path, small(), 2, duration=60 * MS, flush_every=20)
+    return path.read_bytes(), replay(path).result()
+
+
+def attempt(path: Path, read: Callable[[Path], Any], seed: int) -> Any:
+    """Return what reading gives, None for an error of one line; a file that fails is kept."""
+    begin = time.process_time()
+    try:
+        return read(path)
+    except (MddagError, GraphError) as error:
+        assert '\n' not in str(error)
+        assert str(path.parent) in str(error)
+        return None
+    except BaseException:
+        kept = Path(f'fuzz-{seed}{path.suffix}').resolve()
+        kept.write_bytes(path.read_bytes())
+        print(f'seed {seed}: kept as {kept}')
+        raise
+    finally:
+        assert time.process_time() - begin < SLOW_S, seed
+
+
+@pytest.fixture(autouse=True)
+def bounded_memory() -> Iterator[None]:
+    """Fail where the fuzzed readers took much memory, or all there is."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    yield
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert (after - before) * 1024 < MEMORY
+
+
+@pytest.mark.timeout(180 + 2 * LONG_S)
+def test_damaged_files(sound: tuple[bytes, dict[str, Any]], tmp_path: Path) -> None:
+    """What is counted is right, or less is and that is said."""
+    data, whole = sound
+    path = tmp_path / 'a.mcap'
+    expected = counts(whole)
+    replayed = 0
+    for seed in rounds(0):
+        rng = random.Random(seed)
+        changed = bytearray(data)
+        mutate = rng.choice(STRUCTURAL)
+        mutate(changed, rng)
+        path.write_bytes(changed)
+        outcome = attempt(path, replay, seed)
+        if outcome is None:
+            continue
+        replayed += 1
+        result = outcome.result()
+        if counts(result) != expected:
+            assert outcome.warnings, seed
+            if mutate not in (row, stretch):    # which may double sound chunks
+                never_above(result, whole)
+        if seed % 8 == 0:
+            attempt(path, lambda path: reschedule(path, workers=1).result(), seed)
+    assert replayed > 100
+
+
+@pytest.mark.timeout(180 + 2 * LONG_S)
+def test_changes_under_a_right_crc(sound: tuple[bytes, dict[str, Any]], tmp_path: Path) -> None:
+    """Such a file says what it says; it must not break anything."""
+    data, _ = sound
+    path = tmp_path / 'a.mcap'
+    for seed in rounds(1):
+        rng = random.Random(seed)
+        changed = bytearray(data)
+        inside(changed, rng)
+        path.write_bytes(changed)
+        if seed % 4 == 0:
+            attempt(path, lambda path: reschedule(path, workers=1).result(), seed)
+        else:
+            attempt(path, lambda path: replay(path).result(), seed)
+
+
+@pytest.mark.timeout(180 + 2 * LONG_S)
+@pytest.mark.parametrize('kind', ['mcap with zstd chunks', 'sqlite3', 'sqlite3, file in zstd'])
+def test_damaged_bags(tmp_path: Path, kind: str) -> None:
+    """Arrivals are those of the sound bag, or an error or a warning says what is missing."""
+    path = write_bag(tmp_path / 'bag', *FORMATS[kind])
+    file = next(p for p in path.iterdir() if p.name != 'metadata.yaml')
+    data = file.read_bytes()
+    mutations = (flip, cut, stretch)
+    for number, seed in enumerate(rounds(2)):
+        if number == 300 and not LONG_S:
+            break
+        rng = random.Random(seed)
+        changed = bytearray(data)
+        rng.choice(mutations)(changed, rng)
+        file.write_bytes(changed)
+        attempt(file, lambda file: Bag(file.parent, {'/points'}), seed)

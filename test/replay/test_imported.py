@@ -1,0 +1,302 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Jobs, verdicts and waits of imported recordings; a hand-made one that needs no CARET files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.replay import replay, ReplayError, reschedule
+from mddag_executor.replay.follower import Execution, Observer
+from mddag_executor.replay.imported import ImportedMapping, ImportedRecording
+from mddag_executor.replay.imported_jobs import ImportedFollower
+from msg_graph import loads, TaskSet
+import pytest
+
+from .recorded import BEGIN, MS, Recorded, US
+
+GRAB, DETECT, FUSE_BOXES, FUSE_IMU, IMU, PLAN = 11, 12, 13, 14, 15, 16
+IMAGE, BOXES, IMU_OUT, PATH = 100, 101, 102, 103
+
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /camera
+    callbacks: [{name: grab, timer: 100ms, publishes: [/image, /info]}]
+  - node: /detect
+    callbacks: [{name: detect, subscription: /image, publishes: [/boxes]}]
+  - node: /imu
+    callbacks: [{name: read, subscription: /info, publishes: [/imu]}]
+  - node: /fuse
+    callbacks:
+      - {name: join, sync: [/boxes, /imu], deadline: 50ms}
+      - {name: plan, timer: 50ms, reads: [join], deadline: 20ms}
+paths:
+  - {name: seen, callbacks: ['/camera:grab', '/detect:detect', '/fuse:join', '/fuse:plan']}
+"""
+N = 5
+
+
+@pytest.fixture
+def graph() -> TaskSet:
+    return loads(GRAPH, 'graph.yaml')
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Recorded:
+    """
+    Give a recording of `N` jobs of 40 ms each, in two processes.
+
+    The camera's timer was made at 7 ms, the planner's at 0. Both legs of the fusion and the
+    planner are in one callback group; the boxes' leg waits 2 ms for the other.
+    """
+    r = Recorded(tmp_path / 'recorded.mcap')
+    r.node(1, '/camera')
+    r.node(2, '/detect')
+    r.node(3, '/imu', pid=2)
+    r.node(4, '/fuse')
+    r.timer(GRAB, 1, 100 * MS, time=7 * MS)
+    r.timer(PLAN, 4, 50 * MS)
+    r.publisher(IMAGE, 1, '/image')
+    r.publisher(104, 1, '/info')
+    r.publisher(BOXES, 2, '/boxes')
+    r.publisher(IMU_OUT, 3, '/imu', pid=2)
+    r.subscription(DETECT, 2, '/image')
+    r.subscription(IMU, 3, '/info', pid=2)
+    r.subscription(FUSE_BOXES, 4, '/boxes')
+    r.subscription(FUSE_IMU, 4, '/imu')
+    r.group(0xA0, 'mutually_exclusive', ('subscription', FUSE_BOXES),
+            ('subscription', FUSE_IMU), ('timer', PLAN))
+    for k in range(1, N + 1):
+        at = 7 * MS + k * 100 * MS
+        r.run(GRAB, 1, at + 1 * MS, at + 5 * MS)
+        image = r.publish(IMAGE, 1, at + 2 * MS)
+        info = r.publish(104, 1, at + 3 * MS)
+        r.receive(DETECT, 2, at + 6 * MS, at + 20 * MS, image)
+        boxes = r.publish(BOXES, 2, at + 19 * MS)
+        r.receive(IMU, 9, at + 10 * MS, at + 16 * MS, info, style='take', pid=2)
+        imu = r.publish(IMU_OUT, 9, at + 15 * MS, pid=2)
+        r.receive(FUSE_IMU, 3, at + 18 * MS, at + 21 * MS, imu)
+        r.receive(FUSE_BOXES, 4, at + 22 * MS, at + 40 * MS, boxes)
+    for k in range(1, 2 * N):
+        r.run(PLAN, 5, k * 50 * MS + 400 * US, k * 50 * MS + 5 * MS)
+    return r
+
+
+def result_of(path: Path, graph: TaskSet) -> tuple[dict[str, Any], list[str]]:
+    outcome = replay(path, graph)
+    return outcome.result(), [w.removeprefix(f'{path}: ') for w in outcome.warnings]
+
+
+TWO = ['2 processes ran callbacks, each with workers of its own: the 6 threads are taken together']
+
+
+def test_jobs_responses_and_where_the_time_went(recorded: Recorded, graph: TaskSet) -> None:
+    result, warnings = result_of(recorded.write(), graph)
+    assert warnings == TWO
+    camera = result['dags']['/camera']
+    assert camera['jobs'] == N
+    sink = camera['sinks']['/fuse:join']
+    assert (sink['completed'], sink['late'], sink['expired']) == (N, 0, 0)
+    # from the timer's release, 7 ms + k * 100 ms, to the end of the leg that made it whole
+    assert sink['response_ns'] == dict.fromkeys(('min', 'median', 'p99', 'max'), 40 * MS)
+    assert sink['slack_ns'] == dict.fromkeys(('min', 'p1', 'median', 'max'), 10 * MS)
+    worst = sink['breakdown']['worst']
+    assert [step['vertex'] for step in worst['chain']] == [
+        '/camera:grab', '/detect:detect', '/fuse:join']
+    # grab 1 ms after its release; a message is ready at its source timestamp, 10 us after its
+    # publication
+    waits = 1 * MS + (6 - 2) * MS - 10 * US + (22 - 19) * MS - 10 * US
+    assert worst['waiting_ns'] == waits
+    assert worst['waiting_group_ns'] == (21 - 19) * MS - 10 * US
+    assert worst['executing_ns'] == 40 * MS - waits
+    assert (worst['release_lag_ns'], worst['transport_ns'], worst['unknown_ns']) == (0, 0, 0)
+    plan = result['dags']['/fuse']['sinks']['/fuse:plan']
+    assert (plan['completed'], plan['late'], plan['response_ns']['max']) == (2 * N - 1, 0, 5 * MS)
+    use = result['callbacks']['/fuse:join']
+    assert (use['executions'], use['busy_ns']) == (2 * N, N * (3 + 18) * MS)
+    assert use['waiting_group_ns'] == N * ((21 - 19) * MS - 10 * US)
+
+
+def test_the_path(recorded: Recorded, graph: TaskSet) -> None:
+    path = result_of(recorded.write(), graph)[0]['paths']['seen']
+    assert path['hops'] == ['trigger', 'trigger', 'variable']
+    # published at 9 ms after k * 100 ms, kept at 47 ms after it, planned with 50 ms after it, and
+    # once more 50 ms later
+    age = [50 * MS + 400 * US - 9 * MS, 100 * MS + 400 * US - 9 * MS]
+    assert path['data_age'] == {
+        'count': 2 * N - 3, 'min': age[0], 'mean': round((4 * age[0] + 3 * age[1]) / 7),
+        'median': age[0], 'p99': age[1], 'max': age[1]}
+    assert path['response_time']['best']['max'] == age[0]
+    assert path['reaction_time']['max'] == age[0] + 100 * MS
+
+
+def test_a_lost_message_expires_the_job_and_is_said(recorded: Recorded, graph: TaskSet) -> None:
+    names = recorded.names()
+    bound = [place for place, name in enumerate(names) if 'bind' in name]
+    first = bound[0]        # the first image's source timestamp
+    recorded.run(PLAN, 5, 3000 * MS, 3001 * MS)
+    recorded.run(GRAB, 1, 3007 * MS, 3008 * MS)
+    result, warnings = result_of(recorded.write(but=[first]), graph)
+    sink = result['dags']['/camera']['sinks']['/fuse:join']
+    assert (sink['completed'], sink['expired']) == (N - 1, 1)
+    assert [line for line in warnings if '/detect subscription /image (1)' in line] == [
+        '1 executions ran for messages whose publication is not in it: they belong to no job and '
+        'no path: /detect subscription /image (1)']
+    assert [line for line in warnings if 'periods of timers' in line]
+
+
+def test_late_and_off_the_grid(tmp_path: Path) -> None:
+    graph = loads('mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n'
+                  '      - {name: t, timer: 10ms, deadline: 5ms}\n', 'graph.yaml')
+    r = Recorded(tmp_path / 'timer.mcap')
+    r.node(1, '/n')
+    r.timer(GRAB, 1, 10 * MS)
+    r.run(GRAB, 1, 10 * MS - 200 * US, 12 * MS)     # just before: its init was recorded after it
+    r.run(GRAB, 1, 24 * MS, 26 * MS)                # late
+    r.run(GRAB, 1, 27 * MS, 28 * MS)                # not a period of this timer
+    r.run(GRAB, 1, 50 * MS, 51 * MS)                # two left out
+    result, warnings = result_of(r.write(), graph)
+    sink = result['dags']['/n']['sinks']['/n:t']
+    assert (sink['completed'], sink['late']) == (4, 1)
+    assert (sink['response_ns']['min'], sink['response_ns']['max']) == (1 * MS, 6 * MS)
+    assert result['first_miss']['job'] == 1
+    assert warnings == [
+        '1 executions of timers are off the grid of their periods (reset, or by another clock): '
+        'they count as released when they started: /n timer 10ms (1)',
+        '2 periods of timers passed without an execution (late by more than one, or events were '
+        'lost): there are no jobs of them: /n timer 10ms (2)']
+
+
+SOURCE = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {{name: s, subscription: /in, period: 100ms, deadline: 50ms, release_from: {}}}
+"""
+
+
+@pytest.mark.parametrize('release_from, stated, response, said', [
+    ('arrival', 0, 5 * MS + 4 * US, False), ('source_timestamp', 0, 15 * MS, False),
+    ('header_stamp', 30 * MS, 75 * MS, False), ('header_stamp', 0, 15 * MS, True)])
+def test_releases_of_messages(
+    tmp_path: Path, release_from: str, stated: int, response: int, said: bool
+) -> None:
+    r = Recorded(tmp_path / 'source.mcap')
+    r.node(1, '/n')
+    r.node(2, '/driver')
+    r.publisher(IMAGE, 2, '/in')
+    r.subscription(DETECT, 1, '/in')
+    stamp = r.publish(IMAGE, 8, 90 * MS - 10 * US)
+    r.receive(DETECT, 1, 100 * MS, 105 * MS, stamp, stated=stated)
+    result, warnings = result_of(
+        r.write(), loads(SOURCE.format(release_from), 'graph.yaml'))
+    assert result['dags']['/n']['sinks']['/n:s']['response_ns']['max'] == response
+    assert [line for line in warnings if 'should be by a stamp' in line] == ([
+        '1 releases should be by a stamp that is not recorded, and are by the next best one: '
+        '/n:s (header_stamp)'] if said else [])
+
+
+def test_matching_by_order_and_period(tmp_path: Path) -> None:
+    graph = loads("""\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: a, timer: 10ms, dag: a, deadline: 5ms}
+      - {name: b, timer: 10ms, dag: b, deadline: 5ms}
+      - {name: c, timer: 30ms, dag: c, deadline: 5ms}
+  - node: /gone
+    callbacks: [{name: d, timer: 10ms, deadline: 5ms}]
+""", 'graph.yaml')
+    r = Recorded(tmp_path / 'order.mcap')
+    r.node(1, '/n')
+    for number, (callback, period) in enumerate(((21, 10), (22, 10), (23, 33))):
+        r.timer(callback, 1, period * MS, time=number)
+        r.run(callback, number + 1, 40 * MS + number, 41 * MS + number * MS)
+    result, warnings = result_of(r.write(), graph)
+    longest = {key: use['longest_ns'] for key, use in result['callbacks'].items()}
+    assert longest == {'/n:a': 1 * MS, '/n:b': 2 * MS - 1, '/n:c': 3 * MS - 2, '/gone:d': 0}
+    assert warnings == [
+        '1 of the 4 callbacks of graph.yaml are not in it, so they count as never completed: '
+        '/gone:d', '1 timers have other periods than declared: /n:c (33ms instead of 30ms)']
+
+
+def test_reschedule_keeps_releases_times_and_groups(recorded: Recorded, graph: TaskSet) -> None:
+    path = recorded.write()
+    found = reschedule(path, graph, policy='rad', workers=6, overheads=False)
+    sink = found.result()['dags']['/camera']['sinks']['/fuse:join']
+    assert sink['completed'] == N
+    # grab 4 ms, then the longer of detect 14 and imu 6, then the leg that made it whole, 18
+    assert sink['response_ns']['median'] == (4 + 14 + 18) * MS
+    assert found.tables.n_groups == 1
+    with pytest.raises(ReplayError, match='it was imported'):
+        reschedule(path)
+
+
+def test_without_a_graph(recorded: Recorded) -> None:
+    outcome = replay(recorded.write())
+    result = outcome.result()
+    assert (outcome.warnings, result['dags'], outcome.tally.missed) == ([], {}, False)
+    assert result['recorded_callbacks']['/fuse subscription /imu'] == {
+        'executions': N, 'unfinished': 0, 'busy_ns': N * 3 * MS, 'shortest_ns': 3 * MS,
+        'longest_ns': 3 * MS}
+    imu = next(each for each in result['communications'] if each['topic'] == '/imu')
+    assert (imu['publisher'], imu['callback'], imu['sent'], imu['arrived']) == (
+        '/imu', '/fuse subscription /imu', N, N)
+    assert imu['latency_ns']['median'] == 3 * MS
+    assert result['recording']['start_ns'] == BEGIN + 50 * MS
+
+
+def test_a_graph_of_other_nodes(recorded: Recorded) -> None:
+    other = loads('mddag: 1\nnodes:\n  - node: /x\n    callbacks:\n'
+                  '      - {name: t, timer: 10ms, deadline: 5ms}\n', 'x.yaml')
+    with pytest.raises(ReplayError, match='none of the callbacks of x.yaml is in it'):
+        replay(recorded.write(), other)
+
+
+def test_cut_anywhere_it_says_something_or_judges_what_is_there(
+    recorded: Recorded, graph: TaskSet
+) -> None:
+    total = len(recorded.names())
+    whole, _ = result_of(recorded.write(), graph)
+    for stop in range(0, total, 7):
+        path = recorded.write(stop=stop)
+        try:
+            result, _ = result_of(path, graph)
+        except ReplayError as error:
+            assert 'run' in error.problem or 'none of the callbacks' in error.problem
+            continue
+        for dag, found in result['dags'].items():
+            assert found['jobs'] <= whole['dags'][dag]['jobs']
+            for name, sink in found['sinks'].items():
+                assert sink['late'] == sink['expired'] == 0, (stop, name)
+
+
+def test_the_last_leg_makes_a_sync_callback_whole(recorded: Recorded, graph: TaskSet) -> None:
+    recording = ImportedRecording(recorded.write())
+    told: list[tuple[int, int, bool]] = []
+
+    class Completed(Observer):
+
+        def completed(self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
+                      execution: Execution | None) -> None:
+            if graph.vertices[vertex].name == '/fuse:join':
+                told.append((job, leg, whole))
+
+    ImportedFollower(recording, ImportedMapping(recording, graph), [Completed()]).run()
+    assert told == [each for job in range(N) for each in ((job, 1, False), (job, 0, True))]

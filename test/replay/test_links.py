@@ -1,0 +1,279 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Links of imported recordings, rule by rule, and lost events that never go unsaid."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mddag_executor.replay.imported import ImportedMapping, ImportedRecording
+from mddag_executor.replay.imported_jobs import ImportedFollower
+from mddag_executor.replay.linked import Publication, Run
+import pytest
+
+from .recorded import BEGIN, MS, Recorded, US
+
+CAMERA, DETECT = 11, 12         # callbacks
+IMAGE = 100                     # publisher
+
+
+class Told:
+    """Keeps what a linker says."""
+
+    def __init__(self) -> None:
+        self.runs: list[tuple[str, int, int]] = []
+        self.links: list[tuple[str, int, int | None]] = []
+        self.published_at: list[tuple[str, int, int, int]] = []
+
+    def started(self, run: Run, message: Publication | None) -> None:
+        """Keep what an execution ran for: the publication's time."""
+        self.links.append((run.callback.label, run.start - BEGIN,
+                           None if message is None else message.time - BEGIN))
+
+    def ended(self, run: Run) -> None:
+        """Keep an execution."""
+        self.runs.append((run.callback.label, run.start - BEGIN, run.end - BEGIN))
+
+    def published(self, message: Publication) -> None:
+        """Keep a publication's times."""
+        rclcpp, rcl, dds = (
+            time - BEGIN if time else 0 for time in (message.rclcpp, message.rcl, message.dds))
+        self.published_at.append((message.topic, rclcpp, rcl, dds))
+
+
+def linked(path: Path) -> tuple[Told, list[str]]:
+    """Return what the linker says of a recording, and the warnings."""
+    told = Told()
+    recording = ImportedRecording(path)
+    follower = ImportedFollower(recording, ImportedMapping(recording, None), [], sinks=[told])
+    follower.run()
+    return told, [line.removeprefix(f'{path}: ') for line in follower.warnings()]
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Recorded:
+    """Give a recording of a camera with a timer and a detector with a subscription."""
+    recorded = Recorded(tmp_path / 'recorded.mcap')
+    recorded.node(1, '/camera')
+    recorded.node(2, '/detector')
+    recorded.timer(CAMERA, 1, 100 * MS)
+    recorded.publisher(IMAGE, 1, '/image')
+    recorded.subscription(DETECT, 2, '/image')
+    return recorded
+
+
+@pytest.mark.parametrize('publish, receive', [
+    ('caret', 'caret'), ('caret', 'take'), ('tracing', 'take'), ('rclpy', 'take')])
+def test_messages_between_threads(recorded: Recorded, publish: str, receive: str) -> None:
+    for k in range(3):
+        at = (k + 1) * 100 * MS
+        recorded.run(CAMERA, 1, at, at + 3 * MS)
+        stamp = recorded.publish(IMAGE, 1, at + 1 * MS, style=publish)
+        recorded.receive(DETECT, 2, at + 2 * MS, at + 9 * MS, stamp, style=receive)
+    told, warnings = linked(recorded.write())
+    assert warnings == []
+    sent = 1 * MS if publish != 'rclpy' else 1 * MS + 5 * US
+    assert [link for link in told.links if link[0].startswith('/detector')] == [
+        ('/detector subscription /image', at + 2 * MS, at + sent)
+        for at in (100 * MS, 200 * MS, 300 * MS)]
+    assert told.runs[:2] == [
+        ('/camera timer 100ms', 100 * MS, 103 * MS),
+        ('/detector subscription /image', 102 * MS, 109 * MS)]
+    assert len(told.runs) == 6
+    if publish == 'caret':
+        assert told.published_at[0] == ('/image', 101 * MS, 101 * MS + 5 * US, 101 * MS + 8 * US)
+
+
+def test_the_subscriber_may_be_faster_than_the_tracer(recorded: Recorded) -> None:
+    recorded.run(CAMERA, 1, 100 * MS, 103 * MS)
+    stamp = recorded.publish(IMAGE, 1, 101 * MS)
+    # before the stamp is recorded, 20 us after the publication
+    recorded.receive(DETECT, 2, 101 * MS + 15 * US, 101 * MS + 18 * US, stamp)
+    told, warnings = linked(recorded.write())
+    assert told.links[-1] == ('/detector subscription /image', 101 * MS + 15 * US, 101 * MS)
+    assert warnings == []
+
+
+def test_messages_within_a_process_by_address(recorded: Recorded) -> None:
+    recorded.subscription(13, 2, '/image', within=14)
+    for at, original in ((100 * MS, 0x500), (200 * MS, 0x500)):     # the address is used again
+        recorded.run(CAMERA, 1, at, at + 3 * MS)
+        recorded.add('ros2:rclcpp_intra_publish', at + MS, 1, IMAGE, original)
+        recorded.add('ros2:message_construct', at + MS + 1, 1, original, 0x600)
+        recorded.add('ros2:dispatch_intra_process_subscription_callback', at + 2 * MS, 2, 0x600,
+                     14, 0)
+        recorded.run(14, 2, at + 2 * MS + 1, at + 5 * MS, within=True)
+    told, warnings = linked(recorded.write())
+    assert warnings == []
+    label = '/detector subscription /image #2'      # both callbacks of the subscription are one
+    assert [link for link in told.links if link[0] == label] == [
+        (label, at + 2 * MS + 1, at + MS) for at in (100 * MS, 200 * MS)]
+
+
+def test_messages_within_a_process_by_buffer_and_index(recorded: Recorded) -> None:
+    label = '/detector subscription /image'
+    for k in range(4):
+        at = (k + 1) * 100 * MS
+        recorded.run(CAMERA, 1, at, at + 3 * MS)
+        recorded.add('ros2:rclcpp_intra_publish', at + MS, 1, IMAGE, 0x500)
+        recorded.add('ros2:rclcpp_ring_buffer_enqueue', at + MS + 1, 1, 0xB, k % 2, 1, 0)
+        # and to other processes: the same publication
+        recorded.add('ros2:rclcpp_publish', at + MS + 2, 1, IMAGE, 0x500, 0)
+    for k in range(2):      # two wait at a time: the first two are taken after the second
+        at = 200 * MS + (k + 2) * MS
+        recorded.add('ros2:rclcpp_ring_buffer_dequeue', at, 2, 0xB, k, 1)
+        recorded.run(DETECT, 2, at + 1, at + 2, within=True)
+    told, warnings = linked(recorded.write())
+    assert [link for link in told.links if link[0] == label] == [
+        (label, 202 * MS + 1, 101 * MS), (label, 203 * MS + 1, 201 * MS)]
+    assert len(told.published_at) == 4
+    assert warnings == []
+
+
+def test_overwritten_messages_are_said(recorded: Recorded) -> None:
+    for at, overwritten in ((100 * MS, 0), (200 * MS, 1)):
+        recorded.run(CAMERA, 1, at, at + 3 * MS)
+        recorded.add('ros2:rclcpp_intra_publish', at + MS, 1, IMAGE, 0x500)
+        recorded.add('ros2:rclcpp_ring_buffer_enqueue', at + MS + 1, 1, 0xB, 0, 1, overwritten)
+    recorded.add('ros2:rclcpp_ring_buffer_dequeue', 204 * MS, 2, 0xB, 0, 0)
+    recorded.run(DETECT, 2, 205 * MS, 206 * MS, within=True)
+    told, warnings = linked(recorded.write())
+    assert told.links[-1][2] == 201 * MS
+    assert warnings == ['1 messages were overwritten in a ring buffer before they were taken: '
+                        '/image (1)']
+
+
+def test_a_callback_in_several_threads_at_once(recorded: Recorded) -> None:
+    recorded.run(CAMERA, 1, 100 * MS, 130 * MS)
+    recorded.run(CAMERA, 2, 110 * MS, 120 * MS)
+    told, warnings = linked(recorded.write())
+    assert [run[1:] for run in told.runs] == [(110 * MS, 120 * MS), (100 * MS, 130 * MS)]
+    assert not [line for line in warnings if 'have no' in line]
+
+
+def test_a_callback_inside_another(recorded: Recorded) -> None:
+    recorded.timer(13, 2, 10 * MS)
+    recorded.run(CAMERA, 1, 100 * MS, 130 * MS)
+    recorded.run(13, 1, 110 * MS, 120 * MS)
+    recorded.publish(IMAGE, 1, 125 * MS)
+    told, warnings = linked(recorded.write())
+    assert sorted(run[1:] for run in told.runs) == [
+        (100 * MS, 130 * MS), (110 * MS, 120 * MS)]
+    assert warnings == []
+
+
+def test_addresses_are_used_again(recorded: Recorded) -> None:
+    recorded.node(3, '/late', time=400 * MS)
+    recorded.timer(DETECT, 3, 20 * MS, time=401 * MS)       # the address of the detector's
+    recorded.run(DETECT, 1, 300 * MS, 301 * MS)
+    recorded.run(DETECT, 1, 421 * MS, 422 * MS)
+    # and of the publisher's: another topic
+    recorded.publisher(IMAGE, 3, '/other', time=402 * MS)
+    recorded.publish(IMAGE, 1, 300 * MS + 1)
+    recorded.publish(IMAGE, 1, 421 * MS + 1)
+    told, _ = linked(recorded.write())
+    assert [run[0] for run in told.runs] == ['/detector subscription /image', '/late timer 20ms']
+    assert [each[0] for each in told.published_at] == ['/image', '/other']
+
+
+def test_processes_have_addresses_of_their_own(recorded: Recorded) -> None:
+    recorded.node(1, '/other', pid=2)
+    recorded.subscription(CAMERA, 1, '/image', pid=2)       # the camera's address
+    recorded.run(CAMERA, 1, 100 * MS, 103 * MS)
+    stamp = recorded.publish(IMAGE, 1, 101 * MS)
+    recorded.receive(CAMERA, 1, 105 * MS, 106 * MS, stamp, pid=2)
+    told, warnings = linked(recorded.write())
+    assert told.links == [('/camera timer 100ms', 100 * MS, None),
+                          ('/other subscription /image', 105 * MS, 101 * MS)]
+    assert warnings == []
+
+
+def test_same_stamps_on_other_topics_and_on_the_same(recorded: Recorded) -> None:
+    recorded.publisher(101, 1, '/other')
+    recorded.run(CAMERA, 1, 100 * MS, 103 * MS)
+    recorded.publish(IMAGE, 1, 101 * MS, stamp=50)
+    recorded.publish(101, 1, 102 * MS, stamp=50)
+    recorded.receive(DETECT, 2, 105 * MS, 106 * MS, 50)
+    told, warnings = linked(recorded.write())
+    assert (told.links[-1][2], warnings) == (101 * MS, [])
+    recorded.publish(IMAGE, 3, 102 * MS, stamp=50)
+    told, warnings = linked(recorded.write())
+    assert told.links[-1][2] is None
+    assert warnings == ['1 executions ran for messages with the topic and source timestamp of '
+                        'another one: they belong to no job and no path: '
+                        '/detector subscription /image (1)']
+
+
+def test_what_was_initialised_before_the_recording(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / 'late.mcap')
+    recorded.node(1, '/camera')
+    # CARET repeats it, with the time on the monotonic clock, which is 7 s behind
+    recorded.add('ros2_caret:caret_init', 90 * MS, 1, BEGIN + 90 * MS - 7_000 * MS, 'jazzy')
+    recorded.add('ros2_caret:rcl_timer_init', 91 * MS, 1, 10_011, 100 * MS,
+                 BEGIN + 30 * MS - 7_000 * MS)
+    recorded.add('ros2:rclcpp_timer_callback_added', 92 * MS, 1, 10_011, CAMERA)
+    recorded.add('ros2:rclcpp_timer_link_node', 93 * MS, 1, 10_011, 1)
+    recorded.run(CAMERA, 1, 131 * MS, 132 * MS)
+    entities = ImportedRecording(recorded.write()).entities
+    assert [(c.label, c.grid) for c in entities.every] == [
+        ('/camera timer 100ms', BEGIN + 30 * MS)]
+
+
+def test_any_lost_event_is_said_or_changes_nothing(recorded: Recorded) -> None:
+    """Leave out each event in turn: no link may be another one, and what is missing is said."""
+    for k in range(3):
+        at = (k + 1) * 100 * MS
+        recorded.run(CAMERA, 1, at, at + 3 * MS)
+        stamp = recorded.publish(IMAGE, 1, at + 1 * MS)
+        recorded.receive(DETECT, 2, at + 2 * MS, at + 9 * MS, stamp)
+    whole, nothing = linked(recorded.write())
+    assert nothing == []
+    seen = set()
+    names = recorded.names()
+    for place, name in enumerate(names):
+        if not any(part in name for part in ('callback_start', 'callback_end', 'bind', 'publish',
+                                             'dds_write', 'dispatch')) or name.endswith('init'):
+            continue
+        if place > len(names) - 10:
+            break       # at the end it may be cut off, or still run
+        told, warnings = linked(recorded.write(but=[place]))
+        assert set(told.runs) <= set(whole.runs)
+        if (told.links, told.runs) != (whole.links, whole.runs):
+            assert warnings, (place, name)
+            seen.add(name.partition(':')[2])
+    assert seen == {'callback_start', 'callback_end', 'dds_bind_addr_to_stamp', 'rclcpp_publish',
+                    'dispatch_subscription_callback'}
+
+
+def test_what_else_the_thread_writes_is_not_the_publication(recorded: Recorded) -> None:
+    recorded.run(CAMERA, 1, 100 * MS, 103 * MS)
+    recorded.add('ros2:rclcpp_publish', 101 * MS, 1, IMAGE, 0x50, 0)
+    recorded.add('ros2:rcl_publish', 101 * MS + 1, 1, IMAGE, 0x50)
+    recorded.add('ros2_caret:dds_write', 101 * MS + 2, 1, 0x60)     # a service's, say
+    recorded.add('ros2_caret:dds_bind_addr_to_stamp', 101 * MS + 3, 1, 0x60, BEGIN + 77)
+    # of another publication only the beginning is recorded; what comes with the next callback in
+    # the thread is not its end
+    recorded.run(CAMERA, 1, 200 * MS, 203 * MS)
+    recorded.add('ros2:rclcpp_publish', 201 * MS, 1, IMAGE, 0x50, 0)
+    recorded.run(CAMERA, 1, 300 * MS, 303 * MS)
+    recorded.add('ros2_caret:dds_write', 301 * MS + 2, 1, 0x60)
+    recorded.add('ros2_caret:dds_bind_addr_to_stamp', 301 * MS + 3, 1, 0x60, BEGIN + 88)
+    recorded.receive(DETECT, 2, 305 * MS, 306 * MS, 77)
+    recorded.receive(DETECT, 2, 307 * MS, 308 * MS, 88)
+    told, warnings = linked(recorded.write())
+    assert told.published_at == [('/image', 101 * MS, 101 * MS + 1, 0), ('/image', 201 * MS, 0, 0)]
+    assert [link[2] for link in told.links if link[0].startswith('/detector')] == [None, None]
+    assert warnings == ['2 executions ran for messages whose publication is not in it: they '
+                        'belong to no job and no path: /detector subscription /image (2)']

@@ -1,0 +1,342 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Ordinary bags, written by rosbags, as releases: every storage and compression, and damage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import shutil
+import sqlite3
+from typing import Any
+
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from mddag_executor.cli import main as program
+from mddag_executor.errors import MddagError
+from mddag_executor.replay import bags
+from mddag_executor.replay.bags import Bag, BagError, is_ordinary, UNKNOWN
+from mddag_executor.replay.bags_reschedule import BagReschedule, reschedule_bag
+from mddag_executor.simulate import SimulationError, START
+from msg_graph import loads
+import pytest
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
+import zstandard
+
+MS = 1_000_000
+BEGIN = 1_732_166_766_000_000_000
+STORE = get_typestore(Stores.ROS2_JAZZY)
+GRAPH = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /lidar
+    callbacks:
+      - {name: in, subscription: /points, period: 100ms, publishes: [/cloud], execution_time: 1ms}
+  - node: /detector
+    callbacks:
+      - {name: detect, subscription: /cloud, deadline: 20ms, execution_time: 8ms}
+  - node: /control
+    callbacks:
+      - {name: tick, timer: 30ms, deadline: 10ms, execution_time: 3ms}
+"""
+BY_HEADER = GRAPH.replace('period: 100ms', 'period: 100ms, release_from: header_stamp')
+FORMATS: dict[str, tuple[StoragePlugin, CompressionMode | None]] = {
+    'mcap': (StoragePlugin.MCAP, None),
+    'mcap with zstd chunks': (StoragePlugin.MCAP, CompressionMode.STORAGE),
+    'mcap, messages in zstd': (StoragePlugin.MCAP, CompressionMode.MESSAGE),
+    'mcap, file in zstd': (StoragePlugin.MCAP, CompressionMode.FILE),
+    'sqlite3': (StoragePlugin.SQLITE3, None),
+    'sqlite3, messages in zstd': (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+    'sqlite3, file in zstd': (StoragePlugin.SQLITE3, CompressionMode.FILE),
+}
+
+
+def header(stamp: int) -> bytes:
+    """Return a std_msgs/Header as CDR."""
+    time = STORE.types['builtin_interfaces/msg/Time'](*divmod(stamp, 1_000_000_000))
+    message = STORE.types['std_msgs/msg/Header'](time, 'lidar')
+    return bytes(STORE.serialize_cdr(message, 'std_msgs/msg/Header'))
+
+
+def write_bag(
+    path: Path, storage: StoragePlugin = StoragePlugin.MCAP,
+    compression: CompressionMode | None = None, stamps: Any = None,
+) -> Path:
+    """Write a bag of ten scans, each 5 ms after its stamp, and a message of another topic."""
+    writer = Writer(path, version=9, storage_plugin=storage)
+    if compression is not None:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
+        points = writer.add_connection('/points', 'std_msgs/msg/Header', typestore=STORE)
+        chatter = writer.add_connection('/chatter', 'std_msgs/msg/String', typestore=STORE)
+        text = STORE.types['std_msgs/msg/String']('hello')
+        writer.write(
+            chatter, BEGIN, STORE.serialize_cdr(text, 'std_msgs/msg/String'))
+        for i in range(10):
+            stamp = BEGIN + i * 100 * MS
+            given = stamp if stamps is None else stamps[i]
+            writer.write(points, stamp + 5 * MS, header(given))
+    return path
+
+
+def responses(outcome: BagReschedule, dag: str, sink: str) -> dict[str, int]:
+    found: dict[str, int] = outcome.result()['dags'][dag]['sinks'][sink]['response_ns']
+    return found
+
+
+@pytest.mark.parametrize('kind', FORMATS)
+def test_every_storage_gives_the_same(tmp_path: Path, kind: str) -> None:
+    path = write_bag(tmp_path / 'bag', *FORMATS[kind])
+    stamps = Bag(path, {'/points'}).stamps['/points']
+    assert list(stamps.arrival) == [BEGIN + i * 100 * MS + 5 * MS for i in range(10)]
+    assert list(stamps.header) == [BEGIN + i * 100 * MS for i in range(10)]
+    outcome = reschedule_bag(path, loads(BY_HEADER, 'g.yaml'))
+    assert outcome.warnings == []
+    assert set(responses(outcome, '/lidar', '/detector:detect').values()) == {14 * MS}
+    by_arrival = reschedule_bag(path, loads(GRAPH, 'g.yaml'))
+    assert set(responses(by_arrival, '/lidar', '/detector:detect').values()) == {9 * MS}
+    for each in (outcome, by_arrival):
+        assert sum(each.tally.jobs) == 10 + 31     # of the timer from 0 to 905 ms
+        assert each.workers == 2
+        assert each.result()['recording']['messages'] == 11
+    assert outcome.notes[0] == '/lidar: 10 jobs from the header stamp of /points'
+    assert 'nominal period' in outcome.notes[1]
+    file = next(p for p in path.iterdir() if p.name != 'metadata.yaml')
+    assert is_ordinary(str(path)) and is_ordinary(str(file))
+    assert reschedule_bag(file, loads(BY_HEADER, 'g.yaml')).log == outcome.log
+
+
+def test_the_schedule_is_that_of_the_core(tmp_path: Path) -> None:
+    """On one worker scans and timer get into each other's way."""
+    outcome = reschedule_bag(write_bag(tmp_path / 'bag'), loads(GRAPH, 'g.yaml'), workers=1)
+    first = [(time - BEGIN, vertex) for time, kind, _, _, vertex, _ in outcome.log
+             if kind == START][:4]
+    assert first == [(0, 2), (5 * MS, 0), (6 * MS, 1), (30 * MS, 2)]
+    slow = reschedule_bag(
+        tmp_path / 'bag', loads(GRAPH, 'g.yaml'), workers=1, dispatch_overhead=MS)
+    begun = [time - BEGIN for time, kind, *_ in slow.log if kind == START]
+    assert begun[:3] == [0, 5 * MS, 7 * MS]
+    table = [[2 * MS, 4 * MS], [MS]]
+    given = reschedule_bag(tmp_path / 'bag', loads(GRAPH, 'g.yaml'), times=table)
+    assert set(responses(given, '/lidar', '/detector:detect').values()) == {6 * MS}
+    drawn = GRAPH.replace('execution_time: 8ms', 'execution_time: {quantiles_us: [1000, 9000]}')
+    seeds = [reschedule_bag(tmp_path / 'bag', loads(drawn, 'g.yaml'), seed=seed).log
+             for seed in (1, 1, 2)]
+    assert seeds[0] == seeds[1] != seeds[2]
+
+
+def test_stamps_that_can_not_be_are_said(tmp_path: Path) -> None:
+    stamps = [BEGIN + i * 100 * MS for i in range(10)]
+    stamps[3] = 0
+    stamps[4] += 50 * MS
+    path = write_bag(tmp_path / 'bag', stamps=stamps)
+    outcome = reschedule_bag(path, loads(BY_HEADER, 'g.yaml'))
+    assert [text.split(': ', 1)[1] for text in outcome.warnings] == [
+        f'1 of the 10 messages of /points (std_msgs/msg/Header) {why}: they are released at their '
+        'arrival' for why in ('have no header stamp', 'have a header stamp after it')]
+    assert responses(outcome, '/lidar', '/detector:detect')['min'] == 9 * MS
+    chatter = BY_HEADER.replace('/points', '/chatter')
+    outcome = reschedule_bag(path, loads(chatter, 'g.yaml'))
+    assert 'have no header stamp' in outcome.warnings[0]
+    published = BY_HEADER.replace('header_stamp', 'source_timestamp')
+    outcome = reschedule_bag(path, loads(published, 'g.yaml'))
+    assert '10 of the 10 messages' in outcome.warnings[0]
+    assert 'no publication time' in outcome.warnings[0]
+
+
+def test_what_is_not_in_the_bag_is_said(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / 'bag')
+    text = GRAPH + """\
+  - node: /camera
+    callbacks:
+      - {name: in, subscription: /image, period: 10ms, deadline: 5ms, execution_time: 1ms}
+      - {name: ask, service: /s, period: 10ms, deadline: 5ms, execution_time: 1ms, dag: ask}
+"""
+    outcome = reschedule_bag(path, loads(text, 'g.yaml'))
+    assert [text.split(': ', 1)[1] for text in outcome.warnings] == [
+        'topic /image is not in it, so there are no jobs of /camera',
+        'ask starts with a service call, which a bag does not have: there are no jobs of it']
+    nothing = """\
+mddag: 1
+nodes:
+  - node: /camera
+    callbacks: [{name: in, subscription: /i, period: 9ms, deadline: 5ms, execution_time: 1ms}]
+"""
+    with pytest.raises(BagError, match='none of the sources of g.yaml is in it: it has /chatter'):
+        reschedule_bag(path, loads(nothing, 'g.yaml'))
+    with pytest.raises(SimulationError, match='g.yaml:4: /camera:in declares no execution_time'):
+        reschedule_bag(path, loads(nothing.replace(', execution_time: 1ms', ''), 'g.yaml'))
+
+
+@pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_several_files(tmp_path: Path, storage: StoragePlugin) -> None:
+    """As `ros2 bag record --max-bag-size` splits; one may be missing, or metadata.yaml."""
+    suffix = 'db3' if storage == StoragePlugin.SQLITE3 else 'mcap'
+    path = tmp_path / 'drive'
+    path.mkdir()
+    for i, part in enumerate('ab'):
+        stamps = [BEGIN + (10 * i + j) * 100 * MS for j in range(10)]
+        write_bag(tmp_path / part, storage, stamps=stamps)
+        shutil.copy(tmp_path / part / f'{part}.{suffix}', path / f'drive_{i}.{suffix}')
+    metadata = (tmp_path / 'a' / 'metadata.yaml').read_text().replace(
+        f'- a.{suffix}', f'- drive_0.{suffix}\n  - drive_1.{suffix}')
+    metadata = metadata.replace('message_count: 11', 'message_count: 22')
+    (path / 'metadata.yaml').write_text(metadata)
+    bag = Bag(path, {'/points'})
+    assert bag.warnings == []
+    assert list(bag.stamps['/points'].header) == [BEGIN + i * 100 * MS for i in range(20)]
+    (path / 'metadata.yaml').unlink()
+    again = Bag(path, {'/points'})
+    assert list(again.stamps['/points'].header) == list(bag.stamps['/points'].header)
+    assert 'metadata.yaml is missing' in again.warnings[0]
+    (path / 'metadata.yaml').write_text(metadata)
+    (path / f'drive_1.{suffix}').unlink()
+    half = Bag(path, {'/points'})
+    assert len(half.stamps['/points'].header) == 10
+    assert '1 of its 2 files are missing' in half.warnings[0]
+    (path / f'drive_0.{suffix}').unlink()
+    with pytest.raises(BagError, match='none of the bag files that it names is there'):
+        Bag(path, {'/points'})
+
+
+@pytest.mark.parametrize('text', [
+    '', '[', '- 1', 'rosbag2_bagfile_information: 1', 'rosbag2_bagfile_information: {}',
+    'rosbag2_bagfile_information: {relative_file_paths: []}',
+    'rosbag2_bagfile_information: {relative_file_paths: [1]}', '\x00', '[' * 5000,
+    '!!python/object:os.system x'])
+def test_wrong_metadata(tmp_path: Path, text: str) -> None:
+    path = write_bag(tmp_path / 'bag')
+    (path / 'metadata.yaml').write_text(text)
+    with pytest.raises(BagError) as caught:
+        Bag(path, {'/points'})
+    assert str(caught.value).startswith(f'{path}/metadata.yaml: this is no metadata of a bag (')
+    assert '\n' not in str(caught.value)
+
+
+def test_metadata_names_only_what_lies_beside_it(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / 'bag')
+    other = write_bag(tmp_path / 'other')
+    text = (path / 'metadata.yaml').read_text()
+    (path / 'metadata.yaml').write_text(
+        text.replace('- bag.mcap', f'- {other}/other.mcap'))
+    with pytest.raises(BagError, match='none of the bag files'):
+        Bag(path, {'/points'})
+
+
+@pytest.mark.parametrize('kind', FORMATS)
+def test_damage_is_an_error_of_one_line_or_a_warning(tmp_path: Path, kind: str) -> None:
+    path = write_bag(tmp_path / 'bag', *FORMATS[kind])
+    file = next(p for p in path.iterdir() if p.name != 'metadata.yaml')
+    data = file.read_bytes()
+    whole = list(Bag(path, {'/points'}).stamps['/points'].arrival)
+    for size in range(0, len(data), max(1, len(data) // 40)):
+        file.write_bytes(data[:size])
+        try:
+            bag = Bag(path, {'/points'})
+        except MddagError as error:
+            assert '\n' not in str(error) and str(error).startswith(str(path))
+            continue
+        found = list(bag.stamps['/points'].arrival) if bag.stamps else []
+        assert found == whole[:len(found)]
+        assert bag.warnings or found == whole
+
+
+def test_hostile_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bags, '_SPARE', 1 << 20)
+    bomb = tmp_path / 'bomb.db3.zstd'
+    packer = zstandard.ZstdCompressor().compressobj()
+    with bomb.open('wb') as file:
+        file.write(packer.compress(b'SQLite format 3\0'))
+        for _ in range(40):
+            file.write(packer.compress(bytes(1 << 20)))
+        file.write(packer.flush())
+    assert bomb.stat().st_size < 10_000
+    with pytest.raises(BagError, match='it unpacks to more than 1000 times its size'):
+        Bag(bomb, {'/points'})
+    empty = tmp_path / 'empty.db3'
+    sqlite3.connect(empty).execute('CREATE TABLE a(b)').connection.close()
+    for content in (b'SQLite format 3\0' * 100, None):
+        if content is not None:
+            empty.write_bytes(content)
+        with pytest.raises(BagError, match='its SQLite storage can not be read'):
+            Bag(empty, {'/points'})
+    with pytest.raises(BagError, match='is no file'):
+        Bag(tmp_path / 'gone', {'/points'})
+    (tmp_path / 'folder').mkdir()
+    with pytest.raises(BagError, match='there is neither metadata.yaml nor a bag file'):
+        Bag(tmp_path / 'folder', {'/points'})
+
+
+@pytest.mark.parametrize('compression', list(CompressionType))
+def test_mcap_of_another_writer(tmp_path: Path, compression: CompressionType) -> None:
+    """Without metadata, with publication times, chunks in any compression or none, disorder."""
+    path = tmp_path / 'a.mcap'
+    with path.open('wb') as stream:
+        writer = McapWriter(stream, compression=compression, chunk_size=200)
+        writer.start('ros2')
+        schema = writer.register_schema('std_msgs/msg/Header', 'ros2msg', b'\
+# a comment\nint32 CONSTANT=1\n\nbuiltin_interfaces/Time stamp\nstring frame_id\n')
+        channel = writer.register_channel('/points', 'cdr', schema)
+        for i in (0, 2, 1, 3):
+            stamp = BEGIN + i * 100 * MS
+            writer.add_message(channel, stamp + 5 * MS, header(stamp), stamp + 2 * MS)
+        writer.finish()
+    text = GRAPH.replace('period: 100ms', 'period: 100ms, release_from: source_timestamp')
+    outcome = reschedule_bag(path, loads(text, 'g.yaml'))
+    assert outcome.warnings == []
+    assert set(responses(outcome, '/lidar', '/detector:detect').values()) == {12 * MS}
+    assert set(Bag(path, {'/points'}).stamps['/points'].header) == {
+        BEGIN + i * 100 * MS for i in range(4)}
+
+
+def test_counts_that_differ_are_said(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / 'bag')
+    metadata = path / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('message_count: 11', 'message_count: 12'))
+    assert Bag(path, {'/points'}).warnings == [
+        f'{path}: metadata.yaml says that there are 12 messages, but there are 11']
+    assert UNKNOWN < 0
+
+
+def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_bag(tmp_path / 'bag')
+    graph = tmp_path / 'g.yaml'
+    graph.write_text(BY_HEADER)
+    times = tmp_path / 'times.json'
+    times.write_text('{"/lidar": {"/lidar:in": 2000, "/detector:detect": 16000}, '
+                     '"/control": {"/control:tick": 100}}')
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        status = program.main(['replay', *map(str, arguments)])
+        output = capsys.readouterr()
+        return status, output.out, output.err
+
+    status, out, err = call(path, graph, '--reschedule', '--fail-on-miss')
+    assert (status, err) == (0, '')
+    assert '/lidar: 10 jobs from the header stamp of /points' in out.splitlines()
+    assert 'policy rad, 2 workers' in out
+    status, out, _ = call(
+        path, graph, '--reschedule', '--execution-times', times, '--fail-on-miss')
+    assert status == 1
+    assert '9 late' in out     # the last one is open at the end
+    for arguments, says in (
+            ([path], 'no run of this executor is recorded in it, so there are no jobs: to take'),
+            ([path, graph], 'no run of this executor is recorded in it'),
+            ([path, graph, '--reschedule', '--overheads', 'recorded'], 'a bag has none'),
+            ([path, '--reschedule', '--execution-times', times], 'give a GRAPH')):
+        status, out, err = call(*arguments)
+        assert (status, out) == (2, '')
+        assert err.startswith('error: ') and says in err and err.count('\n') == 1

@@ -1,0 +1,202 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""End-to-end flows and response times, by hand and against slow ones."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+from mddag_executor.replay.path_cases import cases, statistics
+from mddag_executor.replay.paths import PathBook, Places
+from msg_graph import loads
+
+from .cases_by_hand import slow_cases
+
+RECORDS = st.lists(st.tuples(
+    st.integers(0, 15), st.one_of(st.none(), st.integers(0, 25))), max_size=14)
+
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks: [{name: send, timer: 100ms, publishes: [/t]}]
+  - node: /b
+    callbacks:
+      - {name: keep, subscription: /t, deadline: 1s}
+      - {name: use, timer: 50ms, reads: [keep], publishes: [/u], deadline: 1s}
+  - node: /c
+    callbacks:
+      - {name: take, timer: 30ms, dag: c, reads: [/u], publishes: [/v]}
+      - {name: other, timer: 40ms, publishes: [/w]}
+  - node: /d
+    callbacks: [{name: end, subscription: /v, deadline: 1s}]
+  - node: /e
+    callbacks: [{name: end, subscription: /w, deadline: 1s}]
+paths:
+  - name: all
+    callbacks: ['/a:send', '/b:keep', '/b:use', '/c:take', '/d:end']
+"""
+
+
+@given(RECORDS)
+def test_the_cases_are_what_the_definitions_say(records: list[tuple[int, int | None]]) -> None:
+    found = cases(records)
+    expected = slow_cases(records)
+    named = {**found._asdict(), 'all': found.every}
+    assert {case: sorted(named[case]) for case in expected} == expected
+
+
+def test_response_times_of_some_flows() -> None:
+    # 10 -> 30; 20 is overtaken; 40 -> 70; 50 is lost; 60 -> 90, and 60 -> 120 again
+    found = cases([(10, 30), (20, None), (40, 70), (50, None), (60, 90), (60, 120)])
+    assert found.every == [(20, 50), (40, 30), (50, 40), (60, 30)]
+    assert found.best == [(40, 30), (60, 30)]
+    assert found.worst == [(20, 50), (50, 40)]
+    assert found.worst_with_external_latency == [(20, 50), (40, 50)]
+    assert found.data_age == [(10, 20), (40, 30), (60, 30), (60, 60)]
+    assert statistics(found.every) == {
+        'count': 4, 'min': 30, 'mean': 38, 'median': 30, 'p99': 50, 'max': 50}
+    assert statistics([]) is None
+
+
+class Driver:
+    """Tells a book what happens, by names."""
+
+    def __init__(self, text: str = GRAPH) -> None:
+        self.book = PathBook(loads(text, 'graph.yaml'))
+
+    def run(self, key: str, start: int, message: Places | None = None, topic: str = '') -> Places:
+        """Begin an execution."""
+        places: Places = {}
+        self.book.started(key, places, start, message, topic)
+        return places
+
+    def send(self, key: str | None, places: Places | None, topic: str, time: int,
+             node: str = '') -> Places:
+        """Publish."""
+        message: Places = {}
+        self.book.published(
+            topic, node or (key or '').partition(':')[0], key, places, message, (time, 0, 0))
+        return message
+
+    def end(self, key: str, places: Places, time: int) -> None:
+        """End an execution."""
+        self.book.ended(key, places, time)
+
+    def starts(self) -> list[list[int | None]]:
+        """Return for each flow its first publication and the start of each later callback."""
+        return [[flow.columns[0][0], *(c[3] for c in flow.columns[1:])]
+                for flow in self.book.flows(0)]
+
+
+def test_a_flow_over_trigger_variable_and_topic() -> None:
+    d = Driver()
+    assert [hop.kind for hop in d.book.hops(0)] == ['trigger', 'variable', 'topic', 'trigger']
+    a = d.run('/a:send', 0)
+    m = d.send('/a:send', a, '/t', 1)
+    d.end('/a:send', a, 2)
+    early = d.run('/b:use', 3)              # nothing is kept so far
+    d.send('/b:use', early, '/u', 4)
+    d.end('/b:use', early, 5)
+    keep = d.run('/b:keep', 6, m, '/t')
+    during = d.run('/b:use', 7)             # still the older value
+    d.send('/b:use', during, '/u', 8)
+    d.end('/b:keep', keep, 9)
+    for start in (10, 20):                  # reads it twice
+        use = d.run('/b:use', start)
+        d.send('/b:use', use, '/u', start + 1)
+        d.end('/b:use', use, start + 2)
+    take = d.run('/c:take', 30)
+    v = d.send('/c:take', take, '/v', 31)
+    end = d.run('/d:end', 32, v, '/v')
+    d.end('/d:end', end, 33)
+    assert d.starts() == [[1, 6, 10, None, None], [1, 6, 20, 30, 32]]
+    whole = d.book.flows(0)[1]
+    assert (whole.begin, whole.end) == (0, 33)
+
+
+def test_a_recorded_take_says_more_than_the_latest() -> None:
+    d = Driver()
+    messages = []
+    for k in range(2):
+        a = d.run('/a:send', 100 * k)
+        m = d.send('/a:send', a, '/t', 100 * k + 1)
+        keep = d.run('/b:keep', 100 * k + 2, m, '/t')
+        d.end('/b:keep', keep, 100 * k + 3)
+        use = d.run('/b:use', 100 * k + 4)
+        messages.append(d.send('/b:use', use, '/u', 100 * k + 5))
+        d.end('/b:use', use, 100 * k + 6)
+    take = d.run('/c:take', 200)
+    d.book.took('/c:take', take, messages[0])       # its queue held the older one
+    assert d.starts() == [[1, 2, 4, 200, None], [101, 102, 104, None, None]]
+
+
+def test_what_others_publish_is_no_flow() -> None:
+    d = Driver()
+    a = d.run('/a:send', 0)
+    m = d.send('/a:send', a, '/t', 1)
+    d.run('/b:keep', 2, None, '/t')         # a message of unknown origin
+    d.run('/b:keep', 3, {}, '/t')           # one of another publisher
+    d.run('/b:keep', 4, m, '/t')
+    d.send('/c:other', {}, '/w', 5)
+    assert d.starts() == [[1, 4, None, None, None]]
+
+
+SYNC = """\
+mddag: 1
+nodes:
+  - node: /s
+    callbacks:
+      - {name: left, subscription: /in, publishes: [/l]}
+      - {name: right, subscription: /in, publishes: [/r]}
+      - {name: source, timer: 100ms, publishes: [/in]}
+      - {name: join, sync: [/l, /r], publishes: [/out]}
+      - {name: end, subscription: /out, deadline: 100ms}
+paths:
+  - {name: left, callbacks: ['/s:left', '/s:join', '/s:end']}
+"""
+
+
+def test_the_other_leg_of_a_sync_may_publish() -> None:
+    d = Driver(SYNC)
+    left = d.run('/s:left', 0)
+    l_message = d.send('/s:left', left, '/l', 1)
+    d.run('/s:join', 2, l_message, '/l')
+    right_leg = d.run('/s:join', 5, {}, '/r')       # made it whole
+    out = d.send('/s:join', right_leg, '/out', 6)
+    d.run('/s:end', 7, out, '/out')
+    assert d.starts() == [[1, 2, 7]]
+
+
+def test_publications_outside_of_executions() -> None:
+    d = Driver(SYNC)
+    left = d.run('/s:left', 0)
+    d.end('/s:left', left, 1)
+    message = d.send(None, None, '/l', 3, '/s')     # by a thread of the node
+    d.run('/s:join', 4, message, '/l')
+    assert d.starts() == [[3, 4, None]]
+
+
+def test_what_is_kept_may_be_of_unknown_origin() -> None:
+    d = Driver()
+    a = d.run('/a:send', 0)
+    m = d.send('/a:send', a, '/t', 1)
+    known = d.run('/b:keep', 2, m, '/t')
+    d.end('/b:keep', known, 3)
+    unknown = d.run('/b:keep', 4, None, '/t')
+    d.end('/b:keep', unknown, 5)
+    use = d.run('/b:use', 6)            # reads the unknown one: nobody knows how old it is
+    d.send('/b:use', use, '/u', 7)
+    assert d.starts() == [[1, 2, None, None, None]]

@@ -1,0 +1,203 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Systems from traces: who is who, what was measured, what drifted; on traces made here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+import re
+
+from mddag_executor.errors import InputError
+from mddag_executor.replay.as_recorded import replay_recording
+from mddag_executor.replay.drift import drift_of_import, WatchedRecording
+from mddag_executor.replay.sketching import System
+from mddag_executor.trace import TraceFile
+from msg_graph import loads
+from msg_graph.blanks import declaration_with_blanks, MARK
+from msg_graph.from_caret import declaration_from_caret
+import pytest
+
+MS = 1_000_000
+PID = 7
+BAGS = Path(__file__).resolve().parents[2] / 'bags'
+ARCHITECTURE = """\
+named_paths: []
+nodes:
+- node_name: /a
+  callbacks:
+  - {callback_name: /a/callback_0, callback_type: timer_callback, period_ns: 10000000}
+  - {callback_name: /a/callback_1, callback_type: timer_callback, period_ns: 10000000}
+  publishes:
+  - {topic_name: /x, callback_names: [UNDEFINED]}
+- node_name: /b
+  callbacks:
+  - {callback_name: /b/callback_0, callback_type: subscription_callback, topic_name: /x}
+  - {callback_name: /b/callback_1, callback_type: subscription_callback, topic_name: /out}
+  - {callback_name: /b/callback_2, callback_type: subscription_callback, topic_name: /never}
+"""
+
+
+def head() -> list[tuple[object, ...]]:
+    """Return who is who: rclcpp makes a subscription's links in another order than rclpy."""
+    return [
+        ('rcl_node_init', 0, 1, 100, 0, 'a', '/'),
+        ('rcl_node_init', 0, 1, 200, 0, 'b', '/'),
+        ('rcl_node_init', 0, 1, 300, 0, 'quiet', '/ns'),
+        ('rcl_publisher_init', 0, 1, 110, 100, 0, '/x', 10),
+        ('rcl_publisher_init', 0, 1, 111, 100, 0, '/rosout', 10),
+        ('rcl_publisher_init', 0, 1, 112, 100, 0, '/unseen', 10),
+        ('rcl_publisher_init', 0, 1, 310, 300, 0, '/alone', 10),
+        *(event for n in (0, 1) for event in (
+            ('rcl_timer_init', 0, 1, 120 + n, 10 * MS),
+            ('rclcpp_timer_callback_added', 0, 1, 120 + n, 130 + n),
+            ('rclcpp_timer_link_node', 0, 1, 120 + n, 100),
+            ('callback_group_add_timer', 0, 1, 140, 120 + n))),
+        ('add_callback_group', 0, 1, 5, 140, 'mutually_exclusive'),
+        *(event for n, topic in enumerate(('/x', '/out', '/parameter_events')) for event in (
+            ('rclcpp_subscription_callback_added', 0, 1, 220 + n, 230 + n),
+            ('rclcpp_subscription_init', 0, 1, 210 + n, 220 + n),
+            ('rcl_subscription_init', 0, 1, 210 + n, 200, 0, topic, 10))),
+        ('rcl_service_init', 0, 1, 250, 200, 0, '/b/get_parameters'),
+        ('rclcpp_service_callback_added', 0, 1, 250, 251),
+        ('rcl_service_init', 0, 1, 260, 200, 0, '/serve'),
+        ('rclcpp_service_callback_added', 0, 1, 260, 261),
+    ]
+
+
+def run(callback: int, thread: int, start: int, length: int, *publishers: int
+        ) -> list[tuple[object, ...]]:
+    return [('callback_start', start, thread, callback, False),
+            *(('rcl_publish', start + 1, thread, each, 0) for each in publishers),
+            ('callback_end', start + length, thread, callback)]
+
+
+def trace(path: Path, events: Iterable[tuple[object, ...]]) -> Path:
+    with TraceFile(path) as file:
+        file.extend(sorted(events, key=lambda event: event[1]), PID)
+        assert file.rejected == 0, file.rejection
+    return path
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    """Give a trace of two timers, of which the second publishes, and of two subscriptions."""
+    events = head()
+    for k in range(20):
+        at = 1_000 * MS + 10 * MS * k
+        events += run(130, 1, at, MS)
+        events += run(131, 2, at, 2 * MS + k, 110, 111)
+        events += run(230, 3, at + 3 * MS, MS)
+        events += run(231, 3, at // 2 + 4 * MS, MS)
+    events.append(('callback_end', 5_000 * MS, 9, 131))  # cut: its start is not there
+    return trace(tmp_path / 'r.mcap', events)
+
+
+def test_from_a_trace(recorded: Path) -> None:
+    text = declaration_with_blanks(System(recorded).sketch())
+    assert f'# From the trace {recorded}.' in text
+    accepted = re.sub(rf'^( +)# (\w+: .*# {MARK})', r'\1\2', text, flags=re.MULTILINE)
+    # That quiet node's publisher has no callback: a timer of unknown period is supposed.
+    accepted = accepted.replace('publishes: [/unseen]', 'publishes: []', 1).replace(
+        '        publishes: [/x]\n', '', 1)
+    task_set = loads(accepted)
+    assert [(c.key, c.kind, c.topics) for c in task_set.callbacks] == [
+        ('/a:callback_0', 'timer', ()), ('/a:callback_1', 'timer', ()),
+        ('/b:callback_0', 'subscription', ('/x',)), ('/b:callback_1', 'subscription', ('/out',)),
+        ('/b:callback_2', 'service', ()), ('/ns/quiet:callback_0', 'timer', ())]
+    assert task_set.callbacks[0].group == task_set.callbacks[1].group == 'callback_group_0'
+    assert task_set.callbacks[1].publishes == ('/x', '/unseen')
+    assert task_set.callbacks[3].period_ns == 5 * MS
+    assert 'nobody here publishes the topic; the time between two messages; proposed' in text
+    time = task_set.callbacks[1].execution_time
+    assert time is not None
+    assert time.quantiles_ns == (
+        2 * MS, 2 * MS + 9, 2 * MS + 17, 2 * MS + 19, 2 * MS + 19)
+    assert time.percent == (0, 50, 90, 99, 100)
+    assert 'get_parameters' not in text and 'parameter_events' not in text
+
+
+def test_measures_for_an_architecture_file(recorded: Path) -> None:
+    system, counts = System(recorded), []
+    text = declaration_from_caret(
+        ARCHITECTURE, 'arch.yaml', lambda sketch: counts.append(system.measure(sketch)))
+    assert counts == [4]
+    plain = declaration_from_caret(ARCHITECTURE, 'arch.yaml')
+    assert plain.count('which callback publishes /x?') == 2
+    assert '# period: 5ms' in text and '# period: 5ms' not in plain
+    assert text.count('# measured in 20 executions') == 4
+    # The second timer was seen to publish; of the first it is not known that it never does.
+    assert text.index('callback_1') < text.index('publishes: [/x]\n')
+
+
+def test_what_is_no_system(tmp_path: Path) -> None:
+    path = trace(tmp_path / 'e.mcap', [('callback_start', 1, 1, 5, False)])
+    with pytest.raises(InputError, match='no timer, subscription or service of a node'):
+        System(path)
+
+
+def test_a_recorded_declaration_gives_names_and_deadlines() -> None:
+    bag = BAGS / 'demo_short.mcap'
+    system = System(bag, 'bag')
+    assert system.task_set is not None
+    text = declaration_with_blanks(system.sketch())
+    again = loads(text)
+    before = system.task_set
+    assert [c.key for c in again.callbacks] == [c.key for c in before.callbacks]
+    assert [(d.name, d.period_ns, d.edges, [v.name for v in d.vertices]) for d in again.dags] == [
+        (d.name, d.period_ns, d.edges, [v.name for v in d.vertices]) for d in before.dags]
+    assert [v.deadline_ns for v in again.vertices] == [v.deadline_ns for v in before.vertices]
+    assert MARK not in text.split('mddag: 1')[1]
+
+
+def test_a_recorded_run_as_declared_has_no_drift() -> None:
+    recording = WatchedRecording(BAGS / 'demo_short.mcap')
+    replayed = replay_recording(recording, None)
+    assert replayed.task_set.callbacks
+    assert recording.drift(replayed.task_set) == []
+
+
+def test_drift_of_a_recorded_run_against_another_declaration() -> None:
+    recording = WatchedRecording(BAGS / 'demo_short.mcap')
+    text = recording.task_set.text
+    other = loads(text.replace('timer: 100ms', 'timer: 150ms'))
+    replay_recording(recording, None)
+    found = recording.drift(other)
+    slower = [dag.vertices[dag.source].callback.key for dag in other.dags
+              if dag.period_ns == 150 * MS]
+    assert {each.callback for each in found if each.kind == 'rate'} == set(slower) != set()
+
+
+def test_drift_of_an_imported_recording(recorded: Path) -> None:
+    text = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: one, timer: 10ms, deadline: 5ms, dag: one}
+      - {name: two, timer: 10ms, publishes: [/x]}
+  - node: /b
+    callbacks:
+      - {name: x, subscription: /x, deadline: 5ms}
+      - {name: o, subscription: /out, period: 5ms, deadline: 5ms, dag: o}
+"""
+    census = System(recorded).census
+    assert drift_of_import(census, loads(text)) == []
+    found = drift_of_import(census, loads(text.replace(', publishes: [/x]', ', deadline: 1s')
+                                          .replace('/x, deadline', '/x, period: 15ms, deadline')
+                                          .replace('/out', '/gone').replace('two', 'zwei')))
+    assert [(each.kind, each.callback) for each in found] == [
+        ('publishes', '/a:zwei'), ('rate', '/b:x'), ('never ran', '/b:o')]
+    assert (found[1].declared, found[1].observed) == (15 * MS, 10 * MS)

@@ -1,0 +1,221 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The event loop with messages that take time, and the overheads measured in a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mddag_executor.core import policy as find_policy
+from mddag_executor.core import Tables
+from mddag_executor.core.state import new_state, SINK_DONE
+from mddag_executor.replay import reschedule
+from mddag_executor.replay.timed import busy_times, edges_of, Engine, Transports
+from mddag_executor.simulate import END, Load, PREEMPT, START
+from mddag_executor.trace import TraceFile
+from msg_graph import loads
+import pytest
+
+from .helpers import Chances, MS, SMALL, START_TIME, VirtualRun
+
+CHAIN = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: a, timer: 100ms, publishes: [/x, /y], dag: a}
+  - node: /b
+    callbacks:
+      - {name: b, subscription: /x, publishes: [/z]}
+  - node: /c
+    callbacks:
+      - {name: c, sync: [/y, /z], deadline: 90ms}
+  - node: /d
+    callbacks:
+      - {name: d, timer: 100ms, deadline: 20ms, dag: d}
+"""
+# edges of DAG a: a to b, a to c, b to c
+
+
+def engine(
+    delays: list[int], workers: int = 2, preemptive: bool = False, horizon: int = 100 * MS,
+    late: int = 50 * MS, jobs: int = 1, bound: int = 64,
+) -> tuple[list[tuple[int, int, int]], list[tuple[int, ...]]]:
+    """Run a (4 ms), b (2 ms), c (3 ms), and d (1 ms, later); return starts and completed sinks."""
+    task_set = loads(CHAIN, 'g.yaml')
+    tables = Tables.build(task_set, max_active_jobs=bound)
+    load = Load([*(job * MS for job in range(jobs)), late], [0] * jobs + [1],
+                [*range(jobs), 0], [4 * MS, 2 * MS, 3 * MS] * jobs + [MS], [0, 3 * jobs], [3, 1])
+    transports = Transports(delays * jobs, [0, 0], [3, 0])
+    state = new_state(tables, workers, preemptive=preemptive, propagate=2)
+    run = Engine(tables, state, find_policy('rad').key, load, transports)
+    run.run(horizon)
+    starts = [(time // 1000, worker, vertex) for time, kind, worker, _, vertex, _ in run.log
+              if kind == START]
+    done = [(d[2], d[5] // 1000) for d in state.decisions if d[0] == SINK_DONE]
+    assert edges_of(tables) == [3, 0]
+    return starts, done
+
+
+def test_messages_take_their_time() -> None:
+    assert engine([0, 0, 0]) == (
+        [(0, 0, 0), (4000, 0, 1), (6000, 0, 2), (50_000, 0, 3)], [(2, 9000), (3, 51_000)])
+    assert engine([MS, 0, 2 * MS])[0][:3] == [(0, 0, 0), (5000, 0, 1), (9000, 0, 2)]
+    # the last of the messages that a join waits for decides
+    assert engine([MS, 20 * MS, 2 * MS])[0][:3] == [(0, 0, 0), (5000, 0, 1), (24_000, 0, 2)]
+
+
+def test_a_callback_may_publish_before_its_end() -> None:
+    starts, done = engine([-3 * MS, 0, -MS])
+    assert starts[:3] == [(0, 0, 0), (1000, 1, 1), (4000, 0, 2)]
+    assert done[0] == (2, 7000)
+    # not before its start
+    assert engine([-30 * MS, 0, 0])[0][:2] == [(0, 0, 0), (0, 1, 1)]
+    # preempted, its end is not known in advance: the message is there with it
+    assert engine([-3 * MS, 0, 0], preemptive=True)[0][1] == (4000, 0, 1)
+
+
+def test_a_worker_is_free_while_a_message_is_on_its_way() -> None:
+    starts, _ = engine([5 * MS, 0, 0], workers=1, late=5 * MS)
+    assert starts == [(0, 0, 0), (5000, 0, 3), (9000, 0, 1), (11_000, 0, 2)]
+
+
+def test_preemption() -> None:
+    starts, done = engine([0, 0, 0], workers=1, preemptive=True, late=MS)
+    assert starts == [(0, 0, 0), (1000, 0, 3), (2000, 0, 0), (5000, 0, 1), (7000, 0, 2)]
+    assert done == [(3, 2000), (2, 10_000)]
+
+
+def test_the_horizon() -> None:
+    assert engine([0, 0, 0], horizon=9 * MS)[1] == [(2, 9000)]
+    assert engine([0, 0, 0], horizon=9 * MS - 1)[1] == []
+    assert engine([10 * MS, 0, 0], horizon=12 * MS)[0] == [(0, 0, 0)]
+
+
+def test_a_message_of_a_job_that_has_ended_is_ignored() -> None:
+    """With one job open at a time the second expires the first while its message is on its way."""
+    starts, done = engine([20 * MS, 0, 0], jobs=6, bound=1)
+    assert [vertex for _, _, vertex in starts].count(1) == 1
+    assert [vertex for vertex, _ in done] == [2, 3]
+
+
+def test_busy_times() -> None:
+    log = [(0, START, 0, 0, 0, 0), (4, PREEMPT, 0, 0, 0, 0), (4, START, 0, 0, 1, 0),
+           (6, END, 0, 0, 1, 0), (7, START, 1, 0, 0, 0)]
+    assert busy_times(log, 3, 10) == [6, 3, 0]
+
+
+def record(path: Path, delay: int, wake: int, ready_early: int = 0) -> None:
+    """Record three jobs of a chain of three, with these overheads, ns."""
+    text = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: a, timer: 100ms, publishes: [/x], dag: a}
+      - {name: b, subscription: /x, publishes: [/y]}
+      - {name: c, subscription: /y, deadline: 90ms}
+"""
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 2, 100 * MS, 64, False)
+        for job in range(3):
+            release = START_TIME + job * 100 * MS
+            file.add('job_release', release + 10_000, 1, 1, 0, job, release)
+            ready = release + 10_000
+            for vertex in range(3 if job < 2 else 2):      # the last one is cut off
+                start = ready + wake
+                end = start + 5 * MS
+                worker = vertex % 2
+                file.add('dispatch', start, 1, 10 + worker, 9 + vertex, 0, vertex, job, worker,
+                         ready, 0)
+                file.add('callback_start', start, 1, 10 + worker, 9 + vertex, False)
+                file.add('callback_end', end, 1, 10 + worker, 9 + vertex)
+                file.add('complete', end, 1, 10 + worker, 9 + vertex, 0, vertex, job, True, end, 0)
+                ready = end + delay - ready_early
+        file.add('shutdown', START_TIME + 300 * MS, 1, 1, START_TIME + 300 * MS)
+
+
+@pytest.mark.parametrize(('delay', 'wake', 'early'), [
+    (0, 0, 0), (700_000, 0, 0), (0, 300_000, 0), (700_000, 300_000, 0),
+    # published 3 ms before the end: the next one runs at the same time, on the other worker
+    (700_000, 300_000, 3 * MS)])
+def test_overheads_are_measured_and_reproduced(
+    tmp_path: Path, delay: int, wake: int, early: int
+) -> None:
+    path = tmp_path / 'a.mcap'
+    record(path, delay, wake, early)
+    outcome = reschedule(path)
+    result = outcome.result()
+    sink = result['dags']['a']['sinks']['/n:c']
+    expected = 10_000 + 15 * MS + 2 * (delay - early) + 3 * wake
+    assert sink['response_ns']['max'] == sink['response_ns']['min'] == expected
+    assert sink['completed'] == 3       # medians stand in for what is not recorded
+    recorded = result['recorded']['dags']['a']['sinks']['/n:c']
+    assert recorded['response_ns']['max'] == expected
+    assert result['overheads'] == {
+        'included': True, 'added_ns': 0, 'dispatch_median_ns': wake,
+        'transport_median_ns': delay - early}
+    ideal = reschedule(path, overheads=False).result()
+    assert ideal['dags']['a']['sinks']['/n:c']['response_ns']['max'] == 15 * MS
+    added = reschedule(path, overheads=False, dispatch_overhead=MS).result()
+    assert added['dags']['a']['sinks']['/n:c']['response_ns']['max'] == 18 * MS
+
+
+def test_waiting_for_a_worker_is_no_overhead(tmp_path: Path) -> None:
+    """Of what waited while its worker was busy only what came after that is dispatch."""
+    path = tmp_path / 'a.mcap'
+    text = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: a, timer: 100ms, dag: a, deadline: 50ms}
+      - {name: b, timer: 100ms, dag: b, deadline: 60ms}
+"""
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
+        # one round of timers: neither starts before both have been noticed
+        file.add('job_release', START_TIME + 1000, 1, 1, 1, 0, START_TIME)
+        file.add('job_release', START_TIME + 9000, 1, 1, 0, 0, START_TIME)
+        for dag, start, end in ((0, 9000, 5 * MS), (1, 5 * MS + 2000, 8 * MS)):
+            ready = START_TIME + (9000 if dag == 0 else 1000)
+            start, end = START_TIME + start, START_TIME + end
+            file.add('dispatch', start, 1, 10, 9 + dag, dag, 0, 0, 0, ready, 0)
+            file.add('callback_start', start, 1, 10, 9 + dag, False)
+            file.add('callback_end', end, 1, 10, 9 + dag)
+            file.add('complete', end, 1, 10, 9 + dag, dag, 0, 0, True, end, 0)
+        file.add('shutdown', START_TIME + 50 * MS, 1, 1, START_TIME + 50 * MS)
+    outcome = reschedule(path)
+    assert [(time - START_TIME, kind, vertex) for time, kind, _, _, vertex, _ in outcome.log] == [
+        (9000, START, 0), (5 * MS, END, 0), (5 * MS, START, 1), (8 * MS, END, 1)]
+    two = reschedule(path, workers=2)
+    assert [(time - START_TIME, kind, vertex) for time, kind, _, _, vertex, _ in two.log][:2] == [
+        (9000, START, 0), (9000, START, 1)]
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_the_prediction_of_a_virtual_run(tmp_path: Path, seed: int) -> None:
+    """One DAG, workers enough, nothing lost: the same response times."""
+    path = tmp_path / 'a.mcap'
+    alone = loads(SMALL[:SMALL.index('  - node: /imu')], 'alone.yaml')
+    VirtualRun(path, alone, seed, workers=8, duration=500 * MS, longest=3 * MS,
+               chances=Chances(0, 0, 0, 0, 0, 0.3))
+    result = reschedule(path).result()
+    for name, dag in result['dags'].items():
+        for sink_name, sink in dag['sinks'].items():
+            recorded = result['recorded']['dags'][name]['sinks'][sink_name]['response_ns']
+            # of two long legs of a sync callback at the same time the longer one counts twice
+            for key, tolerance in (('median', 0.02), ('p99', 0.001), ('max', 0.001)):
+                assert sink['response_ns'][key] == pytest.approx(recorded[key], rel=tolerance)

@@ -1,0 +1,183 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Tolerated misses (ratio and burst, as CARET's report has them) and JUnit XML."""
+
+from __future__ import annotations
+
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from hypothesis import given
+from hypothesis import strategies as st
+from mddag_executor.cli import main as program
+from mddag_executor.core import Tables
+from mddag_executor.core.state import (
+    Decision,
+    SINK_ABORTED,
+    SINK_DONE,
+    SINK_EXPIRED,
+    SINK_MISSED,
+)
+from mddag_executor.replay.tolerances import due_and_missed, longest_burst, MissTally, Tolerance
+from mddag_executor.report.junit import junit
+from mddag_executor.trace import TraceFile
+from msg_graph import loads
+import pytest
+
+MS = 1_000_000
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks: [{name: a, timer: 10ms, deadline: 8ms}]
+"""
+
+
+def sink_of(missed: list[bool]) -> dict[str, Any]:
+    """Return the result of a sink whose jobs missed or not, in a tally that is told of them."""
+    task_set = loads(GRAPH, 'g.yaml')
+    tally = MissTally(task_set, Tables.build(task_set))
+    decisions: list[Decision] = []
+    for job, miss in enumerate(missed):
+        deadline = job * 10 * MS + 8 * MS
+        kind = (SINK_DONE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED)[job % 4] if miss else SINK_DONE
+        time = deadline + miss if kind == SINK_DONE else -1
+        decisions.append((kind, 0, 0, job, deadline, time))
+    tally.add(reversed(decisions))      # jobs may complete out of order
+    result = tally.result()
+    tally.add_bursts(result['dags'])
+    found: dict[str, Any] = result['dags']['/n']['sinks']['/n:a']
+    return found
+
+
+@given(st.lists(st.booleans(), max_size=30), st.none() | st.floats(0, 1),
+       st.none() | st.integers(0, 10))
+def test_the_verdict_is_that_of_caret(
+    missed: list[bool], ratio: float | None, burst: int | None
+) -> None:
+    """Its definition: sum(miss) / len > ratio fails, as does max(len(run)) > burst_num."""
+    sink = sink_of(missed)
+    runs = [len(list(run)) for miss, run in groupby(missed) if miss]
+    assert sink['longest_burst'] == max(runs, default=0)
+    assert due_and_missed(sink) == (len(missed), sum(missed))
+    fails = any(missed) if ratio is None and burst is None else bool(
+        ratio is not None and missed and sum(missed) / len(missed) > ratio
+        or burst is not None and max(runs, default=0) > burst)
+    assert (Tolerance(ratio, burst).broken_by(sink) is not None) == fails
+
+
+def test_a_job_that_is_not_there_ends_a_burst() -> None:
+    assert longest_burst([]) == 0
+    assert longest_burst([7, 5, 6, 6, 9]) == 3
+
+
+HOSTILE = 'a"]]><&\'\x00\x1b[2J\n\ud800\uffff\u202e</testcase>'
+
+
+def test_junit_with_hostile_names() -> None:
+    sinks = {HOSTILE: sink_of([True] * 3), 'good': sink_of([False]), 'none': sink_of([])}
+    result = {'dags': {HOSTILE: {'sinks': sinks}}, 'duration_ns': 30 * MS, 'policy': 'rad',
+              'workers': 2, 'preemptive': False, 'rescheduled': False, 'warnings': [HOSTILE]}
+    broken = Tolerance(0.5, 2).verdicts(result['dags'])
+    assert list(broken) == [(HOSTILE, HOSTILE)]
+    root = ElementTree.fromstring(junit(result, broken, HOSTILE))
+    suite = root[0]
+    assert {key: suite.attrib[key] for key in ('tests', 'failures', 'errors', 'skipped')} == {
+        'tests': '3', 'failures': '1', 'errors': '0', 'skipped': '1'}
+    bad, good, none = suite.findall('testcase')
+    failure = bad.find('failure')
+    assert failure is not None
+    assert failure.attrib['message'] == (
+        '3 of 3 jobs missed the deadline (100.0000%), at most 50.0000% are tolerated; '
+        '3 jobs in a row missed the deadline, at most 2 are tolerated')
+    for text in (bad.attrib['name'], bad.attrib['classname'], suite.attrib['name']):
+        assert '\\x00' in text and '\\x1b[2J\\n\\ud800' in text
+        assert all(c.isprintable() for c in text)
+    assert good.find('failure') is None and good.find('skipped') is None
+    assert none.find('skipped') is not None
+    assert suite.findtext('system-err')
+
+
+@pytest.fixture
+def trace(tmp_path: Path) -> Path:
+    """Give a trace of ten jobs, of which the third and the fourth are late."""
+    path = tmp_path / 'run.mcap'
+    with TraceFile(path) as file:
+        file.add('task_set', 0, 1, 1, GRAPH, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
+        for job in range(10):
+            release = (job + 1) * 10 * MS
+            end = release + (9 if job in (2, 3) else 1) * MS
+            file.add('job_release', release, 1, 1, 0, job, release)
+            file.add('dispatch', release, 1, 5, 7, 0, 0, job, 0, release, 0)
+            file.add('callback_start', release, 1, 5, 7, False)
+            file.add('callback_end', end, 1, 5, 7)
+            file.add('complete', end, 1, 5, 7, 0, 0, job, True, end, 0)
+            if job in (2, 3):
+                file.add('deadline', end, 1, 5, 0, 0, job, release + 8 * MS, end)
+        file.add('shutdown', 200 * MS, 1, 1, 200 * MS)
+    return path
+
+
+@pytest.mark.parametrize(('options', 'status'), [
+    ([], 1), (['--tolerate-ratio', '0.2'], 0), (['--tolerate-ratio', '0.19'], 1),
+    (['--tolerate-burst', '2'], 0), (['--tolerate-burst', '1'], 1),
+    (['--tolerate-ratio', '0.2', '--tolerate-burst', '1'], 1),
+    (['--tolerate-ratio', '0.1', '--tolerate-burst', '2'], 1),
+    (['--tolerate-ratio', '1', '--tolerate-burst', '2'], 0),
+])
+def test_the_exit_status(
+    trace: Path, options: list[str], status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for mode in ([], ['--reschedule']):
+        arguments = ['replay', str(trace), *options, *mode, '--fail-on-miss']
+        assert program.main(arguments) == status
+        said = 'not tolerated: /n:a: ' in capsys.readouterr().out
+        assert said == bool(options and status)
+
+
+def test_junit_on_the_command_line(
+    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / 'out.xml'
+    assert program.main(['replay', str(trace), '--junit', str(out)]) == 0
+    case = ElementTree.parse(out).getroot().find('testsuite/testcase')
+    assert case is not None and case.find('failure') is not None
+    assert program.main(
+        ['replay', str(trace), '--junit', str(out), '--tolerate-burst', '2']) == 0
+    case = ElementTree.parse(out).getroot().find('testsuite/testcase')
+    assert case is not None and case.find('failure') is None
+    assert case.attrib == {'classname': '/n', 'name': '/n:a', 'time': '0.009000000'}
+    capsys.readouterr()
+    assert program.main(['replay', str(trace), '--junit', '-']) == 0
+    ElementTree.fromstring(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(('options', 'says'), [
+    (['--tolerate-ratio', '1.5', '--fail-on-miss'], "'1.5' is no number from 0 to 1"),
+    (['--tolerate-ratio', 'nan', '--fail-on-miss'], "'nan' is no number from 0 to 1"),
+    (['--tolerate-burst', '-1', '--fail-on-miss'], "'-1' is no whole number from 1 up"),
+    (['--tolerate-burst', '2'], 'it decides about --fail-on-miss and --junit: add one'),
+    (['--junit', '/gone/out.xml'], 'there is no directory /gone'),
+    (['--junit', '-', '--json', '-'], 'can be only one of --json and --junit'),
+])
+def test_wrong_options(
+    trace: Path, options: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert program.main(['replay', str(trace), *options]) == 2
+    output = capsys.readouterr()
+    assert output.out == ''
+    assert says in output.err and output.err.count('\n') == 1

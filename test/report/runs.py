@@ -1,0 +1,96 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Runs for the tests of reports: a small trace written by hand, and simulated ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.simulate import (
+    draw_execution_times,
+    Load,
+    periodic_load,
+    Run,
+    scale_execution_times,
+    Settings,
+    simulate,
+)
+from mddag_executor.trace import TraceFile
+import msg_graph
+from msg_graph import TaskSet
+
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
+START = 1_732_166_766_000_000_000
+MS = 1_000_000
+HOSTILE = '</script><img src=x onerror="window.hacked=1">=cmd()\x1b[31m&amp;{{7*7}}'
+
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /driver
+    callbacks:
+      - {name: tick, timer: 10ms, publishes: [/data]}
+  - node: /filter
+    callbacks:
+      - {name: run, subscription: /data, deadline: 8ms}
+paths:
+  - {name: whole, callbacks: ['/driver:tick', '/filter:run']}
+"""
+
+
+def by_hand(path: Path, hostile: bool = False, finished: bool = True) -> Path:
+    """Write a trace of three jobs; the third is 2 ms late; then an undeclared callback runs."""
+    with TraceFile(path) as file:
+        def add(name: str, ms: int, *fields: Any) -> None:
+            file.add(name, START + ms * MS, 1, 9, *fields)
+
+        def run(vertex: int, job: int, ready: int, start: int, end: int) -> None:
+            add('dispatch', start, vertex + 1, 0, vertex, job, vertex, START + ready * MS, 0)
+            add('callback_start', start, vertex + 1, False)
+            add('callback_end', end, vertex + 1)
+            add('complete', end, vertex + 1, 0, vertex, job, True, START + end * MS, 0)
+
+        add('task_set', 0, GRAPH, HOSTILE if hostile else 'graph.yaml', 'rad', 2, 100 * MS, 64,
+            False)
+        add('rclcpp_callback_register', 0, 77, HOSTILE if hostile else 'extra')
+        for job, first in enumerate((1, 2, 6)):
+            at = 10 + 10 * job
+            add('job_release', at, 0, job, START + at * MS)
+            run(0, job, at, at, at + first)
+            run(1, job, at + first, at + first + 1, at + first + 4)
+        add('deadline', 40, 0, 1, 2, START + 38 * MS, START + 40 * MS)
+        add('dispatch', 41, 77, -1, -1, -1, -1, START + 41 * MS, 0)
+        add('callback_start', 41, 77, False)
+        add('callback_end', 43, 77)
+        if finished:
+            add('shutdown', 50, START + 50 * MS)
+    return path
+
+
+def autoware(name: str = 'autoware_multi') -> TaskSet:
+    return msg_graph.load(CONFIG / f'{name}.yaml')
+
+
+def simulated(
+    task_set: TaskSet, *, utilisation: float = 0.95, workers: int = 5, ms: int = 300,
+    seed: int = 0, **settings: Any,
+) -> tuple[Load, Run]:
+    """Simulate with a log."""
+    times = scale_execution_times(
+        task_set, draw_execution_times(task_set, seed), workers, utilisation)
+    load = periodic_load(task_set, times, ms * MS)
+    return load, simulate(
+        task_set, load, Settings(workers=workers, duration_ns=ms * MS, **settings), log=True)

@@ -1,0 +1,97 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Two runs side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.replay import replay
+from mddag_executor.report.diff import callbacks_table, compare, sinks_table, summary
+import msg_graph
+import pytest
+
+from . import runs
+
+MS = runs.MS
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> dict[str, Any]:
+    return replay(runs.by_hand(tmp_path / 'run.mcap')).result()
+
+
+def changed(result: dict[str, Any], **sink: Any) -> dict[str, Any]:
+    before = result['dags']['/driver']['sinks']['/filter:run']
+    return {**result, 'dags': {'/driver': {'sinks': {'/filter:run': {**before, **sink}}}}}
+
+
+def test_a_run_is_no_worse_than_itself(result: dict[str, Any]) -> None:
+    difference = compare(result, result, 0.0)
+    sink = difference['dags']['/driver']['sinks']['/filter:run']
+    assert sink['a'] == sink['b'] == {
+        'relative_deadline_ns': 8 * MS, 'due': 3, 'in_time': 2, 'late': 1, 'expired': 0,
+        'aborted': 0, 'response_ns': {'min': 5 * MS, 'median': 6 * MS, 'p99': 10 * MS,
+                                      'max': 10 * MS}}
+    assert set(sink['change_ns'].values()) == {0} and set(sink['change'].values()) == {0.0}
+    assert difference['worse'] is sink['worse'] is False
+    assert difference['callbacks']['/driver:tick']['a'] == {
+        'executions': 3, 'mean_ns': 3 * MS, 'longest_ns': 6 * MS, 'mean_wait_ns': 0}
+    lines = list(summary(difference))
+    assert '3 sink jobs due, 2 in time (66.67 %), 1 late' in lines[0]
+    assert lines[-1] == '0 sinks are worse in the second run'
+
+
+@pytest.mark.parametrize(('sink', 'tolerance', 'worse'), [
+    ({'late': 2}, None, True),
+    ({'late': 0}, None, False),
+    ({'completed': 6, 'late': 2}, None, False),         # the same share
+    ({'completed': 6, 'late': 3}, None, True),
+    ({'expired': 1}, None, True),
+    ({'response_ns': {'min': 1, 'median': 2, 'p99': 11 * MS, 'max': 11 * MS}}, None, False),
+    ({'response_ns': {'min': 1, 'median': 2, 'p99': 11 * MS, 'max': 11 * MS}}, 0.1, False),
+    ({'response_ns': {'min': 1, 'median': 2, 'p99': 11 * MS + 1, 'max': 12 * MS}}, 0.1, True),
+    ({'response_ns': {'min': 1, 'median': 2, 'p99': 9 * MS, 'max': 12 * MS}}, 0.0, False),
+    ({'response_ns': None}, 0.0, False)])
+def test_what_is_worse(
+    result: dict[str, Any], sink: dict[str, Any], tolerance: float | None, worse: bool
+) -> None:
+    assert compare(result, changed(result, **sink), tolerance)['worse'] is worse
+
+
+def test_the_tables(result: dict[str, Any]) -> None:
+    after = changed(result, late=2, response_ns={
+        'min': 5 * MS, 'median': 9 * MS, 'p99': 20 * MS, 'max': 20 * MS})
+    difference = compare(result, after)
+    line = sinks_table(difference).splitlines()[1].split()
+    assert line == ['/driver', 'filter:run', '3', '3', '2', '1', '1', '2', '6', 'ms', '+50.0',
+                    '%', '10', 'ms', '+100.0', '%', '10', 'ms', '+100.0', '%', 'worse']
+    table = [row.split() for row in callbacks_table(difference).splitlines()]
+    assert ['/driver:tick', '3', '3', '3', 'ms', '3', 'ms', '6', 'ms', '6', 'ms', '0', 'ns', '0',
+            'ns'] in table
+
+
+def test_what_only_one_run_has(result: dict[str, Any], tmp_path: Path) -> None:
+    graph = runs.GRAPH.replace('deadline: 8ms', 'deadline: 5ms').replace('name: whole', 'name: w')
+    other = replay(runs.by_hand(tmp_path / 'other.mcap'), msg_graph.loads(graph)).result()
+    difference = compare(result, other)
+    assert 'worse, deadline then 5 ms' in sinks_table(difference)
+    lacking = {**result, 'dags': {}}
+    assert 'only in the first' in sinks_table(compare(result, lacking))
+    difference = compare(lacking, result)
+    assert 'only in the second' in sinks_table(difference) and not difference['worse']
+    assert difference['dags']['/driver']['sinks']['/filter:run']['a'] is None
+    assert '/driver:tick' in callbacks_table(compare({**result, 'callbacks': {}}, result))

@@ -1,0 +1,307 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""HTML reports in headless Chromium: they open without an error, and a miss can be found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import os
+from pathlib import Path
+import shutil
+import time
+from typing import Any
+
+from mddag_executor.replay import replay
+from mddag_executor.report import html
+import pytest
+
+from . import runs
+
+pytest.importorskip('bokeh', reason='Bokeh is not installed')
+webdriver = pytest.importorskip('selenium.webdriver', reason='selenium is not installed')
+
+CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') \
+    or shutil.which('google-chrome')
+DRIVER = shutil.which('chromedriver')
+
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None or DRIVER is None, reason='Chromium or its driver is not installed')
+
+FLAGS = (
+    '--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
+    '--disable-background-networking', '--disable-component-update', '--disable-sync',
+    '--disable-dev-shm-usage', '--window-size=1400,1000',
+    # whatever a page asked for over the network would fail and be an error on its console
+    '--host-resolver-rules=MAP * ~NOTFOUND')
+PATIENCE_S = 60.0
+
+
+@pytest.fixture(scope='module')
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    from selenium.common.exceptions import WebDriverException
+    from selenium.webdriver.chrome.service import Service
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    profile = tmp_path_factory.mktemp('profile')
+    for flag in (*FLAGS, f'--user-data-dir={profile}'):
+        options.add_argument(flag)
+    options.set_capability('goog:loggingPrefs', {'browser': 'ALL'})
+    os.environ.setdefault('SE_OFFLINE', 'true')
+    try:
+        driver = webdriver.Chrome(options=options, service=Service(DRIVER))
+    except WebDriverException as error:
+        pytest.skip(f'Chromium does not start here: {(error.msg or "").splitlines()[:1]}')
+    driver.set_script_timeout(PATIENCE_S)
+    driver.set_page_load_timeout(PATIENCE_S)
+    yield driver
+    driver.quit()
+
+
+def wait_for(condition: Callable[[], Any]) -> Any:
+    end = time.monotonic() + PATIENCE_S
+    while True:
+        value = condition()
+        if value:
+            return value
+        assert time.monotonic() < end, 'the page does not get there'
+        time.sleep(0.02)
+
+
+def opened(browser: Any, path: Path) -> Any:
+    """Open a report and wait until it is drawn."""
+    browser.get(path.as_uri())
+    wait_for(lambda: browser.execute_script(
+        'return !!(window.mddag && mddag.ready) '
+        '|| document.getElementById("mddag-status").textContent'))
+    assert browser.execute_script('return !!(window.mddag && mddag.ready)')
+    return browser
+
+
+def complaints(browser: Any) -> list[str]:
+    return [entry['message'] for entry in browser.get_log('browser')
+            if entry['level'] not in ('INFO', 'DEBUG')]
+
+
+def status(browser: Any) -> str:
+    text = browser.execute_script('return document.getElementById("mddag-status").textContent')
+    assert isinstance(text, str)
+    return text
+
+
+def bars(browser: Any, view: int, column: str) -> list[Any]:
+    values = browser.execute_script(
+        f'return Array.from(mddag.views[{view}].bars.data.{column})')
+    assert isinstance(values, list)
+    return values
+
+
+def write(path: Path, data: html.ReportData) -> Path:
+    with path.open('wb') as file:
+        html.write(file, data)
+    return path
+
+
+@pytest.fixture(scope='module')
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp('small')
+    watch = html.Watch()
+    outcome = replay(runs.by_hand(folder / 'run.mcap', hostile=True), watcher=watch)
+    return write(folder / 'report.html', html.of_outcome(outcome, watch))
+
+
+@pytest.fixture(scope='module')
+def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give a run of more executions than are drawn one by one, with many misses."""
+    task_set = runs.autoware()
+    load, run = runs.simulated(task_set, ms=4500, utilisation=0.98)
+    return write(tmp_path_factory.mktemp('large') / 'report.html',
+                 html.of_run(task_set, load, run))
+
+
+def test_it_opens_without_an_error(browser: Any, small: Path) -> None:
+    opened(browser, small)
+    assert bars(browser, 0, 'left') == pytest.approx(
+        [0, 0.002, 0.010, 0.013, 0.020, 0.027, 0.031])
+    assert bars(browser, 0, 'right') == pytest.approx(
+        [0.001, 0.005, 0.012, 0.016, 0.026, 0.030, 0.033])
+    red, blue, light, grey = '#d7191c', '#9ecae1', '#9ecae1', '#969696'
+    assert bars(browser, 0, 'colour') == [blue, blue, light, light, red, red, grey]
+    # workers from the top, then spare threads; the misses are below all
+    assert [round(bottom + 0.4) for bottom in bars(browser, 0, 'bottom')] == [3, 2, 3, 2, 3, 2, 1]
+    assert complaints(browser) == []
+
+
+def test_the_facts_of_a_job_are_there_to_hover(browser: Any, small: Path) -> None:
+    opened(browser, small)
+    columns = [bars(browser, 1, name) for name in 'abdef']
+    facts = [' | '.join(parts) for parts in zip(*columns)]
+    assert facts[5] == (
+        '/filter:run | job 2 of /driver, released at 0.020000 s | ready 0.026000 s, started '
+        '0.027000 s, worker 1 | waited 1 ms, ran 3 ms | MISSED at filter:run: response 10 ms, '
+        '2 ms late (deadline 8 ms)')
+    assert 'in time at filter:run: response 5 ms, 3 ms of slack' in facts[0]
+    assert 'declared by no DAG' in facts[6]
+
+
+def test_names_cannot_become_markup(browser: Any, small: Path) -> None:
+    opened(browser, small)
+    assert 'window.hacked=1' in bars(browser, 1, 'a')[6]
+    point_at(browser, 'callbacks', 0.032, 0)
+    tip = wait_for(lambda: shown_tip(browser))
+    assert 'declared by no DAG' in tip and '<img src=x onerror="window.hacked=1">' in tip
+    assert browser.execute_script('return window.hacked === undefined')
+    assert browser.execute_script('return document.images.length') == 0
+    assert complaints(browser) == []
+
+
+def point_at(browser: Any, name: str, x: float, y: float) -> None:
+    """Move the mouse to a place of a picture, given as its axes have it."""
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.actions.action_builder import ActionBuilder
+    where = browser.execute_script("""
+        for (const view of Bokeh.index) {
+          if (view.model.name !== arguments[0]) continue;
+          view.el.scrollIntoView({block: 'center'});
+          const box = view.el.getBoundingClientRect();
+          return [box.left + view.frame.x_scale.compute(arguments[1]),
+                  box.top + view.frame.y_scale.compute(arguments[2])];
+        }""", name, x, y)
+    actions = ActionBuilder(browser)
+    actions.pointer_action.move_to_location(round(where[0]), round(where[1]) + 1)
+    actions.pointer_action.move_to_location(round(where[0]), round(where[1]))
+    actions.perform()
+    ActionChains(browser).pause(0.05).perform()
+
+
+def shown_tip(browser: Any) -> str:
+    """Return the text of the tool tip that is shown."""
+    text = browser.execute_script("""
+        const found = [];
+        const search = (root) => root.querySelectorAll('*').forEach((element) => {
+          if (element.classList.contains('bk-Tooltip')) {
+            found.push((element.shadowRoot || element).textContent);
+          }
+          if (element.shadowRoot) search(element.shadowRoot);
+        });
+        search(document);
+        return found.join(' ');""")
+    assert isinstance(text, str)
+    return text
+
+
+def test_the_wheel_zooms_only_with_ctrl(browser: Any, small: Path) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
+    from selenium.webdriver.common.keys import Keys
+    opened(browser, small)
+    point_at(browser, 'callbacks', 0.02, 1)
+    width = 'return mddag.range.end - mddag.range.start'
+    before = browser.execute_script(width)
+    plot = browser.find_elements('css selector', '.mddag-plot')[2]
+    origin = ScrollOrigin.from_element(plot, 100, 0)
+    ActionChains(browser).scroll_from_origin(origin, 0, -120).perform()
+    time.sleep(0.3)
+    assert browser.execute_script(width) == before
+    ActionChains(browser).key_down(Keys.CONTROL).scroll_from_origin(
+        origin, 0, -120).key_up(Keys.CONTROL).perform()
+    wait_for(lambda: browser.execute_script(width) < before)
+    assert complaints(browser) == []
+
+
+def test_a_miss_can_be_found(browser: Any, large: Path) -> None:
+    opened(browser, large)
+    assert browser.execute_script('return mddag.views[1].exact') is False
+    # far too many to draw one by one, so they are added up
+    assert browser.execute_script('return mddag.meta.kept') > 4000
+    assert 100 < len(bars(browser, 1, 'left')) <= 24000
+    first = browser.execute_script('return mddag.missed[0]')
+    browser.find_element('id', 'mddag-next').click()
+    wait_for(lambda: browser.execute_script('return mddag.views[1].exact'))
+    assert f'job {first["job"]} of' in status(browser) and 'MISSED' in status(browser)
+    start, end = browser.execute_script('return [mddag.range.start, mddag.range.end]')
+    unit = browser.execute_script('return mddag.meta.unit_ns') / 1e9
+    assert start < first['release'] * unit < first['shown'] * unit < end < start + 2
+    assert '#d7191c' in bars(browser, 1, 'colour')
+    assert browser.execute_script('return mddag.views[1].marks.data.x.length') >= 1
+    browser.find_element('id', 'mddag-next').click()
+    second = wait_for(lambda: browser.execute_script(
+        'return mddag.range.start') != start and status(browser))
+    browser.find_element('id', 'mddag-previous').click()
+    wait_for(lambda: browser.execute_script('return mddag.range.start') == start)
+    assert status(browser) != second
+    browser.find_element('id', 'mddag-whole').click()
+    wait_for(lambda: browser.execute_script('return mddag.views[1].exact') is False)
+    assert complaints(browser) == []
+
+
+def test_the_table_of_misses_leads_to_them(browser: Any, large: Path) -> None:
+    opened(browser, large)
+    wanted = browser.execute_script('return mddag.meta.misses[3]')
+    browser.execute_script('document.querySelector("[data-miss=\'3\']").click()')
+    wait_for(lambda: 'MISSED' in status(browser))
+    assert f'job {wanted[1]} of' in status(browser)
+
+
+def test_sums_add_up_to_what_ran(browser: Any, large: Path) -> None:
+    """However wide the view, the height of bars times their width is what was busy."""
+    opened(browser, large)
+    busy = browser.execute_script("""
+        const data = mddag.views[1].bars.data;
+        return data.left.reduce((sum, left, i) => sum +
+          (data.right[i] - left) * (data.top[i] - data.bottom[i] - 0.12) / 0.72, 0);""")
+    took = browser.execute_script(
+        'return mddag.columns.took.reduce((a, b) => a + b, 0) * mddag.meta.unit_ns / 1e9')
+    assert busy == pytest.approx(took, rel=1e-3)
+
+
+def test_the_flow_of_messages_along_a_path(browser: Any, small: Path) -> None:
+    opened(browser, small)
+    choice = browser.find_element('id', 'mddag-path')
+    options = [option.text for option in choice.find_elements('tag name', 'option')]
+    assert options == ['to filter:run, as its worst job took it', 'path whole']
+    find = 'return Bokeh.documents[0].get_model_by_name("flow_lines").data'
+    lines = wait_for(lambda: browser.execute_script(f'{find}.x0.length') and
+                     browser.execute_script(find))
+    black = [i for i, colour in enumerate(lines['colour']) if colour == '#000000']
+    assert len(black) == 5      # two callbacks, wait and run each, and the message
+    sent = [(round(lines['x0'][i], 6), round(lines['x1'][i], 6))
+            for i, colour in enumerate(lines['colour']) if colour != '#000000']
+    assert (0.026, 0.026) in sent       # job 2: sent at its end, there at once
+    assert 'The worst job, 2' in browser.find_element('id', 'mddag-flow-note').text
+    assert browser.execute_script(
+        'return Array.from(Bokeh.documents[0].get_model_by_name("flow_axis")'
+        '.major_label_overrides.values())') == ['driver:tick', 'filter:run']
+    choice.find_elements('tag name', 'option')[1].click()
+    wait_for(lambda: 'worst' not in browser.find_element('id', 'mddag-flow-note').text)
+    assert complaints(browser) == []
+
+
+def test_what_is_drawn_is_visible(browser: Any, large: Path, tmp_path: Path) -> None:
+    """The canvas of the timeline has pixels in the colours of the legend."""
+    opened(browser, large)
+    browser.find_element('id', 'mddag-next').click()
+    wait_for(lambda: browser.execute_script('return mddag.views[1].exact'))
+    time.sleep(0.3)
+    shot = tmp_path / 'page.png'
+    browser.execute_script('document.getElementById("mddag-timeline").scrollIntoView()')
+    time.sleep(0.3)
+    assert browser.save_screenshot(str(shot))
+    image = pytest.importorskip('matplotlib.image').imread(shot)[..., :3]
+    red = (abs(image - [0xd7 / 255, 0x19 / 255, 0x1c / 255]) < 0.02).all(axis=2)
+    blue = (abs(image - [0x31 / 255, 0x82 / 255, 0xbd / 255]) < 0.02).all(axis=2)
+    assert red.sum() > 300 and blue.sum() > 300
+    widths = browser.execute_script(
+        'return [document.documentElement.scrollWidth, window.innerWidth]')
+    assert widths[0] <= widths[1]       # nothing sticks out

@@ -1,0 +1,250 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Timelines: what is told of a schedule is what its trace says; memory stays bounded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mddag_executor.core.state import SINK_DONE, SINK_MISSED
+from mddag_executor.replay import replay, reschedule
+from mddag_executor.replay.bags_reschedule import reschedule_bag
+from mddag_executor.replay.follower import Observer, Piece
+from mddag_executor.report import html
+from mddag_executor.report.timeline import (
+    BINS,
+    Bins,
+    END,
+    JOB,
+    MOST_UNDECLARED,
+    OTHERS,
+    ROW,
+    START,
+    Timeline,
+)
+from mddag_executor.report.timeline_log import Schedule, tell
+from mddag_executor.simulate import periodic_load, Settings, simulate
+from mddag_executor.simulate.recording import write_trace
+import msg_graph
+import numpy as np
+import pytest
+
+from ..replay.test_ordinary_bags import BY_HEADER, write_bag
+from . import runs
+
+
+def piece(vertex: int, job: int, start: int, end: int, worker: int = 0, callback: int = 1
+          ) -> Piece:
+    return Piece(callback, min(vertex, 0), vertex, job, worker, start, start, end, True)
+
+
+@pytest.mark.parametrize(('policy', 'preemptive', 'utilisation', 'seed'), [
+    ('rad', False, 0.95, 0), ('rad', True, 1.2, 1), ('fifo', False, 1.3, 2), ('rm', True, 0.9, 3)])
+def test_a_schedule_is_told_as_its_trace_says(
+    policy: str, preemptive: bool, utilisation: float, seed: int, tmp_path: Path
+) -> None:
+    task_set = runs.autoware()
+    load, run = runs.simulated(
+        task_set, policy=policy, preemptive=preemptive, utilisation=utilisation, seed=seed)
+    told = html.of_run(task_set, load, run)
+    write_trace(tmp_path / 'run.mcap', task_set, load, run)
+    watch = html.Watch()
+    read = html.of_replay(replay(tmp_path / 'run.mcap', watcher=watch), watch)
+    assert told.tally.result() == read.tally.result() == run.tally.result()
+    assert told.timeline.n_executions == len(told.timeline.columns().executions[0]) > 100
+    for ours, theirs in zip(told.timeline.columns(), read.timeline.columns()):
+        assert np.array_equal(ours, theirs)
+    assert told.timeline.bins.busy == read.timeline.bins.busy
+    assert told.usage.callbacks() == read.usage.callbacks()
+    for sink in told.tables.sinks:
+        assert told.chains.result(task_set, sink) == read.chains.result(task_set, sink)
+
+
+class Spy(Observer):
+    """Notes all that it is told, but for recorded misses, which only a recording has."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[Any, ...]] = []
+
+    def released(self, *what: Any) -> None:
+        self.told.append(('released', *what))
+
+    def started(self, *what: Any) -> None:
+        self.told.append(('started', *what))
+
+    def ran(self, piece: Piece) -> None:
+        self.told.append(('ran', *piece))
+
+    def completed(self, *what: Any) -> None:
+        self.told.append(('completed', *what))
+
+    def ended(self, *what: Any) -> None:
+        self.told.append(('ended', *what))
+
+    def finished(self, now: int) -> None:
+        self.told.append(('finished', now))
+
+    def observers(self, task_set: Any, judge: Any) -> list[Observer]:
+        return [self]
+
+    def handlers(self) -> dict[str, Any]:
+        return {}
+
+
+@pytest.mark.parametrize(('settings', 'utilisation'), [
+    ({'policy': 'rad'}, 0.95), ({'policy': 'rad', 'preemptive': True}, 1.2),
+    ({'policy': 'fifo'}, 1.4), ({'policy': 'rad', 'stop_at_first_miss': True}, 1.5)])
+def test_observers_are_told_the_same_in_the_same_order(
+    settings: dict[str, Any], utilisation: float, tmp_path: Path
+) -> None:
+    task_set = runs.autoware()
+    load, run = runs.simulated(task_set, utilisation=utilisation, **settings)
+    write_trace(tmp_path / 'run.mcap', task_set, load, run)
+    told, read = Spy(), Spy()
+    tell(Schedule(task_set, load, run.log, run.decisions, 300 * runs.MS, run.ended_ns), [told])
+    replay(tmp_path / 'run.mcap', watcher=read)
+    assert len(told.told) > 100 and {what[0] for what in told.told} >= {
+        'released', 'started', 'ran', 'completed', 'finished'}
+    assert told.told == read.told
+
+
+def test_an_end_at_the_instant_of_a_release_comes_first(tmp_path: Path) -> None:
+    task_set = msg_graph.loads(runs.GRAPH, 'g.yaml')
+    load = periodic_load(task_set, [[5 * runs.MS, 5 * runs.MS]], 50 * runs.MS)
+    run = simulate(task_set, load, Settings(workers=1, duration_ns=50 * runs.MS), log=True)
+    write_trace(tmp_path / 'run.mcap', task_set, load, run)
+    told, read = Spy(), Spy()
+    tell(Schedule(task_set, load, run.log, run.decisions, 50 * runs.MS, run.ended_ns), [told])
+    replay(tmp_path / 'run.mcap', watcher=read)
+    at_ten = [what[0] for what in told.told if 10 * runs.MS in what and 'started' != what[0]]
+    assert at_ten[:3] == ['ran', 'completed', 'released']
+    assert told.told == read.told
+
+
+def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path: Path) -> None:
+    task_set = msg_graph.loads(
+        runs.GRAPH.replace('deadline: 8ms', 'deadline: 8ms, execution_time: 30ms')
+        .replace('timer: 10ms', 'timer: 10ms, execution_time: 1ms, max_active_jobs: 2'), 'g.yaml')
+    load = periodic_load(task_set, [[runs.MS, 30 * runs.MS]], 100 * runs.MS)
+    run = simulate(task_set, load, Settings(workers=1, duration_ns=100 * runs.MS), log=True)
+    write_trace(tmp_path / 'run.mcap', task_set, load, run)
+    told, read = Spy(), Spy()
+    schedule = Schedule(
+        task_set, load, run.log, run.decisions, 100 * runs.MS, run.ended_ns,
+        numbers=[[10 * job for job in range(10)]])
+    tell(schedule, [told])
+    replay(tmp_path / 'run.mcap', watcher=read)
+    place = {'released': 2, 'started': 3, 'ran': 4, 'completed': 3, 'ended': 2}
+    expected = []
+    for what in read.told:
+        at = place.get(what[0])
+        expected.append(what if at is None else (*what[:at], 10 * what[at], *what[at + 1:]))
+    assert told.told == expected
+    assert any(what[0] == 'ended' for what in told.told)
+
+
+@pytest.mark.parametrize('workers', [2, 7])
+def test_a_rescheduled_run_has_the_verdicts_of_its_report(workers: int) -> None:
+    outcome = reschedule(runs.CONFIG.parent / 'bags' / 'demo_short.mcap', workers=workers)
+    data = html.of_reschedule(outcome)
+    assert data.tally.result()['dags'] == outcome.tally.result()['dags']
+    executions = data.timeline.columns().executions
+    busy = [int((executions[END] - executions[START])[executions[2] == w].sum())
+            for w in range(workers)]
+    for ours, theirs in zip(busy, outcome.worker_busy()):
+        assert 0 <= theirs - ours < 200 * runs.MS   # what still ran at the end is no execution yet
+
+
+def test_a_bag_has_the_verdicts_of_its_report(tmp_path: Path) -> None:
+    task_set = msg_graph.loads(BY_HEADER.replace('20ms', '13ms'), 'g.yaml')
+    outcome = reschedule_bag(write_bag(tmp_path / 'bag'), task_set)
+    data = html.of_outcome(outcome, None)
+    assert data.tally.result()['dags'] == outcome.tally.result()['dags']
+    assert data.timeline.n_missed == 9 and ('assumed', outcome.notes[0]) in data.facts
+    # (the tenth has no verdict: the bag ends with its release)
+    # a release lies before the message that brings it
+    lag = data.chains.sinks[1].worst
+    assert lag is not None and lag.breakdown.release_lag_ns == 5 * runs.MS
+
+
+def test_what_is_aborted_and_stopped_is_told() -> None:
+    task_set = runs.autoware()
+    load, run = runs.simulated(task_set, utilisation=1.5, stop_at_first_miss=True)
+    assert run.ended_ns < 300 * runs.MS
+    data = html.of_run(task_set, load, run)
+    assert data.timeline.n_missed >= 1
+    assert data.timeline.columns().executions[END].max() <= run.ended_ns
+
+
+def test_detail_is_bounded_and_keeps_the_misses() -> None:
+    timeline = Timeline(most=100, block=10)
+    for i in range(1000):
+        timeline.released(0, i, 100 * i, 100 * i)
+        timeline.ran(piece(0, i, 100 * i, 100 * i + 50))
+        late = i in (333, 777)
+        timeline.decided([(SINK_DONE, 0, 0, i, 100 * i + 60, 100 * i + (70 if late else 50))])
+    columns = timeline.columns()
+    assert timeline.n_executions == 1000 and timeline.n_missed == 2
+    assert timeline.kept == len(columns.executions[0]) <= 100
+    assert {333, 777} <= set(columns.executions[JOB].tolist())
+    assert {333, 777} <= set(columns.verdicts[1].tolist())
+    jobs = columns.executions[JOB]
+    assert jobs[0] == 0 and jobs[-1] >= 960
+    assert int(np.diff(jobs).max()) <= 330      # what is kept is spread over the run
+    for left, right in timeline.gaps():
+        inside = (columns.executions[START] > left) & (columns.executions[END] < right)
+        assert not inside.any() and left < right
+    assert len(timeline.gaps()) >= 3
+    assert sum(timeline.bins.busy) == 1000 * 50 and sum(timeline.bins.missed) == 2
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 10 ** 12), st.integers(0, 10 ** 11), st.booleans()),
+                min_size=1, max_size=40))
+def test_sums_hold_whatever_the_width(stretches: list[tuple[int, int, bool]]) -> None:
+    bins = Bins()
+    first = stretches[0][0]
+    for start, took, lent in stretches:
+        bins.add(lent, start, start + took)
+    assert bins.origin == first
+    for sums, of_lent in ((bins.lent, True), (bins.busy, False)):
+        assert sum(sums) == sum(
+            max(0, start + took - max(start, first))
+            for start, took, lent in stretches if lent == of_lent)
+        assert len(sums) == BINS and all(0 <= part for part in sums)
+    assert 0 < bins.used <= BINS
+
+
+def test_undeclared_callbacks_have_names_and_a_bound() -> None:
+    timeline = Timeline()
+    timeline.handlers()['ros2:rclcpp_callback_register'](('', 0, 1, 1, 7, 'spin_some'))
+    for callback in (7, 8, *range(1000, 1000 + MOST_UNDECLARED + 5)):
+        timeline.ran(piece(-1, 4, 0, 1, callback=callback))
+    names = timeline.undeclared_names()
+    assert names[:2] == ['spin_some', 'callback 0x8']
+    assert len(names) == MOST_UNDECLARED + 1 and names[-1] == OTHERS
+    rows = timeline.columns().executions
+    assert int(rows[ROW].min()) == -len(names) and set(rows[JOB].tolist()) == {-1}
+
+
+def test_never_completed_counts_at_its_deadline() -> None:
+    timeline = Timeline()
+    timeline.ran(piece(0, 0, 0, 10))
+    timeline.decided([(SINK_MISSED, 0, 0, 0, 10 ** 9, -1)])
+    assert timeline.n_missed == 1
+    assert timeline.columns().verdicts.T.tolist() == [[0, 0, 10 ** 9, -1, 1]]

@@ -1,0 +1,100 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The package in a colcon workspace: built, tested and used from there.
+
+It needs colcon in the environment of the tests (pip install colcon-common-extensions); without an
+installation of ROS, the rclpy that it finds there is that of the package index.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+import os
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+TOP = Path(__file__).resolve().parent.parent
+NAME = 'mddag_executor'
+NEEDED = ('colcon_core', 'colcon_ros', 'colcon_python_setup_py', 'colcon_test_result')
+COLCON = 'import sys; from colcon_core.command import main; sys.exit(main())'
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        any(find_spec(name) is None for name in NEEDED),
+        reason='colcon is not installed here: pip install colcon-common-extensions')]
+
+
+@pytest.fixture(scope='module')
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give a workspace in which this package has been built."""
+    place = tmp_path_factory.mktemp('workspace')
+    shutil.copytree(
+        TOP, place / 'src' / NAME, ignore=shutil.ignore_patterns(
+            '.venv*', '.git', '.*_cache', '.hypothesis', '__pycache__', '*.egg-info', 'build',
+            'install', 'log', '*.orig'))
+    done = colcon(place, 'build', '--packages-select', NAME)
+    assert done.returncode == 0 and f'Finished <<< {NAME}' in done.stdout, done.stderr
+    return place
+
+
+def colcon(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, '-c', COLCON, *arguments], cwd=place, capture_output=True, text=True,
+        timeout=170, check=False, stdin=subprocess.DEVNULL)
+
+
+def in_workspace(place: Path, command: str) -> subprocess.CompletedProcess[str]:
+    """Run a command in a shell that has sourced the workspace, somewhere else."""
+    return subprocess.run(
+        ['bash', '-c', f'. "{place}/install/setup.bash" && cd / && {command}'],
+        capture_output=True, text=True, timeout=60, check=False, stdin=subprocess.DEVNULL,
+        env={**os.environ, 'COLCON_TRACE': '', 'PYTHON': sys.executable})
+
+
+@pytest.mark.skipif(shutil.which('bash') is None, reason='there is no bash')
+def test_what_was_built_is_what_runs(workspace: Path):
+    installed = workspace / 'install' / NAME
+    program = installed / 'lib' / NAME / 'mddag'  # where `ros2 run` looks
+    done = in_workspace(workspace, f'"{program}" --version')
+    assert (done.returncode, done.stdout[:6]) == (0, 'mddag '), done.stderr
+    done = in_workspace(
+        workspace, f'"{sys.executable}" -c "import {NAME}; print({NAME}.__file__)"')
+    assert done.stdout.startswith(str(installed))
+    done = in_workspace(workspace, f'"{program}" graph check "{installed}/share/{NAME}/config/'
+                                   'autoware.yaml"')
+    assert done.returncode == 0 and 'perception' in done.stdout
+
+
+def test_what_others_look_up_is_installed(workspace: Path):
+    share = workspace / 'install' / NAME / 'share'
+    assert (share / 'ament_index/resource_index/packages' / NAME).is_file()
+    for name in ('package.xml', 'launch/autoware_demo.launch.py', 'config/autoware.yaml'):
+        assert (share / NAME / name).is_file()
+
+
+def test_colcon_test_runs_the_tests(workspace: Path):
+    done = colcon(
+        workspace, 'test', '--packages-select', NAME, '--return-code-on-test-failure',
+        '--pytest-args', 'test/msg_graph/test_duration.py', 'test/live/test_rates.py')
+    assert done.returncode == 0, done.stdout + done.stderr
+    done = colcon(workspace, 'test-result', '--all')
+    assert done.returncode == 0 and '0 errors, 0 failures' in done.stdout
+    assert int(done.stdout.split('Summary: ')[1].split()[0]) > 10
