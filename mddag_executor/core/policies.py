@@ -114,7 +114,7 @@ class Policy(NamedTuple):
 
     def mode(self, preemptive: bool | None) -> bool:
         """
-        Return whether to preempt: what was asked for, or the policy's own mode (None).
+        Return whether to preempt: as was asked for, else as the policy does by itself.
 
         :raises PolicyError: when the policy knows no preemption.
         """

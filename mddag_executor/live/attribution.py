@@ -63,7 +63,9 @@ class Origin(NamedTuple):
 
 
 class Takes(Protocol):
-    """What a publisher takes from after it has published."""
+    """What a publisher takes from after it has published, for one executor."""
+
+    owner: Any
 
     def take(self, begin: int, /) -> None:
         """Take what was published since then (system time, ns)."""
@@ -84,7 +86,7 @@ class PublisherState:
         self.topic = topic
         self.count = 0
         self.offset = 0
-        self.takes: Takes | None = None
+        self.takes: tuple[Takes, ...] = ()
         self.noted_by: Attribution | None = None
         self.notes: _Topic | None = None
 

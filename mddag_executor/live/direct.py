@@ -51,6 +51,7 @@ from typing import Any
 
 from mddag_executor.live.attribution import PublisherState
 from mddag_executor.live.entities import EntitySet, Receiver
+from mddag_executor.live.groups import shared_subscriptions
 from mddag_executor.live.hooks import install, publisher_state
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import (
@@ -64,6 +65,8 @@ from rclpy.subscription import Subscription
 
 MATCHED = QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED
 MOST_AT_ONCE = 64
+
+_several_executors = threading.Lock()
 
 
 class Watch(EventHandler):
@@ -101,12 +104,14 @@ class Direct:
     :param on_miss: called when a message is not there that was published.
     """
 
-    __slots__ = ('subscription', 'watch', 'refused', '_lock', '_newest', '_receiver', '_on_miss')
+    __slots__ = (
+        'owner', 'subscription', 'watch', 'refused', '_lock', '_newest', '_receiver', '_on_miss')
 
     def __init__(
-        self, subscription: Subscription, watch: Watch, receiver: Receiver,
+        self, owner: DirectTakes, subscription: Subscription, watch: Watch, receiver: Receiver,
         on_miss: Callable[[], None],
     ) -> None:
+        self.owner = owner
         self.subscription = subscription
         self.watch = watch
         self.refused = False
@@ -148,9 +153,10 @@ class Direct:
 class Several:
     """All that one publisher takes from; RAD is to choose among all that a message starts."""
 
-    __slots__ = ('_directs', '_receiver')
+    __slots__ = ('owner', '_directs', '_receiver')
 
-    def __init__(self, directs: list[Direct], receiver: Receiver) -> None:
+    def __init__(self, owner: DirectTakes, directs: list[Direct], receiver: Receiver) -> None:
+        self.owner = owner
         self._directs = directs
         self._receiver = receiver
 
@@ -198,7 +204,10 @@ class DirectTakes:
         takes: dict[int, list[Direct]] = {}
         states: dict[int, PublisherState] = {}
         chosen: list[Direct] = []
+        shared = shared_subscriptions(entities.nodes)
         for subscription in entities.subscriptions:
+            if id(subscription) in shared:
+                continue  # its watch and another executor's events of the node do not agree
             try:
                 locals_ = publishers.get(subscription.topic_name)
                 direct = self._direct(subscription) if locals_ else None
@@ -252,18 +261,20 @@ class DirectTakes:
                 self._refused[key] = subscription
                 return None
             direct = self._known[key] = Direct(
-                subscription, watch, self._receiver, self._on_change)
+                self, subscription, watch, self._receiver, self._on_change)
         return direct
 
     def _set_takes(
         self, takes: dict[int, list[Direct]], states: dict[int, PublisherState]
     ) -> None:
-        for key, state in self._states.items():
-            if states.get(key) is not state:
-                state.takes = None
-        for key, state in states.items():
-            mine = takes[key]
-            state.takes = mine[0] if len(mine) == 1 else Several(mine, self._receiver)
+        with _several_executors:  # a node's callback groups may be on several
+            for key, state in (*self._states.items(), *states.items()):
+                others = tuple(t for t in state.takes if t.owner is not self)
+                mine = takes.get(key, []) if states.get(key) is state else []
+                if len(mine) > 1:
+                    state.takes = (*others, Several(self, mine, self._receiver))
+                else:
+                    state.takes = (*others, *mine)
         self._states = states
 
     def _forget(self, entities: EntitySet) -> None:

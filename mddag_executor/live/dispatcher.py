@@ -198,7 +198,7 @@ class Dispatcher:
                     entry.unattributed += 1
                 self._start_undeclared(entry, work, now)
             running = current.running
-            if running is None or not running.ends_soon():
+            if running is None or not running.ends_soon(self):
                 self.dispatch(now)
 
     def undeclared_ready(self, entry: Entry, work: Work) -> None:

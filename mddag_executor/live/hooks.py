@@ -38,8 +38,12 @@ class Running(Protocol):
     def publish(self, send: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
         """Send a message on behalf of the running callback."""
 
-    def ends_soon(self) -> bool:
-        """Return whether this callback has ended soon after it published, the last times."""
+    def ends_soon(self, dispatcher: Any) -> bool:
+        """
+        Return whether this callback has ended soon after it published, the last times.
+
+        And is of this dispatcher.
+        """
 
     def waits(self) -> Any:
         """Return a context manager that lends the worker's place while it is entered."""
@@ -85,8 +89,7 @@ def install() -> None:
                 send(self, msg)
             else:
                 running.publish(send, self, msg, state)
-        takes = state.takes  # not before: see ``direct``
-        if takes is not None:
+        for takes in state.takes:  # looked up after it is sent: see ``direct``
             takes.take(begin)
 
     def call_and_wait(self: Any, request: Any, *args: Any, **kwargs: Any) -> Any:

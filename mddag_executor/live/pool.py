@@ -109,10 +109,11 @@ class Running:
         if not self.published:
             self.published = monotonic_ns()
 
-    def ends_soon(self) -> bool:
-        """Return whether this callback has ended soon after it published, the last times."""
+    def ends_soon(self, dispatcher: Dispatcher) -> bool:
+        """Return whether this callback of this dispatcher is expected to end soon."""
         work = self.seat.work
-        return work is not None and work.entry.soon >= work.entry.soon_from
+        return (work is not None and work.entry.soon >= work.entry.soon_from
+                and self.pool.dispatcher is dispatcher)
 
     def ended(self, entry: Entry, now: int) -> None:
         """Note how soon after publishing a callback has ended."""
@@ -327,7 +328,8 @@ class Pool:
     def is_idle(self) -> bool:
         """Return whether nothing runs and nothing is ready."""
         state = self._scheduler.state
-        return not state.ready and state.scalars[N_IDLE] >= self.dispatcher.n_workers
+        waiting = state.ready or state.unpolled
+        return not waiting and state.scalars[N_IDLE] >= self.dispatcher.n_workers
 
     def resume_polled(self) -> bool:
         """

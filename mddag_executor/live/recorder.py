@@ -22,7 +22,7 @@ import time
 from typing import Any
 
 from mddag_executor.live.entries import Entry, SERVICE, SUBSCRIPTION, TIMER
-from mddag_executor.trace import TraceError, TraceWriter
+from mddag_executor.trace.errors import TraceError
 from msg_graph import TaskSet
 from rclpy.logging import get_logger
 from rclpy.utilities import get_rmw_implementation_identifier
@@ -48,6 +48,7 @@ class Recorder:
         self, path: str, task_set: TaskSet | None, policy: str, workers: int,
         default_deadline: int, max_active_jobs: int, clock_offset: int,
     ) -> None:
+        from mddag_executor.trace.writer import TraceWriter  # late: it loads the compression
         self.writer = TraceWriter(path, clock_offset=clock_offset)
         self.record = self.writer.record
         self.path = path

@@ -38,7 +38,7 @@ from mddag_executor.live.attribution import Origin
 from mddag_executor.live.entries import Entry
 from msg_graph import TaskSet
 
-KEEP_RESPONSES = 10_000
+KEEP_RESPONSES = 2_000
 KEEP_ABORTED = 4096
 NO_ORIGIN = Origin(-1, -1, -1, -1)
 

@@ -25,7 +25,11 @@ Theory of operation
      that a message of its topic was taken with from the publication on, before the topic's next
      publication.  They stand right behind `rcl_publish`.
    * `dispatch_subscription_callback`: what an execution in a job ran for is what the vertex before
-     it published in that job.  It stands right before `callback_start`.
+     it published in that job.  It stands right before `callback_start`, in place of `rmw_take`:
+     the executor takes in another thread, which CARET holds for a callback's own taking.
+
+   * From Jazzy on callback groups belong to an executor through its entities collector: the
+     executor stands for its own.
 
    Messages of which neither is known are not filled in: CARET shows them as lost.
 """
@@ -88,7 +92,7 @@ def caret_events(path: str | os.PathLike[str]) -> Iterator[Event]:
         yield from read_events(path, CARET_EVENTS)
         return
     filler = _Filler(recording, _stamps(path))
-    for event in read_events(path, CARET_EVENTS | {_DISPATCH}):
+    for event in read_events(path, (CARET_EVENTS | {_DISPATCH}) - {'ros2:rmw_take'}):
         yield from filler.take(event)
 
 
@@ -121,6 +125,11 @@ def _stamps(path: str | os.PathLike[str]) -> dict[str, list[tuple[int, int]]]:
     return found
 
 
+def _head(event: Event) -> Event:
+    """Return who an event is of, and when it was."""
+    return {key: value for key, value in event.items() if key.startswith('_')}
+
+
 class _Filler:
     """Adds what CARET's tracer would have seen."""
 
@@ -143,6 +152,16 @@ class _Filler:
             return
         if name == 'ros2:callback_start':
             yield from self._dispatched(event)
+        elif name == 'ros2_caret:construct_executor':
+            yield {**_head(event), '_name': 'ros2_caret:executor_entity_collector_to_executor',
+                   'executor_addr': event['executor_addr'],
+                   'entities_collector_addr': event['executor_addr']}
+        elif name == 'ros2_caret:add_callback_group':
+            event = {
+                **_head(event), '_name': 'ros2_caret:callback_group_to_executor_entity_collector',
+                'entities_collector_addr': event['executor_addr'],
+                'callback_group_addr': event['callback_group_addr'],
+                'group_type_name': event['group_type_name']}
         yield event
         if name == 'ros2:rcl_publish':
             yield from self._written(event)
@@ -176,7 +195,7 @@ class _Filler:
             self._jobs.setdefault((dag, job), {})[(vertex, topic)] = stamp, address
             if len(self._jobs) > _KEEP_JOBS:
                 self._jobs.popitem(last=False)
-        head = {key: value for key, value in event.items() if key.startswith('_')}
+        head = _head(event)
         yield {**head, '_name': 'ros2_caret:dds_write', 'message': address}
         yield {**head, '_name': 'ros2_caret:dds_bind_addr_to_stamp', 'addr': address,
                'source_stamp': stamp}
@@ -194,7 +213,7 @@ class _Filler:
             if (before, topic) in messages:
                 stamp, address = messages[(before, topic)]
                 yield {
-                    **{key: value for key, value in event.items() if key.startswith('_')},
+                    **_head(event),
                     '_name': 'ros2:dispatch_subscription_callback', 'message': address,
                     'callback': event['callback'], 'source_stamp': stamp, 'message_timestamp': 0}
                 return

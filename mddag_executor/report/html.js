@@ -16,48 +16,12 @@
   const element = (id) => document.getElementById(id);
   const meta = JSON.parse(element('mddag-meta').textContent);
   const SECOND = 1e9 / meta.unit_ns;
+  const {lower, spans, unpack} = window.mddagColumns;
   let c = null;                         // columns by name
   let longest = 0, slack = null, ratio = null, least = null, released = null, missed = [];
   let shown = null;                     // when each miss is shown, ascending
 
   // --- data --------------------------------------------------------------------------------------
-
-  async function unpack() {
-    const text = atob(element('mddag-data').textContent);
-    const packed = new Uint8Array(text.length);
-    for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
-    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('deflate'));
-    const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
-    const columns = {};
-    let at = 0;
-    for (const column of meta.columns) {
-      const values = new Float64Array(column.n);
-      for (let plane = 0, weight = 1; plane < column.width; plane++, weight *= 256) {
-        for (let i = 0; i < column.n; i++) values[i] += bytes[at++] * weight;
-      }
-      let before = 0;
-      for (let i = 0; i < column.n; i++) {
-        const u = values[i], v = u % 2 ? -(u + 1) / 2 : u / 2;
-        values[i] = before = column.delta ? before + v : v;
-      }
-      columns[column.name] = values;
-    }
-    return columns;
-  }
-
-  function lower(values, wanted, from = 0, to = values.length) {
-    while (from < to) {
-      const middle = (from + to) >> 1;
-      if (values[middle] < wanted) from = middle + 1; else to = middle;
-    }
-    return from;
-  }
-
-  function spans(values, count) {       // of equal numbers in ascending order: [from, to]
-    const found = [];
-    for (let n = 0; n < count; n++) found.push([lower(values, n), lower(values, n + 1)]);
-    return found;
-  }
 
   function prepare() {
     const n = c.start.length, last = new Float64Array(meta.rows.length);
@@ -418,7 +382,7 @@
     if (typeof DecompressionStream === 'undefined') {
       throw new Error('this browser is too old: use one of 2023 or newer');
     }
-    c = await unpack();
+    c = await unpack(meta.columns, element('mddag-data').textContent);
     prepare();
     const wait = () => {
       const doc = window.Bokeh && Bokeh.documents.find((d) => d.get_model_by_name('timeline_range'));

@@ -54,7 +54,7 @@ from mddag_executor.report.timeline_log import Schedule, tell
 from mddag_executor.simulate import Load, Run
 from msg_graph import TaskSet
 
-_SCRIPT = Path(__file__).with_name('html.js')
+_SCRIPTS = [Path(__file__).with_name(name) for name in ('html_columns.js', 'html.js')]
 _STYLE = Path(__file__).with_name('html.css')
 _LEGEND = (
     ('#d7191c', 'deadline missed'), ('#fd8d3c', 'slack below 10 % of the deadline'),
@@ -122,7 +122,8 @@ def of_replay(outcome: Replay, watch: Watch) -> ReportData:
     facts = [('recording', result['recording']['trace']), *_facts(result)]
     data = watch.data('Replay as recorded', facts, outcome.task_set, result['workers'],
                       outcome.duration_ns, outcome.warnings)
-    return data._replace(paths=result.get('paths', {}))
+    return data._replace(
+        paths=result.get('paths', {}), recorded=result.get('recorded_callbacks', {}))
 
 
 def of_reschedule(outcome: Reschedule) -> ReportData:
@@ -242,7 +243,9 @@ def _page(
     yield f'<script id="mddag-meta" type="application/json">{json_for_html(prepared.meta)}'
     yield '</script>\n<script id="mddag-data" type="application/octet-stream;base64">'
     yield prepared.blob
-    yield f'</script>\n{script}\n<script>{_SCRIPT.read_text(encoding="utf-8")}</script>\n'
+    yield f'</script>\n{script}\n'
+    for path in _SCRIPTS:
+        yield f'<script>{path.read_text(encoding="utf-8")}</script>\n'
     yield '</body></html>\n'
 
 

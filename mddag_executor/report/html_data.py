@@ -70,6 +70,7 @@ class ReportData(NamedTuple):
     :ivar facts: what stands below the title: pairs of a word and a text.
     :ivar duration_ns: from the first release to the end of the run.
     :ivar paths: end-to-end times of the declared paths, as in the result of a replay.
+    :ivar recorded: the callbacks of an imported recording, as in the result of a replay.
     """
 
     title: str
@@ -84,6 +85,7 @@ class ReportData(NamedTuple):
     duration_ns: int
     warnings: list[str]
     paths: Mapping[str, Any] = {}
+    recorded: Mapping[str, Any] = {}
 
 
 class Line(NamedTuple):

@@ -26,6 +26,8 @@ from mddag_executor.report.replays import (
     callbacks_rows,
     PATHS_HEADER,
     paths_rows,
+    RECORDED_HEADER,
+    recorded_rows,
 )
 from mddag_executor.report.tables import counts, response_cells, short_names
 from mddag_executor.report.text import format_ns, printable
@@ -165,4 +167,8 @@ def callbacks_html(data: ReportData) -> str:
     undeclared = data.usage.undeclared.result()
     if undeclared['executions']:
         rows += callbacks_rows({'undeclared callbacks': undeclared})
-    return f'<div class="scroll">{html_table(CALLBACKS_HEADER, rows, 1)}</div>'
+    tables = [html_table(CALLBACKS_HEADER, rows, 1)]
+    if data.recorded:
+        tables.append(html_table(RECORDED_HEADER, recorded_rows(data.recorded), 1))
+    return '<h3>In the recording</h3>\n'.join(
+        f'<div class="scroll">{each}</div>\n' for each in tables)

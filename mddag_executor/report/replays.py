@@ -27,6 +27,7 @@ _TIMES_HEADER = (
     'worst job', 'waiting', 'for group', 'executing', 'suspended', 'transport')
 CALLBACKS_HEADER = (
     'callback', 'executions', 'busy', 'mean', 'longest', 'mean wait', 'longest wait')
+RECORDED_HEADER = ('callback', 'executions', 'busy', 'shortest', 'mean', 'longest')
 PATHS_HEADER = ('path', 'arrived', 'case', 'count', 'min', 'median', 'p99', 'max')
 _COMPARISON_HEADER = (
     'DAG', 'sink', 'deadline', 'in time', 'recorded', 'median', 'recorded', 'p99', 'recorded',
@@ -78,13 +79,16 @@ def callbacks_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[
 
 def recorded_table(callbacks: Mapping[str, Mapping[str, int]]) -> str:
     """Return a table with a row for each callback of an imported recording that ran."""
-    rows: list[list[Cell]] = []
+    return table(RECORDED_HEADER, recorded_rows(callbacks))
+
+
+def recorded_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[Cell]]:
+    """Yield the rows of the table of an imported recording's callbacks."""
     for label, use in callbacks.items():
         n = use['executions']
-        rows.append([
+        yield [
             label, n, _time(use['busy_ns']), _time(use['shortest_ns']) if n else None,
-            _time(use['busy_ns'] // n) if n else None, _time(use['longest_ns']) if n else None])
-    return table(('callback', 'executions', 'busy', 'shortest', 'mean', 'longest'), rows)
+            _time(use['busy_ns'] // n) if n else None, _time(use['longest_ns']) if n else None]
 
 
 def communications_table(communications: Iterable[Mapping[str, Any]]) -> str:

@@ -27,7 +27,7 @@ from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.live import direct, hooks, pool
 import pytest
 import rclpy
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
@@ -45,7 +45,8 @@ nodes:
 
 
 def takes_of(publisher: Any) -> Any:
-    return hooks.publisher_state(publisher).takes
+    takes = hooks.publisher_state(publisher).takes
+    return takes[0] if takes else None
 
 
 def make_direct(ros_context: Any) -> MultiDeadlineExecutor:
@@ -169,7 +170,7 @@ executor.add_node(node)
 thread = threading.Thread(target=executor.spin)
 thread.start()
 state = hooks.publisher_state(publisher)
-while state.takes is None:
+while not state.takes:
     time.sleep(0.01)
 for number in range(50):
     publisher.publish(Header(frame_id=str(number)))
@@ -177,7 +178,7 @@ for number in range(50):
 end = time.monotonic() + 10
 while len(got) < 50 and time.monotonic() < end:
     time.sleep(0.01)
-print(len(got), got == [str(n) for n in range(50)], state.takes is None)
+print(len(got), got == [str(n) for n in range(50)], not state.takes)
 executor.shutdown()
 thread.join()
 rclpy.shutdown()
@@ -349,3 +350,39 @@ def test_counts_are_the_same_with_and_without(ros_context, make_node, monkeypatc
     statistics = executor.statistics()
     assert statistics['undeclared'] == 0
     assert statistics['callbacks']['/node:sink']['ran'] == len(got)
+
+
+def test_two_executors_share_a_node_and_each_gets_its_own(ros_context, make_node):
+    node, got = make_node(), {'first': [], 'second': []}
+    group = MutuallyExclusiveCallbackGroup()
+    node.create_subscription(Header, '/a', lambda m: got['first'].append(m.frame_id), 100)
+    node.create_subscription(
+        Header, '/a', lambda m: got['second'].append(m.frame_id), 100, callback_group=group)
+    publisher = node.create_publisher(Header, '/a', 100)
+    first, second = make_direct(ros_context), make_direct(ros_context)
+    first.add_node(node)
+    second.add_callback_group(group, node)
+    with Spinning(first), Spinning(second):
+        assert wait_for(lambda: len(hooks.publisher_state(publisher).takes) == 2)
+        for number in range(50):
+            publisher.publish(Header(frame_id=str(number)))
+        assert wait_for(lambda: all(len(ids) >= 50 for ids in got.values())), got
+    assert got['first'] == got['second'] == [str(number) for number in range(50)]
+    assert not hooks.publisher_state(publisher).takes
+
+
+def test_a_publishing_callback_wakes_the_workers_of_another_executor(ros_context, make_node):
+    """That it will end soon is no reason: it takes from its own executor only."""
+    node, got = make_node(), []
+    group = ReentrantCallbackGroup()
+    publisher = node.create_publisher(Header, '/a', 100)
+    node.create_timer(0.01, lambda: publisher.publish(Header()))
+    node.create_subscription(
+        Header, '/a', lambda m: got.append(time.monotonic()), 100, callback_group=group)
+    first, second = make_direct(ros_context), make_direct(ros_context)
+    first.add_node(node)
+    second.add_callback_group(group, node)
+    with Spinning(first), Spinning(second):
+        assert wait_for(lambda: len(got) >= 100)
+    gaps = sorted(after - before for before, after in zip(got[30:], got[31:]))
+    assert gaps[len(gaps) // 2] < 0.03

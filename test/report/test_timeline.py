@@ -45,7 +45,7 @@ import numpy as np
 import pytest
 
 from ..replay.test_ordinary_bags import BY_HEADER, write_bag
-from . import runs
+from ..report import runs
 
 
 def piece(vertex: int, job: int, start: int, end: int, worker: int = 0, callback: int = 1

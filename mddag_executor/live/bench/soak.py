@@ -144,8 +144,8 @@ class Soak:
     def _on_miss(self, miss: DeadlineMiss) -> None:
         if miss.vertex not in self._infeasible:
             self._missed.append((miss.release_ns, miss.vertex))
-            if len(self._missed) > 200_000:
-                del self._missed[:100_000]
+            if len(self._missed) > 20_000:
+                del self._missed[:10_000]
 
     def _spin(self) -> None:
         while not self._ending:

@@ -1,0 +1,230 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The code blocks of a page, and how each is tried.
+
+Theory of operation
+-------------------
+A page (Markdown) has a folder of its own for its test, with `config/` and `bags/` of the checkout
+in it.  Its blocks are tried there in the order of the page, so that one may use what one before it
+has made.  What is done with a block depends on its language:
+
+* `sh`: run by bash, which must end with status 0; `mddag` and `python` are those of this test.
+* `text` right behind: the output of that command.  `…` in it stands for anything.
+* `python`: run as a program.
+* `yaml`: a declaration, which must load.
+* `json`: must parse.
+
+Comments (HTML, invisible on the page) right before a block change that:
+
+* `<!-- file: NAME -->`: the block is that file's content (and a declaration must still load, once
+  all files of the page are there).
+* `<!-- exit: N -->`: it ends with this status.
+* `<!-- until: TEXT -->`: it runs until TEXT comes out, and then gets Ctrl-C.
+* `<!-- in the test: A => B -->`: B is tried in place of A, to be quick.
+* `<!-- not run: REASON -->`: it is not run, for one of ``REASONS``; what can be checked without
+  running it is: Python must compile, YAML must parse, options of `mddag` must exist.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import json
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+
+import msg_graph
+import yaml
+
+TOP = Path(__file__).resolve().parent.parent
+REASONS = (
+    'an excerpt',
+    'needs an installed ROS',
+    'needs root',
+    'needs a recorded drive',
+    'needs another machine',
+    'takes minutes',
+)
+_BLOCK = re.compile(
+    r'(?P<marks>(?:^[ ]*<!-- [^\n]* -->\n+)*)'
+    r'^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=indent)```$',
+    re.MULTILINE | re.DOTALL)
+_MARK = re.compile(r'<!-- (file|exit|until|in the test|not run): (.*?) -->')
+_TIMEOUT_S = 60.0
+
+
+@dataclass
+class Block:
+    """A code block: its page, line, language and text, and the marks before it."""
+
+    page: str
+    line: int
+    language: str
+    text: str
+    marks: dict[str, list[str]] = field(default_factory=dict)
+
+    @property
+    def place(self) -> str:
+        return f'{self.page}:{self.line}'
+
+    @property
+    def reason(self) -> str | None:
+        """Return why it is not run, None if it is."""
+        return self.mark('not run')
+
+    def mark(self, kind: str) -> str | None:
+        return self.marks.get(kind, [None])[0]
+
+    @property
+    def to_try(self) -> str:
+        """Return the text with what the test has in place of it."""
+        text = self.text
+        for each in self.marks.get('in the test', []):
+            old, new = each.split(' => ')
+            assert old in text, f'{self.place}: there is no {old!r}'
+            text = text.replace(old, new)
+        return text
+
+
+def pages() -> list[str]:
+    """Return all pages of the project, by their paths in the checkout."""
+    found = [TOP / name for name in ('README.md', 'CONTRIBUTING.md', 'CHANGELOG.md')]
+    found += [TOP / 'bags' / 'README.md', *(TOP / 'examples').glob('*.md'),
+              *sorted((TOP / 'docs').rglob('*.md'))]
+    return [path.relative_to(TOP).as_posix() for path in found if path.exists()]
+
+
+def blocks(page: str, text: str | None = None) -> list[Block]:
+    """Return the code blocks of a page."""
+    if text is None:
+        text = (TOP / page).read_text(encoding='utf-8')
+    found = []
+    for match in _BLOCK.finditer(text):
+        marks: dict[str, list[str]] = {}
+        for kind, value in _MARK.findall(match['marks']):
+            marks.setdefault(kind, []).append(value)
+        indent = match['indent']
+        lines = match['text'].splitlines(keepends=True)
+        found.append(Block(
+            page, text.count('\n', 0, match.start('language')) + 1, match['language'],
+            ''.join(line.removeprefix(indent) for line in lines), marks))
+    return found
+
+
+class Folder:
+    """
+    The folder in which the blocks of one page are tried.
+
+    :param path: an empty folder.
+    :param files: further files that the page takes for granted.
+    """
+
+    def __init__(self, path: Path, files: dict[str, str] | None = None) -> None:
+        self.path = path
+        self.output = ''
+        for name in ('config', 'bags'):
+            (path / name).symlink_to(TOP / name)
+        for name, text in (files or {}).items():
+            self.write(name, text)
+        programs = path / '.bin'
+        programs.mkdir()
+        for name, command in (('mddag', '-m mddag_executor'), ('python', '')):
+            program = programs / name
+            program.write_text(f'#!/bin/sh\nexec {sys.executable} {command} "$@"\n')
+            program.chmod(0o755)
+        self._environment = {
+            **os.environ, 'PYTHONPATH': os.pathsep.join([str(path), str(TOP)]),
+            'PATH': os.pathsep.join([str(programs), os.environ['PATH']])}
+
+    def write(self, name: str, text: str) -> Path:
+        """Write a file below the folder."""
+        path = self.path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding='utf-8')
+        return path
+
+    def try_all(self, found: list[Block]) -> None:
+        """Try blocks, one after the other; those that are files are there from the first on."""
+        for block in found:
+            name = block.mark('file')
+            if name is not None:
+                self.write(name, block.text)
+        for block in found:
+            self.try_one(block)
+
+    def try_one(self, block: Block) -> None:
+        """Try a block; an AssertionError says what is wrong with it."""
+        assert block.language, f'{block.place}: a block has no language'
+        if block.reason is not None:
+            assert block.reason in REASONS, f'{block.place}: no known reason: {block.reason}'
+            self._look_at(block)
+        elif block.language == 'sh':
+            self._run(block, ['bash', '-eo', 'pipefail', '-c', block.to_try])
+        elif block.language == 'python' and block.mark('file') is None:
+            self.write('example.py', block.to_try)
+            self._run(block, [sys.executable, 'example.py'])
+        elif block.language == 'text' and block.mark('file') is None:
+            expected = re.escape(block.text.rstrip()).replace('…', '.*?')
+            actual = '\n'.join(line.rstrip() for line in self.output.rstrip().splitlines())
+            assert re.fullmatch(expected, actual, re.DOTALL), (
+                f'{block.place}: the output is not\n{block.text}\nbut\n{actual}')
+        elif block.language == 'yaml':
+            name = block.mark('file')
+            if name is not None and 'arguments:' in block.text:
+                return  # a part, which what includes it shows
+            msg_graph.load(self.write(name or 'block.yaml', block.text))
+        elif block.mark('file') is None or block.language in ('python', 'json'):
+            self._look_at(block)
+
+    def _look_at(self, block: Block) -> None:
+        if block.language == 'python':
+            compile(block.text, block.place, 'exec')
+        elif block.language == 'yaml':
+            yaml.safe_load(block.text)
+        elif block.language == 'json':
+            json.loads(block.text)
+        else:
+            assert block.reason is not None, (
+                f'{block.place}: nobody knows how to try {block.language!r}: mark it')
+
+    def _run(self, block: Block, command: list[str]) -> None:
+        expected, until = int(block.mark('exit') or 0), block.mark('until')
+        with subprocess.Popen(
+                command, cwd=self.path, env=self._environment, text=True,
+                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                start_new_session=True) as process:
+            assert process.stdout is not None
+            try:
+                if until is not None:
+                    found = any(until in line for line in process.stdout)
+                    process.send_signal(signal.SIGINT)  # as a user ends it
+                output, errors = process.communicate(timeout=_TIMEOUT_S)
+            finally:
+                if process.poll() is None:
+                    os.killpg(process.pid, signal.SIGKILL)
+        if until is not None:
+            assert found, f'{block.place}: {until!r} never came\n{errors}'
+            # As with rclpy's own executors, spin() ends with one of these after Ctrl-C.
+            last = errors.strip().splitlines()[-1:]
+            assert not last or re.match(
+                r'KeyboardInterrupt|.*ExternalShutdownException', last[0]), errors
+            return
+        assert process.returncode == expected, (
+            f'{block.place} ended with {process.returncode}\n{output}{errors}')
+        self.output = output if expected != 2 else errors

@@ -1,0 +1,231 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What README and documentation show works, and the documentation builds, offline."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import io
+import os
+from pathlib import Path
+import re
+import shlex
+import subprocess
+import sys
+
+from mddag_executor.cli import main as program
+from mddag_executor.errors import UsageError
+import pytest
+
+from .doc_blocks import Block, blocks, Folder, pages, REASONS, TOP
+
+PAGES = pages()
+LARGEST_IMAGE = 150_000
+# What a page takes for granted: nodes of the reader's own robot.
+NODES = """
+from rclpy.node import Node
+from std_msgs.msg import Header
+
+
+class Camera(Node):
+
+    def __init__(self):
+        super().__init__('camera')
+        self.images = self.create_publisher(Header, '/image', 1)
+        self.timer = self.create_timer(0.1, self.capture)
+
+    def capture(self):
+        self.images.publish(Header(stamp=self.get_clock().now().to_msg()))
+
+
+class Detector(Node):
+
+    def __init__(self):
+        super().__init__('detector')
+        self.create_subscription(Header, '/image', self.detect, 1)
+        self.seen = 0
+
+    def detect(self, image):
+        self.seen += 1
+        print('seen', self.seen, flush=True)
+"""
+COMMON = """
+mddag: 1
+nodes:
+  - node: /vehicle
+    callbacks:
+      - {name: report, timer: 20ms, publishes: [/vehicle/twist, /points], deadline: 20ms}
+"""
+FILES = {
+    'README.md': {'my_robot.py': NODES},
+}
+
+
+def every_block() -> Iterator[Block]:
+    for page in PAGES:
+        yield from blocks(page)
+
+
+@pytest.mark.parametrize('page', [page for page in PAGES if blocks(page)])
+def test_what_a_page_shows_works(page: str, tmp_path: Path) -> None:
+    Folder(tmp_path, FILES.get(page)).try_all(blocks(page))
+
+
+@pytest.mark.parametrize('reason', REASONS)
+def test_what_is_not_run(reason: str) -> None:
+    """List what is not run: `pytest -rs` shows it."""
+    found = [block.place for block in every_block() if block.reason == reason]
+    assert found, 'nothing is marked so any more: take it out of REASONS'
+    pytest.skip(f'{reason}: {", ".join(found)}')
+
+
+# --- commands ------------------------------------------------------------------------------------
+
+def command_lines() -> list[tuple[str, str]]:
+    """Return every command line of `mddag` in blocks and between backquotes, and its page."""
+    found = []
+    for page in PAGES:
+        if page == 'CHANGELOG.md':
+            continue
+        text = (TOP / page).read_text(encoding='utf-8')
+        for block in blocks(page):
+            if block.language == 'sh':
+                lines = block.text.replace('\\\n', ' ').splitlines()
+                found += [(page, part.strip()) for line in lines
+                          for part in re.split(r'&&|\|\|?|;', line.partition(' #')[0])]
+        text = re.sub(r'^ *```.*?^ *```$', '', text, flags=re.MULTILINE | re.DOTALL)
+        found += [(page, line.replace('\n', ' ')) for line in re.findall(r'`([^`]+)`', text)]
+    lines = [(page, re.sub(r'^.*?(\bros2 run mddag_executor )?\bmddag ', '', line))
+             for page, line in found
+             if re.match(r'(\S+=\S+ |chrt \S+ \S+ |ros2 run mddag_executor )*'
+                         r'(\.venv/bin/)?mddag ', line)]
+    return sorted(set(lines))
+
+
+def known_options(words: list[str]) -> tuple[str, set[str]]:
+    """Return the help of the verb that a command line names, and its options."""
+    verbs = [word for word in words[:2] if re.fullmatch(r'[a-z-]+', word)]
+    for count in range(len(verbs), 0, -1):
+        out = io.StringIO()
+        try:
+            with contextlib.redirect_stdout(out):
+                program.run([*verbs[:count], '--help'])
+        except SystemExit:
+            if count == 1 and len(verbs) == 2 and 'VERB ...' in out.getvalue():
+                break
+            return out.getvalue(), set(re.findall(r'(?<![\w-])--?[a-z][\w-]*', out.getvalue()))
+        except UsageError:
+            continue
+    raise AssertionError(f'there is no such verb: {" ".join(words[:2])}')
+
+
+@pytest.mark.parametrize(('page', 'line'), command_lines())
+def test_commands_and_options_exist(page: str, line: str) -> None:
+    line = re.split(r' [|>] ?', line)[0]
+    words = shlex.split(line.replace('…', ' '), comments=True)
+    if words[0].startswith('-') or words[0].isupper():
+        return  # mddag --help, mddag VERB --help
+    _, options = known_options(words)
+    used = {word.partition('=')[0].strip('[]') for word in words
+            if re.match(r'\[?--?[a-z]', word)}
+    if '--ros-args' in used:
+        used = {word for word in used if word != '-r'}
+    assert used - options - {'--help'} == set(), f'{page}: {line}'
+
+
+def test_a_wrong_option_is_found() -> None:
+    _, options = known_options(['graph', 'check', 'x.yaml'])
+    assert '--json' in options and '--nonsense' not in options
+    with pytest.raises(AssertionError, match='no such verb'):
+        known_options(['nonsense'])
+
+
+# --- the mechanism itself ------------------------------------------------------------------------
+
+@pytest.mark.parametrize('text', [
+    '```sh\nfalse\n```',
+    '```sh\nfalse | cat\n```',
+    '<!-- exit: 1 -->\n```sh\ntrue\n```',
+    '```sh\necho a b c\n```\n```text\na … d\n```',
+    '```python\nraise SystemExit(1)\n```',
+    '<!-- not run: an excerpt -->\n```python\ndef f(:\n```',
+    '<!-- not run: no time -->\n```sh\ntrue\n```',
+    '```yaml\nmddag: 1\nnodes: []\n```',
+    '```json\n{\n```',
+    '```ini\na=b\n```',
+    '```\ntext\n```',
+])
+def test_what_is_wrong_fails(text: str, tmp_path: Path) -> None:
+    found = blocks('page.md', text)
+    assert len(found) == text.count('```') // 2
+    with pytest.raises((AssertionError, SyntaxError, ValueError)):
+        Folder(tmp_path).try_all(found)
+
+
+def test_what_is_right_passes(tmp_path: Path) -> None:
+    text = ('<!-- file: a.txt -->\n```text\nhello\n```\n'
+            '<!-- in the test: sleep 100 => true -->\n```sh\nsleep 100\ncat a.txt; echo b c d\n```\n'
+            '```text\nhello\nb … d\n```\n'
+            '<!-- exit: 2 -->\n```sh\nmddag graph check none.yaml\n```\n'
+            '```text\nerror: none.yaml: …\n```\n')
+    Folder(tmp_path).try_all(blocks('page.md', text))
+
+
+# --- the site ------------------------------------------------------------------------------------
+
+def test_the_site_builds_without_warnings_and_needs_no_network(tmp_path: Path) -> None:
+    pytest.importorskip('mkdocs', reason='the extra `docs` is not installed')
+    result = subprocess.run(
+        [sys.executable, '-m', 'mkdocs', 'build', '--strict', '-d', str(tmp_path / 'site')],
+        cwd=TOP, env={**os.environ, 'NO_MKDOCS_2_WARNING': '1'}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False, timeout=150)
+    assert result.returncode == 0, result.stdout
+    assert 'WARNING' not in result.stdout
+    found = list((tmp_path / 'site').rglob('*.html'))
+    assert len(found) > len(list((TOP / 'docs').rglob('*.md'))) - 1
+    fetched = re.compile(
+        r'<(?:script|img|iframe)[^>]*\ssrc="?(?:https?:)?//'
+        r'|<link(?![^>]*rel="?(?:canonical|next|prev))[^>]*\shref="?(?:https?:)?//'
+        r'|@import|fonts\.g', re.IGNORECASE)
+    for path in found:
+        hit = fetched.search(path.read_text(encoding='utf-8'))
+        assert hit is None, f'{path.name} fetches {hit}'
+    api = (tmp_path / 'site' / 'api.html').read_text(encoding='utf-8')
+    for name in ('MultiDeadlineExecutor', 'DeadlineMiss', 'read_events', 'TaskSet'):
+        assert f'{name}' in api
+
+
+def test_images_are_small_and_used() -> None:
+    texts = ''.join((TOP / page).read_text(encoding='utf-8') for page in PAGES)
+    for path in (TOP / 'docs' / 'images').iterdir():
+        assert path.stat().st_size <= LARGEST_IMAGE, f'{path.name} is too large'
+        assert path.name in texts, f'{path.name} is on no page'
+
+
+@pytest.mark.parametrize('page', [page for page in PAGES if not page.startswith('docs/')])
+def test_links_of_other_pages_lead_somewhere(page: str) -> None:
+    text = (TOP / page).read_text(encoding='utf-8')
+    for name in re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', text):
+        assert (TOP / page).parent.joinpath(name).exists(), name
+
+
+def test_files_that_pages_name_exist() -> None:
+    """A path between backquotes that begins with a folder of the checkout is there."""
+    folders = ('mddag_executor', 'msg_graph', 'config', 'launch', 'bags', 'test', 'docs')
+    for page in PAGES:
+        text = (TOP / page).read_text(encoding='utf-8')
+        for name in re.findall(rf'`((?:{"|".join(folders)})/[\w./-]+)`', text):
+            assert (TOP / name).exists(), f'{page}: {name}'
