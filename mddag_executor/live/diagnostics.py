@@ -330,12 +330,11 @@ class _Publisher:
         self._publisher = self._node.create_publisher(DiagnosticArray, TOPIC, 10)
 
     def publish(self, statuses: list[Status]) -> None:
-        from builtin_interfaces.msg import Time
         from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
         message = DiagnosticArray()
         # of the system's clock: simulated time may stand still, and this is about the process
-        seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
-        message.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
+        stamp = message.header.stamp
+        stamp.sec, stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
         for status in statuses:
             message.status.append(DiagnosticStatus(
                 level=bytes([status.level]), name=status.name, message=status.message,

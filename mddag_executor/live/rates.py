@@ -71,7 +71,7 @@ class RateWatch:
         self._registry = registry
         self._warn = warn
         self._clock = clock
-        self._next = 0.0
+        self._next = clock()
         self._known: dict[Entry, _Known] = {}
 
     def look(self) -> None:
@@ -79,10 +79,11 @@ class RateWatch:
         now = self._clock()
         if now < self._next:
             return
-        self._next = now + LOOK_S
+        since, self._next = self._next - LOOK_S, now + LOOK_S
         before = self._known
         self._known = {
-            entry: before.get(entry) or _Known(now) for entry in self._registry.timers()}
+            entry: before.get(entry) or _Known(max(0.0, since))
+            for entry in self._registry.timers()}
         for entry, known in self._known.items():
             if now < known.next:
                 continue

@@ -127,17 +127,24 @@ class Lateness:
 
 @contextmanager
 def spinning(**arguments: Any) -> Iterator[MultiDeadlineExecutor]:
-    """Give an executor that spins in a thread."""
+    """Give an executor, which ``start`` lets spin in a thread; both have ended afterwards."""
     executor = MultiDeadlineExecutor(**arguments)
     try:
         yield executor
     finally:
         executor.shutdown(5.0)
+        thread = _threads.pop(executor, None)
+        if thread is not None:
+            thread.join(5.0)
+
+
+_threads: dict[MultiDeadlineExecutor, threading.Thread] = {}
 
 
 def start(executor: MultiDeadlineExecutor) -> None:
     """Let an executor spin in a thread."""
-    threading.Thread(target=executor.spin, daemon=True).start()
+    thread = _threads[executor] = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
 
 
 def throughput(body: Body, workers: int, seconds: float) -> float:

@@ -169,7 +169,7 @@ class Soak:
         while not self.nodes.matched() and time.monotonic() < end:
             time.sleep(0.05)
         begin = time.monotonic()
-        warm_up = min(20.0, self._seconds / 3)
+        warm_up = min(60.0, self._seconds / 3)
         time.sleep(warm_up)
         self._misuse_once()
         before = usage()
@@ -264,7 +264,8 @@ class Soak:
             'executions': _sum(statistics, 'ready'), 'ran': _sum(statistics, 'ran'),
             'dropped': _sum(statistics, 'dropped'), 'skipped': _sum(statistics, 'skipped'),
             'unattributed': _sum(statistics, 'unattributed'),
-            'clean_windows': len(self._clean), 'disturbed_windows': len(self._clean) - len(judged),
+            'cut_off': self.nodes.cut_off, 'clean_windows': len(self._clean),
+            'disturbed_windows': len(self._clean) - len(judged),
             'stalls': len(self._stalls.stalls), 'clean_misses': len(clean_misses),
             'clean_missed_sinks': sorted(set(clean_misses)),
             'infeasible_sinks': sorted(self._infeasible), 'simulated_ticks': ticks}

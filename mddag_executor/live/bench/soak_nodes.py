@@ -38,6 +38,7 @@ from rclpy.callback_groups import (
 )
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
@@ -55,13 +56,15 @@ class SoakNodes:
     """
     The nodes of a declaration; each can be destroyed and made again.
 
-    ``started`` counts the starts of bodies, ``raise_next`` lets the next body raise.
+    ``started`` counts the starts of bodies, ``raise_next`` lets the next body raise, ``cut_off``
+    counts bodies whose node was destroyed while they ran, so that they could not publish.
     """
 
     def __init__(self, task_set: TaskSet, plan: ExecutionPlan) -> None:
         self.task_set = task_set
         self.started = 0
         self.raise_next = False
+        self.cut_off = 0
         self.nodes: dict[str, Node] = {}
         self.timers: dict[str, Timer] = {}
         self._plan = plan
@@ -113,8 +116,11 @@ class SoakNodes:
             job = current_job()
             self._emulate(usual if job is None else times.get(job.dag, usual))
             message = stamped(release or (time.time_ns() if job is None else job.release_ns))
-            for publisher in publishers:
-                publisher.publish(message)
+            try:
+                for publisher in publishers:
+                    publisher.publish(message)
+            except InvalidHandle:
+                self.cut_off += 1  # its node was destroyed while it ran
 
         def counted(release: int = 0) -> None:
             with self._lock:
