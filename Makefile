@@ -12,7 +12,7 @@ ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: help env demo test soak fuzz lint clean distclean
+.PHONY: help env demo test soak fuzz lint docs clean distclean
 .NOTPARALLEL:
 
 help:
@@ -21,6 +21,7 @@ help:
 	@echo 'make soak       the Autoware workload with random faults for SOAK_SECONDS (600)'
 	@echo 'make fuzz       read damaged traces and bags for FUZZ_SECONDS (600) each'
 	@echo 'make lint       run the linters and mypy only'
+	@echo 'make docs       build the documentation, build/docs/index.html'
 	@echo 'make env        make or refresh the environment in $(VENV)/ (the others do it, too)'
 	@echo 'make clean      remove what builds and tests left behind'
 	@echo 'make distclean  the same, and the environment'
@@ -47,6 +48,10 @@ soak: env
 
 lint: env
 	@$(BIN)/python -m pytest -q -m linter test/test_linters.py test/test_layers.py
+
+docs: env
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	@echo 'build/docs/index.html'
 
 clean:
 	rm -rf build install log dist *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

@@ -22,6 +22,7 @@ from setuptools import find_packages, setup
 NAME = 'mddag_executor'
 BATCH = ['matplotlib>=3.7', 'numba>=0.60']
 DASK = ['distributed>=2023.5']
+DOCS = ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26']
 EXPORT = ['perfetto>=0.11', 'pyarrow>=14']
 REPORT = ['bokeh>=3.6']
 TOP = ['rich>=13']
@@ -80,6 +81,8 @@ setup(
         'batch': BATCH,
         # those runs on more than one machine
         'dask': DASK,
+        # make docs
+        'docs': DOCS,
         # files for Perfetto and for data frames
         'export': EXPORT,
         # --report OUT.html
@@ -94,6 +97,7 @@ setup(
         'test': [
             *BATCH,
             *DASK,
+            *DOCS,
             *EXPORT,
             *REPORT,
             *TOP,

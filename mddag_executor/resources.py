@@ -40,6 +40,7 @@ def roots() -> Iterator[Path]:
     package = Path(__file__).resolve().parent
     if (package.parent / 'package.xml').is_file():
         yield package.parent
+    yield package.parent / 'share' / _NAME  # pip install --target
     # PREFIX/lib/python3.12/site-packages/mddag_executor, and Debian's PREFIX/local/lib/…
     for prefix in list(package.parents)[3:5]:
         yield prefix / 'share' / _NAME

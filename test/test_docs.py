@@ -28,6 +28,7 @@ import sys
 
 from mddag_executor.cli import main as program
 from mddag_executor.errors import UsageError
+from msg_graph import GraphError
 import pytest
 
 from .doc_blocks import Block, blocks, Folder, pages, REASONS, TOP
@@ -67,10 +68,11 @@ mddag: 1
 nodes:
   - node: /vehicle
     callbacks:
-      - {name: report, timer: 20ms, publishes: [/vehicle/twist, /points], deadline: 20ms}
+      - {name: report, timer: 20ms, publishes: [/vehicle/twist], deadline: 20ms}
 """
 FILES = {
     'README.md': {'my_robot.py': NODES},
+    'docs/graphs.md': {'common.yaml': COMMON},
 }
 
 
@@ -82,6 +84,12 @@ def every_block() -> Iterator[Block]:
 @pytest.mark.parametrize('page', [page for page in PAGES if blocks(page)])
 def test_what_a_page_shows_works(page: str, tmp_path: Path) -> None:
     Folder(tmp_path, FILES.get(page)).try_all(blocks(page))
+
+
+def test_no_block_is_overlooked() -> None:
+    for page in PAGES:
+        fences = re.findall(r'^ *```', (TOP / page).read_text(encoding='utf-8'), re.MULTILINE)
+        assert len(fences) == 2 * len(blocks(page)), page
 
 
 @pytest.mark.parametrize('reason', REASONS)
@@ -146,6 +154,20 @@ def test_commands_and_options_exist(page: str, line: str) -> None:
     assert used - options - {'--help'} == set(), f'{page}: {line}'
 
 
+def test_every_verb_is_on_the_page_of_commands() -> None:
+    text = (TOP / 'docs' / 'commands.md').read_text(encoding='utf-8')
+    verbs = set(program.available()) - {'graph', 'import'}
+    help_of_graph, _ = known_options(['graph', 'check'])
+    assert 'mddag graph check' in help_of_graph
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), pytest.raises(SystemExit):
+        program.run(['graph', '--help'])
+    verbs |= {f'graph {name}' for name in re.findall(r'^    ([a-z-]+)\b', out.getvalue(),
+                                                     re.MULTILINE)}
+    assert {'graph fmt', 'graph assign-deadlines'} <= verbs
+    assert not [verb for verb in verbs if f'`mddag {verb}`' not in text]
+
+
 def test_a_wrong_option_is_found() -> None:
     _, options = known_options(['graph', 'check', 'x.yaml'])
     assert '--json' in options and '--nonsense' not in options
@@ -171,13 +193,14 @@ def test_a_wrong_option_is_found() -> None:
 def test_what_is_wrong_fails(text: str, tmp_path: Path) -> None:
     found = blocks('page.md', text)
     assert len(found) == text.count('```') // 2
-    with pytest.raises((AssertionError, SyntaxError, ValueError)):
+    with pytest.raises((AssertionError, SyntaxError, ValueError, GraphError)):
         Folder(tmp_path).try_all(found)
 
 
 def test_what_is_right_passes(tmp_path: Path) -> None:
     text = ('<!-- file: a.txt -->\n```text\nhello\n```\n'
-            '<!-- in the test: sleep 100 => true -->\n```sh\nsleep 100\ncat a.txt; echo b c d\n```\n'
+            '<!-- in the test: sleep 100 => true -->\n'
+            '```sh\nsleep 100\ncat a.txt; echo b c d\n```\n'
             '```text\nhello\nb … d\n```\n'
             '<!-- exit: 2 -->\n```sh\nmddag graph check none.yaml\n```\n'
             '```text\nerror: none.yaml: …\n```\n')
@@ -187,7 +210,8 @@ def test_what_is_right_passes(tmp_path: Path) -> None:
 # --- the site ------------------------------------------------------------------------------------
 
 def test_the_site_builds_without_warnings_and_needs_no_network(tmp_path: Path) -> None:
-    pytest.importorskip('mkdocs', reason='the extra `docs` is not installed')
+    for name in ('material', 'mkdocs', 'mkdocstrings'):
+        pytest.importorskip(name, reason='the extra `docs` is not installed')
     result = subprocess.run(
         [sys.executable, '-m', 'mkdocs', 'build', '--strict', '-d', str(tmp_path / 'site')],
         cwd=TOP, env={**os.environ, 'NO_MKDOCS_2_WARNING': '1'}, text=True,
@@ -224,7 +248,8 @@ def test_links_of_other_pages_lead_somewhere(page: str) -> None:
 
 def test_files_that_pages_name_exist() -> None:
     """A path between backquotes that begins with a folder of the checkout is there."""
-    folders = ('mddag_executor', 'msg_graph', 'config', 'launch', 'bags', 'test', 'docs')
+    folders = ('mddag_executor', 'msg_graph', 'config', 'launch', 'bags', 'test', 'docs',
+               'examples')
     for page in PAGES:
         text = (TOP / page).read_text(encoding='utf-8')
         for name in re.findall(rf'`((?:{"|".join(folders)})/[\w./-]+)`', text):

@@ -150,7 +150,7 @@ def policy(name: str) -> Policy:
     """
     try:
         return POLICIES[name]
-    except KeyError:
+    except (KeyError, TypeError):  # a list, say
         raise PolicyError(
             f"policy '{name}': there is no such policy: choose one of {', '.join(POLICIES)}"
         ) from None

@@ -26,9 +26,8 @@ intake does not look after it, and each ``publish`` of one of these publishers t
 Nothing may get lost or wait by that:
 
 1.  Who publishes from elsewhere is counted by the middleware: the subscription is direct only
-    while it has exactly as many publishers as these nodes have with a compatible QoS.  A
-    *watch* on the middleware's event "matched" tells when that number changes; then it is chosen
-    anew.
+    while it has exactly as many publishers as these nodes have with a compatible QoS.  They are
+    counted again every ``LOOK_S``.
 2.  A message that is not there when ``publish`` returns (the middleware delivers in a thread of
     its own, or filters) shows that the assumption is wrong here: the intake takes over for good.
 3.  Whoever starts to look after a subscription, the intake or this one, first takes what is there
@@ -37,9 +36,16 @@ Nothing may get lost or wait by that:
     arrive, whichever of several threads gets which.  One lock for each subscription keeps the
     messages in order.
 
+5.  Whatever happened, every ``LOOK_S`` all that has arrived is taken.  So a publisher from
+    elsewhere that has just come, or has come and gone, is served that much later at the most.
+
+Why not the middleware's event "matched"?  rclpy's native executor crashes when it is told of an
+event whose waitable is just being removed (it lets go of Python objects without the interpreter
+lock), and publishers come and go just when nodes are destroyed.  In a wait set such an event wakes
+for every message.
+
 Subscriptions with durability other than volatile get messages from the past at some later time,
-so they are not direct; neither are those of which a user watches the same event, of which the
-middleware tells only one.
+so they are not direct.
 """
 
 from __future__ import annotations
@@ -51,50 +57,17 @@ from typing import Any
 
 from mddag_executor.live.attribution import PublisherState
 from mddag_executor.live.entities import EntitySet, Receiver
-from mddag_executor.live.groups import shared_subscriptions
 from mddag_executor.live.hooks import install, publisher_state
-from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.event_handler import (
-    EventHandler,
-    QoSSubscriptionEventType,
-    UnsupportedEventTypeError,
-)
 from rclpy.exceptions import InvalidHandle
 from rclpy.qos import DurabilityPolicy, qos_check_compatible, QoSCompatibility
 from rclpy.subscription import Subscription
 
-MATCHED = QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED
 MOST_AT_ONCE = 64
 
+LOOK_S = 0.1
+"""How often to look after direct subscriptions."""
+
 _several_executors = threading.Lock()
-
-
-class Watch(EventHandler):
-    """
-    Tells when the number of a subscription's publishers changes.
-
-    It belongs to no node, and its callback runs in the intake's thread.
-    """
-
-    def __init__(self, subscription: Subscription, on_change: Callable[[], None]) -> None:
-        super().__init__(
-            callback_group=ReentrantCallbackGroup(), callback=self.look, event_type=MATCHED,
-            parent_impl=subscription.handle)
-        self._subscription = subscription
-        self._on_change = on_change
-        self.expected = 0
-
-    def close(self) -> None:
-        """Let go of it."""
-        super().destroy()  # type: ignore[no-untyped-call]
-
-    def look(self, _: Any = None) -> None:
-        """Compare the number with what was expected."""
-        try:
-            if self._subscription.get_publisher_count() != self.expected:
-                self._on_change()
-        except InvalidHandle:
-            self._on_change()
 
 
 class Direct:
@@ -105,20 +78,29 @@ class Direct:
     """
 
     __slots__ = (
-        'owner', 'subscription', 'watch', 'refused', '_lock', '_newest', '_receiver', '_on_miss')
+        'owner', 'subscription', 'publishers', 'refused', '_lock', '_newest', '_receiver',
+        '_on_miss')
 
     def __init__(
-        self, owner: DirectTakes, subscription: Subscription, watch: Watch, receiver: Receiver,
+        self, owner: DirectTakes, subscription: Subscription, receiver: Receiver,
         on_miss: Callable[[], None],
     ) -> None:
         self.owner = owner
         self.subscription = subscription
-        self.watch = watch
+        # how many there are, all of these nodes
+        self.publishers = 0
         self.refused = False
         self._lock = threading.Lock()
         self._newest = 0
         self._receiver = receiver
         self._on_miss = on_miss
+
+    def changed(self) -> bool:
+        """Return whether there are more or fewer publishers than when they were counted."""
+        try:
+            return bool(self.subscription.get_publisher_count() != self.publishers)
+        except InvalidHandle:
+            return False  # destroyed: its node tells the executor
 
     def take(self, begin: int) -> None:
         """
@@ -187,9 +169,10 @@ class DirectTakes:
         self._refused: dict[int, Subscription] = {}
         self._states: dict[int, PublisherState] = {}
         self._chosen: frozenset[int] = frozenset()
-        self._watched: frozenset[int] = frozenset()
         self._before: EntitySet | None = None
         self._left: EntitySet | None = None
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
 
     def choose(self, entities: EntitySet) -> EntitySet:
         """
@@ -204,20 +187,17 @@ class DirectTakes:
         takes: dict[int, list[Direct]] = {}
         states: dict[int, PublisherState] = {}
         chosen: list[Direct] = []
-        shared = shared_subscriptions(entities.nodes)
         for subscription in entities.subscriptions:
-            if id(subscription) in shared:
-                continue  # its watch and another executor's events of the node do not agree
             try:
                 locals_ = publishers.get(subscription.topic_name)
                 direct = self._direct(subscription) if locals_ else None
                 if direct is None or locals_ is None:
                     continue
                 matching = [p for p in locals_ if _compatible(p, subscription)]
-                direct.watch.expected = subscription.get_publisher_count()
+                direct.publishers = subscription.get_publisher_count()
             except InvalidHandle:
                 continue  # destroyed meanwhile
-            if not matching or direct.watch.expected != len(matching):
+            if not matching or direct.publishers != len(matching):
                 continue
             chosen.append(direct)
             for publisher in matching:
@@ -225,7 +205,22 @@ class DirectTakes:
                 states[id(publisher)] = publisher_state(publisher)
         self._set_takes(takes, states)
         self._forget(entities)
+        if self._thread is None:
+            self._thread = threading.Thread(
+                target=self._look_after, args=(self._stopping,), name='mddag-intake-direct',
+                daemon=True)
+            self._thread.start()
         return self._rest(entities, chosen)
+
+    def _look_after(self, stopping: threading.Event) -> None:
+        while not stopping.wait(LOOK_S):
+            changed = False
+            for key, direct in list(self._known.items()):
+                if key in self._chosen:
+                    direct.take(0)
+                changed = changed or direct.changed()
+            if changed:
+                self._on_change()
 
     def settle(self) -> None:
         """Take what has arrived before the publishers took."""
@@ -237,8 +232,8 @@ class DirectTakes:
     def stop(self) -> None:
         """Have publishers take no more; the intake has been stopped, or looks after all."""
         self._set_takes({}, {})
-        for direct in self._known.values():
-            direct.watch.close()
+        self._stopping.set()
+        self._stopping, self._thread = threading.Event(), None
         self._known = {}
         self._before = self._left = None
 
@@ -247,21 +242,14 @@ class DirectTakes:
         direct = self._known.get(key)
         if direct is not None and direct.refused:
             self._refused[key] = subscription
-            self._known.pop(key).watch.close()
+            del self._known[key]
         if self._refused.get(key) is subscription:
             return None
         if direct is None:
-            handlers: Any = subscription.event_handlers
-            if (subscription.qos_profile.durability != DurabilityPolicy.VOLATILE
-                    or any(e.event_type == MATCHED for e in handlers)):
-                return None
-            try:
-                watch = Watch(subscription, self._on_change)
-            except UnsupportedEventTypeError:
-                self._refused[key] = subscription
+            if subscription.qos_profile.durability != DurabilityPolicy.VOLATILE:
                 return None
             direct = self._known[key] = Direct(
-                self, subscription, watch, self._receiver, self._on_change)
+                self, subscription, self._receiver, self._on_change)
         return direct
 
     def _set_takes(
@@ -282,21 +270,17 @@ class DirectTakes:
         present = {id(s): s for s in entities.subscriptions}
         for key, direct in list(self._known.items()):
             if present.get(key) is not direct.subscription:
-                self._known.pop(key).watch.close()
+                del self._known[key]
         self._refused = {
             key: s for key, s in self._refused.items() if present.get(key) is s}
 
     def _rest(self, entities: EntitySet, chosen: list[Direct]) -> EntitySet:
         keys = frozenset(id(direct.subscription) for direct in chosen)
-        known = frozenset(self._known)
-        if (self._left is not None and entities is self._before and keys == self._chosen
-                and known == self._watched):
+        if self._left is not None and entities is self._before and keys == self._chosen:
             return self._left
-        self._before, self._chosen, self._watched = entities, keys, known
+        self._before, self._chosen = entities, keys
         self._left = replace(
-            entities,
-            subscriptions=[s for s in entities.subscriptions if id(s) not in keys],
-            events=[*entities.events, *(direct.watch for direct in self._known.values())])
+            entities, subscriptions=[s for s in entities.subscriptions if id(s) not in keys])
         return self._left
 
 

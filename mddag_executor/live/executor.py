@@ -37,6 +37,7 @@ import threading
 import time
 from typing import Any, TYPE_CHECKING
 
+from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.live import hooks
 from mddag_executor.live.diagnostics import Diagnostics
 from mddag_executor.live.dispatcher import Dispatcher
@@ -48,13 +49,18 @@ from mddag_executor.live.receiver import Receiver
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 from mddag_executor.live.settings import (
+    call_back,
+    check_context,
+    check_thresholds,
     diagnostics_period_ns,
+    MOST_JOBS,
     resolve,
     thread_setting,
     Thresholds,
+    whole,
 )
 from mddag_executor.live.statistics import statistics
-from mddag_executor.live.stepping import Stepping
+from mddag_executor.live.stepping import deadline_of, Stepping
 from mddag_executor.live.tasks import make_task
 from mddag_executor.live.verdicts import DeadlineMiss
 from mddag_executor.live.waitset import WaitSetIntake
@@ -102,8 +108,9 @@ class MultiDeadlineExecutor(Stepping):
         as ``1s``; None or 0: not at all.
     :param thresholds: what makes a status of the diagnostics worse than OK.
     :raises msg_graph.GraphError: when the declaration is not right.
-    :raises mddag_executor.errors.MddagError: on an unknown policy, intake or thread setting, and
-        when the trace can not be written.
+    :raises mddag_executor.errors.MddagError: on an unknown policy, intake or thread setting, a
+        value of the wrong kind, and when the trace can not be written.
+    :raises rclpy.exceptions.NotInitializedException: when ``rclpy.init`` was not called before.
     """
 
     _sigint_gc: Any = None  # for the base class' finalizer, where construction fails
@@ -131,6 +138,12 @@ class MultiDeadlineExecutor(Stepping):
             graph, num_workers, default_deadline, intake)
         prepare = thread_setting(worker_policy, worker_priority, worker_cpus)
         every_ns = diagnostics_period_ns(diagnostics_period)
+        max_active_jobs = whole('max_active_jobs', max_active_jobs, MOST_JOBS)
+        call_back('on_deadline_miss', on_deadline_miss)
+        find_policy(policy)
+        check_context(context)
+        thresholds = check_thresholds(thresholds)
+        # All is checked by now: nothing below leaves a trace or a thread of what can't be made.
         hooks.install()
         self._recorder = None
         clock_offset = time.time_ns() - time.monotonic_ns()
@@ -168,7 +181,7 @@ class MultiDeadlineExecutor(Stepping):
         if every_ns is not None:
             self._diagnostics = Diagnostics(
                 self._context, task_set, self._dispatcher, self._pool, self._registry,
-                self._recorder, every_ns, thresholds or Thresholds())
+                self._recorder, every_ns, thresholds)
         self._intake_kind = intake
 
     # --- tasks -----------------------------------------------------------------------------------
@@ -217,11 +230,9 @@ class MultiDeadlineExecutor(Stepping):
             pass
 
     def _spin(self, done: Callable[[], bool], timeout_sec: float | None) -> None:
+        deadline = deadline_of(timeout_sec)
         if not self._spinning.acquire(blocking=False):
             raise RuntimeError('Executor is already spinning')
-        deadline = None
-        if timeout_sec is not None and timeout_sec >= 0:
-            deadline = time.monotonic() + timeout_sec
         try:
             if self._is_shutdown:
                 return

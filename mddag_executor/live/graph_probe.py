@@ -216,9 +216,11 @@ def _listen(node: Node, found: Probe) -> list[tuple[Any, Seen]]:
 
 
 def _message_type(kind: str) -> Any:
-    """Return the class of a type as `std_msgs/msg/String`."""
-    package, _, name = kind.replace('/', '.').rpartition('.')
-    return getattr(import_module(package), name)
+    """Return the class of a type as `std_msgs/msg/String`: other nodes say it, so nothing else."""
+    match kind.split('/'):
+        case [package, 'msg', name] if package.isidentifier() and name.isidentifier():
+            return getattr(import_module(f'{package}.msg'), name)
+    raise ValueError('this is no name of a message type')
 
 
 def sketch_of(found: Probe) -> Sketch:

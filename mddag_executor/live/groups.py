@@ -37,7 +37,7 @@ running the group.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 import threading
 import time
 from typing import Any, TYPE_CHECKING
@@ -99,11 +99,6 @@ class NodeShare:
         if name not in _PARTS:
             return value
         return [e for e in list(value) if self._has(getattr(e, 'callback_group', None))]
-
-
-def shared_subscriptions(nodes: Iterable[Any]) -> set[int]:
-    """Return the ids of the subscriptions of nodes that several executors share."""
-    return {id(s) for node in nodes if isinstance(node, NodeShare) for s in node.subscriptions}
 
 
 class GroupOwner(Executor):

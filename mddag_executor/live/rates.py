@@ -22,7 +22,8 @@ releases nothing: the period is skipped and counted, and the phase is kept, so t
 bursts afterwards.  Who spins looks at these counts now and then, not the intake: on the way of a
 timer there is nothing more to do.  A timer that has skipped a share of ``LEAST`` of its periods
 lately is warned of, at once the first time, then after ``AGAIN_S`` at the earliest and each time
-twice as long, up to ``RARELY_S``.  (One that skips a period now and then is only counted.)
+twice as long, up to ``RARELY_S``.  (One that skips a period now and then, or fewer than ``FEWEST``
+altogether, as when everything starts, is only counted.)
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from rclpy.logging import get_logger
 LOOK_S = 0.5
 AGAIN_S, RARELY_S = 10.0, 640.0
 LEAST = 0.05
+FEWEST = 3
 
 
 class _Known:
@@ -71,7 +73,7 @@ class RateWatch:
         self._registry = registry
         self._warn = warn
         self._clock = clock
-        self._next = clock()
+        self._next = self._looked = clock()
         self._known: dict[Entry, _Known] = {}
 
     def look(self) -> None:
@@ -79,18 +81,17 @@ class RateWatch:
         now = self._clock()
         if now < self._next:
             return
-        since, self._next = self._next - LOOK_S, now + LOOK_S
+        since, self._looked, self._next = self._looked, now, now + LOOK_S
         before = self._known
         self._known = {
-            entry: before.get(entry) or _Known(max(0.0, since))
-            for entry in self._registry.timers()}
+            entry: before.get(entry) or _Known(since) for entry in self._registry.timers()}
         for entry, known in self._known.items():
             if now < known.next:
                 continue
             skipped, ran = entry.skipped - known.skipped, entry.ran - known.ran
-            if skipped and skipped >= LEAST * (skipped + ran):
+            if skipped >= max(FEWEST, LEAST * (skipped + ran)):
                 self._tell(entry, known, now)
-            elif now - known.at >= AGAIN_S:
+            elif now - known.at >= AGAIN_S and skipped + ran >= 2 * FEWEST:
                 known.begin(entry, now)
 
     def _tell(self, entry: Entry, known: _Known, now: float) -> None:

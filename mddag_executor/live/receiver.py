@@ -22,7 +22,6 @@ from typing import Any
 
 from mddag_executor.live.attribution import Origin
 from mddag_executor.live.crossings import header_stamp
-from mddag_executor.live.direct import Watch
 from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.entries import Entry, Work
 from mddag_executor.live.recorder import Recorder
@@ -146,9 +145,6 @@ class Receiver:
 
     def on_waitable(self, waitable: Any, data: Any) -> None:
         """Take in what a waitable has taken."""
-        if type(waitable) is Watch:
-            waitable.look()
-            return
         entry = self._registry[waitable]
         if entry is None:
             return

@@ -16,17 +16,79 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+import operator
 import os
+from typing import Any
 
 from mddag_executor.errors import UsageError
 from msg_graph import load, parse_duration, TaskSet
+from msg_graph.duration import DAY
+from rclpy.context import Context
+from rclpy.exceptions import NotInitializedException
+from rclpy.utilities import get_default_context
 
 INTAKES = ('auto', 'events', 'waitset')
 DEFAULT_WORKERS = 7
 POLICIES = ('SCHED_OTHER', 'SCHED_BATCH', 'SCHED_FIFO', 'SCHED_RR')
 SHORTEST_DIAGNOSTICS_NS = 10_000_000
+MOST_WORKERS = 4096
+MOST_JOBS = 1_000_000
+
+
+def whole(name: str, value: Any, most: int, unit: str = '') -> int:
+    """
+    Return a whole number from 1 up.
+
+    :raises UsageError: when it is none, or too large.
+    """
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool):
+        raise UsageError(f'{name}: {value!r} is no whole number: give 1{unit} or more')
+    if number < 1:
+        raise UsageError(f'{name}: {number}{unit} is too {"short" if unit else "few"}: '
+                         'give at least 1')
+    if number > most:
+        raise UsageError(f'{name}: {number}{unit} is too much: give at most {most}{unit}')
+    return number
+
+
+def call_back(name: str, value: Any) -> None:
+    """
+    Look at something that is to be called.
+
+    :raises UsageError: when that is impossible.
+    """
+    if value is not None and not callable(value):
+        raise UsageError(f'{name}: {value!r} can not be called: give a function or None')
+
+
+def check_thresholds(value: Any) -> Thresholds:
+    """
+    Return the thresholds of the diagnostics, the usual ones for None.
+
+    :raises UsageError: when it is something else.
+    """
+    if value is not None and not isinstance(value, Thresholds):
+        raise UsageError(f'thresholds: {value!r} are none: give Thresholds(...), or None')
+    return value or Thresholds()
+
+
+def check_context(context: Any) -> None:
+    """
+    Look at the context that an executor is to belong to, None for the default one.
+
+    :raises UsageError: when it is no context.
+    :raises NotInitializedException: when it has not been initialised.
+    """
+    if context is not None and not isinstance(context, Context):
+        raise UsageError(f'context: {context!r} is no rclpy context: give one, or None')
+    if (get_default_context() if context is None else context).handle is None:
+        raise NotInitializedException('an executor needs a context: call rclpy.init() before')
 
 
 @dataclass(frozen=True)
@@ -55,12 +117,10 @@ class Thresholds:
         """Check the values."""
         for field in ('warn_ratio', 'error_ratio'):
             value = getattr(self, field)
-            if not 0.0 < value <= 1.0:
+            if not isinstance(value, (int, float)) or not 0.0 < value <= 1.0:
                 raise UsageError(f'{field}: {value} is no share: give more than 0, at most 1')
         for field in ('warn_burst', 'window', 'stale_periods'):
-            value = getattr(self, field)
-            if value < 1:
-                raise UsageError(f'{field}: {value} is too few: give at least 1')
+            whole(field, getattr(self, field), MOST_JOBS)
 
 
 def diagnostics_period_ns(period: int | str | None) -> int | None:
@@ -72,8 +132,9 @@ def diagnostics_period_ns(period: int | str | None) -> int | None:
     """
     if isinstance(period, str):
         period = parse_duration(period)
-    if not period:
+    if period is None or period == 0:
         return None
+    period = whole('diagnostics_period', period, DAY, ' ns')
     if period < SHORTEST_DIAGNOSTICS_NS:
         raise UsageError(
             f'diagnostics_period: {period} ns is too short: give at least '
@@ -92,14 +153,15 @@ def resolve(
     :raises UsageError: on a value that makes no sense.
     """
     task_set = load(graph) if isinstance(graph, (str, os.PathLike)) else graph
+    if task_set is not None and not isinstance(task_set, TaskSet):
+        raise UsageError(f'graph: {graph!r} is no declaration: give the path of one, a TaskSet, '
+                         'or None')
     if num_workers is None:
         num_workers = (task_set.workers if task_set is not None else None) or DEFAULT_WORKERS
-    if num_workers < 1:
-        raise UsageError(f'num_workers: {num_workers} is too few: give at least 1')
+    num_workers = whole('num_workers', num_workers, MOST_WORKERS)
     if isinstance(default_deadline, str):
         default_deadline = parse_duration(default_deadline)
-    if default_deadline < 1:
-        raise UsageError(f'default_deadline: {default_deadline} ns is too short: give at least 1')
+    default_deadline = whole('default_deadline', default_deadline, DAY, ' ns')
     if intake not in INTAKES:
         raise UsageError(f"intake: '{intake}' is unknown: give {', '.join(INTAKES[:-1])} or "
                          f'{INTAKES[-1]}')
@@ -107,7 +169,7 @@ def resolve(
 
 
 def thread_setting(
-    policy: str | None, priority: int | None, cpus: set[int] | None
+    policy: str | None, priority: int | None, cpus: Iterable[int] | None
 ) -> Callable[[], None] | None:
     """
     Return what each worker thread calls first, None where nothing is to be set.
@@ -124,10 +186,10 @@ def thread_setting(
             f"worker_policy: '{policy}' is unknown: give one of {', '.join(POLICIES)}")
     if not hasattr(os, 'sched_setscheduler'):
         raise UsageError('worker_policy: this system has none: leave it out')
-    if cpus is not None and not cpus <= os.sched_getaffinity(0):
-        raise UsageError(
-            f'worker_cpus: {sorted(cpus)} has CPUs that this process may not use: '
-            f'choose from {sorted(os.sched_getaffinity(0))}')
+    if priority is not None and priority != 0:  # 0: the one of SCHED_OTHER
+        whole('worker_priority', priority, 99)
+    if cpus is not None:
+        cpus = _cpus(cpus)
 
     def prepare() -> None:
         if cpus is not None:
@@ -142,3 +204,19 @@ def thread_setting(
                 'raise its rtprio limit (ulimit -r) or run it with CAP_SYS_NICE') from None
 
     return prepare
+
+
+def _cpus(cpus: Any) -> set[int]:
+    """Return a set of CPUs that this process may use, and has one at least."""
+    mine = os.sched_getaffinity(0)
+    try:
+        found = set(cpus)
+    except TypeError:
+        found = set()
+    if isinstance(cpus, str) or not found:
+        raise UsageError(f'worker_cpus: {cpus!r} is no set of CPUs: choose from {sorted(mine)}')
+    if not found <= mine:
+        raise UsageError(
+            f'worker_cpus: {sorted(found, key=str)} has CPUs that this process may not use: '
+            f'choose from {sorted(mine)}')
+    return found

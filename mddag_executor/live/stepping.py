@@ -37,6 +37,18 @@ from rclpy.executors import TimeoutObject
 from rclpy.task import Future
 
 
+def deadline_of(timeout_sec: float | None) -> float | None:
+    """
+    Return the monotonic time at which a time-out is over; None for never.
+
+    :param timeout_sec: seconds; None or negative: for ever.
+    :raises TypeError: when it is no number.
+    """
+    if timeout_sec is None or timeout_sec < 0:
+        return None
+    return time.monotonic() + timeout_sec
+
+
 class Stepping(Upkeep):
     """The part of the executor that runs one callback in the calling thread."""
 
@@ -83,11 +95,9 @@ class Stepping(Upkeep):
         self._spin_once(seconds, lambda: future.done() or future.cancelled())
 
     def _spin_once(self, timeout_sec: float | None, done: Callable[[], bool]) -> None:
+        deadline = deadline_of(timeout_sec)
         if not self._spinning.acquire(blocking=False):
             raise RuntimeError('Executor is already spinning')
-        deadline = None
-        if timeout_sec is not None and timeout_sec >= 0:
-            deadline = time.monotonic() + timeout_sec
         try:
             while not self._is_shutdown:
                 self._check_context()

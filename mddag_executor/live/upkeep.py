@@ -56,7 +56,16 @@ class Upkeep(GroupOwner):
     _registry: Registry
 
     def add_node(self, node: Node) -> bool:
-        """Add a node whose callbacks this executor runs; False when it has it already."""
+        """
+        Add a node whose callbacks this executor runs; False when it has it already.
+
+        :raises TypeError: when it is no node.
+        :raises RuntimeError: when the executor was shut down.
+        """
+        if not hasattr(node, 'executor'):
+            raise TypeError(f'{node!r} is no node: add an rclpy.node.Node')
+        if self._guard is None:
+            raise RuntimeError('The executor was shut down: add the node to a new one')
         added: bool = super().add_node(node)
         if added:
             self.wake()

@@ -89,8 +89,12 @@ def cached() -> bool:
 
 
 @cache
-def _fingerprint() -> str:
-    """Return a hash of all that the compiled code depends on."""
+def _fingerprint(more: tuple[str, ...] = ()) -> str:
+    """
+    Return a hash of all that the compiled code depends on.
+
+    :param more: names of further modules that are compiled.
+    """
     import llvmlite
     import numba
     digest = hashlib.sha256()
@@ -100,6 +104,7 @@ def _fingerprint() -> str:
     names = {module.__name__ for module in _MODULES}
     names |= {row.key.__module__ for row in POLICIES.values()}
     names |= {f'{__package__}.{name}' for name in _OWN}
+    names |= set(more)
     files = set()
     for name in sorted(names):
         spec = find_spec(name)
@@ -111,22 +116,22 @@ def _fingerprint() -> str:
     return digest.hexdigest()[:24]
 
 
-def _folder() -> Path | None:
+def _folder(more: tuple[str, ...] = ()) -> Path | None:
     """Return the folder for the compiled code, whether it is there or not; None without a home."""
     base = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
     if not os.path.isabs(base):
         return None
-    return Path(base, 'mddag_executor', _fingerprint())
+    return Path(base, 'mddag_executor', _fingerprint(more))
 
 
-def _stamp() -> Path | None:
+def _stamp(more: tuple[str, ...] = ()) -> Path | None:
     """
     Return a file beside which numba may keep what it compiles; None where there can be none.
 
     numba keeps the code with the source file of a function, and compiles anew when that file is
     changed.  This file is never changed: its folder's name tells the sources.
     """
-    folder = _folder()
+    folder = _folder(more)
     if folder is None:
         return None
     file = folder / 'kernel.py'
@@ -153,13 +158,39 @@ def _forget_old(folder: Path) -> None:
 @cache
 def _entries() -> dict[str, Callable[..., Any]]:
     """Return the compiled entry points, which compile, or load what was compiled, when called."""
-    from mddag_executor.simulate import kernel, structures, vectors
+    from mddag_executor.simulate import kernel
+    return _compiled_entries((kernel,), _ENTRIES, _stamp())
+
+
+def entries_of(
+    kernels: tuple[ModuleType, ...], names: tuple[str, ...]
+) -> dict[str, Callable[..., Any]]:
+    """
+    Return entry points of another driver of the compiled core, as those of ``kernel`` are.
+
+    :param kernels: modules all of whose functions are compiled beside those of the core; their
+        entry points are in the last one.
+    :param names: of the entry points.
+    """
+    return _compiled_entries(kernels, names, _stamp(tuple(each.__name__ for each in kernels)))
+
+
+def cached_entries(kernels: tuple[str, ...], name: str) -> bool:
+    """Tell whether an entry point of such modules, by name, has been compiled before."""
+    folder = _folder(kernels)
+    return folder is not None and any(folder.glob(f'**/*{name}*.nbc'))
+
+
+def _compiled_entries(
+    kernels: tuple[ModuleType, ...], names: tuple[str, ...], stamp: Path | None
+) -> dict[str, Callable[..., Any]]:
+    from mddag_executor.simulate import structures, vectors
     from numba import njit
-    space = dict(vars(kernel))  # with its name: what is loaded from disk looks its module up
-    for module in _MODULES:
+    space = dict(vars(kernels[-1]))  # with its name: what is loaded from disk looks its module up
+    for module in (*_MODULES, *kernels):
         space.update((k, v) for k, v in vars(module).items() if not k.startswith('__'))
     space.update((name, getattr(vectors, name)) for name in _REPLACED)
-    for module in (*_MODULES, kernel):
+    for module in (*_MODULES, *kernels):
         inner = ModuleType(module.__name__)  # for names such as `rules.complete`
         for name, function in _functions(module):
             space[name] = njit(error_model='numpy')(_bound(function, space))
@@ -167,11 +198,10 @@ def _entries() -> dict[str, Callable[..., Any]]:
         if module in (jobs, rules):
             space[module.__name__.rsplit('.', 1)[1]] = inner
     structures.bind_policies(space)
-    stamp = _stamp()
     return {
         name: njit(error_model='numpy', nogil=True, cache=stamp is not None)(
-            _bound(getattr(kernel, name), space, None if stamp is None else str(stamp)))
-        for name in _ENTRIES}
+            _bound(getattr(kernels[-1], name), space, None if stamp is None else str(stamp)))
+        for name in names}
 
 
 def _functions(module: ModuleType) -> list[tuple[str, FunctionType]]:
@@ -188,9 +218,9 @@ def _bound(function: Any, space: dict[str, Any], file: str | None = None) -> Fun
     return FunctionType(code, space, function.__name__, function.__defaults__)
 
 
-def _compile_elsewhere() -> None:
-    """Have a process compile for ``evaluate``; if it fails, this one does when it needs it."""
-    program = f'from {__name__} import compile_here; compile_here()'
+def compile_elsewhere(module: str = __name__) -> None:
+    """Have a process compile what a module needs; if it fails, this one does when it needs it."""
+    program = f'from {module} import compile_here; compile_here()'
     path = os.pathsep.join(each or os.getcwd() for each in sys.path)
     try:
         done = subprocess.run(
@@ -280,7 +310,7 @@ class CompiledJudge:
     def warm_up(self) -> None:
         """Compile, or load what was compiled before."""
         if _stamp() is not None and not cached():
-            _compile_elsewhere()
+            compile_elsewhere()
         none = np.ones((0, self._columns), dtype=np.int64)
         self(Settings(preemptive=False, judge='completions'), none)
 

@@ -38,7 +38,7 @@ from collections import Counter
 from collections.abc import Iterator
 from operator import itemgetter
 import struct
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from mddag_executor.trace import records
 from mddag_executor.trace.blocks import Block, Damage, load
@@ -84,12 +84,17 @@ class Reading:
 
         :raises TraceError: where too many chunks overlap in time
         """
+        for events in self._by_time(stream, blocks):
+            yield from events
+
+    def _by_time(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Any]:
+        """Yield what ``_take`` makes of what ``_in_order`` returns, in the order of time."""
         known = self._scan(blocks)
         order = sorted(range(len(known)), key=lambda number: known[number].start_time)
         starts = [known[number].start_time for number in order]
         sound = 0                       # blocks before this one have been found sound,
         usable = len(known)             # those from this one on have not and are not used
-        loaded: dict[int, list[Event]] = {}
+        loaded: dict[int, Any] = {}
         for number, next_start in zip(order, (*starts[1:], None)):
             if number < usable:
                 try:
@@ -103,7 +108,7 @@ class Reading:
                 except Damage as damage:
                     self._keep(damage)
                     usable = min(sound, number)
-            yield from _take(loaded, next_start)
+            yield self._take(loaded, next_start)
 
     def _keep(self, damage: Damage) -> None:
         self.damage = damage.with_traceback(None)       # which would keep the chunk in memory
@@ -117,20 +122,30 @@ class Reading:
             self._keep(damage)
         return known
 
-    def _in_order(self, stream: BinaryIO, block: Block, pending: int) -> list[Event]:
+    def _take(self, loaded: dict[int, Any], before: int | None) -> Any:
+        return _take(loaded, before)
+
+    def _in_order(self, stream: BinaryIO, block: Block, pending: int) -> Any:
         """Return the events of a block in the order of time."""
-        room = _PENDING_LIMIT - pending
+        room = self._room(pending)
         events: list[Event] = []
         for some in self._decode(load(stream, block), block):
             events += some
             if len(events) > room:
-                raise TraceError(
-                    self._path, 'holds too much in disorder to put it into order of time',
-                    'sort it first, as with `mcap sort`')
+                raise self._too_unordered()
         events.sort(key=_time_of)
         if events and events[0][1] < block.start_time:
             raise Damage('a chunk holds an event from before the time in its head', block.offset)
         return events
+
+    def _room(self, pending: int) -> int:
+        """Return how many events may be loaded beside those that are."""
+        return _PENDING_LIMIT - pending
+
+    def _too_unordered(self) -> TraceError:
+        return TraceError(
+            self._path, 'holds too much in disorder to put it into order of time',
+            'sort it first, as with `mcap sort`')
 
     def _decode(self, data: bytes, block: Block) -> Iterator[list[Event]]:
         """Yield the events of a block's records, some at a time; raise Damage where malformed."""

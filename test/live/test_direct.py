@@ -26,7 +26,6 @@ from typing import Any
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.live import direct, hooks, pool
 import pytest
-import rclpy
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
@@ -202,20 +201,13 @@ def test_what_can_not_be_direct(ros_context, make_node):
     publisher = node.create_publisher(Header, '/late', late)
     publisher.publish(Header(frame_id='early'))
     node.create_subscription(Header, '/late', lambda m: got.append(m.frame_id), late)
-    seen = []
-    node.create_subscription(
-        Header, '/watched', print, 10,
-        event_callbacks=rclpy.event_handler.SubscriptionEventCallbacks(
-            matched=seen.append, use_default_callbacks=False))
-    watched = node.create_publisher(Header, '/watched', 10)
     executor = make_direct(ros_context)
     executor.add_node(node)
     with Spinning(executor):
         assert wait_for(lambda: got == ['early'])
         publisher.publish(Header(frame_id='now'))
         assert wait_for(lambda: got == ['early', 'now'])
-        assert wait_for(lambda: seen)
-        assert takes_of(publisher) is None and takes_of(watched) is None
+        assert takes_of(publisher) is None
 
 
 def test_a_destroyed_subscription_is_no_harm(ros_context, make_node):
@@ -386,3 +378,32 @@ def test_a_publishing_callback_wakes_the_workers_of_another_executor(ros_context
         assert wait_for(lambda: len(got) >= 100)
     gaps = sorted(after - before for before, after in zip(got[30:], got[31:]))
     assert gaps[len(gaps) // 2] < 0.03
+
+
+def test_a_message_of_a_publisher_that_was_there_for_a_moment_does_not_wait(
+    ros_context, make_node,
+):
+    node, other, got = make_node('here'), make_node('elsewhere'), []
+    node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 10)
+    publisher = node.create_publisher(Header, '/a', 10)
+    executor = make_direct(ros_context)
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: takes_of(publisher) is not None)
+        foreign = other.create_publisher(Header, '/a', 10)
+        assert wait_for(lambda: foreign.get_subscription_count() > 0)
+        foreign.publish(Header(frame_id='brief'))
+        other.destroy_publisher(foreign)
+        assert wait_for(lambda: got == ['brief'])
+
+
+def test_no_thread_is_left(ros_context, make_node):
+    node = make_node()
+    node.create_subscription(Header, '/a', print, 10)
+    publisher = node.create_publisher(Header, '/a', 10)
+    executor = make_direct(ros_context)
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: takes_of(publisher) is not None)
+    assert wait_for(
+        lambda: not [t for t in threading.enumerate() if t.name == 'mddag-intake-direct'], 1.0)

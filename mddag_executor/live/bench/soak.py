@@ -130,6 +130,8 @@ class Soak:
         plan = ExecutionPlan(task_set, seed, utilisation, workers, 'sleep')
         self._infeasible = {sink.vertex for sink in plan.infeasible()}
         self._missed: list[tuple[int, str]] = []
+        deadlines = [v.deadline_ns or 0 for v in task_set.vertices]
+        self._settle_s = min(2.0, max(deadlines) / 1e9)
         self.executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, on_deadline_miss=self._on_miss, intake=intake)
         self.nodes = SoakNodes(task_set, plan)
@@ -174,7 +176,7 @@ class Soak:
         self._misuse_once()
         before = usage()
         self._say(f'warm after {warm_up:.0f} s: {before}')
-        slot = FAULT_S + RECOVERY_S + CLEAN_S
+        slot = FAULT_S + RECOVERY_S + CLEAN_S + self._settle_s
         while time.monotonic() - begin + slot <= self._seconds:
             self._one_fault()
         after = usage()
@@ -195,6 +197,7 @@ class Soak:
         missed = len(self._missed)
         time.sleep(CLEAN_S)
         self._clean.append((start, time.time_ns()))
+        time.sleep(self._settle_s)  # for what was released last, before the next fault hits it
         self._say(f'{fault}: {len(self._missed) - missed} misses noticed in the clean window, '
                   f'{usage()["memory"] / 1e6:.1f} MB')
 
@@ -238,7 +241,7 @@ class Soak:
         self, before: dict[str, int], after: dict[str, int], elapsed: float
     ) -> dict[str, Any]:
         ticks = self._simulated.ticks
-        time.sleep(0.5)
+        time.sleep(2.0)
         simulated_goes_on = self._simulated.ticks > ticks
         for timer in self.nodes.timers.values():
             timer.cancel()

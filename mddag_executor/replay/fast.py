@@ -1,0 +1,296 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The replay of long traces in compiled code: results as those of the plain one, sooner.
+
+Theory of operation
+-------------------
+1. Events come as rows of numbers, a chunk at a time (``trace.columns``); ``fast_kernel`` goes
+   through them.  Events that are no numbers (who is who, the end) go to the handlers that they
+   have in the plain replay, in their order among the others.
+2. What the core decides, and the misses that were recorded, are counted in Python, by the objects
+   that count them in the plain replay; the sums are put into these objects at the end.
+3. Whatever is not as an executor records it (times that run backwards, a DAG that is not there,
+   numbers too large for 64 bits), is *declined*: the replay is begun anew, in plain Python, which
+   says what is wrong.
+4. Memory depends on the open jobs, on the sinks' completions, and, where paths are declared, on
+   the length of the trace: 15 bytes for each step of a flow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from mddag_executor.core import NEVER
+from mddag_executor.core.policies import POLICIES
+from mddag_executor.core.state import State
+from mddag_executor.replay import fast_work as fw
+from mddag_executor.replay.chains import Breakdown, Step, Worst
+from mddag_executor.replay.drift import WatchedRecording
+from mddag_executor.replay.fast_arrays import grown, make_work, Numbers
+from mddag_executor.replay.fast_compile import entries
+from mddag_executor.replay.follower import Event, Execution, Follower
+from mddag_executor.replay.groups import RecordedGroups
+from mddag_executor.replay.judge import Judge, Miss
+from mddag_executor.replay.mapping import Mapping
+from mddag_executor.replay.own_paths import OwnPaths
+from mddag_executor.replay.recording import Recording, TASK_SET
+from mddag_executor.replay.usage import Usage
+from mddag_executor.simulate.compiled import Empty, Lent
+from mddag_executor.trace.columns import Columns
+import numpy as np
+
+_MASK = 2 ** 64 - 1
+_HOSTED = 'mddag:hosted'
+
+
+class Declined(Exception):
+    """Something is for the plain replay; inside this package only."""
+
+
+class FastReplay:
+    """
+    Replays one trace of this executor.
+
+    The other parameters are those of the plain replay, to which nothing has been told; they are
+    filled in.
+    """
+
+    def __init__(
+        self, recording: Recording, mapping: Mapping, judge: Judge, usage: Usage,
+        follower: Follower, paths: OwnPaths, groups: RecordedGroups,
+    ) -> None:
+        self._recording = recording
+        self._watched = recording if isinstance(recording, WatchedRecording) else None
+        self._mapping = mapping
+        self._judge = judge
+        self._usage = usage
+        self._follower = follower
+        self._paths = paths
+        self._groups = groups
+        self._do = entries()
+        self._tables = Lent(judge.tables, list(POLICIES).index('rad'))
+        self._state = Empty(len(State._fields))
+        self._numbers = Numbers(mapping.task_set)
+        self._work = make_work(mapping, judge, usage, paths, self._numbers)
+        self._work.scalars[fw.WATCHED] = self._watched is not None
+        self._group_numbers: dict[int, int] = {}
+        self._known_callbacks: dict[int, tuple[int, int]] = {}
+        self._started = False
+        self._stale = True      # what Python knows of callbacks and publishers may be new
+        self._finished = False
+
+    def run(self, progress: Callable[[int], None] | None = None) -> None:
+        """
+        Replay.
+
+        :raises Declined: where the plain replay should do it; what was filled in is of no use.
+        """
+        names = set(self._follower.handlers)
+        if self._watched is not None:
+            names |= self._watched.names()
+        self._do['begin_run'](self._tables.address, self._state.address)
+        try:
+            count = 0
+            for columns in self._recording.columns(names, fw.KINDS, self._do['scan']):
+                self._advance(columns)
+                count += len(columns.rows)
+                if progress is not None:
+                    progress(count)
+            self._end()
+        finally:
+            self._do['free_run'](self._state.address)
+
+    def _advance(self, columns: Columns) -> None:
+        rows = columns.rows
+        if not self._started and len(rows):
+            self._begin(rows)
+        pieces = np.empty((len(rows), 2), dtype=np.int64)
+        i = 0
+        while i < len(rows):
+            if rows[i, 1] == fw.OTHER:
+                self._other(columns.others[rows[i, 2]])
+                i += 1
+                continue
+            if self._stale:
+                self._refresh()
+            i = self._do['advance'](
+                self._tables.address, self._state.address, self._work, rows, i, pieces)
+            self._take_away(pieces)
+            status = self._work.scalars[fw.STATUS]
+            if status == fw.DECLINED:
+                raise Declined
+            if status == fw.TOO_FULL:
+                self._work = grown(self._work, self._length('x_slot'), self._do['copy_table'])
+
+    def _length(self, column: str) -> int:
+        return self._state.length(State._fields.index(column))
+
+    def _begin(self, rows: Any) -> None:
+        """Learn the process's id from the first events; another one's are declined."""
+        numbers = rows[rows[:, 1] != fw.OTHER]
+        if len(numbers):
+            self._work.scalars[fw.PROCESS_ID] = numbers[0, 3]
+            self._started = True
+
+    def _take_away(self, pieces: Any) -> None:
+        """Count what has been decided, and missed, and ran."""
+        scalars = self._work.scalars
+        decisions = self._state.rows(State._fields.index('decisions'), 6)
+        if decisions:
+            self._judge.tally.add(decisions)
+        for side, *miss in self._work.misses[:scalars[fw.N_MISSES]].tolist():
+            self._judge.differ(Miss(*miss), side)
+        n = scalars[fw.N_PIECES]
+        if n:
+            self._usage.pool.add_many(pieces[:n, 0], pieces[:n, 1])
+
+    # --- events for Python -----------------------------------------------------------------------
+
+    def _other(self, event: Event) -> None:
+        name = event[0]
+        if None in event or name in fw.KINDS or name == _HOSTED or not 0 <= event[1] < NEVER:
+            raise Declined
+        if self._watched is not None:
+            if name == 'ros2:rcl_publisher_init':
+                self._tell_published()      # a handle that is used again means another one
+            self._watched.take(event)
+            if name != TASK_SET:
+                self._work.scalars[fw.LAST] = max(self._work.scalars[fw.LAST], event[1])
+        follower, scalars = self._follower, self._work.scalars
+        handler = follower.handlers.get(name)
+        if handler is None:
+            return
+        follower.end = int(scalars[fw.FINISH])
+        handler(event)
+        scalars[fw.FINISH] = follower.end
+        scalars[fw.SHUT_DOWN] = follower.shut_down
+        if follower.strange:
+            raise Declined
+        if follower.shut_down and not self._finished:
+            self._finish(follower.end)
+        self._stale = True
+
+    def _refresh(self) -> None:
+        """Tell the compiled code what is known of callbacks and publishers."""
+        self._stale = False
+        groups = self._groups.by_callback()
+        topics = self._paths.topic_of if self._paths.book else {}
+        for callback in {**groups, **topics}:
+            group = groups.get(callback, -1)
+            number = 0 if group < 0 else \
+                1 + self._group_numbers.setdefault(group, len(self._group_numbers))
+            topic = 1 + self._numbers.topics.get(topics.get(callback, ''), -1)
+            if self._known_callbacks.get(callback) == (number, topic):
+                continue
+            self._known_callbacks[callback] = number, topic
+            self._make_room()
+            for column, value in ((fw.C_GROUP, number), (fw.C_TOPIC, topic)):
+                self._do['set_callback'](self._work, _signed(callback), column, value)
+        while len(self._group_numbers) > len(self._work.group_count):
+            self._work = self._work._replace(
+                group_busy=np.concatenate([self._work.group_busy] * 2),
+                group_count=np.concatenate(
+                    [self._work.group_count, np.zeros_like(self._work.group_count)]))
+        if self._paths.book:
+            self._work = self._work._replace(publishers=self._numbers.publishers(self._paths))
+            self._work.scalars[fw.ANY_PUBLISHED] = self._paths.any_published
+
+    def _make_room(self) -> None:
+        if 2 * self._work.counts[fw.CALLBACKS] + 2 >= len(self._work.callbacks):
+            self._work.scalars[fw.FULL] = 1
+            self._work = grown(self._work, self._length('x_slot'), self._do['copy_table'])
+
+    # --- the end ---------------------------------------------------------------------------------
+
+    def _finish(self, now: int) -> None:
+        self._finished = True
+        if not self._do['finish_run'](
+                self._tables.address, self._state.address, self._work, now):
+            raise Declined
+        self._take_away(np.empty((0, 2), dtype=np.int64))
+
+    def _end(self) -> None:
+        """Put the sums where the plain replay has them."""
+        follower, scalars = self._follower, self._work.scalars
+        follower.end = int(scalars[fw.FINISH])
+        if not follower.shut_down:
+            if follower.end == 0:
+                follower.end = min(max(0, self._recording.head.time), NEVER - 1)
+            self._finish(follower.end)
+        begin = int(scalars[fw.BEGIN])
+        follower.start = None if begin < 0 else begin
+        follower.jobs = int(scalars[fw.JOBS])
+        judge = self._judge
+        judge.contradictions = int(scalars[fw.CONTRADICTIONS])
+        judge.n_recorded = int(scalars[fw.N_RECORDED])
+        for dag, count in enumerate(self._work.released.tolist()):
+            judge.tally.jobs[dag] += count
+        self._end_sinks()
+        self._end_use()
+        if self._watched is not None:
+            self._tell_published()
+            self._end_watched(self._watched)
+        if self._paths.book:
+            self._paths.flows = self._numbers.flows(self._work, self._do['flows_of'])
+
+    def _end_sinks(self) -> None:
+        for vertex, times in self._judge.chains.sinks.items():
+            row = self._work.sinks[vertex].tolist()
+            times.completed = row[fw.B_COMPLETED]
+            if not times.completed:
+                continue
+            times.sums = row[fw.B_LAG:fw.B_UNKNOWN + 1]
+            times.group = row[fw.B_GROUP]
+            steps = self._work.worst[vertex, :row[fw.W_STEPS]].tolist()
+            times.worst = Worst(
+                row[fw.W_JOB], row[fw.W_RELEASE], row[fw.W_COMPLETED],
+                [Step(step[0], step[fw.K_LEG], Execution(*step[fw.K_READY:fw.K_BUSY + 1]),
+                      step[fw.K_GROUP]) for step in steps],
+                Breakdown(*row[fw.W_PARTS:fw.W_PARTS + 6]))
+
+    def _end_use(self) -> None:
+        for use, row in zip(self._usage.every(), self._work.use.tolist()):
+            use.executions, use.busy, use.longest = row[fw.U_RAN:fw.U_LONGEST + 1]
+            use.waiting, use.longest_wait = row[fw.U_WAITING:fw.U_LONGEST_WAIT + 1]
+            use.group = row[fw.U_GROUP]
+        for worker, (took, ran) in enumerate(self._work.workers.tolist()):
+            if ran:
+                self._usage.by_worker[worker - 1] = took
+
+    def _tell_published(self) -> None:
+        """Tell which callbacks have published what, and forget it."""
+        pairs = self._work.pairs
+        pid = int(self._work.scalars[fw.PROCESS_ID])
+        if self._watched is not None:
+            for callback, publisher in pairs[pairs[:, 4] != 0, :2].tolist():
+                self._watched.published((pid, callback & _MASK), (pid, publisher & _MASK))
+        pairs[:] = 0
+        self._work.counts[fw.PAIRS] = 0
+
+    def _end_watched(self, watched: WatchedRecording) -> None:
+        work, pid = self._work, int(self._work.scalars[fw.PROCESS_ID])
+        rows = work.callbacks[work.callbacks[:, 4] != 0].tolist()
+        rows.sort(key=lambda row: row[fw.C_ORDER])
+        watched.counted(
+            {(pid, row[0] & _MASK): row[fw.C_RAN] for row in rows if row[fw.C_RAN]},
+            {(pid, row[0] & _MASK): (row[fw.C_DAG] - 1, row[fw.C_VERTEX] - 1)
+             for row in rows if row[fw.C_DAG]},
+            work.releases.tolist(), int(work.scalars[fw.FIRST]), int(work.scalars[fw.LAST]))
+
+
+def _signed(number: int) -> int:
+    return number - 2 ** 64 if number >= 2 ** 63 else number

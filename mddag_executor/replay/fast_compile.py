@@ -1,0 +1,64 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The compiled replay's entry points.
+
+What numba makes of them is kept on disk (see ``simulate.compiled``); where that has not been done
+before, it takes half a minute, so that only long traces are worth it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+from mddag_executor.simulate.compiled import available, cached_entries, compile_elsewhere
+from mddag_executor.simulate.compiled import entries_of
+
+_KERNELS = tuple(f'mddag_executor.{name}' for name in (
+    'trace.columns_kernel', 'replay.fast_work', 'replay.fast_tables', 'replay.fast_paths',
+    'replay.fast_kernel'))
+_ENTRIES = ('advance', 'begin_run', 'finish_run', 'copy_table', 'set_callback', 'flows_of',
+            'scan', 'free_run')
+WORTH_COMPILING = 4_000_000
+"""Events from which on compiling, which is done once, is worth its time."""
+WORTH_LOADING = 300_000
+"""Events from which on it is worth to load what was compiled."""
+
+
+def worth_it(messages: int | None) -> bool:
+    """Tell whether to replay a trace of so many messages with compiled code."""
+    if messages is None or messages < WORTH_LOADING or not available():
+        return False
+    if cached_entries(_KERNELS, 'advance'):
+        return True
+    if messages < WORTH_COMPILING:
+        return False
+    compile_elsewhere(__name__)
+    return cached_entries(_KERNELS, 'advance')
+
+
+@cache
+def entries() -> dict[str, Callable[..., Any]]:
+    """Return the compiled entry points."""
+    from importlib import import_module
+    return entries_of(tuple(import_module(name) for name in _KERNELS), _ENTRIES)
+
+
+def compile_here() -> None:
+    """Compile everything, by replaying nothing."""
+    from mddag_executor.replay.fast import replay_nothing
+    replay_nothing()

@@ -1,0 +1,280 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Paths in compiled code: what ``own_paths`` and ``paths`` do, on arrays.
+
+A *place* is a position in a path; places of one path follow one another, so the place before p is
+p - 1.  Of each of the last jobs there is a row with what it has run and published, in steps; a
+step is a row of four columns, of the last place's executions two (the second tells the end).
+It is compiled and never called as it stands here (see ``fast_compile``).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mddag_executor.replay.fast_tables import find, insert, remove
+from mddag_executor.replay.fast_work import (
+    ANY_PUBLISHED,
+    C_TOPIC,
+    CALLBACKS,
+    FULL,
+    J_PLACE,
+    KEEP_JOBS,
+    N_JOBS,
+    N_STEPS,
+    PATH_JOBS,
+    RUN_END,
+    STARTING,
+    TRIGGER,
+    VARIABLE,
+)
+
+
+def count_row(w: Any, table: int, length: int) -> None:
+    """Count one more row of a table, and tell when it should be larger."""
+    w.counts[table] += 1
+    if 2 * w.counts[table] >= length:
+        w.scalars[FULL] = 1
+
+
+def _job(w: Any, dag: int, job: int) -> int:
+    """Return the row of what a job has run and published."""
+    i = find(w.path_jobs, dag, job, 0, 0)
+    if i >= 0:
+        return w.path_jobs[i, J_PLACE]
+    n = w.scalars[N_JOBS]
+    place = n % KEEP_JOBS
+    if n >= KEEP_JOBS:
+        old = find(w.path_jobs, w.job_ring[place, 0], w.job_ring[place, 1], 0, 0)
+        remove(w.path_jobs, old)
+        w.counts[PATH_JOBS] -= 1
+    i = insert(w.path_jobs, dag, job, 0, 0)
+    count_row(w, PATH_JOBS, len(w.path_jobs))
+    w.path_jobs[i, J_PLACE] = place
+    w.job_ring[place, 0] = dag
+    w.job_ring[place, 1] = job
+    w.scalars[N_JOBS] = n + 1
+    for k in range(w.jobs.shape[1]):
+        w.jobs[place, k] = -1
+    return place
+
+
+def _find_run(w: Any, row: int, vertex: int, ready: int) -> int:
+    """Return where the steps of a run stand, or -1."""
+    at = w.v_runs[vertex]
+    width = 1 + w.v_places[vertex + 1] - w.v_places[vertex]
+    for k in range(w.jobs[row, at] + 1):
+        if w.jobs[row, at + 1 + k * width] == ready:
+            return at + 2 + k * width
+    return -1
+
+
+def add_step(w: Any, place: int, parent: int, kind: int, time: int) -> int:
+    """Add a step and return its number."""
+    n = w.scalars[N_STEPS]
+    w.step_parent[n] = parent
+    w.step_place[n] = place
+    w.step_kind[n] = kind
+    w.step_time[n] = time
+    w.scalars[N_STEPS] = n + 1
+    if kind == 1 and w.place_last[place] != 0:
+        w.step_parent[n + 1] = -1
+        w.step_place[n + 1] = place
+        w.step_kind[n + 1] = RUN_END
+        w.step_time[n + 1] = -1
+        w.scalars[N_STEPS] = n + 2
+    return n
+
+
+def path_started(w: Any, dag: int, vertex: int, job: int, ready: int, start: int) -> bool:
+    """Take in an execution that has begun; False where there is no room for it."""
+    first, last = w.v_places[vertex], w.v_places[vertex + 1]
+    if first == last:
+        return True
+    row = _job(w, dag, job)
+    if _find_run(w, row, vertex, ready) >= 0:
+        return True
+    topic = -1
+    if w.v_topics[vertex] < w.v_topics[vertex + 1]:
+        i = find(w.callbacks, w.scalars[STARTING], 0, 0, 0)
+        if i >= 0:
+            topic = w.callbacks[i, C_TOPIC] - 1
+    at = w.v_runs[vertex]
+    k = w.jobs[row, at] + 1
+    if k >= w.v_most[vertex]:
+        return False
+    w.jobs[row, at] = k
+    at += 1 + k * (1 + last - first)
+    w.jobs[row, at] = ready
+    for j in range(first, last):
+        at += 1
+        w.jobs[row, at] = -1
+        p = w.v_place[j]
+        parent = -1
+        if w.place_position[p] > 0:
+            hop = w.place_hop[p]
+            if hop == TRIGGER:
+                if topic >= 0 and w.hop_topics[p, topic] == 0:
+                    continue
+                parent = _message(w, row, vertex, p - 1, topic)
+            elif hop == VARIABLE:
+                parent = w.place_done[p - 1]
+            else:
+                parent = w.place_published[p - 1]
+            if parent == -1:
+                w.place_started[p] = -1
+                continue
+        step = add_step(w, p, parent, 1, start)
+        w.jobs[row, at] = step
+        w.place_started[p] = step
+    return True
+
+
+def _message(w: Any, row: int, vertex: int, place: int, topic: int) -> int:
+    """Return the step of a place in the message that started a vertex, or -1."""
+    step = -1
+    for b in range(w.v_befores[vertex], w.v_befores[vertex + 1]):
+        before = w.v_before[b]
+        for j in range(w.v_places[before], w.v_places[before + 1]):
+            if w.v_place[j] != place:
+                continue
+            if topic >= 0:
+                step = _latest(w, row, w.message_at[j, topic], step)
+            else:
+                for k in range(w.v_topics[vertex], w.v_topics[vertex + 1]):
+                    step = _latest(w, row, w.message_at[j, w.v_topic[k]], step)
+    return step
+
+
+def _latest(w: Any, row: int, at: int, step: int) -> int:
+    if at >= 0 and w.jobs[row, at] >= 0:
+        return w.jobs[row, at]
+    return step
+
+
+def path_published(
+    w: Any, dag: int, vertex: int, job: int, ready: int, topic: int, time: int
+) -> None:
+    """Take in what an execution publishes."""
+    first, last = w.v_places[vertex], w.v_places[vertex + 1]
+    if first == last:
+        return
+    row = _job(w, dag, job)
+    run = _find_run(w, row, vertex, ready)
+    for j in range(first, last):
+        p = w.v_place[j]
+        if w.publish_topics[p, topic] == 0:
+            continue
+        parent = -1
+        if run >= 0:
+            parent = w.jobs[row, run + j - first]
+        if parent == -1 and w.place_sync[p] != 0:
+            parent = w.place_started[p]
+        if parent == -1 and w.place_position[p] > 0:
+            w.place_published[p] = -1
+            continue
+        step = add_step(w, p, parent, 0, time)
+        w.jobs[row, w.message_at[j, topic]] = step
+        w.place_published[p] = step
+
+
+def path_published_outside(w: Any, node: int, topic: int, time: int) -> None:
+    """Take in what a node publishes outside of executions."""
+    if node < 0:
+        return
+    for j in range(w.node_places[node], w.node_places[node + 1]):
+        p = w.node_place[j]
+        if w.publish_topics[p, topic] == 0:
+            continue
+        parent = w.place_started[p]
+        if parent == -1 and w.place_position[p] > 0:
+            w.place_published[p] = -1
+            continue
+        w.place_published[p] = add_step(w, p, parent, 0, time)
+
+
+def path_ran(w: Any, dag: int, vertex: int, job: int, ready: int, end: int) -> None:
+    """Take in that an execution (or a piece of it) has ended."""
+    first, last = w.v_places[vertex], w.v_places[vertex + 1]
+    if first == last:
+        return
+    row = _job(w, dag, job)
+    if w.scalars[ANY_PUBLISHED] == 0:
+        for k in range(w.v_publishes[vertex], w.v_publishes[vertex + 1]):
+            path_published(w, dag, vertex, job, ready, w.v_publish[k], end)
+    run = _find_run(w, row, vertex, ready)
+    for j in range(first, last):
+        p = w.v_place[j]
+        step = -1
+        if run >= 0:
+            step = w.jobs[row, run + j - first]
+        if step != -1:
+            if w.place_last[p] != 0:
+                w.step_time[step + 1] = end
+            w.place_done[p] = step
+        elif w.place_sync[p] == 0:
+            w.place_done[p] = -1
+
+
+def mark_steps(w: Any, n: int, marks: Any) -> None:
+    """Mark the steps at which flows end with 1 (see ``paths``)."""
+    for step in range(n):
+        marks[step] = 0
+    for step in range(n):           # 1: another step follows
+        if w.step_parent[step] != -1:
+            marks[w.step_parent[step]] |= 1
+    for step in range(n):           # 2: an execution that reads it went on
+        parent = w.step_parent[step]
+        if parent != -1 and w.step_kind[step] == 1 and marks[step] & 1:
+            marks[parent] |= 2
+    for step in range(n):           # 4: a flow ends here
+        if marks[step] & 1 or w.step_kind[step] == RUN_END:
+            continue
+        parent = w.step_parent[step]
+        if not (parent != -1 and w.step_kind[step] == 1 and marks[parent] & 2
+                and w.place_last[w.step_place[step]] == 0):
+            marks[step] |= 4
+
+
+def path_flows(w: Any, first: int, last: int, n: int, marks: Any, flows: Any) -> int:
+    """
+    Write the flows of the path with these places: first publication, arrival, begin, end.
+
+    What there is not is -1.  Return how many there are; with no room in ``flows`` only count.
+    """
+    count = 0
+    for leaf in range(n):
+        if marks[leaf] & 4 and first <= w.step_place[leaf] < last:
+            if len(flows) > 0:
+                published = arrival = begin = end = -1
+                step = leaf
+                while step != -1:
+                    place = w.step_place[step]
+                    if w.step_kind[step] == 1:
+                        if place == last - 1:
+                            arrival = w.step_time[step]
+                            end = w.step_time[step + 1]
+                        if place == first:
+                            begin = w.step_time[step]
+                    elif place == first and w.step_time[step] != 0:
+                        published = w.step_time[step]
+                    step = w.step_parent[step]
+                flows[count, 0] = published if published != -1 else begin
+                flows[count, 1] = arrival
+                flows[count, 2] = begin
+                flows[count, 3] = end
+            count += 1
+    return count

@@ -1,0 +1,156 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What the compiled replay works on: the columns of its arrays, and their rows.
+
+``fast`` makes the arrays and reads the results from them; ``fast_kernel`` and ``fast_paths`` are
+compiled and change them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+# Kinds of rows (0: an event that is not decoded, see ``trace.columns``).
+(OTHER, START, END, RELEASE, DISPATCH, COMPLETE, DEADLINE, EXPIRE, ABORT, PUBLISH,
+ RCL_PUBLISH) = range(11)
+KINDS = {
+    'ros2:callback_start': START, 'ros2:callback_end': END, 'mddag:job_release': RELEASE,
+    'mddag:dispatch': DISPATCH, 'mddag:complete': COMPLETE, 'mddag:deadline': DEADLINE,
+    'mddag:expire': EXPIRE, 'mddag:abort': ABORT, 'ros2:rclcpp_publish': PUBLISH,
+    'ros2:rcl_publish': RCL_PUBLISH}
+
+# Why the compiled code came back: all is done, an event for Python, something is full, the output
+# is to be taken away, or this is nothing for it.
+ALL_DONE, FOR_PYTHON, TOO_FULL, TAKE_AWAY, DECLINED = range(5)
+
+# Places in ``scalars``.
+(STATUS, BEGIN, FINISH, SHUT_DOWN, JOBS, STARTING, PROCESS_ID, FIRST, LAST, FULL, N_MISSES,
+ N_PIECES, N_RECORDED, COMPARE, CONTRADICTIONS, NEXT_ID, COUNTED, N_WAITED, N_RECENT, KEYED,
+ ANY_PUBLISHED, N_STEPS, N_JOBS, HAS_PATHS, WATCHED, N_SCALARS) = range(26)
+
+# Hash tables, in the order of ``counts``.
+(THREADS, OPEN, SLOTS, RECENT, CALLBACKS, PAIRS, PATH_JOBS, PUBLISHERS, N_TABLES) = range(9)
+
+# A thread: what it runs; the execution whose piece ended last; callbacks that it is within.
+(T_RUNNING, T_CALLBACK, T_DAG, T_VERTEX, T_JOB, T_WORKER, T_READY, T_START,
+ T_LAST, T_LAST_DAG, T_LAST_VERTEX, T_LAST_JOB, T_LAST_READY, T_LAST_START, T_LAST_END,
+ T_LAST_BUSY, T_LAST_ID, T_DEPTH, T_STACK) = range(5, 24)
+DEEPEST = 16
+# An execution that is not complete.
+O_START, O_END, O_BUSY, O_WAITED = range(5, 9)
+S_SLOT = 5
+# A callback: group, topic, DAG and vertex are kept plus one, 0 for none.
+C_GROUP, C_TOPIC, C_RAN, C_DAG, C_VERTEX, C_ORDER = range(5, 11)
+J_PLACE = 5
+# A publisher: its topic and node, plus one.
+P_TOPIC, P_NODE = 5, 6
+WIDTHS = (T_STACK + DEEPEST, 9, 6, 5, 11, 5, 6, 7)
+
+# What callbacks used.
+U_RAN, U_BUSY, U_LONGEST, U_WAITING, U_LONGEST_WAIT, U_GROUP, N_USE = range(7)
+# A step of a chain.
+K_KNOWN, K_LEG, K_READY, K_START, K_END, K_BUSY, K_GROUP, N_CHAIN = range(8)
+# What became of a sink: parts of the response time; the worst job.
+(B_LAG, B_WAITING, B_EXECUTING, B_SUSPENDED, B_TRANSPORT, B_UNKNOWN, B_GROUP, B_COMPLETED,
+ W_JOB, W_RELEASE, W_COMPLETED, W_STEPS, W_PARTS) = range(13)
+N_SINK = W_PARTS + 7
+
+KEEP_RECENT = 4096
+KEEP_WAITED = 4096
+KEEP_JOBS = 4096
+KEEP_BUSY = 256
+MOST_WORKERS = 4096
+LIMIT = 1 << 40
+"""Longer times (ns) are left to Python, whose sums have no limit."""
+
+# Kinds of hops to a place of a path.
+TRIGGER, TOPIC, VARIABLE = range(3)
+RUN_END = 2     # kind of a step's second row, which has its end
+
+
+class Work(NamedTuple):
+    """All arrays; of int64 where nothing else is said."""
+
+    scalars: Any
+    counts: Any
+    threads: Any
+    open: Any
+    slots: Any
+    recent: Any
+    callbacks: Any
+    pairs: Any
+    path_jobs: Any
+    publishers: Any
+    recent_ring: Any
+    # the mapping: by recorded DAG, vertex (from map_first on) and leg (from map_legs on)
+    map_dag: Any
+    map_first: Any
+    map_vertex: Any
+    map_legs: Any
+    legs: Any
+    newest: Any
+    releases: Any
+    # by DAG of the declaration that judges
+    judge_newest: Any
+    released: Any
+    use_of: Any
+    use: Any
+    workers: Any
+    group_busy: Any
+    group_count: Any
+    # vertices before each leg
+    before_legs: Any
+    before_first: Any
+    before: Any
+    chain: Any
+    walk: Any
+    sinks: Any
+    worst: Any
+    misses: Any
+    # paths: by vertex its places, its topics, what it publishes
+    v_places: Any
+    v_place: Any
+    v_topics: Any
+    v_topic: Any
+    v_publishes: Any
+    v_publish: Any
+    # vertices before each vertex
+    v_befores: Any
+    v_before: Any
+    # by vertex: where its runs stand in a job, and how many fit
+    v_runs: Any
+    v_most: Any
+    # by vertex's place and topic: where its message stands in a job, -1 for none
+    message_at: Any
+    # by place: position, kind of the hop to it, whether it is of a sync, whether it is the last
+    place_position: Any
+    place_hop: Any
+    place_sync: Any
+    place_last: Any
+    hop_topics: Any
+    publish_topics: Any
+    node_places: Any
+    node_place: Any
+    place_started: Any
+    place_done: Any
+    place_published: Any
+    jobs: Any           # what is kept of each of the last jobs
+    job_ring: Any
+    # steps: int32, int16, int8, int64
+    step_parent: Any
+    step_place: Any
+    step_kind: Any
+    step_time: Any

@@ -1,0 +1,150 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Walking over the records of a chunk in compiled code; see ``columns``.
+
+This module needs numba; nothing is compiled when it is imported.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+# Columns of a row: when, what, thread, process, and the fields from there on.
+TIME, KIND, THREAD, PROCESS, FIELDS = range(5)
+ROW = 11
+OTHER = 0
+"""The kind of an event that is not decoded here; its thread is its place among those."""
+
+# What a channel's messages are; from FIRST_LAYOUT on: in which layout.
+UNKNOWN, PASSED_OVER, FIRST_LAYOUT = range(3)
+
+# Columns of a layout: kind, size, number of fields; then offset, size and sign of each field.
+L_KIND, L_SIZE, L_FIELDS, L_FIRST = range(4)
+LAYOUT = L_FIRST + 3 * ROW
+
+# What is handed back.
+POSITION, ROWS, MESSAGES, OTHERS, STATUS, N_RESULTS = range(6)
+DONE, DEFINITION, CUT, FULL = range(4)
+
+
+def _peek(width: int) -> Any:
+    """Return what reads a number at any address."""
+    kind = ir.IntType(8 * width)
+    word = ir.IntType(64)
+
+    @intrinsic
+    def peek(typing: Any, address: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            value = builder.load(builder.inttoptr(args[0], kind.as_pointer()))
+            value.align = 1
+            return value if width == 8 else builder.zext(value, word)
+
+        return types.int64(types.int64), generate
+
+    return peek
+
+
+peek1, peek2, peek4, peek8 = (_peek(width) for width in (1, 2, 4, 8))
+
+
+def number(address: int, size: int, signed: int) -> int:
+    """Return the number of that size at an address; one of 8 bytes without a sign may wrap."""
+    if size == 8:
+        return peek8(address)
+    if size == 4:
+        value = peek4(address)
+        return value - ((value >> 31) << 32) if signed else value
+    if size == 2:
+        value = peek2(address)
+        return value - ((value >> 15) << 16) if signed else value
+    value = peek1(address)
+    if signed == 2:
+        return 1 if value != 0 else 0
+    return value - ((value >> 7) << 8) if signed else value
+
+
+def scan_records(
+    data: int, end: int, classes: Any, layouts: Any, rows: Any, others: Any, result: Any,
+) -> None:
+    """
+    Walk from ``result[POSITION]`` on: to the end, a definition, a record that is cut, or until
+    there is no room for more.
+
+    :param data: address of the records; a few bytes after their end can be read.
+    :param rows: what was found, one row for each event.
+    :param others: where the messages begin that are not decoded here.
+    """
+    position = result[POSITION]
+    count = result[ROWS]
+    messages = result[MESSAGES]
+    n_others = result[OTHERS]
+    status = DONE
+    while position < end:
+        at = data + position
+        opcode = peek1(at)
+        length = peek8(at + 1)
+        if length < 0 or length > end - position - 9:
+            status = CUT
+            break
+        after = position + 9 + length
+        if opcode == 5:
+            messages += 1
+            what = classes[peek2(at + 9)]
+            if what != PASSED_OVER:
+                if count == len(rows):
+                    messages -= 1
+                    status = FULL
+                    break
+                layout = what - FIRST_LAYOUT
+                rows[count, TIME] = 0
+                if (layout >= 0 and peek2(at + 31) == 0x0100
+                        and position + 35 + layouts[layout, L_SIZE] <= after):
+                    fields = at + 35
+                    rows[count, KIND] = layouts[layout, L_KIND]
+                    place = L_FIRST
+                    for i in range(layouts[layout, L_FIELDS]):
+                        value = number(fields + layouts[layout, place],
+                                       layouts[layout, place + 1], layouts[layout, place + 2])
+                        # time, process, thread: as they stand in the message
+                        column = i
+                        if i == 1:
+                            column = PROCESS
+                        elif i == 2:
+                            column = THREAD
+                        elif i > 2:
+                            column = i + 1
+                        rows[count, column] = value
+                        place += 3
+                else:
+                    rows[count, KIND] = OTHER
+                    rows[count, THREAD] = n_others
+                    others[n_others, 0] = position
+                    others[n_others, 1] = after
+                    n_others += 1
+                count += 1
+        elif opcode == 3 or opcode == 4:
+            status = DEFINITION
+            break
+        position = after
+    result[POSITION] = position
+    result[ROWS] = count
+    result[MESSAGES] = messages
+    result[OTHERS] = n_others
+    result[STATUS] = status

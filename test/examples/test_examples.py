@@ -1,0 +1,159 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Every example runs to its end as its README says, and does what it claims."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+from typing import Any
+
+import msg_graph
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
+NAMES = sorted(path.name for path in EXAMPLES.iterdir() if path.is_dir())
+COMMAND = re.compile(r'^\| \[(\w+)\]\((\S+)\) \| `(python|sh) examples/(\S+)` \|', re.MULTILINE)
+
+
+def run(example: str, *arguments: str | Path) -> str:
+    """Run an example as the README says, from elsewhere; return what it printed."""
+    file = EXAMPLES / COMMANDS[example][1]
+    program = [sys.executable] if file.suffix == '.py' else ['sh']
+    done = subprocess.run(
+        [*program, str(file), *map(str, arguments)], capture_output=True, text=True, timeout=90,
+        stdin=subprocess.DEVNULL, check=False,
+        env={**os.environ, 'MDDAG': f'{sys.executable} -m mddag_executor'})
+    assert done.returncode == 0, done.stderr
+    assert 'Traceback' not in done.stderr, done.stderr
+    return done.stdout
+
+
+def result(example: str, tmp_path: Path) -> dict[str, Any]:
+    """Run an example that is a `mddag run`; return its result."""
+    run(example, '--json', tmp_path / 'result.json')
+    found: dict[str, Any] = json.loads((tmp_path / 'result.json').read_text())
+    return found
+
+
+COMMANDS = {name: (program, file) for name, _, program, file in COMMAND.findall(
+    (EXAMPLES / 'README.md').read_text(encoding='utf-8'))}
+
+
+def test_the_readme_has_every_example() -> None:
+    assert sorted(COMMANDS) == NAMES
+    for program, file in COMMANDS.values():
+        assert (EXAMPLES / file).suffix == {'python': '.py', 'sh': '.sh'}[program]
+    links = re.findall(r'\]\(([^)]+)\)', (EXAMPLES / 'README.md').read_text(encoding='utf-8'))
+    assert [link for link in links if not (EXAMPLES / link).is_file()] == []
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_every_declaration_is_right(name: str) -> None:
+    assert msg_graph.load(EXAMPLES / name / 'graph.yaml').dags
+
+
+def test_hello_deadline() -> None:
+    printed = re.fullmatch(r'(\d+) images, (\d+) later than 40 ms\n', run('hello_deadline'))
+    assert printed is not None
+    assert int(printed[1]) >= 29  # of the thirty, one may be open when the future is done
+
+
+def test_hello_deadline_has_thirty_lines() -> None:
+    text = (EXAMPLES / 'hello_deadline' / 'hello.py').read_text(encoding='utf-8')
+    code = text.split('"""')[2]
+    assert len([line for line in code.splitlines() if line.strip()]) <= 30
+
+
+def test_sensor_fusion(tmp_path: Path) -> None:
+    found = result('sensor_fusion', tmp_path)
+    sinks = found['dags']['fusion']['sinks']
+    assert set(sinks) == {'/brake:decide', '/map:update', '/viewer:show'}
+    # The sync completes once for each pulse, with the leg that made it whole.
+    for sink in sinks.values():
+        assert 20 <= sink['completed'] <= found['dags']['fusion']['jobs']
+    assert sinks['/brake:decide']['response_ns']['min'] >= 45_000_000  # 30 + 10 + 5 ms
+    assert found['never_ran'] == []
+
+
+def test_overload() -> None:
+    blocks = run('overload').split('queue of ')
+    assert [block.split(':')[0] for block in blocks[1:]] == ['10', '1']
+    ends = []
+    for block in blocks[1:]:
+        counts = {name: {end: int(count) for count, end in re.findall(r'(\d+) (\w+)', line)}
+                  for name, line in re.findall(r'^  (control|perception): (.*)$', block, re.M)}
+        for dag in counts.values():
+            # Up to six jobs are open at the end.
+            assert 0 <= dag['jobs'] - sum(v for k, v in dag.items() if k != 'jobs') <= 6
+        told = {what: int(count) for count, what in re.findall(
+            r'(\d+) (perception \w+)', block.split('misses:')[1])}
+        assert told.get('perception aborted', 0) == counts['perception']['aborted']
+        assert counts['control']['aborted'] == 0
+        ends.append(counts)
+    long, short = ends
+    assert long['perception']['aborted'] > 10
+    assert short['perception']['completed'] > long['perception']['completed']
+    assert short['perception']['aborted'] < long['perception']['aborted']
+
+
+def test_services_and_actions() -> None:
+    service, action, control = run('services_and_actions').splitlines()
+    assert service == 'service: calibrated'
+    assert action == 'action: [0, 1, 1, 2, 3, 5, 8, 13, 21, 34, 55, 89]'
+    steps, undeclared = re.fullmatch(
+        r'control: (\d+) steps, \d+ late; (\d+) undeclared callbacks beside it', control).groups()
+    # The service takes 100 ms and the action 200: control went on every 20 ms meanwhile.
+    assert int(steps) >= 10
+    assert int(undeclared) >= 13
+
+
+def test_two_processes(tmp_path: Path) -> None:
+    found = result('two_processes', tmp_path)
+    chain = found['dags']['chain']
+    assert set(chain['sinks']) == {'/control:step'}
+    sink = chain['sinks']['/control:step']
+    assert sink['completed'] >= 20
+    # All of them as jobs of the other process' timer, none as undeclared callbacks.
+    assert found['undeclared'] == 0
+    assert found['callbacks']['/control:step']['unattributed'] == 0
+    assert '/sensor:read' not in found['callbacks']
+
+
+def test_numpy_pipeline() -> None:
+    one, right, two, right_too = run('numpy_pipeline').splitlines()
+    assert right == right_too == 'the results are right'
+    for workers, line in ((1, one), (2, two)):
+        printed = re.fullmatch(
+            rf'{workers} workers: (\d+) images, \d+ late; at most (\d+) filters at once, '
+            r'(\d+\.\d+) on average', line)
+        assert printed is not None, line
+        assert int(printed[1]) >= 7
+        assert int(printed[2]) == workers  # with two of them, two filters at once
+
+
+def test_third_party(tmp_path: Path) -> None:
+    output = run('third_party', '--json', tmp_path / 'result.json')
+    heard = re.search(r'^heard (\d+) messages$', output, re.MULTILINE)
+    assert heard is not None
+    found = json.loads((tmp_path / 'result.json').read_text())
+    sink = found['dags']['talk']['sinks']['/listener:heard']
+    assert 15 <= sink['completed'] <= int(heard[1])
+    assert found['never_ran'] == []
+    for program in (EXAMPLES / 'third_party' / 'install' / 'lib').rglob('*.py'):
+        assert 'mddag' not in program.read_text(encoding='utf-8').split('"""', 1)[1]

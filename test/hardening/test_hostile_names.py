@@ -1,0 +1,194 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Names in traces, bags and diagnostics may be hostile: they are shown, and do nothing.
+
+A recorded run is written anew with all of its texts changed into ones that would work as terminal
+escapes, HTML, paths, templates, formulas or code, and given to every verb that reads traces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import json
+import os
+from pathlib import Path
+import subprocess
+
+from mddag_executor.cli.main import user_line
+from mddag_executor.replay import replay
+from mddag_executor.trace import read_events, TraceFile
+from mddag_executor.trace.schema import EVENTS
+import pytest
+import yaml
+
+TOP = Path(__file__).resolve().parents[2]
+BAG = TOP / 'bags' / 'demo_short.mcap'
+Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+
+HOSTILE = [
+    '\x1b]0;owned\x07', '\x1b[2J\x1b[31m', '\x9b31m', '\r\n\x08', '\x00', '\u202e\u2066',
+    '<script>window.hacked=1</script>', '"><img src=x onerror=alert(1)>', "=HYPERLINK('http://x')",
+    '../../../../tmp/mddag-owned', '/etc/passwd', '{0.__class__}%s%n$(id)`id`', '{{7*7}}',
+    "'); import os; os.system('id')", '[bold red]rich[/]', 'a' * 5000, '\udbff'.encode(
+        'utf-8', 'replace').decode(), '💣' * 40, '',
+]
+
+
+def with_texts(path: Path, change: Callable[[str, str, int], str], most: int = 2500) -> Path:
+    """Write the recorded run with other texts: `change(event, field, number)` of each."""
+    number = 0
+    with TraceFile(path) as file:
+        for event, _ in zip(read_events(BAG), range(most)):
+            kind = EVENTS[event['_name']]
+            values = []
+            for field, type_name in kind.fields:
+                value = event[field]
+                if type_name == 'string' and (kind.name, field) not in KEPT:
+                    value = change(kind.name, field, number)
+                    number += 1
+                values.append(value)
+            file.add(event['_name'], event['_timestamp'], event['_vpid'], event['_vtid'], *values)
+    assert number > 100
+    return path
+
+
+# Without these two it would not be a run at all, and is refused; see below.
+KEPT = {('task_set', 'yaml'), ('task_set', 'policy')}
+
+
+@pytest.fixture(scope='module')
+def trace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return with_texts(tmp_path_factory.mktemp('hostile') / 'run.mcap',
+                      lambda event, field, number: HOSTILE[number % len(HOSTILE)])
+
+
+def harmless(text: str) -> None:
+    """Check that a terminal has nothing to obey."""
+    assert [c for c in text if not c.isprintable() and c != '\n'] == []
+
+
+VERBS = {
+    'replay': ('replay', 'TRACE'),
+    'replay --reschedule': ('replay', 'TRACE', '--reschedule', '--workers', '2'),
+    'diff': ('diff', 'TRACE', 'TRACE'),
+    'from-trace': ('graph', 'from-trace', 'TRACE', '-o', 'graph.yaml'),
+    'csv': ('export', 'TRACE', '-o', 'out.csv'),
+    'report': ('replay', 'TRACE', '--report', 'out.html'),
+    'json': ('replay', 'TRACE', '--json', 'out.json'),
+}
+
+
+@pytest.mark.parametrize('name', VERBS)
+def test_no_verb_obeys_a_name(mddag: Mddag, trace: Path, tmp_path: Path, name: str) -> None:
+    before = {path for path in Path('/tmp').iterdir() if 'mddag-owned' in path.name}
+    arguments = [str(trace) if word == 'TRACE' else word for word in VERBS[name]]
+    done = mddag(*arguments, cwd=tmp_path)
+    assert done.returncode in (0, 2), done.stderr
+    assert 'Traceback' not in done.stderr
+    if done.returncode == 2:
+        assert done.stderr.startswith('error: '), done.stderr
+        assert not list(tmp_path.iterdir())
+    harmless(done.stdout)
+    harmless(done.stderr)
+    for path in tmp_path.iterdir():
+        text = path.read_text(encoding='utf-8')
+        if path.suffix == '.html':
+            assert '<script>window.hacked' not in text and '<img src=x' not in text
+            harmless(text.replace('\t', ''))
+        elif path.suffix == '.json':
+            json.loads(text)
+        elif path.suffix == '.csv':
+            harmless(text.replace('\r\n', '\n'))
+            assert not any(cell.startswith('=') for row in text.splitlines()
+                           for cell in row.split(','))
+        elif path.suffix == '.yaml':
+            yaml.safe_load(text)
+            harmless(text)
+    assert {path for path in Path('/tmp').iterdir() if 'mddag-owned' in path.name} == before
+
+
+def test_most_verbs_really_read_it(mddag: Mddag, trace: Path, tmp_path: Path) -> None:
+    """What the test above lets through as refused is the exception."""
+    done = mddag('replay', trace, '--json', '-', cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    jobs = sum(dag['jobs'] for dag in json.loads(done.stdout)['dags'].values())
+    assert jobs > 20
+
+
+@pytest.mark.parametrize('field', ['yaml', 'policy', 'file'])
+@pytest.mark.parametrize('text', HOSTILE)
+def test_a_hostile_declaration_in_a_trace(tmp_path: Path, field: str, text: str) -> None:
+    """It is refused in one line, or its name is only a name."""
+    path = tmp_path / 'run.mcap'
+    event = next(event for event in read_events(BAG) if event['_name'] == 'mddag:task_set')
+    with TraceFile(path) as file:
+        file.add('task_set', event['_timestamp'], 1, 1, *(
+            text if name == field else event[name]
+            for name, _ in EVENTS['mddag:task_set'].fields))
+    try:
+        result = replay(str(path)).result()
+    except Exception as error:
+        line = user_line(error)
+        assert line is not None, 'this would be shown as a defect, with its traceback'
+        harmless(line)
+    else:
+        json.dumps(result)
+
+
+@pytest.mark.parametrize('include', ['/etc/passwd', 'secret.yaml', '../secret.yaml'])
+def test_a_declaration_in_a_trace_includes_nothing(
+    mddag: Mddag, tmp_path: Path, include: str
+) -> None:
+    (tmp_path / 'secret.yaml').write_text('mddag: 1\nnodes: [this is secret]\n')
+    event = next(event for event in read_events(BAG) if event['_name'] == 'mddag:task_set')
+    with TraceFile(tmp_path / 'run.mcap') as file:
+        values = dict(event, yaml=f'mddag: 1\ninclude: [{include}]\n',
+                      file=str(tmp_path / 'graph.yaml'))
+        file.add('task_set', event['_timestamp'], 1, 1, *(
+            values[name] for name, _ in EVENTS['mddag:task_set'].fields))
+    done = mddag('replay', 'run.mcap', cwd=tmp_path)
+    assert done.returncode == 2
+    assert 'secret]' not in done.stderr and 'root:' not in done.stderr
+    assert done.stderr.count('\n') == 1
+    assert 'includes nothing' in done.stderr or 'relative' in done.stderr
+
+
+@pytest.mark.parametrize('names', [
+    ['../secret.mcap'], ['/etc/passwd'], ['sub/../../secret.mcap'], ['\x00'], [5], {}, [[]], None])
+def test_a_bag_names_only_its_own_files(mddag: Mddag, tmp_path: Path, names: object) -> None:
+    (tmp_path / 'secret.mcap').write_bytes(BAG.read_bytes())
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    (bag / 'metadata.yaml').write_text(yaml.safe_dump(
+        {'rosbag2_bagfile_information': {'relative_file_paths': names, 'message_count': 1}}))
+    done = mddag('replay', bag, TOP / 'config' / 'autoware.yaml', '--reschedule', cwd=tmp_path)
+    assert done.returncode == 2, done.stdout
+    assert done.stderr.startswith('error: ') and done.stderr.count('\n') == 1, done.stderr
+    harmless(done.stderr)
+
+
+def test_names_of_files_are_shown_harmless(mddag: Mddag, tmp_path: Path) -> None:
+    for verb in (('graph', 'check'), ('replay',), ('simulate',)):
+        done = mddag(*verb, 'no\x1b[31m\u202esuch', cwd=tmp_path)
+        assert done.returncode == 2
+        harmless(done.stderr)
+    name = 'a\x1b[31m.mcap'
+    os.link(BAG, tmp_path / name) if os.stat(BAG).st_dev == os.stat(tmp_path).st_dev else \
+        (tmp_path / name).write_bytes(BAG.read_bytes())
+    for options in ((), ('--reschedule',), ('--report', 'o\x1b.html'), ('--json', 'o\x1b.json')):
+        done = mddag('replay', name, *options, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        harmless(done.stdout)
+        harmless(done.stderr)

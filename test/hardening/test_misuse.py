@@ -1,0 +1,221 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The executor under misuse: a clear exception, no hang, and everything as it was before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import threading
+import time
+from typing import Any
+
+from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.errors import MddagError
+from mddag_executor.live.settings import Thresholds
+import msg_graph
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.exceptions import NotInitializedException
+
+GRAPH = """
+mddag: 1
+nodes: [{node: /n, callbacks: [{name: tick, timer: 10ms, deadline: 10ms, dag: d}]}]
+"""
+
+WRONG = [
+    *(('graph', value) for value in (42, b'x', ['a'], {'mddag': 1}, object(), True)),
+    *(('num_workers', value) for value in ('7', 0, -1, 2.5, True, float('nan'), 10**9, [])),
+    *(('policy', value) for value in (None, 5, 'x', [], {})),
+    *(('default_deadline', value) for value in (None, 1.5, -5, 0, True, [], 10**30)),
+    *(('intake', value) for value in (None, 5, 'x')),
+    *(('max_active_jobs', value) for value in ('x', 0, -1, 1.5, None, True)),
+    *(('on_deadline_miss', value) for value in (5, 'x', [])),
+    *(('worker_policy', value) for value in (5, 'x', '__class__', 'sched_yield')),
+    *(('worker_priority', value) for value in (5, 'x')),
+    *(('worker_cpus', value) for value in ('x', '0', 5, {'a'}, set(), [], {10**6}, {-1}, [[0]])),
+    *(('diagnostics_period', value) for value in ([], -5, 1.5, True, 10**30)),
+    *(('thresholds', value) for value in (5, {'warn_ratio': 1.0})),
+    *(('context', value) for value in (5, 'x', object())),
+]
+
+
+@pytest.mark.parametrize(('name', 'value'), WRONG)
+def test_a_wrong_argument_is_named_in_one_line(
+    ros_context: Any, tmp_path: Path, name: str, value: Any
+) -> None:
+    trace = tmp_path / 'trace.mcap'
+    arguments = {'context': ros_context, 'trace': str(trace), name: value}
+    with pytest.raises(MddagError) as caught:
+        MultiDeadlineExecutor(**arguments)
+    assert name in str(caught.value) and '\n' not in str(caught.value)
+    # Nothing was begun: no file, and (as ros_context looks) no thread.
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize('period', ['soon', '', '5', '1 parsec'])
+def test_a_wrong_time_is_a_graph_error(ros_context: Any, period: str) -> None:
+    for name in ('default_deadline', 'diagnostics_period'):
+        with pytest.raises(ValueError, match='is not a time|unit|time'):
+            MultiDeadlineExecutor(context=ros_context, **{name: period})
+
+
+@pytest.mark.parametrize('wrong', [
+    {'warn_ratio': 'x'}, {'warn_ratio': 0.0}, {'error_ratio': 2}, {'warn_burst': 0},
+    {'window': 1.5}, {'stale_periods': None}])
+def test_wrong_thresholds(wrong: dict[str, Any]) -> None:
+    with pytest.raises(MddagError, match=next(iter(wrong))):
+        Thresholds(**wrong)
+
+
+@pytest.mark.parametrize('graph', ['', 'no/such.yaml', '/', 'a\0b'])
+def test_a_path_that_leads_nowhere(ros_context: Any, graph: str) -> None:
+    with pytest.raises(msg_graph.GraphError) as caught:
+        MultiDeadlineExecutor(graph, context=ros_context)
+    assert str(caught.value).isprintable()
+
+
+def test_before_init() -> None:
+    with pytest.raises(NotInitializedException, match='rclpy.init'):
+        MultiDeadlineExecutor(context=Context())
+
+
+@pytest.fixture
+def executor(ros_context: Any) -> Any:
+    made = MultiDeadlineExecutor(msg_graph.loads(GRAPH), 2, context=ros_context)
+    yield made
+    assert made.shutdown(5.0)
+
+
+@pytest.fixture
+def node(ros_context: Any) -> Any:
+    made = rclpy.create_node('n', context=ros_context, start_parameter_services=False)
+    yield made
+    made.destroy_node()
+
+
+@pytest.mark.parametrize('wrong', [None, 5, 'node', object()])
+def test_what_is_no_node(executor: Any, wrong: Any) -> None:
+    with pytest.raises(TypeError, match='is no node'):
+        executor.add_node(wrong)
+    assert executor.get_nodes() == []
+    executor.spin_once(0.0)
+
+
+@pytest.mark.parametrize('wrong', ['x', [], {}, 1j])
+def test_a_wrong_timeout_leaves_the_executor_as_it_was(executor: Any, wrong: Any) -> None:
+    with pytest.raises(TypeError):
+        executor.spin_once(wrong)
+    with pytest.raises(TypeError):
+        executor.spin_until_future_complete(rclpy.Future(), wrong)
+    executor.spin_once(0.0)  # would say that it spins already
+
+
+def test_after_shutdown(executor: Any, node: Any) -> None:
+    executor.add_node(node)
+    assert executor.shutdown(5.0) and executor.shutdown(5.0)
+    begin = time.monotonic()
+    executor.spin()
+    executor.spin_once()
+    executor.spin_until_future_complete(rclpy.Future())
+    executor.spin_once_until_future_complete(rclpy.Future())
+    executor.wake()
+    assert not executor.create_task(lambda: 1).done()
+    executor.remove_node(node)
+    with pytest.raises(RuntimeError, match='shut down'):
+        executor.add_node(node)
+    assert executor.statistics()['dags']['d']['jobs'] == 0
+    assert time.monotonic() - begin < 5.0
+
+
+def in_a_callback(executor: Any, node: Any, action: Any) -> Any:
+    """Have a timer's callback do something while the executor spins in a thread; what it got."""
+    got: list[Any] = []
+    ended = threading.Event()
+
+    def tick() -> None:
+        timer.cancel()
+        try:
+            got.append(action())
+        except Exception as error:
+            got.append(error)
+        ended.set()
+
+    timer = node.create_timer(0.01, tick)
+    executor.add_node(node)
+    spinning = threading.Thread(target=executor.spin)
+    spinning.start()
+    assert ended.wait(10.0), 'the callback hangs'
+    assert executor.shutdown(5.0)
+    spinning.join(5.0)
+    assert not spinning.is_alive()
+    return got[0]
+
+
+def test_spinning_twice(executor: Any, node: Any) -> None:
+    errors = [in_a_callback(executor, node, action) for action in (executor.spin,)]
+    assert [type(error) for error in errors] == [RuntimeError]
+
+
+def test_stepping_within_a_callback(executor: Any, node: Any) -> None:
+    error = in_a_callback(executor, node, lambda: executor.spin_once(0.1))
+    assert isinstance(error, RuntimeError) and 'already spinning' in str(error)
+
+
+@pytest.mark.parametrize('timeout', [None, 0.5, -1.0])
+def test_shutdown_within_a_callback(executor: Any, node: Any, timeout: float | None) -> None:
+    assert in_a_callback(executor, node, lambda: executor.shutdown(timeout)) is True
+
+
+def test_removing_the_node_within_its_callback(executor: Any, node: Any) -> None:
+    assert in_a_callback(executor, node, lambda: executor.remove_node(node)) is None
+    assert executor.get_nodes() == []
+
+
+def test_everything_from_many_threads_at_once(executor: Any, ros_context: Any) -> None:
+    """Whatever threads do to an executor that spins, it goes on and ends."""
+    errors: list[BaseException] = []
+    stop = threading.Event()
+    ran = []
+
+    def disturb(index: int) -> None:
+        try:
+            while not stop.is_set():
+                mine = rclpy.create_node(
+                    f'n{index}', context=ros_context, start_parameter_services=False,
+                    enable_rosout=False)
+                mine.create_timer(0.002, lambda: ran.append(index))
+                executor.add_node(mine)
+                executor.create_task(ran.append, index)
+                executor.statistics()
+                stop.wait(0.02)
+                executor.wake()
+                executor.remove_node(mine)
+                mine.destroy_node()
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=disturb, args=(i,)) for i in range(4)]
+    spinning = threading.Thread(target=executor.spin)
+    for thread in (spinning, *threads):
+        thread.start()
+    time.sleep(1.0)
+    stop.set()
+    for thread in threads:
+        thread.join(10.0)
+    assert spinning.is_alive() and errors == []
+    assert set(ran) == {0, 1, 2, 3}
+    assert executor.shutdown(5.0)
+    spinning.join(5.0)
+    assert not any(thread.is_alive() for thread in (spinning, *threads))

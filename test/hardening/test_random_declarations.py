@@ -1,0 +1,152 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Random declarations through every verb that reads one: done or refused in one line, no traceback.
+
+Half of them are put together from the words of the language, most of which make no sense, half
+come from `mddag generate` and are then damaged. `HARDENING_EXAMPLES=10000` draws that many.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from pathlib import Path
+import tempfile
+
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
+from mddag_executor.cli import main as program
+from mddag_executor.cli.text import printable
+import yaml
+
+EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '150'))
+TOPICS = ['/a', '/b', '/c', '/d', '/e']
+NAMES = ['t', 'u', 'v', 'w', 'x']
+TIMES = ['1us', '7us', '1ms', '10ms', '33.3ms', '999.999ms', '1s', '86400s', '1440min', '0.5ms']
+VERBS = (
+    ('graph', 'check'), ('graph', 'analyse'), ('graph', 'fmt'),
+    ('graph', 'draw', '-o', 'out.mmd'), ('graph', 'draw', '-o', 'out.dot'),
+    ('graph', 'assign-deadlines', '-o', 'out.yaml'),
+    ('simulate', '--duration', '300us', '--workers', '2'),
+    ('simulate', '--duration', '300us', '--policy', 'llf', '--preemptive', '--trace', 'out.mcap'),
+    ('evaluate', '--runs', '2', '--duration', '300us', '--policies', 'rad,fifo', '--core', 'plain'),
+)
+
+
+@st.composite
+def callbacks(draw: st.DrawFn, name: str) -> dict[str, object]:
+    """Draw a callback: usually one that could be meant."""
+    topic = st.sampled_from(TOPICS)
+    found: dict[str, object] = {'name': name}
+    start = draw(st.sampled_from(['timer', 'timer', 'subscription', 'subscription', 'sync',
+                                  'service', 'none']))
+    if start == 'timer':
+        found['timer'] = draw(st.sampled_from(TIMES))
+    elif start == 'subscription':
+        found['subscription'] = draw(topic)
+    elif start == 'sync':
+        found['sync'] = draw(st.lists(topic, min_size=1, max_size=3))
+    elif start == 'service':
+        found |= {'service': '/s', 'period': draw(st.sampled_from(TIMES))}
+    for key, values in (
+        ('publishes', st.lists(topic, max_size=3)), ('reads', st.lists(topic, max_size=2)),
+        ('deadline', st.sampled_from(TIMES)),
+        ('execution_time', st.sampled_from(
+            ['0ns', '1us', '1ms', '86400s', {'quantiles_us': [1, 2, 3]},
+             {'quantiles_us': [0, 10**10]}])),
+        ('on_miss', st.sampled_from(['abort', 'continue'])),
+        ('max_active_jobs', st.sampled_from([1, 2, 10**6, 2**31, 10**30, 0])),
+        ('release_from', st.sampled_from(['arrival', 'header_stamp', 'source_timestamp'])),
+        ('group', st.sampled_from(['g', 'h', 'reentrant'])), ('dag', st.sampled_from(NAMES)),
+    ):
+        if draw(st.integers(0, 2)) == 0:
+            found[key] = draw(values)
+    return found
+
+
+@st.composite
+def composed(draw: st.DrawFn) -> str:
+    nodes = []
+    for i in range(draw(st.integers(1, 3))):
+        each = [draw(callbacks(name)) for name in NAMES[:draw(st.integers(1, 4))]]
+        nodes.append({'node': f'/n{i}', 'callbacks': each})
+    data: dict[str, object] = {'mddag': 1, 'nodes': nodes}
+    if draw(st.booleans()):
+        data['workers'] = draw(st.sampled_from([1, 7, 4096, 10**9]))
+    return str(yaml.safe_dump(data, sort_keys=False))
+
+
+def run(*arguments: str) -> tuple[int, str, str]:
+    """Run a verb in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = program.main(arguments)
+    return status, out.getvalue(), err.getvalue()
+
+
+def through_all_verbs(text: str) -> int:
+    """Give a declaration to all verbs; return how many used it."""
+    used = 0
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        Path('graph.yaml').write_text(text, encoding='utf-8')
+        for verb in VERBS:
+            kind = 2 if verb[0] == 'graph' else 1
+            status, out, err = run(*verb[:kind], 'graph.yaml', *verb[kind:])
+            assert status in (0, 1, 2), f'{verb}: {err}\n{text}'
+            used += status != 2
+            for line in (out + err).split('\n'):
+                assert line == printable(line)
+            if status == 2:
+                assert all(line.startswith('error: ') for line in err.splitlines()), err
+                assert out == ''
+        if verb_failed := [path for path in Path().iterdir() if path.suffix == '.part']:
+            raise AssertionError(f'left half written: {verb_failed}')
+    return used
+
+
+@settings(max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow])
+@given(composed())
+def test_composed(text: str) -> None:
+    through_all_verbs(text)
+
+
+@settings(max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow])
+@given(st.integers(0, 2**31), st.integers(0, 2**31), st.sampled_from(
+    ['', 'cut', 'double', 'number', 'word']))
+def test_generated_and_damaged(seed: int, place: int, how: str) -> None:
+    status, text, err = run('generate', '--seed', str(seed), '--dags', '1:3', '--vertices', '1:6',
+                            '--utilisation', '0.1:3')
+    assert status == 0, err
+    lines = text.splitlines(keepends=True)
+    row = place % len(lines)
+    if how == 'cut':
+        del lines[row]
+    elif how == 'double':
+        lines.insert(row, lines[row])
+    elif how == 'number':
+        lines[row] = ''.join('9' if c.isdigit() else c for c in lines[row])
+    elif how == 'word':
+        lines[row] = lines[row].replace(':', ': "', 1)
+    used = through_all_verbs(''.join(lines))
+    assert used == len(VERBS) or how, 'what was generated is right'
+
+
+def test_some_are_right() -> None:
+    """The verbs have been given what they can use."""
+    text = yaml.safe_dump({'mddag': 1, 'nodes': [{'node': '/n', 'callbacks': [
+        {'name': 't', 'timer': '1us', 'publishes': ['/a'], 'execution_time': '1us'},
+        {'name': 'u', 'subscription': '/a', 'deadline': '86400s', 'execution_time': '1us'}]}]})
+    assert through_all_verbs(text) == len(VERBS)
