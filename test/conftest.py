@@ -81,8 +81,29 @@ def _claim_domain() -> int:
     raise pytest.UsageError('every ROS domain for tests is in use by another test session')
 
 
+# What runs ROS, or looks at how time passes. Side by side (`make test`) they are one group, which
+# one process runs one after the other while the other process runs the rest.
+ALONE = ('live', 'integration', 'bench', 'launch', 'examples', 'hardening')
+ALONE_FILES = (
+    'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_bench_replay.py',
+    'cli/test_graph_systems.py', 'replay/test_live_replay.py', 'test_docs.py', 'test_readme.py')
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=_rank)
+    if 'PYTEST_XDIST_WORKER' in os.environ:
+        for item in items:
+            if _is_alone(item):
+                item.add_marker(pytest.mark.xdist_group('alone'))
+        items.sort(key=lambda item: not _is_alone(item))  # the longest group first
+
+
+def _is_alone(item: pytest.Item) -> bool:
+    try:
+        path = item.path.relative_to(HERE)
+    except ValueError:
+        return False
+    return path.parts[0] in ALONE or path.as_posix() in ALONE_FILES
 
 
 def _rank(item: pytest.Item) -> tuple[bool, int]:

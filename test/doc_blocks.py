@@ -119,6 +119,7 @@ def blocks(page: str, text: str | None = None) -> list[Block]:
         marks: dict[str, list[str]] = {}
         for kind, value in _MARK.findall(match['marks']):
             marks.setdefault(kind, []).append(value)
+        assert len(marks.get('not run', [])) < 2, f'{page}: a block is marked twice'
         indent = match['indent']
         lines = match['text'].splitlines(keepends=True)
         found.append(Block(

@@ -23,7 +23,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import resource
 from statistics import linear_regression
 from typing import Any
 
@@ -31,6 +30,7 @@ from mddag_executor.cli import common
 from mddag_executor.cli.text import Progress, table
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
+from mddag_executor.memory import peak_memory_mb
 from mddag_executor.resources import find
 
 HELP = 'measure the batch evaluation: time for each run and policy, and for each vertex job'
@@ -107,14 +107,14 @@ def _measure(
                 line.update(len(runs) + len(sizes), f'{core} core, {number} at a time')
                 runs.append(time_runs(
                     experiment, count, core=core, jobs=number, repeat=args.repeat))
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        peak = peak_memory_mb()
         for size in args.vertices:
             for core in cores:
                 line.update(len(runs) + len(sizes), f'{core} core, {size} vertices')
                 sizes.append(time_vertex_jobs(
                     size, core=core, vertex_jobs=_VERTEX_JOBS[core], repeat=args.repeat))
     return {'graph': task_set.file, 'runs': runs, 'vertex_jobs': sizes,
-            'growth': growth(sizes), 'peak_memory_mb': peak / 1024}
+            'growth': growth(sizes), 'peak_memory_mb': peak}
 
 
 def growth(sizes: list[dict[str, Any]]) -> dict[str, float]:

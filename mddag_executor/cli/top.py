@@ -45,6 +45,7 @@ GONE = 'GONE'
 GONE_AFTER_S = 5.0
 INTERVAL_S = 1.0
 PATIENCE_NS = 10_000_000_000
+MOST_STATUSES = 1000
 _STYLES = {'OK': 'green', 'WARN': 'yellow', 'ERROR': 'bold red', 'STALE': 'magenta', GONE: 'dim'}
 
 _DAG_TITLES = ('process', 'DAG', 'state', 'period ms', 'jobs', 'lately', 'missed', 'p50 ms',
@@ -84,7 +85,7 @@ class Status:
 
 
 class Board:
-    """The newest statuses of all processes."""
+    """The newest statuses of all processes, of a thousand at most."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -99,7 +100,11 @@ class Board:
                 each.hardware_id, each.name, LEVELS[level] if level < len(LEVELS) else str(level),
                 each.message, {pair.key: pair.value for pair in each.values}, now)
             if status.is_ours:
+                # At the end, so that the first one is the one that was silent for longest.
+                self._statuses.pop((status.process, status.name), None)
                 self._statuses[(status.process, status.name)] = status
+                if len(self._statuses) > MOST_STATUSES:
+                    del self._statuses[next(iter(self._statuses))]
 
     def statuses(self) -> list[Status]:
         """Return them by process and name; of a process that tells nothing more, as GONE."""

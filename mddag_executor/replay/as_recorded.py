@@ -20,7 +20,9 @@ from collections.abc import Callable, Sequence
 import os
 from typing import Any, Protocol
 
-from mddag_executor.replay.follower import Event, Observer
+from mddag_executor.replay.drift import WatchedRecording
+from mddag_executor.replay.fast_compile import worth_it
+from mddag_executor.replay.follower import Event, Follower, Observer
 from mddag_executor.replay.following import (
     AnyFollower,
     AnyMapping,
@@ -34,9 +36,12 @@ from mddag_executor.replay.groups import RecordedGroups
 from mddag_executor.replay.imported import ImportedRecording
 from mddag_executor.replay.imported_jobs import ImportedFollower
 from mddag_executor.replay.judge import Judge
+from mddag_executor.replay.mapping import Mapping
 from mddag_executor.replay.own_paths import OwnPaths
+from mddag_executor.replay.path_flows import Flows
 from mddag_executor.replay.path_results import path_results
 from mddag_executor.replay.paths import PathBook
+from mddag_executor.replay.recording import Recording
 from mddag_executor.replay.seen import Seen
 from mddag_executor.replay.usage import share, Usage
 from mddag_executor.replay.waits import GroupWaits
@@ -64,7 +69,8 @@ class Replay:
 
     def __init__(
         self, recording: AnyRecording, mapping: AnyMapping, judge: Judge, usage: Usage,
-        follower: AnyFollower, paths: PathBook | None = None, seen: Seen | None = None,
+        follower: AnyFollower, paths: PathBook | Flows | None = None,
+        seen: Seen | None = None,
     ) -> None:
         self._paths = paths
         self._seen = seen
@@ -169,27 +175,66 @@ def replay_recording(
     recording: AnyRecording, task_set: TaskSet | None, progress: Progress | None = None,
     watcher: Watcher | None = None,
 ) -> Replay:
-    """Replay an open recording as recorded; see ``replay``."""
+    """
+    Replay an open recording as recorded; see ``replay``.
+
+    A long trace of this executor is replayed in compiled code, where nobody watches.
+    """
     mapping = map_recording(recording, task_set)
-    groups = RecordedGroups()
-    waits = GroupWaits(groups)
-    judge = Judge(mapping.task_set, mapping.same, waits)
-    usage = Usage(mapping.task_set, waits)
-    observers: list[Observer] = [waits, judge, usage]
-    paths = OwnPaths(mapping.task_set)
-    imported = isinstance(recording, ImportedRecording)
-    handlers = [groups.handlers()]
-    if paths.book and not imported:
-        observers.append(paths)
-        handlers.append(paths.handlers())
-    if watcher is not None:
-        observers.extend(watcher.observers(mapping.task_set, judge))
-        handlers.append(watcher.handlers())
-    seen = Seen()
-    follower = make_follower(recording, mapping, observers, merged(*handlers), [seen])
-    if isinstance(follower, ImportedFollower):
-        follower.run(progress)
-        return Replay(recording, mapping, judge, usage, follower, follower.paths, seen)
-    paths.follower = follower
+    if (watcher is None and isinstance(recording, Recording)
+            and worth_it(recording.message_count)):
+        found = replay_compiled(recording, mapping, progress)
+        if found is not None:
+            return found
+    parts = _Parts(recording, mapping, watcher)
+    follower = parts.follower
     follower.run(progress)
-    return Replay(recording, mapping, judge, usage, follower, paths.book)
+    if isinstance(follower, ImportedFollower):
+        return Replay(recording, mapping, parts.judge, parts.usage, follower, follower.paths,
+                      parts.seen)
+    return Replay(recording, mapping, parts.judge, parts.usage, follower, parts.paths.book)
+
+
+def replay_compiled(
+    recording: Recording, mapping: AnyMapping, progress: Progress | None = None
+) -> Replay | None:
+    """Replay a recording in compiled code; None where that can only be done in Python."""
+    from mddag_executor.replay.fast import Declined, FastReplay
+    assert isinstance(mapping, Mapping)
+    parts = _Parts(recording, mapping, None)
+    follower = parts.follower
+    assert isinstance(follower, Follower)
+    try:
+        FastReplay(recording, mapping, parts.judge, parts.usage, follower, parts.paths,
+                   parts.groups).run(progress)
+    except Declined:
+        if isinstance(recording, WatchedRecording):
+            recording.forget()
+        return None
+    return Replay(recording, mapping, parts.judge, parts.usage, follower, parts.paths.flows)
+
+
+class _Parts:
+    """All that is told of a run."""
+
+    def __init__(
+        self, recording: AnyRecording, mapping: AnyMapping, watcher: Watcher | None
+    ) -> None:
+        self.groups = RecordedGroups()
+        waits = GroupWaits(self.groups)
+        self.judge = Judge(mapping.task_set, mapping.same, waits)
+        self.usage = Usage(mapping.task_set, waits)
+        observers: list[Observer] = [waits, self.judge, self.usage]
+        self.paths = OwnPaths(mapping.task_set)
+        handlers = [self.groups.handlers()]
+        if self.paths.book and not isinstance(recording, ImportedRecording):
+            observers.append(self.paths)
+            handlers.append(self.paths.handlers())
+        if watcher is not None:
+            observers.extend(watcher.observers(mapping.task_set, self.judge))
+            handlers.append(watcher.handlers())
+        self.seen = Seen()
+        self.follower = make_follower(
+            recording, mapping, observers, merged(*handlers), [self.seen])
+        if not isinstance(self.follower, ImportedFollower):
+            self.paths.follower = self.follower

@@ -116,11 +116,11 @@ class Chains:
 
     def __init__(self, task_set: TaskSet, tables: Tables) -> None:
         self._tables = tables
-        # by global vertex and leg: the vertices whose message it is
-        self._before = [before for dag in task_set.dags for before in publishers(dag.vertices)]
-        for vertex, legs in enumerate(self._before):
+        #: By global vertex and leg: the vertices whose message it is.
+        self.before = [before for dag in task_set.dags for before in publishers(dag.vertices)]
+        for vertex, legs in enumerate(self.before):
             first = tables.first_vertex[tables.dag_of[vertex]]
-            self._before[vertex] = [[first + local for local in leg] for leg in legs]
+            self.before[vertex] = [[first + local for local in leg] for leg in legs]
         self._release: dict[int, int] = {}
         self._done: dict[int, dict[int, Step]] = {}
         self.sinks = {vertex: SinkTimes() for vertex in tables.sinks}
@@ -154,7 +154,7 @@ class Chains:
         step = done.get(vertex)
         while step is not None:
             chain.append(step)
-            legs = self._before[step.vertex]
+            legs = self.before[step.vertex]
             if step.leg >= 0 and legs:
                 legs = [legs[step.leg]]
             ready = step.execution.ready
@@ -182,7 +182,7 @@ class Chains:
             executing += published - start - pause
             if after is not None:
                 transport += after.execution.ready - published
-        whole = not self._before[chain[0].vertex]
+        whole = not self.before[chain[0].vertex]
         return Breakdown(
             before if whole else 0, waiting, executing, suspended, transport,
             0 if whole else before)

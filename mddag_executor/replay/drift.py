@@ -28,7 +28,7 @@ it (``msg_graph.binding``). Runs in another declaration's terms are matched by t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import os
 
 from mddag_executor.replay.recording import Recording, TASK_SET
@@ -45,6 +45,12 @@ class WatchedRecording(Recording):
 
     def __init__(self, path: str | os.PathLike[str], name: str | None = None) -> None:
         super().__init__(path, name)
+        self._sources = [dag.vertices[dag.source].callback.key for dag in self.task_set.dags]
+        self._keys = [[v.callback.key for v in dag.vertices] for dag in self.task_set.dags]
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all events that have passed."""
         self._census = Census()
         self._observed = Observed()
         self._key: dict[Address, str] = {}
@@ -52,29 +58,59 @@ class WatchedRecording(Recording):
         self._dropped: Counter[Address] = Counter()
         self._first: int | None = None
         self._last = 0
-        self._sources = [dag.vertices[dag.source].callback.key for dag in self.task_set.dags]
-        self._keys = [[v.callback.key for v in dag.vertices] for dag in self.task_set.dags]
 
     def events(self, names: Iterable[str]) -> Iterator[Event]:
         """Yield the named events in the order of time; look at these and at others."""
         wanted = set(names)
-        handlers = self._census.handlers
-        for event in super().events({*wanted, *handlers, _RELEASE, _DISPATCH, _DROP}):
+        for event in super().events({*wanted, *self.names()}):
             name = event[0]
             if None not in event:
-                handler = handlers.get(name)
-                if handler is not None:
-                    handler(event)
-                elif name == _RELEASE:
-                    self._released(event)
-                elif name == _DISPATCH:
-                    self._dispatched(event)
-                elif name == _DROP:
-                    self._dropped[event[2], event[4]] += 1
+                self.take(event)
                 if name != TASK_SET and event[1] > self._last:
                     self._last = event[1]
             if name in wanted:
                 yield event
+
+    def names(self) -> set[str]:
+        """Return the full names of the events that it looks at."""
+        return {*self._census.handlers, _RELEASE, _DISPATCH, _DROP}
+
+    def take(self, event: Event) -> None:
+        """Look at an event that has all its fields."""
+        name = event[0]
+        handler = self._census.handlers.get(name)
+        if handler is not None:
+            handler(event)
+        elif name == _RELEASE:
+            self._released(event)
+        elif name == _DISPATCH:
+            self._dispatched(event)
+        elif name == _DROP:
+            self._dropped[event[2], event[4]] += 1
+
+    def published(self, callback: Address, publisher: Address) -> None:
+        """Take in that a callback has published, which no event has told."""
+        self._census.published(callback, publisher)
+
+    def counted(
+        self, executions: Mapping[Address, int], vertices: Mapping[Address, tuple[int, int]],
+        releases: Sequence[Sequence[int]], first: int, last: int,
+    ) -> None:
+        """
+        Take in what was counted of releases and dispatches, which no event has told.
+
+        :param vertices: DAG and vertex that a callback was dispatched as.
+        :param releases: of each DAG their number, the first and the last.
+        :param first: when the first of them was recorded, -1 for none; `last`: the last event.
+        """
+        self._executions.update(executions)
+        for callback, (dag, vertex) in vertices.items():
+            self._key[callback] = self._keys[dag][vertex]
+        for source, each in zip(self._sources, releases):
+            if each[0]:
+                self._observed.releases[source] = Releases(*each)
+        self._first = first if first >= 0 else None
+        self._last = max(self._last, last)
 
     def _released(self, event: Event) -> None:
         dag = event[4]

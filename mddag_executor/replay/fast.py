@@ -26,7 +26,7 @@ Theory of operation
    numbers too large for 64 bits), is *declined*: the replay is begun anew, in plain Python, which
    says what is wrong.
 4. Memory depends on the open jobs, on the sinks' completions, and, where paths are declared, on
-   the length of the trace: 15 bytes for each step of a flow.
+   the length of the trace: 16 bytes for each step of a flow.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from mddag_executor.core.state import State
 from mddag_executor.replay import fast_work as fw
 from mddag_executor.replay.chains import Breakdown, Step, Worst
 from mddag_executor.replay.drift import WatchedRecording
-from mddag_executor.replay.fast_arrays import grown, make_work, Numbers
+from mddag_executor.replay.fast_arrays import grown, Header, make_work, Numbers
 from mddag_executor.replay.fast_compile import entries
 from mddag_executor.replay.follower import Event, Execution, Follower
 from mddag_executor.replay.groups import RecordedGroups
@@ -85,13 +85,20 @@ class FastReplay:
         self._tables = Lent(judge.tables, list(POLICIES).index('rad'))
         self._state = Empty(len(State._fields))
         self._numbers = Numbers(mapping.task_set)
-        self._work = make_work(mapping, judge, usage, paths, self._numbers)
+        self._work, self._header = self._use(
+            make_work(mapping, judge, usage, paths, self._numbers))
         self._work.scalars[fw.WATCHED] = self._watched is not None
         self._group_numbers: dict[int, int] = {}
         self._known_callbacks: dict[int, tuple[int, int]] = {}
+        self._known_publishers: dict[int, tuple[int, int]] = {}
         self._started = False
         self._stale = True      # what Python knows of callbacks and publishers may be new
         self._finished = False
+
+    def _use(self, work: fw.Work) -> tuple[fw.Work, Header]:
+        self._work = work
+        self._header = Header(*work)
+        return work, self._header
 
     def run(self, progress: Callable[[int], None] | None = None) -> None:
         """
@@ -112,13 +119,14 @@ class FastReplay:
                     progress(count)
             self._end()
         finally:
-            self._do['free_run'](self._state.address)
+            self._do['free_core'](self._state.address)
 
     def _advance(self, columns: Columns) -> None:
         rows = columns.rows
         if not self._started and len(rows):
             self._begin(rows)
-        pieces = np.empty((len(rows), 2), dtype=np.int64)
+        self._use(self._work._replace(
+            rows=rows, pieces=np.empty((len(rows), 2), dtype=np.int64)))
         i = 0
         while i < len(rows):
             if rows[i, 1] == fw.OTHER:
@@ -128,16 +136,17 @@ class FastReplay:
             if self._stale:
                 self._refresh()
             i = self._do['advance'](
-                self._tables.address, self._state.address, self._work, rows, i, pieces)
-            self._take_away(pieces)
+                self._tables.address, self._state.address, self._header.address, i)
+            self._take_away()
             status = self._work.scalars[fw.STATUS]
             if status == fw.DECLINED:
                 raise Declined
             if status == fw.TOO_FULL:
-                self._work = grown(self._work, self._length('x_slot'), self._do['copy_table'])
+                self._grow()
 
-    def _length(self, column: str) -> int:
-        return self._state.length(State._fields.index(column))
+    def _grow(self) -> None:
+        executions = self._state.length(State._fields.index('x_slot'))
+        self._use(grown(self._work, executions, self._do['copy_table']))
 
     def _begin(self, rows: Any) -> None:
         """Learn the process's id from the first events; another one's are declined."""
@@ -146,7 +155,7 @@ class FastReplay:
             self._work.scalars[fw.PROCESS_ID] = numbers[0, 3]
             self._started = True
 
-    def _take_away(self, pieces: Any) -> None:
+    def _take_away(self) -> None:
         """Count what has been decided, and missed, and ran."""
         scalars = self._work.scalars
         decisions = self._state.rows(State._fields.index('decisions'), 6)
@@ -156,7 +165,8 @@ class FastReplay:
             self._judge.differ(Miss(*miss), side)
         n = scalars[fw.N_PIECES]
         if n:
-            self._usage.pool.add_many(pieces[:n, 0], pieces[:n, 1])
+            pieces = self._work.pieces[:n]
+            self._usage.pool.add_many(pieces[:, 0], pieces[:, 1])
 
     # --- events for Python -----------------------------------------------------------------------
 
@@ -188,40 +198,46 @@ class FastReplay:
         """Tell the compiled code what is known of callbacks and publishers."""
         self._stale = False
         groups = self._groups.by_callback()
-        topics = self._paths.topic_of if self._paths.book else {}
+        topics = self._paths.topic_of if self._paths.book else dict[int, str]()
         for callback in {**groups, **topics}:
             group = groups.get(callback, -1)
             number = 0 if group < 0 else \
                 1 + self._group_numbers.setdefault(group, len(self._group_numbers))
-            topic = 1 + self._numbers.topics.get(topics.get(callback, ''), -1)
+            topic = self._numbers.topic(topics.get(callback, ''))
             if self._known_callbacks.get(callback) == (number, topic):
                 continue
             self._known_callbacks[callback] = number, topic
             self._make_room()
             for column, value in ((fw.C_GROUP, number), (fw.C_TOPIC, topic)):
-                self._do['set_callback'](self._work, _signed(callback), column, value)
+                self._do['set_callback'](self._header.address, _signed(callback), column, value)
         while len(self._group_numbers) > len(self._work.group_count):
-            self._work = self._work._replace(
+            self._use(self._work._replace(
                 group_busy=np.concatenate([self._work.group_busy] * 2),
                 group_count=np.concatenate(
-                    [self._work.group_count, np.zeros_like(self._work.group_count)]))
+                    [self._work.group_count, np.zeros_like(self._work.group_count)])))
         if self._paths.book:
-            self._work = self._work._replace(publishers=self._numbers.publishers(self._paths))
             self._work.scalars[fw.ANY_PUBLISHED] = self._paths.any_published
+            for address, topic, node in self._numbers.publishers(self._paths):
+                if self._known_publishers.get(address) != (topic, node):
+                    self._known_publishers[address] = topic, node
+                    self._make_room()
+                    self._do['set_publisher'](
+                        self._header.address, _signed(address), topic, node)
 
     def _make_room(self) -> None:
-        if 2 * self._work.counts[fw.CALLBACKS] + 2 >= len(self._work.callbacks):
-            self._work.scalars[fw.FULL] = 1
-            self._work = grown(self._work, self._length('x_slot'), self._do['copy_table'])
+        work = self._work
+        if (2 * work.counts[fw.CALLBACKS] + 4 >= len(work.callbacks)
+                or 2 * work.counts[fw.PUBLISHERS] + 4 >= len(work.publishers)):
+            self._grow()
 
     # --- the end ---------------------------------------------------------------------------------
 
     def _finish(self, now: int) -> None:
         self._finished = True
         if not self._do['finish_run'](
-                self._tables.address, self._state.address, self._work, now):
+                self._tables.address, self._state.address, self._header.address, now):
             raise Declined
-        self._take_away(np.empty((0, 2), dtype=np.int64))
+        self._take_away()
 
     def _end(self) -> None:
         """Put the sums where the plain replay has them."""
@@ -245,9 +261,11 @@ class FastReplay:
             self._tell_published()
             self._end_watched(self._watched)
         if self._paths.book:
-            self._paths.flows = self._numbers.flows(self._work, self._do['flows_of'])
+            self._paths.flows = self._numbers.flows(
+                self._work, self._header, self._do['flows_of'])
 
     def _end_sinks(self) -> None:
+        width = len(self._work.walk)
         for vertex, times in self._judge.chains.sinks.items():
             row = self._work.sinks[vertex].tolist()
             times.completed = row[fw.B_COMPLETED]
@@ -255,7 +273,7 @@ class FastReplay:
                 continue
             times.sums = row[fw.B_LAG:fw.B_UNKNOWN + 1]
             times.group = row[fw.B_GROUP]
-            steps = self._work.worst[vertex, :row[fw.W_STEPS]].tolist()
+            steps = self._work.worst[vertex * width:vertex * width + row[fw.W_STEPS]].tolist()
             times.worst = Worst(
                 row[fw.W_JOB], row[fw.W_RELEASE], row[fw.W_COMPLETED],
                 [Step(step[0], step[fw.K_LEG], Execution(*step[fw.K_READY:fw.K_BUSY + 1]),

@@ -25,54 +25,41 @@ from __future__ import annotations
 
 from typing import Any
 
+from mddag_executor.replay import fast_work as fw
 from mddag_executor.replay.fast_tables import find, insert, remove
-from mddag_executor.replay.fast_work import (
-    ANY_PUBLISHED,
-    C_TOPIC,
-    CALLBACKS,
-    FULL,
-    J_PLACE,
-    KEEP_JOBS,
-    N_JOBS,
-    N_STEPS,
-    PATH_JOBS,
-    RUN_END,
-    STARTING,
-    TRIGGER,
-    VARIABLE,
-)
+from mddag_executor.replay.fast_types import columns_of
 
 
 def count_row(w: Any, table: int, length: int) -> None:
     """Count one more row of a table, and tell when it should be larger."""
     w.counts[table] += 1
     if 2 * w.counts[table] >= length:
-        w.scalars[FULL] = 1
+        w.scalars[fw.FULL] = 1
 
 
-def _job(w: Any, dag: int, job: int) -> int:
+def path_job(w: Any, dag: int, job: int) -> int:
     """Return the row of what a job has run and published."""
     i = find(w.path_jobs, dag, job, 0, 0)
     if i >= 0:
-        return w.path_jobs[i, J_PLACE]
-    n = w.scalars[N_JOBS]
-    place = n % KEEP_JOBS
-    if n >= KEEP_JOBS:
+        return w.path_jobs[i, fw.J_PLACE]
+    n = w.scalars[fw.N_JOBS]
+    place = n % fw.KEEP_JOBS
+    if n >= fw.KEEP_JOBS:
         old = find(w.path_jobs, w.job_ring[place, 0], w.job_ring[place, 1], 0, 0)
         remove(w.path_jobs, old)
-        w.counts[PATH_JOBS] -= 1
+        w.counts[fw.PATH_JOBS] -= 1
     i = insert(w.path_jobs, dag, job, 0, 0)
-    count_row(w, PATH_JOBS, len(w.path_jobs))
-    w.path_jobs[i, J_PLACE] = place
+    count_row(w, fw.PATH_JOBS, len(w.path_jobs))
+    w.path_jobs[i, fw.J_PLACE] = place
     w.job_ring[place, 0] = dag
     w.job_ring[place, 1] = job
-    w.scalars[N_JOBS] = n + 1
-    for k in range(w.jobs.shape[1]):
+    w.scalars[fw.N_JOBS] = n + 1
+    for k in range(columns_of(w.jobs)):
         w.jobs[place, k] = -1
     return place
 
 
-def _find_run(w: Any, row: int, vertex: int, ready: int) -> int:
+def find_run(w: Any, row: int, vertex: int, ready: int) -> int:
     """Return where the steps of a run stand, or -1."""
     at = w.v_runs[vertex]
     width = 1 + w.v_places[vertex + 1] - w.v_places[vertex]
@@ -84,19 +71,30 @@ def _find_run(w: Any, row: int, vertex: int, ready: int) -> int:
 
 def add_step(w: Any, place: int, parent: int, kind: int, time: int) -> int:
     """Add a step and return its number."""
-    n = w.scalars[N_STEPS]
-    w.step_parent[n] = parent
-    w.step_place[n] = place
-    w.step_kind[n] = kind
-    w.step_time[n] = time
-    w.scalars[N_STEPS] = n + 1
+    n = w.scalars[fw.N_STEPS]
+    w.steps[n, fw.X_TIME] = time
+    w.steps[n, fw.X_WHAT] = (parent + 1) << fw.X_PARENT | place << fw.X_PLACE | kind
+    w.scalars[fw.N_STEPS] = n + 1
     if kind == 1 and w.place_last[place] != 0:
-        w.step_parent[n + 1] = -1
-        w.step_place[n + 1] = place
-        w.step_kind[n + 1] = RUN_END
-        w.step_time[n + 1] = -1
-        w.scalars[N_STEPS] = n + 2
+        w.steps[n + 1, fw.X_TIME] = -1
+        w.steps[n + 1, fw.X_WHAT] = place << fw.X_PLACE | fw.RUN_END
+        w.scalars[fw.N_STEPS] = n + 2
     return n
+
+
+def parent_of(w: Any, step: int) -> int:
+    """Return the step before a step, or -1."""
+    return (w.steps[step, fw.X_WHAT] >> fw.X_PARENT) - 1
+
+
+def place_of(w: Any, step: int) -> int:
+    """Return the place of a step."""
+    return (w.steps[step, fw.X_WHAT] >> fw.X_PLACE) & 0xFFFF
+
+
+def kind_of(w: Any, step: int) -> int:
+    """Return whether a step is an execution (1), what tells its end, or a publication (0)."""
+    return w.steps[step, fw.X_WHAT] & 0xFF
 
 
 def path_started(w: Any, dag: int, vertex: int, job: int, ready: int, start: int) -> bool:
@@ -104,14 +102,14 @@ def path_started(w: Any, dag: int, vertex: int, job: int, ready: int, start: int
     first, last = w.v_places[vertex], w.v_places[vertex + 1]
     if first == last:
         return True
-    row = _job(w, dag, job)
-    if _find_run(w, row, vertex, ready) >= 0:
+    row = path_job(w, dag, job)
+    if find_run(w, row, vertex, ready) >= 0:
         return True
     topic = -1
     if w.v_topics[vertex] < w.v_topics[vertex + 1]:
-        i = find(w.callbacks, w.scalars[STARTING], 0, 0, 0)
+        i = find(w.callbacks, w.scalars[fw.STARTING], 0, 0, 0)
         if i >= 0:
-            topic = w.callbacks[i, C_TOPIC] - 1
+            topic = w.callbacks[i, fw.C_TOPIC] - 1
     at = w.v_runs[vertex]
     k = w.jobs[row, at] + 1
     if k >= w.v_most[vertex]:
@@ -126,11 +124,11 @@ def path_started(w: Any, dag: int, vertex: int, job: int, ready: int, start: int
         parent = -1
         if w.place_position[p] > 0:
             hop = w.place_hop[p]
-            if hop == TRIGGER:
+            if hop == fw.TRIGGER:
                 if topic >= 0 and w.hop_topics[p, topic] == 0:
                     continue
-                parent = _message(w, row, vertex, p - 1, topic)
-            elif hop == VARIABLE:
+                parent = message_step(w, row, vertex, p - 1, topic)
+            elif hop == fw.VARIABLE:
                 parent = w.place_done[p - 1]
             else:
                 parent = w.place_published[p - 1]
@@ -143,7 +141,7 @@ def path_started(w: Any, dag: int, vertex: int, job: int, ready: int, start: int
     return True
 
 
-def _message(w: Any, row: int, vertex: int, place: int, topic: int) -> int:
+def message_step(w: Any, row: int, vertex: int, place: int, topic: int) -> int:
     """Return the step of a place in the message that started a vertex, or -1."""
     step = -1
     for b in range(w.v_befores[vertex], w.v_befores[vertex + 1]):
@@ -152,14 +150,14 @@ def _message(w: Any, row: int, vertex: int, place: int, topic: int) -> int:
             if w.v_place[j] != place:
                 continue
             if topic >= 0:
-                step = _latest(w, row, w.message_at[j, topic], step)
+                step = latest_step(w, row, w.message_at[j, topic], step)
             else:
                 for k in range(w.v_topics[vertex], w.v_topics[vertex + 1]):
-                    step = _latest(w, row, w.message_at[j, w.v_topic[k]], step)
+                    step = latest_step(w, row, w.message_at[j, w.v_topic[k]], step)
     return step
 
 
-def _latest(w: Any, row: int, at: int, step: int) -> int:
+def latest_step(w: Any, row: int, at: int, step: int) -> int:
     if at >= 0 and w.jobs[row, at] >= 0:
         return w.jobs[row, at]
     return step
@@ -172,8 +170,8 @@ def path_published(
     first, last = w.v_places[vertex], w.v_places[vertex + 1]
     if first == last:
         return
-    row = _job(w, dag, job)
-    run = _find_run(w, row, vertex, ready)
+    row = path_job(w, dag, job)
+    run = find_run(w, row, vertex, ready)
     for j in range(first, last):
         p = w.v_place[j]
         if w.publish_topics[p, topic] == 0:
@@ -211,11 +209,11 @@ def path_ran(w: Any, dag: int, vertex: int, job: int, ready: int, end: int) -> N
     first, last = w.v_places[vertex], w.v_places[vertex + 1]
     if first == last:
         return
-    row = _job(w, dag, job)
-    if w.scalars[ANY_PUBLISHED] == 0:
+    row = path_job(w, dag, job)
+    if w.scalars[fw.ANY_PUBLISHED] == 0:
         for k in range(w.v_publishes[vertex], w.v_publishes[vertex + 1]):
             path_published(w, dag, vertex, job, ready, w.v_publish[k], end)
-    run = _find_run(w, row, vertex, ready)
+    run = find_run(w, row, vertex, ready)
     for j in range(first, last):
         p = w.v_place[j]
         step = -1
@@ -223,7 +221,7 @@ def path_ran(w: Any, dag: int, vertex: int, job: int, ready: int, end: int) -> N
             step = w.jobs[row, run + j - first]
         if step != -1:
             if w.place_last[p] != 0:
-                w.step_time[step + 1] = end
+                w.steps[step + 1, fw.X_TIME] = end
             w.place_done[p] = step
         elif w.place_sync[p] == 0:
             w.place_done[p] = -1
@@ -234,18 +232,19 @@ def mark_steps(w: Any, n: int, marks: Any) -> None:
     for step in range(n):
         marks[step] = 0
     for step in range(n):           # 1: another step follows
-        if w.step_parent[step] != -1:
-            marks[w.step_parent[step]] |= 1
+        parent = parent_of(w, step)
+        if parent != -1:
+            marks[parent] |= 1
     for step in range(n):           # 2: an execution that reads it went on
-        parent = w.step_parent[step]
-        if parent != -1 and w.step_kind[step] == 1 and marks[step] & 1:
+        parent = parent_of(w, step)
+        if parent != -1 and kind_of(w, step) == 1 and marks[step] & 1:
             marks[parent] |= 2
     for step in range(n):           # 4: a flow ends here
-        if marks[step] & 1 or w.step_kind[step] == RUN_END:
+        if marks[step] & 1 or kind_of(w, step) == fw.RUN_END:
             continue
-        parent = w.step_parent[step]
-        if not (parent != -1 and w.step_kind[step] == 1 and marks[parent] & 2
-                and w.place_last[w.step_place[step]] == 0):
+        parent = parent_of(w, step)
+        if not (parent != -1 and kind_of(w, step) == 1 and marks[parent] & 2
+                and w.place_last[place_of(w, step)] == 0):
             marks[step] |= 4
 
 
@@ -257,21 +256,21 @@ def path_flows(w: Any, first: int, last: int, n: int, marks: Any, flows: Any) ->
     """
     count = 0
     for leaf in range(n):
-        if marks[leaf] & 4 and first <= w.step_place[leaf] < last:
+        if marks[leaf] & 4 and first <= place_of(w, leaf) < last:
             if len(flows) > 0:
                 published = arrival = begin = end = -1
                 step = leaf
                 while step != -1:
-                    place = w.step_place[step]
-                    if w.step_kind[step] == 1:
+                    place = place_of(w, step)
+                    if kind_of(w, step) == 1:
                         if place == last - 1:
-                            arrival = w.step_time[step]
-                            end = w.step_time[step + 1]
+                            arrival = w.steps[step, fw.X_TIME]
+                            end = w.steps[step + 1, fw.X_TIME]
                         if place == first:
-                            begin = w.step_time[step]
-                    elif place == first and w.step_time[step] != 0:
-                        published = w.step_time[step]
-                    step = w.step_parent[step]
+                            begin = w.steps[step, fw.X_TIME]
+                    elif place == first and w.steps[step, fw.X_TIME] != 0:
+                        published = w.steps[step, fw.X_TIME]
+                    step = parent_of(w, step)
                 flows[count, 0] = published if published != -1 else begin
                 flows[count, 1] = arrival
                 flows[count, 2] = begin

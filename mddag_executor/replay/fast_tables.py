@@ -24,26 +24,28 @@ from __future__ import annotations
 
 from typing import Any
 
-USED = 4
-VALUES = 5
-_MIX = 0x9E3779B97F4A7C1
+from mddag_executor.replay.fast_types import columns_of
+
+HASH_USED = 4
+HASH_VALUES = 5
+HASH_MIX = 0x9E3779B97F4A7C1
 
 
-def _place(table: Any, a: int, b: int, c: int, d: int) -> int:
+def hash_place(table: Any, a: int, b: int, c: int, d: int) -> int:
     mixed = a * 31 + b
-    mixed = mixed * _MIX + c
+    mixed = mixed * HASH_MIX + c
     mixed ^= mixed >> 29
-    mixed = mixed * _MIX + d
+    mixed = mixed * HASH_MIX + d
     mixed ^= mixed >> 32
-    mixed *= _MIX
+    mixed *= HASH_MIX
     mixed ^= mixed >> 29
     return mixed & (len(table) - 1)
 
 
 def find(table: Any, a: int, b: int, c: int, d: int) -> int:
     """Return the row of a key, or -1."""
-    i = _place(table, a, b, c, d)
-    while table[i, USED] != 0:
+    i = hash_place(table, a, b, c, d)
+    while table[i, HASH_USED] != 0:
         if table[i, 0] == a and table[i, 1] == b and table[i, 2] == c and table[i, 3] == d:
             return i
         i = (i + 1) & (len(table) - 1)
@@ -52,16 +54,16 @@ def find(table: Any, a: int, b: int, c: int, d: int) -> int:
 
 def insert(table: Any, a: int, b: int, c: int, d: int) -> int:
     """Return the row of a key that is not in the table; its values are 0."""
-    i = _place(table, a, b, c, d)
-    while table[i, USED] != 0:
+    i = hash_place(table, a, b, c, d)
+    while table[i, HASH_USED] != 0:
         i = (i + 1) & (len(table) - 1)
-    for column in range(table.shape[1]):
+    for column in range(columns_of(table)):
         table[i, column] = 0
     table[i, 0] = a
     table[i, 1] = b
     table[i, 2] = c
     table[i, 3] = d
-    table[i, USED] = 1
+    table[i, HASH_USED] = 1
     return i
 
 
@@ -71,21 +73,21 @@ def remove(table: Any, i: int) -> None:
     j = i
     while True:
         j = (j + 1) & mask
-        if table[j, USED] == 0:
+        if table[j, HASH_USED] == 0:
             break
-        home = _place(table, table[j, 0], table[j, 1], table[j, 2], table[j, 3])
+        home = hash_place(table, table[j, 0], table[j, 1], table[j, 2], table[j, 3])
         stays = i < home <= j if i <= j else i < home or home <= j
         if not stays:
-            for column in range(table.shape[1]):
+            for column in range(columns_of(table)):
                 table[i, column] = table[j, column]
             i = j
-    table[i, USED] = 0
+    table[i, HASH_USED] = 0
 
 
 def rehash(table: Any, larger: Any) -> None:
     """Copy all rows to a larger table, which is empty."""
     for row in range(len(table)):
-        if table[row, USED] != 0:
+        if table[row, HASH_USED] != 0:
             i = insert(larger, table[row, 0], table[row, 1], table[row, 2], table[row, 3])
-            for column in range(VALUES, table.shape[1]):
+            for column in range(HASH_VALUES, columns_of(table)):
                 larger[i, column] = table[row, column]

@@ -79,78 +79,85 @@ LIMIT = 1 << 40
 # Kinds of hops to a place of a path.
 TRIGGER, TOPIC, VARIABLE = range(3)
 RUN_END = 2     # kind of a step's second row, which has its end
+# A step: its time; its parent plus one, its place and its kind in one number.
+X_TIME, X_WHAT, N_STEP = range(3)
+X_PARENT, X_PLACE = 24, 8       # bits to shift by
+
+
+Vector = Any
+Matrix = Any
+"""Arrays of int64 with one and with two dimensions."""
 
 
 class Work(NamedTuple):
-    """All arrays; of int64 where nothing else is said."""
+    """All arrays."""
 
-    scalars: Any
-    counts: Any
-    threads: Any
-    open: Any
-    slots: Any
-    recent: Any
-    callbacks: Any
-    pairs: Any
-    path_jobs: Any
-    publishers: Any
-    recent_ring: Any
+    scalars: Vector
+    counts: Vector
+    threads: Matrix
+    open: Matrix
+    slots: Matrix
+    recent: Matrix
+    callbacks: Matrix
+    pairs: Matrix
+    path_jobs: Matrix
+    publishers: Matrix
+    recent_ring: Matrix
     # the mapping: by recorded DAG, vertex (from map_first on) and leg (from map_legs on)
-    map_dag: Any
-    map_first: Any
-    map_vertex: Any
-    map_legs: Any
-    legs: Any
-    newest: Any
-    releases: Any
+    map_dag: Vector
+    map_first: Vector
+    map_vertex: Vector
+    map_legs: Vector
+    legs: Vector
+    newest: Vector
+    releases: Matrix
     # by DAG of the declaration that judges
-    judge_newest: Any
-    released: Any
-    use_of: Any
-    use: Any
-    workers: Any
-    group_busy: Any
-    group_count: Any
+    judge_newest: Vector
+    released: Vector
+    use_of: Vector
+    use: Matrix
+    workers: Matrix
+    group_busy: Matrix
+    group_count: Vector
     # vertices before each leg
-    before_legs: Any
-    before_first: Any
-    before: Any
-    chain: Any
-    walk: Any
-    sinks: Any
-    worst: Any
-    misses: Any
+    before_legs: Vector
+    before_first: Vector
+    before: Vector
+    chain: Matrix
+    walk: Vector
+    sinks: Matrix
+    worst: Matrix
+    misses: Matrix
     # paths: by vertex its places, its topics, what it publishes
-    v_places: Any
-    v_place: Any
-    v_topics: Any
-    v_topic: Any
-    v_publishes: Any
-    v_publish: Any
+    v_places: Vector
+    v_place: Vector
+    v_topics: Vector
+    v_topic: Vector
+    v_publishes: Vector
+    v_publish: Vector
     # vertices before each vertex
-    v_befores: Any
-    v_before: Any
+    v_befores: Vector
+    v_before: Vector
     # by vertex: where its runs stand in a job, and how many fit
-    v_runs: Any
-    v_most: Any
+    v_runs: Vector
+    v_most: Vector
     # by vertex's place and topic: where its message stands in a job, -1 for none
-    message_at: Any
+    message_at: Matrix
     # by place: position, kind of the hop to it, whether it is of a sync, whether it is the last
-    place_position: Any
-    place_hop: Any
-    place_sync: Any
-    place_last: Any
-    hop_topics: Any
-    publish_topics: Any
-    node_places: Any
-    node_place: Any
-    place_started: Any
-    place_done: Any
-    place_published: Any
-    jobs: Any           # what is kept of each of the last jobs
-    job_ring: Any
-    # steps: int32, int16, int8, int64
-    step_parent: Any
-    step_place: Any
-    step_kind: Any
-    step_time: Any
+    place_position: Vector
+    place_hop: Vector
+    place_sync: Vector
+    place_last: Vector
+    hop_topics: Matrix
+    publish_topics: Matrix
+    node_places: Vector
+    node_place: Vector
+    place_started: Vector
+    place_done: Vector
+    place_published: Vector
+    jobs: Matrix           # what is kept of each of the last jobs
+    job_ring: Matrix
+    steps: Matrix
+    # what is handed over: events, and start and end of what ran
+    rows: Matrix
+    pieces: Matrix

@@ -211,6 +211,16 @@ class Follower:
             for observer in self._observers:
                 observer.finished(self.end)
 
+    @property
+    def handlers(self) -> dict[str, Callable[[Event], None]]:
+        """Return what takes in the events, by full name."""
+        return self._handlers
+
+    @property
+    def strange(self) -> bool:
+        """Tell whether there were events that make no sense."""
+        return bool(self._strange)
+
     def warnings(self) -> list[str]:
         """Return what was wrong with the events, one line each."""
         name = self._recording.name

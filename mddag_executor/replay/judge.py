@@ -95,10 +95,12 @@ class Judge(Observer):
         self._scheduler = Scheduler(self.tables, 1, propagate=False)
         self._slots: dict[tuple[int, int], int] = {}
         self._newest: dict[int, int] = {}
-        self._compare = compare
+        #: Whether recorded misses must equal those found.
+        self.compare = compare
         # misses that only one side has seen so far: found here (+1) or recorded (-1)
         self._open_misses: dict[Miss, int] = {}
-        self._n_recorded = 0
+        #: How many misses were recorded.
+        self.n_recorded = 0
 
     def hosted(self, dag: int, vertices: set[int]) -> None:
         """Expect nothing of a DAG that other processes run."""
@@ -154,7 +156,7 @@ class Judge(Observer):
         slot = self._slots.get((dag, job))
         if slot is None:
             # under another declaration it may have completed before
-            self.contradictions += self._compare
+            self.contradictions += self.compare
         elif aborted:
             self._scheduler.abort(slot, now)
             self._decided(slot)
@@ -164,9 +166,9 @@ class Judge(Observer):
 
     def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
         """Compare a recorded miss."""
-        if self._compare:
-            self._n_recorded += 1
-            self._differ(Miss(dag, vertex, job, deadline, completed), -1)
+        if self.compare:
+            self.n_recorded += 1
+            self.differ(Miss(dag, vertex, job, deadline, completed), -1)
 
     def finished(self, now: int) -> None:
         """Judge what is open."""
@@ -186,14 +188,15 @@ class Judge(Observer):
                 del self._slots[(dag, job)]
             elif kind == SINK_DONE:
                 self.chains.sink(slot, vertex, job, time)
-                if time > deadline and self._compare:
-                    self._differ(Miss(dag, vertex, job, deadline, time), 1)
-            elif kind in _MISSES and self._compare:
-                self._differ(Miss(dag, vertex, job, deadline, time), 1)
+                if time > deadline and self.compare:
+                    self.differ(Miss(dag, vertex, job, deadline, time), 1)
+            elif kind in _MISSES and self.compare:
+                self.differ(Miss(dag, vertex, job, deadline, time), 1)
             else:
                 assert kind != DROP, 'nothing waits in this core, so nothing can be dropped'
 
-    def _differ(self, miss: Miss, side: int) -> None:
+    def differ(self, miss: Miss, side: int) -> None:
+        """Take in a miss that was found here (side 1) or recorded (-1)."""
         difference = self._open_misses.pop(miss, 0) + side
         if difference:
             self._open_misses[miss] = difference
@@ -212,6 +215,6 @@ class Judge(Observer):
         example = min(found + recorded, key=lambda miss: miss.deadline)
         name = 'an undeclared vertex' if example.vertex < 0 \
             else self.tally.vertex_name(example.vertex)
-        return (f'{len(recorded)} of the {self._n_recorded} misses that the executor recorded are '
+        return (f'{len(recorded)} of the {self.n_recorded} misses that the executor recorded are '
                 f'not found again, {len(found)} that it did not record are found: the first is '
                 f'job {example.job} at {name}')

@@ -56,6 +56,7 @@ from mddag_executor.simulate import Load
 from msg_graph import Dag, TaskSet
 
 _UNKNOWN = -1
+_UNTOLD = -2
 
 
 class RecordedLoad(NamedTuple):
@@ -118,6 +119,7 @@ class LoadBuilder(Observer):
     def __init__(self, task_set: TaskSet, tables: Tables, groups: RecordedGroups) -> None:
         self._task_set = task_set
         self._first = tables.first_vertex
+        self._declared_group = tables.group
         self._groups = groups
         self._jobs = [_Jobs(dag, n) for dag, n in zip(task_set.dags, edges_of(tables))]
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
@@ -151,11 +153,13 @@ class LoadBuilder(Observer):
         row = -1 if vertex < 0 else self._jobs[dag].row.get(job, -1)
         if row >= 0 and not self._edges_into[vertex]:
             ready = max(ready, self._round_end(self._jobs[dag], row))
-        group = self._groups.by_callback().get(callback, -1)
+        group = self._groups.by_callback().get(callback, _UNTOLD)
+        if group == _UNTOLD and vertex >= 0 and self._declared_group[vertex] >= 0:
+            group = _UNTOLD - 1 - self._declared_group[vertex]
         could = max(ready, self._worker_free.get(worker, 0))
         if worker >= 0:
             self._worker_free[worker] = end
-        if group >= 0:
+        if group >= 0 or group < _UNTOLD:
             could = max(could, self._group_free.get(group, 0))
             self._group_free[group] = end
         late = max(0, start - could) if first else 0

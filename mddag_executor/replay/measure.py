@@ -30,7 +30,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 import multiprocessing
 import os
-import resource
 import time
 from typing import Any, NamedTuple
 
@@ -38,6 +37,7 @@ from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Tables
 from mddag_executor.core.state import new_state
 from mddag_executor.errors import MddagError
+from mddag_executor.memory import peak_memory_mb
 from mddag_executor.simulate import (
     draw_execution_times,
     END,
@@ -255,8 +255,7 @@ def _in_child(name: str, path: str, limit: int, pipe: Any) -> None:
         pipe.send(str(error))
         return
     cpu = time.process_time() - begin
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    pipe.send(Speed(count, cpu, peak))
+    pipe.send(Speed(count, cpu, peak_memory_mb()))
 
 
 def measure(name: str, path: str, limit: int) -> Speed:

@@ -33,6 +33,7 @@ from collections.abc import Callable as Function
 from typing import Any
 
 from mddag_executor.replay.follower import Follower, Observer, Piece
+from mddag_executor.replay.path_flows import Flows
 from mddag_executor.replay.paths import PathBook, Places
 from msg_graph import TaskSet
 
@@ -66,10 +67,15 @@ class OwnPaths(Observer):
             [v - vertex.index + p for p in vertex.predecessors]
             for v, vertex in enumerate(task_set.vertices)]
         self._jobs: OrderedDict[tuple[int, int], _Job] = OrderedDict()
-        self._publisher: dict[int, tuple[str, str]] = {}    # by address: node and topic
+        #: By address: node and topic.
+        self.publishers: dict[int, tuple[str, str]] = {}
+        #: What a compiled replay has found instead of the book.
+        self.flows: Flows | None = None
         self._node: dict[int, str] = {}
-        self._topic: dict[int, str] = {}        # by handle, then by callback
-        self._any_published = False
+        #: By handle, then by callback.
+        self.topic_of: dict[int, str] = {}
+        #: Whether what is published is recorded.
+        self.any_published = False
 
     def handlers(self) -> dict[str, Function[[Event], None]]:
         """Return what takes in further events, by full name."""
@@ -88,16 +94,16 @@ class OwnPaths(Observer):
         self._node[event[4]] = f'{event[7].rstrip("/")}/{event[6]}'
 
     def _publisher_init(self, event: Event) -> None:
-        self._any_published = True
-        self._publisher[event[4]] = self._node.get(event[5], ''), event[7]
+        self.any_published = True
+        self.publishers[event[4]] = self._node.get(event[5], ''), event[7]
 
     def _subscription_init(self, event: Event) -> None:
-        self._topic[event[4]] = event[7]
+        self.topic_of[event[4]] = event[7]
 
     def _callback_added(self, event: Event) -> None:
-        topic = self._topic.get(event[4])
+        topic = self.topic_of.get(event[4])
         if topic is not None:
-            self._topic[event[5]] = topic
+            self.topic_of[event[5]] = topic
 
     # --- what happened ---------------------------------------------------------------------------
 
@@ -120,7 +126,7 @@ class OwnPaths(Observer):
             return
         topic = ''
         if self.follower is not None and callback.topics:
-            topic = self._topic.get(self.follower.starting, '')
+            topic = self.topic_of.get(self.follower.starting, '')
         message: Places = {}
         for before in self._before[vertex]:
             for of_topic in (topic,) if topic else callback.topics:
@@ -129,7 +135,7 @@ class OwnPaths(Observer):
         self.book.started(callback.key, places, start, message, topic)
 
     def _publish(self, event: Event) -> None:
-        known = self._publisher.get(event[4])
+        known = self.publishers.get(event[4])
         if known is None or known[1] not in self.book.topics or self.follower is None:
             return
         node, topic = known
@@ -159,7 +165,7 @@ class OwnPaths(Observer):
         if not self.book.concerns(callback.key):
             return
         places = self._job(piece.dag, piece.job).runs.get((piece.vertex, piece.ready), {})
-        if not self._any_published:
+        if not self.any_published:
             for topic in callback.publishes:
                 self._published(piece.dag, piece.vertex, piece.job, piece.ready, topic,
                                 (piece.end, 0, 0))

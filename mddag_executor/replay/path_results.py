@@ -19,10 +19,11 @@ from __future__ import annotations
 from typing import Any
 
 from mddag_executor.replay.path_cases import cases, Record, statistics
+from mddag_executor.replay.path_flows import Flows
 from mddag_executor.replay.paths import Flow, PathBook
 
 
-def path_results(book: PathBook) -> dict[str, Any]:
+def path_results(book: PathBook | Flows) -> dict[str, Any]:
     """
     Return by path its figures, all times in ns.
 
@@ -31,6 +32,8 @@ def path_results(book: PathBook) -> dict[str, Any]:
     start of the last callback, ``whole`` those from the start of the first to the end of the last.
     ``reaction_time`` is the worst case with external latency, ``data_age`` that of every output.
     """
+    if isinstance(book, Flows):
+        return book.figures()
     return {path.name: _result(book, number) for number, path in enumerate(book.paths)}
 
 

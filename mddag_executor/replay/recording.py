@@ -16,14 +16,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 import os
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.errors import InputError
 from mddag_executor.trace import TraceError, TraceReader
 from msg_graph import GraphError, loads, TaskSet
+
+if TYPE_CHECKING:
+    from mddag_executor.trace.columns import Columns
 
 TASK_SET = 'mddag:task_set'
 _RECORD = 'record a run with mddag run GRAPH … --trace'
@@ -102,6 +105,13 @@ class Recording:
         """
         with self._named():
             yield from self._reader.events(names, sorted=True)
+
+    def columns(
+        self, names: Iterable[str], kinds: Mapping[str, int], scan: Any
+    ) -> Iterator[Columns]:
+        """Yield the named events in the order of time as rows; see ``TraceReader.columns``."""
+        with self._named():
+            yield from self._reader.columns(names, kinds, scan)
 
     def _named(self) -> AbstractContextManager[None]:
         return named_errors(self.path, self.name)

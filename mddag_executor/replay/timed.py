@@ -40,10 +40,11 @@ from collections.abc import Sequence
 from heapq import heappop, heappush
 from typing import NamedTuple
 
-from mddag_executor.core import jobs, NEVER, rules, Tables
+from mddag_executor.core import NEVER, rules, Tables
 from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.state import add_slot, OPEN, PREEMPTIVE, State
+from mddag_executor.core.state import OPEN, PREEMPTIVE, State
 from mddag_executor.simulate import END, Load, LogEntry, PREEMPT, START
+from mddag_executor.simulate.engine import release_load
 
 
 class Transports(NamedTuple):
@@ -118,23 +119,9 @@ class Engine:
                 _, _, slot, job, vertex = heappop(messages)
                 self._arrive(slot, job, vertex, instant)
             while n < len(times) and times[n] == instant:
-                self._release(n)
+                release_load(self._t, self._s, self._key, self._load, n, instant)
                 n += 1
             self._dispatch(instant)
-
-    def _release(self, number: int) -> None:
-        load, t, s = self._load, self._t, self._s
-        now, dag, job = load.times[number], load.dags[number], load.jobs[number]
-        release = load.releases[number] if load.releases else now
-        slot = jobs.release_job(t, s, dag, job, release, now)
-        if slot < 0:
-            add_slot(t, s, dag)
-            slot = jobs.release_job(t, s, dag, job, release, now)
-        base = s.job_base[slot]
-        cost = load.cost_base[dag] + job * load.cost_stride[dag]
-        for place in range(t.n_region[dag]):
-            s.x_cost[base + place] = load.costs[cost + place]
-        rules.make_ready(t, s, self._key, base + t.region_offset[t.source[dag]], now)
 
     def _dispatch(self, now: int) -> None:
         t, s, running = self._t, self._s, self._running

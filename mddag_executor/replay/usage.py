@@ -22,6 +22,8 @@ from typing import Any
 from mddag_executor.replay.follower import Execution, Observer, Piece
 from mddag_executor.replay.waits import GroupWaits
 from msg_graph import TaskSet
+import numpy as np
+import numpy.typing as npt
 
 
 class CallbackUse:
@@ -69,6 +71,24 @@ class PoolUse:
             until = min(end, (number + 1) * self.step)
             self._busy[number] = self._busy.get(number, 0) + until - start
             start = until
+        while len(self._busy) > self.MOST_STEPS:
+            self._double()
+
+    def add_many(self, starts: npt.NDArray[np.int64], ends: npt.NDArray[np.int64]) -> None:
+        """Add executions: as ``add`` does, one after the other."""
+        while len(starts) and int((ends // self.step - starts // self.step).max()
+                                  ) > self.MOST_STEPS:
+            self._double()
+        starts, ends = starts[starts < ends], ends[starts < ends]
+        while len(starts):
+            until = np.minimum(ends, (starts // self.step + 1) * self.step)
+            numbers, place = np.unique(starts // self.step, return_inverse=True)
+            busy = np.zeros(len(numbers), dtype=np.int64)
+            np.add.at(busy, place, until - starts)
+            for number, more in zip(numbers.tolist(), busy.tolist()):
+                self._busy[number] = self._busy.get(number, 0) + more
+            goes_on = until < ends
+            starts, ends = until[goes_on], ends[goes_on]
         while len(self._busy) > self.MOST_STEPS:
             self._double()
 
@@ -146,6 +166,15 @@ class Usage(Observer):
     def busy(self) -> int:
         """Return how long declared callbacks ran altogether, ns."""
         return sum(use.busy for use in self._by_key.values())
+
+    def every(self) -> list[CallbackUse]:
+        """Return the use of each declared callback, in file order, then of the undeclared."""
+        return [*self._by_key.values(), self.undeclared]
+
+    def number_by_vertex(self) -> list[int]:
+        """Return for each global vertex the place of its callback in ``every``."""
+        numbers = {id(use): number for number, use in enumerate(self._by_key.values())}
+        return [numbers[id(use)] for use in self._by_vertex]
 
     def callbacks(self) -> dict[str, dict[str, int]]:
         """Return what each declared callback used, in file order."""

@@ -163,21 +163,22 @@ def _entries() -> dict[str, Callable[..., Any]]:
 
 
 def entries_of(
-    kernels: tuple[ModuleType, ...], names: tuple[str, ...]
+    kernels: tuple[ModuleType, ...], names: tuple[str, ...], sources: tuple[str, ...]
 ) -> dict[str, Callable[..., Any]]:
     """
     Return entry points of another driver of the compiled core, as those of ``kernel`` are.
 
-    :param kernels: modules all of whose functions are compiled beside those of the core; their
-        entry points are in the last one.
+    :param kernels: modules all of whose functions are compiled beside those of the core, under
+        names that are not in use there; their entry points are in the last one.
     :param names: of the entry points.
+    :param sources: names of all modules that what is compiled depends on, the core's left out.
     """
-    return _compiled_entries(kernels, names, _stamp(tuple(each.__name__ for each in kernels)))
+    return _compiled_entries(kernels, names, _stamp(sources))
 
 
-def cached_entries(kernels: tuple[str, ...], name: str) -> bool:
-    """Tell whether an entry point of such modules, by name, has been compiled before."""
-    folder = _folder(kernels)
+def cached_entries(sources: tuple[str, ...], name: str) -> bool:
+    """Tell whether an entry point of a driver (see ``entries_of``) has been compiled before."""
+    folder = _folder(sources)
     return folder is not None and any(folder.glob(f'**/*{name}*.nbc'))
 
 
@@ -193,6 +194,7 @@ def _compiled_entries(
     for module in (*_MODULES, *kernels):
         inner = ModuleType(module.__name__)  # for names such as `rules.complete`
         for name, function in _functions(module):
+            assert space[name] is function or name in _REPLACED, f'there are two of {name}'
             space[name] = njit(error_model='numpy')(_bound(function, space))
             setattr(inner, name, space[name])
         if module in (jobs, rules):
@@ -234,7 +236,7 @@ def compile_elsewhere(module: str = __name__) -> None:
 
 def compile_here() -> None:
     """Compile what ``evaluate`` needs, by evaluating no run of nothing."""
-    nothing = _Empty(max(len(Tables._fields) + 1, len(State._fields)))
+    nothing = Empty(max(len(Tables._fields) + 1, len(State._fields)))
     _entries()['accept_runs'](
         nothing.address, nothing.address, nothing.address, 0, 0, 1, 0, 0, 0, 0, 1, False,
         np.zeros(0, dtype=np.bool_))
@@ -242,7 +244,7 @@ def compile_here() -> None:
 
 # --- handing over --------------------------------------------------------------------------------
 
-class _Lent:
+class Lent:
     """A named tuple of integers and lists, as a structure in numpy's memory."""
 
     def __init__(self, row: NamedTuple, *more: int) -> None:
@@ -262,14 +264,14 @@ class _Lent:
         """Return where the structure is, as long as this object lives."""
         return int(self._words.ctypes.data)
 
-    def copy(self) -> _Lent:
+    def copy(self) -> Lent:
         """Return a structure of its own over the same columns."""
         copied = copy(self)
         copied._words = self._words.copy()
         return copied
 
 
-class _Empty:
+class Empty:
     """Memory for a structure or a vector that is all empty."""
 
     def __init__(self, fields: int = 1) -> None:
@@ -279,6 +281,10 @@ class _Empty:
     def address(self) -> int:
         """Return where it is, as long as this object lives."""
         return int(self._words.ctypes.data)
+
+    def length(self, field: int) -> int:
+        """Return how many elements a field has, which is a vector."""
+        return int(self._words[3 * field + 1])
 
     def rows(self, field: int, width: int) -> list[tuple[int, ...]]:
         """Return a copy of a field, which is a vector of tuples."""
@@ -303,8 +309,8 @@ class CompiledJudge:
             task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
         self._columns = built.n_vertices
         self._duration_ns = duration_ns
-        self._tables = [_Lent(built, number) for number in range(len(POLICIES))]
-        self._load = _Lent(load._replace(
+        self._tables = [Lent(built, number) for number in range(len(POLICIES))]
+        self._load = Lent(load._replace(
             cost_base=[built.first_vertex[dag.index] for dag in task_set.dags]))
 
     def warm_up(self) -> None:
@@ -319,7 +325,7 @@ class CompiledJudge:
         row = find_policy(settings.policy)
         preemptive = row.mode(settings.preemptive)
         load = self._load.copy()  # whose costs become each run's
-        working = _Empty(len(State._fields))
+        working = Empty(len(State._fields))
         times = np.ascontiguousarray(times, dtype=np.int64)
         accepted = np.zeros(len(times), dtype=np.bool_)
         _entries()['accept_runs'](
@@ -339,10 +345,10 @@ def run_compiled(
     :return: when the run ended (ns), the log of every worker, and the core's decisions.
     """
     row = find_policy(settings.policy)
-    lent = _Lent(built, list(POLICIES).index(settings.policy))
-    lent_load = _Lent(load)
-    working = _Empty(len(State._fields))
-    log = _Empty()
+    lent = Lent(built, list(POLICIES).index(settings.policy))
+    lent_load = Lent(load)
+    working = Empty(len(State._fields))
+    log = Empty()
     entries = _entries()
     ended = entries['run_once'](
         lent.address, lent_load.address, working.address, settings.workers,

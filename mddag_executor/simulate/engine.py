@@ -120,16 +120,17 @@ def run(
         if now == horizon:
             return horizon
         while next_release < n_releases and load.times[next_release] == now:
-            _release(t, s, key, load, next_release, now)
+            release_load(t, s, key, load, next_release, now)
             next_release += 1
         _dispatch(t, s, key, now, finish_at, running, log)
         if stop_at_first_miss and any_missed(s, seen):
             return now
 
 
-def _release(
+def release_load(
     t: Tables, s: State, key: KeyFunction, load: Load, i: int, now: int
 ) -> None:
+    """Release the i-th job of a load, with the execution times that the load gives it."""
     dag = load.dags[i]
     job = load.jobs[i]
     release = load.releases[i] if len(load.releases) > 0 else now

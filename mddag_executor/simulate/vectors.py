@@ -79,7 +79,7 @@ class VectorType(types.Type):
 
 
 class StructureType(types.Type):
-    """A structure: fields by name, of which each is a ``VectorType`` or ``types.int64``."""
+    """A structure: fields by name, each ``types.int64`` or of three words, as a vector."""
 
     def __init__(self, name: str, fields: dict[str, types.Type]) -> None:
         self.fields = fields
@@ -87,14 +87,15 @@ class StructureType(types.Type):
         super().__init__(name=f'mddag.Structure({name}: {fields})')
 
 
-class _AddressModel(models.PrimitiveModel):
+class AddressModel(models.PrimitiveModel):
+    """What stands for a vector, a structure and whatever else is an address."""
 
     def __init__(self, manager: Any, fe_type: types.Type) -> None:
         super().__init__(manager, fe_type, _I64)
 
 
-register_model(VectorType)(_AddressModel)
-register_model(StructureType)(_AddressModel)
+register_model(VectorType)(AddressModel)
+register_model(StructureType)(AddressModel)
 
 
 # --- in terms of LLVM ----------------------------------------------------------------------------
@@ -123,7 +124,7 @@ class _StructureAttribute(AttributeTemplate):
 
 def _get_field(context: Any, builder: Any, structure: Any, address: Any, name: str) -> Any:
     field = builder.add(address, _I64(_BYTES * WORDS * structure.places[name]))
-    if isinstance(structure.fields[name], VectorType):
+    if not isinstance(structure.fields[name], types.Integer):
         return field
     return builder.load(_pointer(builder, field))
 

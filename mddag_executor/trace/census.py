@@ -185,10 +185,15 @@ class Census:
 
     def _publish(self, event: Event) -> None:
         stack = self._running.get((event[2], event[3]))
-        publisher = self._topic.get((event[2], event[4]))
-        if stack and publisher is not None:
-            node, topic = publisher
-            self.runs[stack[-1][0]].publishes[topic] = None
+        if stack:
+            self.published(stack[-1][0], (event[2], event[4]))
+
+    def published(self, callback: Address, publisher: Address) -> None:
+        """Take in that a callback has published with a publisher."""
+        known = self._topic.get(publisher)
+        if known is not None:
+            node, topic = known
+            self.runs.setdefault(callback, Runs()).publishes[topic] = None
             self.publishers[node][topic] = True
 
     def entities(self) -> Iterator[Entity]:

@@ -34,6 +34,7 @@ from collections.abc import Callable, Iterator, Mapping
 import struct
 from typing import Any, BinaryIO, NamedTuple
 
+from mddag_executor.trace import column_layout as cl
 from mddag_executor.trace import records
 from mddag_executor.trace.blocks import Block, Damage, load
 from mddag_executor.trace.channels import Channels, Event
@@ -43,15 +44,6 @@ import numpy.typing as npt
 
 Rows = npt.NDArray[np.int64]
 Scan = Callable[..., None]
-
-# As in ``columns_kernel``, which can not be imported without numba.
-TIME, KIND, THREAD, PROCESS, FIELDS = range(5)
-ROW, OTHER = 11, 0
-UNKNOWN, PASSED_OVER, FIRST_LAYOUT = range(3)
-L_KIND, L_SIZE, L_FIELDS, L_FIRST = range(4)
-LAYOUT = L_FIRST + 3 * ROW
-POSITION, ROWS, MESSAGES, OTHERS, STATUS, N_RESULTS = range(6)
-DONE, DEFINITION, CUT, FULL = range(4)
 
 _SIGNED = {'q': 1, 'i': 1, 'h': 1, 'b': 1, 'Q': 0, 'I': 0, 'H': 0, 'B': 0, '?': 2}
 _SOME = 1 << 15         # rows at a time
@@ -80,7 +72,7 @@ class ColumnReading(Reading):
         self._kinds = kinds
         self._scan_records = scan
         self._classes = np.zeros(1 << 16, dtype=np.int64)
-        self._layouts = np.zeros((0, LAYOUT), dtype=np.int64)
+        self._layouts = np.zeros((0, cl.LAYOUT), dtype=np.int64)
 
     def columns(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Columns]:
         """
@@ -94,10 +86,10 @@ class ColumnReading(Reading):
         rows, others = self._rows(load(stream, block), block)
         if len(rows) > self._room(pending):
             raise self._too_unordered()
-        times = rows[:, TIME]
+        times = rows[:, cl.TIME]
         if len(rows) > 1 and bool((times[1:] < times[:-1]).any()):
             rows = rows[np.argsort(times, kind='stable')]
-        if len(rows) and rows[0, TIME] < block.start_time:
+        if len(rows) and rows[0, cl.TIME] < block.start_time:
             raise Damage('a chunk holds an event from before the time in its head', block.offset)
         return _Loaded(rows, others)
 
@@ -106,47 +98,47 @@ class ColumnReading(Reading):
         end = len(data)
         data += bytes(_SLACK)
         address = np.frombuffer(data, dtype=np.uint8).ctypes.data
-        rows = np.empty((_SOME, ROW), dtype=np.int64)
+        rows = np.empty((_SOME, cl.ROW), dtype=np.int64)
         places = np.empty((_SOME, 2), dtype=np.int64)
-        result = np.zeros(N_RESULTS, dtype=np.int64)
+        result = np.zeros(cl.N_RESULTS, dtype=np.int64)
         parts: list[Rows] = []
         others: list[Event] = []
         while True:
-            result[ROWS] = result[OTHERS] = 0
+            result[cl.ROWS] = result[cl.OTHERS] = 0
             self._scan_records(
                 address, end, self._classes, self._layouts, rows, places, result)
             # now: a definition that follows may make them known
-            parts.append(self._decoded(data, rows[:result[ROWS]], places, others))
-            position = int(result[POSITION])
-            if result[STATUS] == CUT:
+            parts.append(self._decoded(data, rows[:result[cl.ROWS]], places, others))
+            position = int(result[cl.POSITION])
+            if result[cl.STATUS] == cl.CUT:
                 raise Damage('the records of a chunk do not fit into it', block.offset)
-            if result[STATUS] == DONE:
+            if result[cl.STATUS] == cl.DONE:
                 break
-            if result[STATUS] == DEFINITION:
+            if result[cl.STATUS] == cl.DEFINITION:
                 opcode, length = records.RECORD.unpack_from(data, position)
                 after = position + records.RECORD.size + length
                 self._define(opcode, data[position + records.RECORD.size:after], block)
                 self._classify()
-                result[POSITION] = after
-        self.messages += int(result[MESSAGES])
+                result[cl.POSITION] = after
+        self.messages += int(result[cl.MESSAGES])
         self.chunks += block.chunk
         return parts[0] if len(parts) == 1 else np.concatenate(parts), others
 
     def _decoded(self, data: bytes, rows: Rows, places: Rows, others: list[Event]) -> Rows:
         """Return a copy of rows; what is no row of numbers is decoded, or left out."""
         found = rows.copy()
-        rest = np.flatnonzero(found[:, KIND] == OTHER)
+        rest = np.flatnonzero(found[:, cl.KIND] == cl.OTHER)
         if not len(rest):
             return found
         known = np.ones(len(found), dtype=np.bool_)
         for row in rest.tolist():
-            start, after = places[found[row, THREAD]].tolist()
+            start, after = places[found[row, cl.THREAD]].tolist()
             channel = records.UINT16.unpack_from(data, start + records.RECORD.size)[0]
             before = len(others)
             self._add_any(others, channel, data[start:after])
             if len(others) > before:
-                found[row, TIME] = others[-1][1]
-                found[row, THREAD] = before
+                found[row, cl.TIME] = others[-1][1]
+                found[row, cl.THREAD] = before
             else:
                 known[row] = False
         return found[known]
@@ -156,13 +148,13 @@ class ColumnReading(Reading):
         channels = self._channels
         layouts = []
         for number in channels.passed_over:
-            self._classes[number] = PASSED_OVER
+            self._classes[number] = cl.PASSED_OVER
         for number, (head, size, unpack) in channels.fast.items():
-            layout = self._layout(self._kinds.get(head[0], OTHER), size, unpack)
+            layout = self._layout(self._kinds.get(head[0], cl.OTHER), size, unpack)
             if layout is not None:
-                self._classes[number] = FIRST_LAYOUT + len(layouts)
+                self._classes[number] = cl.FIRST_LAYOUT + len(layouts)
                 layouts.append(layout)
-        self._layouts = np.array(layouts, dtype=np.int64).reshape(-1, LAYOUT)
+        self._layouts = np.array(layouts, dtype=np.int64).reshape(-1, cl.LAYOUT)
 
     def _layout(self, kind: int, size: int, unpack: Any) -> list[int] | None:
         """Return the layout of a channel, None where it is none for rows."""
@@ -178,12 +170,12 @@ class ColumnReading(Reading):
             fields += (offset, length, _SIGNED[code])
             offset += length
         count = len(fields) // 3
-        if kind == OTHER or count >= ROW:
+        if kind == cl.OTHER or count >= cl.ROW:
             return None
-        return [kind, size, count, *fields, *[0] * (LAYOUT - L_FIRST - len(fields))]
+        return [kind, size, count, *fields, *[0] * (cl.LAYOUT - cl.L_FIRST - len(fields))]
 
     def _take(self, loaded: dict[int, Any], before: int | None) -> Columns:
-        """Take out the events before a time (None: all), in the order of time, then of the file."""
+        """Take out the events before a time (None: all), in the order of time."""
         parts: list[Rows] = []
         others: list[Event] = []
         for number in sorted(loaded):
@@ -191,18 +183,18 @@ class ColumnReading(Reading):
             rows = part.take(before)
             if len(rows):
                 if part.others:
-                    other = rows[:, KIND] == OTHER
-                    rows[other, THREAD] += len(others)
+                    other = rows[:, cl.KIND] == cl.OTHER
+                    rows[other, cl.THREAD] += len(others)
                     others += part.others
                 parts.append(rows)
             if not len(part):
                 del loaded[number]
         if not parts:
-            return Columns(np.empty((0, ROW), dtype=np.int64), [])
+            return Columns(np.empty((0, cl.ROW), dtype=np.int64), [])
         if len(parts) == 1:
             return Columns(parts[0], others)
         rows = np.concatenate(parts)
-        return Columns(rows[np.argsort(rows[:, TIME], kind='stable')], others)
+        return Columns(rows[np.argsort(rows[:, cl.TIME], kind='stable')], others)
 
 
 class _Loaded:
@@ -217,7 +209,7 @@ class _Loaded:
 
     def take(self, before: int | None) -> Rows:
         rows = self._rows
-        count = len(rows) if before is None or not len(rows) or rows[-1, TIME] < before else \
-            bisect_left(rows[:, TIME], before)
+        count = len(rows) if before is None or not len(rows) or rows[-1, cl.TIME] < before else \
+            bisect_left(rows[:, cl.TIME], before)
         self._rows = rows[count:]
         return rows[:count]

@@ -23,25 +23,9 @@ from __future__ import annotations
 from typing import Any
 
 from llvmlite import ir
+from mddag_executor.trace import column_layout as cl
 from numba import types
 from numba.extending import intrinsic
-
-# Columns of a row: when, what, thread, process, and the fields from there on.
-TIME, KIND, THREAD, PROCESS, FIELDS = range(5)
-ROW = 11
-OTHER = 0
-"""The kind of an event that is not decoded here; its thread is its place among those."""
-
-# What a channel's messages are; from FIRST_LAYOUT on: in which layout.
-UNKNOWN, PASSED_OVER, FIRST_LAYOUT = range(3)
-
-# Columns of a layout: kind, size, number of fields; then offset, size and sign of each field.
-L_KIND, L_SIZE, L_FIELDS, L_FIRST = range(4)
-LAYOUT = L_FIRST + 3 * ROW
-
-# What is handed back.
-POSITION, ROWS, MESSAGES, OTHERS, STATUS, N_RESULTS = range(6)
-DONE, DEFINITION, CUT, FULL = range(4)
 
 
 def _peek(width: int) -> Any:
@@ -64,7 +48,7 @@ def _peek(width: int) -> Any:
 peek1, peek2, peek4, peek8 = (_peek(width) for width in (1, 2, 4, 8))
 
 
-def number(address: int, size: int, signed: int) -> int:
+def read_number(address: int, size: int, signed: int) -> int:
     """Return the number of that size at an address; one of 8 bytes without a sign may wrap."""
     if size == 8:
         return peek8(address)
@@ -84,67 +68,67 @@ def scan_records(
     data: int, end: int, classes: Any, layouts: Any, rows: Any, others: Any, result: Any,
 ) -> None:
     """
-    Walk from ``result[POSITION]`` on: to the end, a definition, a record that is cut, or until
-    there is no room for more.
+    Walk on to the end, to a definition or a record that is cut, or until there is no room.
 
     :param data: address of the records; a few bytes after their end can be read.
     :param rows: what was found, one row for each event.
-    :param others: where the messages begin that are not decoded here.
+    :param others: where the messages begin and end that are not decoded here.
+    :param result: where to begin; then, how far it has come, and why no further.
     """
-    position = result[POSITION]
-    count = result[ROWS]
-    messages = result[MESSAGES]
-    n_others = result[OTHERS]
-    status = DONE
+    position = result[cl.POSITION]
+    count = result[cl.ROWS]
+    messages = result[cl.MESSAGES]
+    n_others = result[cl.OTHERS]
+    status = cl.DONE
     while position < end:
         at = data + position
         opcode = peek1(at)
         length = peek8(at + 1)
         if length < 0 or length > end - position - 9:
-            status = CUT
+            status = cl.CUT
             break
         after = position + 9 + length
         if opcode == 5:
             messages += 1
             what = classes[peek2(at + 9)]
-            if what != PASSED_OVER:
+            if what != cl.PASSED_OVER:
                 if count == len(rows):
                     messages -= 1
-                    status = FULL
+                    status = cl.FULL
                     break
-                layout = what - FIRST_LAYOUT
-                rows[count, TIME] = 0
+                layout = what - cl.FIRST_LAYOUT
+                rows[count, cl.TIME] = 0
                 if (layout >= 0 and peek2(at + 31) == 0x0100
-                        and position + 35 + layouts[layout, L_SIZE] <= after):
+                        and position + 35 + layouts[layout, cl.L_SIZE] <= after):
                     fields = at + 35
-                    rows[count, KIND] = layouts[layout, L_KIND]
-                    place = L_FIRST
-                    for i in range(layouts[layout, L_FIELDS]):
-                        value = number(fields + layouts[layout, place],
+                    rows[count, cl.KIND] = layouts[layout, cl.L_KIND]
+                    place = cl.L_FIRST
+                    for i in range(layouts[layout, cl.L_FIELDS]):
+                        value = read_number(fields + layouts[layout, place],
                                        layouts[layout, place + 1], layouts[layout, place + 2])
                         # time, process, thread: as they stand in the message
                         column = i
                         if i == 1:
-                            column = PROCESS
+                            column = cl.PROCESS
                         elif i == 2:
-                            column = THREAD
+                            column = cl.THREAD
                         elif i > 2:
                             column = i + 1
                         rows[count, column] = value
                         place += 3
                 else:
-                    rows[count, KIND] = OTHER
-                    rows[count, THREAD] = n_others
+                    rows[count, cl.KIND] = cl.OTHER
+                    rows[count, cl.THREAD] = n_others
                     others[n_others, 0] = position
                     others[n_others, 1] = after
                     n_others += 1
                 count += 1
         elif opcode == 3 or opcode == 4:
-            status = DEFINITION
+            status = cl.DEFINITION
             break
         position = after
-    result[POSITION] = position
-    result[ROWS] = count
-    result[MESSAGES] = messages
-    result[OTHERS] = n_others
-    result[STATUS] = status
+    result[cl.POSITION] = position
+    result[cl.ROWS] = count
+    result[cl.MESSAGES] = messages
+    result[cl.OTHERS] = n_others
+    result[cl.STATUS] = status

@@ -20,17 +20,21 @@ The reading itself, with its orders and what it does on damage, is in `reading`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 import os
 import stat
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TYPE_CHECKING
 import warnings
 
-from mddag_executor.trace.blocks import open_data, read_summary, scan
+from mddag_executor.trace.blocks import open_data, read_summary
+from mddag_executor.trace.blocks import scan as scan_blocks
 from mddag_executor.trace.channels import Channels, Event
 from mddag_executor.trace.errors import TraceError, TraceWarning
 from mddag_executor.trace.reading import Reading
+
+if TYPE_CHECKING:
+    from mddag_executor.trace.columns import Columns
 
 _TASK_SET = 'mddag:task_set'
 _PROCESS = 'mddag:process'
@@ -128,15 +132,34 @@ class TraceReader:
         """
         return self._read(Channels(None if names is None else set(names), False), True)
 
+    def columns(self, names: Iterable[str], kinds: Mapping[str, int], scan: Any
+                ) -> Iterator[Columns]:
+        """
+        Yield what ``events`` yields in the order of time, as rows of numbers, for compiled code.
+
+        :param kinds: see ``columns.ColumnReading``, as for `scan`.
+        """
+        from mddag_executor.trace.columns import ColumnReading
+        channels = Channels(set(names), True)
+        reading = ColumnReading(self.path, channels, kinds, scan)
+        self.fields = channels.fields
+        with open_trace(self.path) as (stream, size):
+            blocks = scan_blocks(stream, open_data(stream, self.path, size), size)
+            yield from reading.columns(stream, blocks)
+        self._warn(reading, size)
+
     def _read(self, channels: Channels, in_time_order: bool) -> Iterator[Event]:
         reading = Reading(self.path, channels)
         self.fields = channels.fields
         with open_trace(self.path) as (stream, size):
-            blocks = scan(stream, open_data(stream, self.path, size), size)
+            blocks = scan_blocks(stream, open_data(stream, self.path, size), size)
             if in_time_order:
                 yield from reading.by_time(stream, blocks)
             else:
                 yield from reading.by_file(stream, blocks)
+        self._warn(reading, size)
+
+    def _warn(self, reading: Reading, size: int) -> None:
         for text in (self._missing(reading, size), reading.undecoded()):
             if text and text not in self.warnings:
                 self.warnings.append(text)

@@ -118,7 +118,7 @@ def test_once_shows_another_process(running: Any, mddag: Mddag):
     assert found['mddag: main']['values']['period_ms'] == '20.000'
     done = mddag('top', '--once')
     assert done.returncode == 0 and re.search(r'/\d+ +mddag: main +\w+ +20.000 ', done.stdout)
-    done = mddag('top', '--duration', '3500ms')
+    done = mddag('top', '--duration', '5s')
     assert done.returncode == 0 and done.stdout.count('workers of') >= 2
 
 

@@ -25,8 +25,10 @@ import json
 import os
 from pathlib import Path
 import subprocess
+from types import SimpleNamespace
 
 from mddag_executor.cli.main import user_line
+from mddag_executor.cli.top import Board, MOST_STATUSES
 from mddag_executor.replay import replay
 from mddag_executor.trace import read_events, TraceFile
 from mddag_executor.trace.schema import EVENTS
@@ -192,3 +194,21 @@ def test_names_of_files_are_shown_harmless(mddag: Mddag, tmp_path: Path) -> None
         assert done.returncode == 0, done.stderr
         harmless(done.stdout)
         harmless(done.stderr)
+
+
+def test_whoever_floods_the_diagnostics_fills_no_memory() -> None:
+    board = Board()
+
+    def say(process: str) -> None:
+        board.take(SimpleNamespace(status=[SimpleNamespace(
+            hardware_id=process, name='mddag: d', level=b'\0', message='',
+            values=[SimpleNamespace(key='window_missed_ratio', value='0')])]))
+
+    say('robot')
+    for i in range(3 * MOST_STATUSES):
+        say(f'flood {i}')
+        if i % 500 == 0:
+            say('robot')
+    shown = [status.process for status in board.statuses()]
+    assert len(shown) == MOST_STATUSES
+    assert 'robot' in shown and f'flood {3 * MOST_STATUSES - 1}' in shown

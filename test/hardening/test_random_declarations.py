@@ -15,7 +15,8 @@
 Random declarations through every verb that reads one: done or refused in one line, no traceback.
 
 Half of them are put together from the words of the language, most of which make no sense, half
-come from `mddag generate` and are then damaged. `HARDENING_EXAMPLES=10000` draws that many.
+come from `mddag generate` and are then damaged. `HARDENING_EXAMPLES=10000` draws that many
+of each.
 """
 
 from __future__ import annotations
@@ -32,17 +33,19 @@ from mddag_executor.cli import main as program
 from mddag_executor.cli.text import printable
 import yaml
 
-EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '150'))
+EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '60'))
 TOPICS = ['/a', '/b', '/c', '/d', '/e']
 NAMES = ['t', 'u', 'v', 'w', 'x']
 TIMES = ['1us', '7us', '1ms', '10ms', '33.3ms', '999.999ms', '1s', '86400s', '1440min', '0.5ms']
 VERBS = (
     ('graph', 'check'), ('graph', 'analyse'), ('graph', 'fmt'),
     ('graph', 'draw', '-o', 'out.mmd'), ('graph', 'draw', '-o', 'out.dot'),
-    ('graph', 'assign-deadlines', '-o', 'out.yaml'),
+    ('graph', 'assign-deadlines', '--runs', '2', '--jobs', '1', '--duration', '300us', '-o',
+     'out.yaml'),
     ('simulate', '--duration', '300us', '--workers', '2'),
     ('simulate', '--duration', '300us', '--policy', 'llf', '--preemptive', '--trace', 'out.mcap'),
-    ('evaluate', '--runs', '2', '--duration', '300us', '--policies', 'rad,fifo', '--core', 'plain'),
+    ('evaluate', '--runs', '2', '--duration', '300us', '--policies', 'rad', '--core', 'plain',
+     '--jobs', '1'),
 )
 
 
@@ -91,10 +94,12 @@ def composed(draw: st.DrawFn) -> str:
 
 def run(*arguments: str) -> tuple[int, str, str]:
     """Run a verb in this process."""
-    out, err = io.StringIO(), io.StringIO()
+    out, err = (io.TextIOWrapper(io.BytesIO(), 'utf-8', newline='\n') for _ in range(2))
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         status = program.main(arguments)
-    return status, out.getvalue(), err.getvalue()
+    for stream in (out, err):
+        stream.seek(0)
+    return status, out.read(), err.read()
 
 
 def through_all_verbs(text: str) -> int:
@@ -128,7 +133,7 @@ def test_composed(text: str) -> None:
     ['', 'cut', 'double', 'number', 'word']))
 def test_generated_and_damaged(seed: int, place: int, how: str) -> None:
     status, text, err = run('generate', '--seed', str(seed), '--dags', '1:3', '--vertices', '1:6',
-                            '--utilisation', '0.1:3')
+                            '--utilisation', str(0.1 + seed % 4 / 10), '--workers', '2')
     assert status == 0, err
     lines = text.splitlines(keepends=True)
     row = place % len(lines)

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from mddag_executor.live.waitset import WaitSetIntake
 import pytest
 from rclpy.context import Context
 from rclpy.node import Node
@@ -52,3 +53,20 @@ def other(ros_context: Context) -> Iterator[Node]:
     made = make_node(ros_context)
     yield made
     made.destroy_node()
+
+
+@pytest.fixture
+def bare_node(ros_context: Context) -> Iterator[Node]:
+    """Give a node that has nothing but what the test makes."""
+    made = make_node(ros_context, start_parameter_services=False, enable_rosout=False)
+    yield made
+    made.destroy_node()
+
+
+@pytest.fixture
+def timer_intake(ros_context: Context, recorder: Recorder) -> Iterator[WaitSetIntake]:
+    """Give an intake of timers only, which is what EventsIntake has for them."""
+    made = WaitSetIntake(ros_context, recorder, kinds={'timer'})
+    yield made
+    made.stop()
+    assert not recorder.errors

@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 import threading
 import time
 from typing import Any
@@ -33,19 +32,13 @@ from .helpers import make_node, matched, MS, nothing, Recorder, text, topic, wai
 
 
 @pytest.fixture
-def node(ros_context: Context) -> Iterator[Node]:
-    made = make_node(ros_context, start_parameter_services=False, enable_rosout=False)
-    yield made
-    made.destroy_node()
+def node(bare_node: Node) -> Node:
+    return bare_node
 
 
 @pytest.fixture
-def intake(ros_context: Context, recorder: Recorder) -> Iterator[WaitSetIntake]:
-    """Give an intake of timers only, which is what EventsIntake has for them."""
-    made = WaitSetIntake(ros_context, recorder, kinds={'timer'})
-    yield made
-    made.stop()
-    assert not recorder.errors
+def intake(timer_intake: WaitSetIntake) -> WaitSetIntake:
+    return timer_intake
 
 
 def on_grid(dues: list[int], period: int) -> bool:
