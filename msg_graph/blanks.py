@@ -37,7 +37,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 
-from msg_graph.duration import exact_duration, format_duration
+from msg_graph.duration import DAY, exact_duration, format_duration, MICROSECOND
 from msg_graph.errors import printable
 from msg_graph.fields import check_path
 from msg_graph.flat import quantiles_text
@@ -134,7 +134,11 @@ class _Writer:
             if callback.guessed:
                 return (f'        timer: {_rounded(callback.interval_ns or 0)}  # {MARK}: is this '
                         f'a timer? Proposed: the measured {_measured(callback)}')
-            return f'        timer: {exact_duration(callback.period_ns or 0)}'
+            period_ns = callback.period_ns or 0
+            if not MICROSECOND <= period_ns <= DAY:
+                return (f'        # timer: 100ms  # {MARK}: its period is said to be '
+                        f'{exact_duration(period_ns)}')
+            return f'        timer: {exact_duration(period_ns)}'
         if callback.kind == 'sync':
             return f'        sync: [{", ".join(callback.starts)}]'
         return f'        {callback.kind}: {callback.starts[0]}'

@@ -106,6 +106,8 @@ def format_duration(ns: int) -> str:
 
 
 def exact_duration(ns: int) -> str:
-    """Return a time that ``parse_duration`` reads back as just this one."""
+    """Return a time that ``parse_duration`` reads back as just this one, if it is one at all."""
     text = format_duration(ns)
-    return text if parse_duration(text, minimum_ns=0) == ns else f'{ns}ns'
+    if 0 <= ns <= DAY and parse_duration(text, minimum_ns=0) == ns:
+        return text
+    return f'{ns}ns'

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 import shutil
 import subprocess
@@ -35,8 +36,10 @@ def suite(tmp_path: Path) -> Path:
 
 
 def run(suite: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    # This session may be a part of one that runs side by side.
+    env = {k: v for k, v in os.environ.items() if not k.startswith('PYTEST_XDIST')}
     return subprocess.run([sys.executable, '-m', 'pytest', *arguments], cwd=suite, text=True,
-                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
+                          env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
 
 
 def test_a_thread_that_stays_is_found(suite: Path) -> None:

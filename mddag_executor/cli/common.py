@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from msg_graph import TaskSet
 
 STDIN = '<stdin>'
+MOST_BYTES = 64 << 20
+"""Of declarations, architecture files and tables of execution times; traces are not read so."""
 _read_already: object = None  # the stream that was standard input when it was read
 
 
@@ -52,11 +54,18 @@ def read_bytes(path: str) -> tuple[str, bytes]:
     Return the name for messages and the content of a file, or of standard input for `-`.
 
     :raises OSError: when the file cannot be read
+    :raises mddag_executor.errors.InputError: when it is larger than any declaration, or endless
     :raises mddag_executor.errors.UsageError: when standard input was read already
     """
     if path != '-':
-        return path, Path(path).read_bytes()
-    return STDIN, _claim_stdin().read()
+        name = path
+        with open(path, 'rb') as file:
+            data = file.read(MOST_BYTES + 1)
+    else:
+        name, data = STDIN, _claim_stdin().read(MOST_BYTES + 1)
+    if len(data) > MOST_BYTES:
+        raise InputError(name, f'it is larger than {MOST_BYTES >> 20} MiB', 'name the right file')
+    return name, data
 
 
 def read_text(path: str) -> tuple[str, str]:
@@ -74,22 +83,6 @@ def read_text(path: str) -> tuple[str, str]:
         line = data.count(b'\n', 0, error.start) + 1
         raise InputError(name, 'this is not UTF-8 text', 'save the file as UTF-8',
                          line=line) from None
-
-
-def read_json(path: str) -> Any:
-    """
-    Return the content of a JSON file, or of standard input for `-`.
-
-    :raises mddag_executor.errors.InputError: when it is no JSON
-    """
-    name, text = read_text(path)
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(name, f'this is not JSON: {error.msg}', 'correct the file',
-                         line=error.lineno) from None
-    except RecursionError:
-        raise InputError(name, 'the JSON is nested too deeply', 'correct the file') from None
 
 
 def load_graph(path: str) -> TaskSet:

@@ -159,10 +159,14 @@ class DirectTakes:
     Not thread-safe: the intake calls it under a lock of its own.
 
     :param on_change: called from any thread when it has to be chosen anew.
+    :param ok: whether the context is still there; without it nothing is looked after.
     """
 
-    def __init__(self, receiver: Receiver, on_change: Callable[[], None]) -> None:
+    def __init__(
+        self, receiver: Receiver, on_change: Callable[[], None], ok: Callable[[], bool]
+    ) -> None:
         install()
+        self._ok = ok
         self._receiver = receiver
         self._on_change = on_change
         self._known: dict[int, Direct] = {}
@@ -213,7 +217,7 @@ class DirectTakes:
         return self._rest(entities, chosen)
 
     def _look_after(self, stopping: threading.Event) -> None:
-        while not stopping.wait(LOOK_S):
+        while not stopping.wait(LOOK_S) and self._ok():
             changed = False
             for key, direct in list(self._known.items()):
                 if key in self._chosen:
@@ -229,13 +233,19 @@ class DirectTakes:
             if direct is not None:
                 direct.take(0)
 
-    def stop(self) -> None:
-        """Have publishers take no more; the intake has been stopped, or looks after all."""
+    def stop(self) -> threading.Thread | None:
+        """
+        Have publishers take no more; the intake has been stopped, or looks after all.
+
+        :return: a thread that ends soon; to be joined without the intake's lock.
+        """
         self._set_takes({}, {})
         self._stopping.set()
-        self._stopping, self._thread = threading.Event(), None
+        thread, self._thread = self._thread, None
+        self._stopping = threading.Event()
         self._known = {}
         self._before = self._left = None
+        return thread
 
     def _direct(self, subscription: Subscription) -> Direct | None:
         key = id(subscription)

@@ -215,7 +215,7 @@ class EventsIntake:
         self._lock = threading.RLock()
         self._given = EMPTY
         self._latest = EMPTY
-        self._direct = DirectTakes(receiver, self._choose_again)
+        self._direct = DirectTakes(receiver, self._choose_again, context.ok)
         self._running = False
         self._parts: dict[str, Any] = {}
         self._ending: list[Any] = []
@@ -334,11 +334,13 @@ class EventsIntake:
         """
         with self._lock:
             self._running = False
-            self._direct.stop()
+            looker = self._direct.stop()
             parts, self._parts = self._parts, {}
             self._ending = [part for part in parts.values() if isinstance(part, _NativeThread)]
         for part in parts.values():
             part.stop()
+        if looker is not None and looker is not threading.current_thread():
+            looker.join()
 
 
 class _Probe:

@@ -41,7 +41,7 @@ from dataclasses import dataclass
 import time
 from typing import Any
 
-from mddag_executor.core.tally import quantile
+from mddag_executor.core.tally import quantile, quantiles_us
 from mddag_executor.live.execution import ExecutionPlan
 from msg_graph import Dag, TaskSet, Vertex
 
@@ -134,7 +134,7 @@ def measure(
         'missing': totals['missing'],
         'on_time_ratio': totals['on_time'] / due if due else None,
         **_throughput(ledger, plan, start, end),
-        'source_delay_us': _quantiles_us([d for delays in ledger.delays for d in delays]),
+        'source_delay_us': quantiles_us([d for delays in ledger.delays for d in delays]),
         'attribution': {
             'wrong': len(ledger.misattributed), 'none': len(ledger.unattributed)},
         'dags': dags}
@@ -203,12 +203,3 @@ def _taken(ledger: Ledger, plan: ExecutionPlan) -> float:
             vertex.dag, vertex.index)
         total += mean / ledger.task_set.dags[vertex.dag].period_ns
     return total / plan.workers
-
-
-def _quantiles_us(values: list[int]) -> dict[str, float] | None:
-    if not values:
-        return None
-    ordered = sorted(values)
-    return {
-        'p50': quantile(ordered, 0.5) / 1000, 'p99': quantile(ordered, 0.99) / 1000,
-        'max': ordered[-1] / 1000}

@@ -45,6 +45,7 @@ from mddag_executor.replay.recording import Recording
 from mddag_executor.replay.seen import Seen
 from mddag_executor.replay.usage import share, Usage
 from mddag_executor.replay.waits import GroupWaits
+from mddag_executor.simulate.compiled import available
 from msg_graph import TaskSet
 
 Progress = Callable[[int], None]
@@ -152,37 +153,39 @@ def replay(
     name: str | None = None,
     progress: Progress | None = None,
     watcher: Watcher | None = None,
+    compiled: bool | None = None,
 ) -> Replay:
     """
     Replay a trace as recorded.
 
-    Memory depends on the jobs that are open at one time, and on the number of sinks' completions
-    (their response times are kept), not on the trace's length.
+    Memory depends on the jobs that are open at one time, on the number of sinks' completions
+    (their response times are kept) and, where paths are declared, on that of their flows.
 
     :param path: a trace of this executor, or an imported one.
     :param task_set: the declaration that judges; None: the one in the trace, if it has one.
     :param name: what messages call the trace, where that is not its path.
     :param progress: told now and then how many events have been read.
     :param watcher: who else is told of the run.
+    :param compiled: whether to use compiled code where that can be; None: for long traces.
     :raises mddag_executor.trace.TraceError: when it is no trace.
     :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, or none of
         the declaration's callbacks.
     """
-    return replay_recording(open_recording(path, name), task_set, progress, watcher)
+    return replay_recording(open_recording(path, name), task_set, progress, watcher, compiled)
 
 
 def replay_recording(
     recording: AnyRecording, task_set: TaskSet | None, progress: Progress | None = None,
-    watcher: Watcher | None = None,
+    watcher: Watcher | None = None, compiled: bool | None = None,
 ) -> Replay:
     """
     Replay an open recording as recorded; see ``replay``.
 
-    A long trace of this executor is replayed in compiled code, where nobody watches.
+    Only a trace of this executor is replayed in compiled code, and only where nobody watches.
     """
     mapping = map_recording(recording, task_set)
-    if (watcher is None and isinstance(recording, Recording)
-            and worth_it(recording.message_count)):
+    if watcher is None and isinstance(recording, Recording) and (
+            worth_it(recording.message_count) if compiled is None else compiled and available()):
         found = replay_compiled(recording, mapping, progress)
         if found is not None:
             return found
@@ -199,7 +202,8 @@ def replay_compiled(
     recording: Recording, mapping: AnyMapping, progress: Progress | None = None
 ) -> Replay | None:
     """Replay a recording in compiled code; None where that can only be done in Python."""
-    from mddag_executor.replay.fast import Declined, FastReplay
+    from mddag_executor.replay.fast import FastReplay
+    from mddag_executor.replay.fast_arrays import Declined
     assert isinstance(mapping, Mapping)
     parts = _Parts(recording, mapping, None)
     follower = parts.follower

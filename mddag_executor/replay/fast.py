@@ -40,7 +40,7 @@ from mddag_executor.core.state import State
 from mddag_executor.replay import fast_work as fw
 from mddag_executor.replay.chains import Breakdown, Step, Worst
 from mddag_executor.replay.drift import WatchedRecording
-from mddag_executor.replay.fast_arrays import grown, Header, make_work, Numbers
+from mddag_executor.replay.fast_arrays import Declined, grown, Header, make_work, Numbers
 from mddag_executor.replay.fast_compile import entries
 from mddag_executor.replay.follower import Event, Execution, Follower
 from mddag_executor.replay.groups import RecordedGroups
@@ -54,11 +54,8 @@ from mddag_executor.trace.columns import Columns
 import numpy as np
 
 _MASK = 2 ** 64 - 1
+_MDDAG = 'mddag:'         # events that name no entities
 _HOSTED = 'mddag:hosted'
-
-
-class Declined(Exception):
-    """Something is for the plain replay; inside this package only."""
 
 
 class FastReplay:
@@ -158,7 +155,7 @@ class FastReplay:
     def _take_away(self) -> None:
         """Count what has been decided, and missed, and ran."""
         scalars = self._work.scalars
-        decisions = self._state.rows(State._fields.index('decisions'), 6)
+        decisions: Any = self._state.rows(State._fields.index('decisions'), 6)
         if decisions:
             self._judge.tally.add(decisions)
         for side, *miss in self._work.misses[:scalars[fw.N_MISSES]].tolist():
@@ -172,7 +169,7 @@ class FastReplay:
 
     def _other(self, event: Event) -> None:
         name = event[0]
-        if None in event or name in fw.KINDS or name == _HOSTED or not 0 <= event[1] < NEVER:
+        if None in event or name in fw.KINDS or not 0 <= event[1] < NEVER:
             raise Declined
         if self._watched is not None:
             if name == 'ros2:rcl_publisher_init':
@@ -190,9 +187,12 @@ class FastReplay:
         scalars[fw.SHUT_DOWN] = follower.shut_down
         if follower.strange:
             raise Declined
+        if name == _HOSTED:
+            for column, values in self._judge.expected.items():
+                self._state.write(State._fields.index(column), values)
         if follower.shut_down and not self._finished:
             self._finish(follower.end)
-        self._stale = True
+        self._stale = self._stale or not name.startswith(_MDDAG)
 
     def _refresh(self) -> None:
         """Tell the compiled code what is known of callbacks and publishers."""

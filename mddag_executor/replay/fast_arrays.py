@@ -32,8 +32,10 @@ from msg_graph import TaskSet
 import numpy as np
 
 _HOPS = {'trigger': fw.TRIGGER, 'topic': fw.TOPIC, 'variable': fw.VARIABLE}
-_TABLES = ('threads', 'open', 'slots', 'recent', 'callbacks', 'pairs', 'path_jobs', 'publishers')
-_RUNS = 6       # of a vertex in a job that are kept at least
+_TABLES = ('threads', 'ongoing', 'slots', 'recent', 'callbacks', 'pairs', 'path_jobs', 'publishers')
+_RUNS = 3       # of a vertex in a job that are kept at least
+_MOST_PLACES = 2 ** 16
+_MOST_NUMBERS = 2 ** 24     # that are kept of all jobs
 
 
 def array(values: Sequence[Any]) -> Any:
@@ -50,6 +52,10 @@ def _rows(lists: Sequence[Sequence[int]]) -> tuple[Any, Any]:
 def zeros(*shape: int) -> Any:
     """Return an array of zeros."""
     return np.zeros(shape, dtype=np.int64)
+
+
+class Declined(Exception):
+    """Something is for the plain replay; inside of the compiled one only."""
 
 
 class Numbers:
@@ -127,7 +133,7 @@ class Numbers:
             places = range(v_places[i], v_places[i + 1])
             if places:
                 runs[i] = width
-                most[i] = max(_RUNS, 3 * len(vertex.callback.topics))
+                most[i] = max(_RUNS, 2 * len(vertex.callback.topics))
                 width += 1 + int(most[i]) * (1 + len(places))
                 for j in places:
                     for topic in np.flatnonzero(publish_topics[v_place[j]]).tolist():
@@ -135,6 +141,8 @@ class Numbers:
                         width += 1
             wide = max(wide, width)
         rows = fw.KEEP_JOBS if self._task_set.paths else 1
+        if rows * wide > _MOST_NUMBERS or self._first_place[-1] >= _MOST_PLACES:
+            raise Declined
         return {
             'v_places': v_places, 'v_place': v_place, 'v_topics': v_topics, 'v_topic': v_topic,
             'v_publishes': v_publishes, 'v_publish': v_publish, 'v_befores': v_befores,
@@ -156,7 +164,8 @@ class Numbers:
         flows_of(header.address, -1, -1, marks, none)
         found = []
         for first, last in zip(self._first_place, self._first_place[1:]):
-            rows = np.empty((flows_of(header.address, first, last, marks, none), 4), dtype=np.int64)
+            n = flows_of(header.address, first, last, marks, none)
+            rows = np.empty((n, 4), dtype=np.int64)
             if len(rows):
                 flows_of(header.address, first, last, marks, rows)
             found.append(FlowColumns(*rows.T))
@@ -170,6 +179,7 @@ def make_work(
     scalars = zeros(fw.N_SCALARS)
     scalars[[fw.BEGIN, fw.FIRST]] = -1
     scalars[fw.COUNTED] = -1
+    scalars[fw.REGION] = max(judge.tables.n_region)
     scalars[fw.COMPARE] = judge.compare
     scalars[fw.HAS_PATHS] = bool(paths.book)
     tables = judge.tables
@@ -218,7 +228,7 @@ def _mapped(mapping: Mapping) -> dict[str, Any]:
 
 
 def _befores(judge: Judge) -> dict[str, Any]:
-    before_legs, _ = _rows(judge.chains.before)
+    before_legs = array([0, *accumulate(map(len, judge.chains.before))])
     before_first, before = _rows([leg for legs in judge.chains.before for leg in legs])
     return {'before_legs': before_legs, 'before_first': before_first, 'before': before}
 
@@ -238,7 +248,7 @@ def grown(work: Work, executions: int, copy: Callable[..., None]) -> Work:
             old, new = Header(table), Header(larger[name])
             copy(old.address, new.address)
     work.scalars[fw.FULL] = 0
-    need = executions + 2 * len(work.before_legs) + len(work.legs) + 16
+    need = executions + int(work.scalars[fw.REGION])
     if need > len(work.chain):
         larger['chain'] = zeros(2 * need, fw.N_CHAIN)
         larger['chain'][:len(work.chain)] = work.chain

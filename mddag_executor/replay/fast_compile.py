@@ -25,16 +25,21 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from mddag_executor.simulate.compiled import available, cached_entries, compile_elsewhere
-from mddag_executor.simulate.compiled import entries_of
+from mddag_executor.simulate.compiled import (
+    available,
+    cached_entries,
+    compile_elsewhere,
+    entries_of,
+    keeps_entries,
+)
 
 _KERNELS = tuple(f'mddag_executor.{name}' for name in (
     'simulate.kernel', 'trace.columns_kernel', 'replay.fast_tables', 'replay.fast_paths',
     'replay.fast_threads', 'replay.fast_core', 'replay.fast_kernel'))
 _SOURCES = (*_KERNELS, 'mddag_executor.trace.column_layout', 'mddag_executor.replay.fast_work',
             'mddag_executor.replay.fast_types')
-_ENTRIES = ('advance', 'begin_run', 'finish_run', 'copy_table', 'set_callback', 'set_publisher', 'flows_of',
-            'scan', 'free_core')
+_ENTRIES = ('advance', 'begin_run', 'finish_run', 'copy_table', 'set_callback', 'set_publisher',
+            'flows_of', 'scan', 'free_core')
 _NOTHING = """\
 mddag: 1
 nodes:
@@ -55,12 +60,16 @@ def worth_it(messages: int | None) -> bool:
     """Tell whether to replay a trace of so many messages with compiled code."""
     if messages is None or messages < WORTH_LOADING or not available():
         return False
-    if cached_entries(_SOURCES, 'advance'):
-        return True
-    if messages < WORTH_COMPILING:
-        return False
-    compile_elsewhere(__name__)
+    if messages >= WORTH_COMPILING:
+        prepare()
     return cached_entries(_SOURCES, 'advance')
+
+
+def prepare() -> None:
+    """Compile, if that has not been done and what is compiled can be kept."""
+    if (available() and not cached_entries(_SOURCES, 'advance')
+            and keeps_entries(_SOURCES)):
+        compile_elsewhere(__name__)
 
 
 @cache

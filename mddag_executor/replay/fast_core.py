@@ -32,6 +32,7 @@ from mddag_executor.simulate.structures import key_of_policy
 
 
 def on_release(t: Any, s: Any, w: Any, now: int, dag: int, job: int, release: int) -> bool:
+    """Take in the release of a job; False where it is for Python."""
     if not 0 <= dag < len(w.map_dag):
         return False
     w.releases[dag, 1] = release if w.releases[dag, 0] == 0 else min(w.releases[dag, 1], release)
@@ -66,7 +67,9 @@ def on_release(t: Any, s: Any, w: Any, now: int, dag: int, job: int, release: in
 
 
 def on_complete(t: Any, s: Any, w: Any, now: int, thread: int, i: int) -> bool:
-    dag, vertex, job, end, leg = w.rows[i, 5], w.rows[i, 6], w.rows[i, 7], w.rows[i, 9], w.rows[i, 10]
+    """Take in a completion; False where it is for Python."""
+    dag, vertex, job = w.rows[i, 5], w.rows[i, 6], w.rows[i, 7]
+    end, leg = w.rows[i, 9], w.rows[i, 10]
     place = mapped(w, dag, vertex)
     if place < 0 or not 0 <= end <= now:
         return False
@@ -76,21 +79,24 @@ def on_complete(t: Any, s: Any, w: Any, now: int, thread: int, i: int) -> bool:
     dag = w.map_dag[dag]
     leg = w.legs[w.map_legs[place] + leg]
     row = find(w.threads, thread, 0, 0, 0)
-    known = (row >= 0 and w.threads[row, fw.T_LAST] != 0 and w.threads[row, fw.T_LAST_DAG] == dag
-             and w.threads[row, fw.T_LAST_VERTEX] == vertex and w.threads[row, fw.T_LAST_JOB] == job)
+    known = (row >= 0 and w.threads[row, fw.T_LAST] != 0
+             and w.threads[row, fw.T_LAST_DAG] == dag
+             and w.threads[row, fw.T_LAST_VERTEX] == vertex
+             and w.threads[row, fw.T_LAST_JOB] == job)
     waited = 0
     if known:
-        execution = find(w.open, dag, vertex, job, w.threads[row, fw.T_LAST_READY])
+        execution = find(w.ongoing, dag, vertex, job, w.threads[row, fw.T_LAST_READY])
         if execution >= 0:
-            waited = w.open[execution, fw.O_WAITED]
+            waited = w.ongoing[execution, fw.O_WAITED]
             w.scalars[fw.N_WAITED] -= 1 if waited != 0 else 0
-            remove(w.open, execution)
+            remove(w.ongoing, execution)
             w.counts[fw.OPEN] -= 1
         if w.threads[row, fw.T_LAST_ID] != w.scalars[fw.COUNTED]:
             w.scalars[fw.COUNTED] = w.threads[row, fw.T_LAST_ID]
             use = w.use_of[vertex]
             w.use[use, fw.U_RAN] += 1
-            w.use[use, fw.U_LONGEST] = max(w.use[use, fw.U_LONGEST], w.threads[row, fw.T_LAST_BUSY])
+            w.use[use, fw.U_LONGEST] = max(
+                w.use[use, fw.U_LONGEST], w.threads[row, fw.T_LAST_BUSY])
     found = find(w.slots, dag, job, 0, 0)
     if found < 0:
         if job > w.judge_newest[dag]:
@@ -104,13 +110,15 @@ def on_complete(t: Any, s: Any, w: Any, now: int, thread: int, i: int) -> bool:
     seen = len(s.decisions)
     rules.admit(s, x, end)
     if rules.complete(t, s, key_of_policy, x, end) and known:
-        keep_step(w, s.job_base[slot] + t.region_offset[vertex], leg, w.threads[row, fw.T_LAST_READY],
-              w.threads[row, fw.T_LAST_START], w.threads[row, fw.T_LAST_END],
-              w.threads[row, fw.T_LAST_BUSY], waited)
+        keep_step(
+            w, s.job_base[slot] + t.region_offset[vertex], leg, w.threads[row, fw.T_LAST_READY],
+            w.threads[row, fw.T_LAST_START], w.threads[row, fw.T_LAST_END],
+            w.threads[row, fw.T_LAST_BUSY], waited)
     return take_decisions(t, s, w, slot, seen)
 
 
 def on_job_end(t: Any, s: Any, w: Any, now: int, dag: int, job: int, aborted: bool) -> bool:
+    """Take in the expiry or abort of a job; False where it is for Python."""
     if not 0 <= dag < len(w.map_dag):
         return False
     dag = w.map_dag[dag]
@@ -130,6 +138,7 @@ def on_job_end(t: Any, s: Any, w: Any, now: int, dag: int, job: int, aborted: bo
 
 
 def on_deadline(w: Any, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
+    """Take in a recorded miss."""
     if w.scalars[fw.COMPARE] == 0:
         return
     place = mapped(w, dag, vertex)
@@ -144,6 +153,7 @@ def on_deadline(w: Any, dag: int, vertex: int, job: int, deadline: int, complete
 def note_miss(
     w: Any, side: int, dag: int, vertex: int, job: int, deadline: int, completed: int
 ) -> None:
+    """Hand over a miss that was found here (side 1) or recorded (-1)."""
     n = w.scalars[fw.N_MISSES]
     w.misses[n, 0] = side
     w.misses[n, 1] = dag
@@ -194,6 +204,8 @@ def sink_done(t: Any, s: Any, w: Any, slot: int, vertex: int, job: int, complete
             after = w.chain[base + t.region_offset[w.walk[k - 1]], fw.K_READY]
             published = min(end, after)
             transport += after - published
+        if max(abs(ready - release), abs(start - release), abs(published - release)) >= fw.LIMIT:
+            return False
         pause = 0
         if w.chain[x, fw.K_LEG] >= 0:
             pause = max(0, min(end - start - w.chain[x, fw.K_BUSY], published - start))
@@ -223,8 +235,9 @@ def sink_done(t: Any, s: Any, w: Any, slot: int, vertex: int, job: int, complete
         for k in range(n):
             v = w.walk[n - 1 - k]
             w.worst[vertex * len(w.walk) + k, 0] = v
+            x = base + t.region_offset[v]
             for column in range(1, fw.N_CHAIN):
-                w.worst[vertex * len(w.walk) + k, column] = w.chain[base + t.region_offset[v], column]
+                w.worst[vertex * len(w.walk) + k, column] = w.chain[x, column]
     return True
 
 

@@ -84,10 +84,11 @@ def advance(tables: int, state: int, work: int, i: int) -> int:
 
 def has_room(t: Any, s: Any, w: Any) -> int:
     """Tell whether there is room for what an event may bring, whatever it is."""
-    if w.scalars[fw.FULL] != 0 or len(s.x_slot) + t.n_vertices * 2 + len(w.legs) + 8 > len(w.chain):
+    executions = len(s.x_slot) + w.scalars[fw.REGION]
+    if w.scalars[fw.FULL] != 0 or executions > len(w.chain):
         return fw.TOO_FULL
-    if w.scalars[fw.HAS_PATHS] != 0 and w.scalars[fw.N_STEPS] + 4 * len(w.place_done) + 4 > len(
-            w.steps):
+    steps = w.scalars[fw.N_STEPS] + 4 * len(w.place_done) + 4
+    if w.scalars[fw.HAS_PATHS] != 0 and steps > len(w.steps):
         return fw.TOO_FULL
     if w.scalars[fw.N_MISSES] + t.n_vertices + 2 > len(w.misses):
         return fw.TAKE_AWAY
@@ -95,6 +96,7 @@ def has_room(t: Any, s: Any, w: Any) -> int:
 
 
 def on_event(t: Any, s: Any, w: Any, i: int) -> int:
+    """Take in one event; return why it is not done, or that all is."""
     now, kind, thread = w.rows[i, 0], w.rows[i, 1], w.rows[i, 2]
     if kind == fw.OTHER:
         return fw.FOR_PYTHON
@@ -172,7 +174,7 @@ def set_publisher(work: int, publisher: int, topic: int, node: int) -> None:
 
 
 def flows_of(work: int, first: int, last: int, marks: Any, flows: Any) -> int:
-    """Mark the ends of flows (where marks are empty), or write those of a path (``path_flows``)."""
+    """Mark where flows end (``first`` is -1), or write those of a path (see ``path_flows``)."""
     w = as_work(work)
     n = w.scalars[fw.N_STEPS]
     if first < 0:

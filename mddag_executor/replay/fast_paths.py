@@ -158,6 +158,7 @@ def message_step(w: Any, row: int, vertex: int, place: int, topic: int) -> int:
 
 
 def latest_step(w: Any, row: int, at: int, step: int) -> int:
+    """Return the step that stands in a job's row, or else the one that is known."""
     if at >= 0 and w.jobs[row, at] >= 0:
         return w.jobs[row, at]
     return step

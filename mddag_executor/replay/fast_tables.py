@@ -32,6 +32,7 @@ HASH_MIX = 0x9E3779B97F4A7C1
 
 
 def hash_place(table: Any, a: int, b: int, c: int, d: int) -> int:
+    """Return the row at which to begin to look for a key."""
     mixed = a * 31 + b
     mixed = mixed * HASH_MIX + c
     mixed ^= mixed >> 29

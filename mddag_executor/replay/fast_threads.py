@@ -35,11 +35,13 @@ from mddag_executor.replay.fast_tables import find, insert, remove
 
 
 def note_time(w: Any, now: int) -> None:
+    """Move the run's end on."""
     if now > w.scalars[fw.FINISH] and w.scalars[fw.SHUT_DOWN] == 0:
         w.scalars[fw.FINISH] = now
 
 
 def thread_row(w: Any, thread: int) -> int:
+    """Return the row of a thread."""
     row = find(w.threads, thread, 0, 0, 0)
     if row < 0:
         row = insert(w.threads, thread, 0, 0, 0)
@@ -48,6 +50,7 @@ def thread_row(w: Any, thread: int) -> int:
 
 
 def callback_row(w: Any, callback: int) -> int:
+    """Return the row of a callback."""
     row = find(w.callbacks, callback, 0, 0, 0)
     if row < 0:
         row = insert(w.callbacks, callback, 0, 0, 0)
@@ -64,6 +67,7 @@ def mapped(w: Any, dag: int, vertex: int) -> int:
 
 
 def on_dispatch(t: Any, s: Any, w: Any, now: int, thread: int, i: int) -> bool:
+    """Take in a dispatch; False where it is for Python."""
     callback, dag, vertex, job = w.rows[i, 4], w.rows[i, 5], w.rows[i, 6], w.rows[i, 7]
     worker, ready = w.rows[i, 8], w.rows[i, 9]
     place = mapped(w, dag, vertex)
@@ -77,7 +81,7 @@ def on_dispatch(t: Any, s: Any, w: Any, now: int, thread: int, i: int) -> bool:
         w.callbacks[row, fw.C_VERTEX] = vertex + 1
     if w.scalars[fw.FIRST] < 0:
         w.scalars[fw.FIRST] = now
-    if not 0 <= ready <= now:
+    if not 0 <= ready <= now or now - ready >= fw.LIMIT:
         return False
     if place >= 0 and w.map_vertex[place] >= 0 and w.map_legs[place] < w.map_legs[place + 1]:
         dag, vertex = w.map_dag[dag], w.map_vertex[place]
@@ -119,6 +123,7 @@ def keep_step(
 
 
 def on_start(w: Any, now: int, thread: int, callback: int) -> bool:
+    """Take in that a callback starts; False where it is for Python."""
     row = thread_row(w, thread)
     depth = w.threads[row, fw.T_DEPTH]
     if depth == fw.DEEPEST:
@@ -131,6 +136,7 @@ def on_start(w: Any, now: int, thread: int, callback: int) -> bool:
 
 
 def on_end(w: Any, now: int, thread: int, callback: int) -> bool:
+    """Take in that a callback has ended; False where it is for Python."""
     row = thread_row(w, thread)
     while w.threads[row, fw.T_DEPTH] > 0:
         w.threads[row, fw.T_DEPTH] -= 1
@@ -146,27 +152,28 @@ def on_end(w: Any, now: int, thread: int, callback: int) -> bool:
         w.scalars[fw.BEGIN] = ready
     if now - start >= fw.LIMIT or start - ready >= fw.LIMIT:
         return False
-    dag, vertex, job = w.threads[row, fw.T_DAG], w.threads[row, fw.T_VERTEX], w.threads[row, fw.T_JOB]
+    dag, vertex = w.threads[row, fw.T_DAG], w.threads[row, fw.T_VERTEX]
+    job = w.threads[row, fw.T_JOB]
     execution = -1
     if dag >= 0:
-        execution = find(w.open, dag, vertex, job, ready)
+        execution = find(w.ongoing, dag, vertex, job, ready)
         first = execution < 0
         if first:
-            execution = insert(w.open, dag, vertex, job, ready)
-            count_row(w, fw.OPEN, len(w.open))
-            w.open[execution, fw.O_START] = start
-        w.open[execution, fw.O_END] = now
-        w.open[execution, fw.O_BUSY] += now - start
-        if w.open[execution, fw.O_BUSY] >= fw.LIMIT:
+            execution = insert(w.ongoing, dag, vertex, job, ready)
+            count_row(w, fw.OPEN, len(w.ongoing))
+            w.ongoing[execution, fw.O_START] = start
+        w.ongoing[execution, fw.O_END] = now
+        w.ongoing[execution, fw.O_BUSY] += now - start
+        if w.ongoing[execution, fw.O_BUSY] >= fw.LIMIT:
             return False
         keep_last(w, row, execution, dag, vertex, job, ready)
     else:
         first = is_new_piece(w, callback, ready)
     waited = group_wait(w, callback, ready, start, now, first)
     if dag >= 0 and waited != 0:
-        if w.open[execution, fw.O_WAITED] == 0:
+        if w.ongoing[execution, fw.O_WAITED] == 0:
             w.scalars[fw.N_WAITED] += 1
-        w.open[execution, fw.O_WAITED] = waited
+        w.ongoing[execution, fw.O_WAITED] = waited
         if w.scalars[fw.N_WAITED] > fw.KEEP_WAITED:
             return False
     n = w.scalars[fw.N_PIECES]
@@ -183,14 +190,15 @@ def on_end(w: Any, now: int, thread: int, callback: int) -> bool:
 def keep_last(
     w: Any, row: int, execution: int, dag: int, vertex: int, job: int, ready: int
 ) -> None:
+    """Keep the execution whose piece ended last in a thread."""
     w.threads[row, fw.T_LAST] = 1
     w.threads[row, fw.T_LAST_DAG] = dag
     w.threads[row, fw.T_LAST_VERTEX] = vertex
     w.threads[row, fw.T_LAST_JOB] = job
     w.threads[row, fw.T_LAST_READY] = ready
-    w.threads[row, fw.T_LAST_START] = w.open[execution, fw.O_START]
-    w.threads[row, fw.T_LAST_END] = w.open[execution, fw.O_END]
-    w.threads[row, fw.T_LAST_BUSY] = w.open[execution, fw.O_BUSY]
+    w.threads[row, fw.T_LAST_START] = w.ongoing[execution, fw.O_START]
+    w.threads[row, fw.T_LAST_END] = w.ongoing[execution, fw.O_END]
+    w.threads[row, fw.T_LAST_BUSY] = w.ongoing[execution, fw.O_BUSY]
     w.scalars[fw.NEXT_ID] += 1
     w.threads[row, fw.T_LAST_ID] = w.scalars[fw.NEXT_ID]
 
@@ -239,6 +247,7 @@ def group_wait(
 def count_use(
     w: Any, vertex: int, worker: int, ready: int, start: int, end: int, first: bool, waited: int
 ) -> bool:
+    """Count what ran; False where it is for Python."""
     took = end - start
     if worker < -1 or worker >= fw.MOST_WORKERS:
         return False
@@ -259,6 +268,7 @@ def count_use(
 
 
 def on_publish(w: Any, now: int, thread: int, publisher: int, kind: int) -> None:
+    """Take in that something is published."""
     row = find(w.threads, thread, 0, 0, 0)
     if w.scalars[fw.WATCHED] != 0 and row >= 0 and w.threads[row, fw.T_DEPTH] > 0:
         callback = w.threads[row, fw.T_STACK + w.threads[row, fw.T_DEPTH] - 1]

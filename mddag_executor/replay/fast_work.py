@@ -39,7 +39,8 @@ ALL_DONE, FOR_PYTHON, TOO_FULL, TAKE_AWAY, DECLINED = range(5)
 # Places in ``scalars``.
 (STATUS, BEGIN, FINISH, SHUT_DOWN, JOBS, STARTING, PROCESS_ID, FIRST, LAST, FULL, N_MISSES,
  N_PIECES, N_RECORDED, COMPARE, CONTRADICTIONS, NEXT_ID, COUNTED, N_WAITED, N_RECENT, KEYED,
- ANY_PUBLISHED, N_STEPS, N_JOBS, HAS_PATHS, WATCHED, N_SCALARS) = range(26)
+ ANY_PUBLISHED, N_STEPS, N_JOBS, HAS_PATHS, WATCHED, REGION,
+ N_SCALARS) = range(27)
 
 # Hash tables, in the order of ``counts``.
 (THREADS, OPEN, SLOTS, RECENT, CALLBACKS, PAIRS, PATH_JOBS, PUBLISHERS, N_TABLES) = range(9)
@@ -73,7 +74,7 @@ KEEP_WAITED = 4096
 KEEP_JOBS = 4096
 KEEP_BUSY = 256
 MOST_WORKERS = 4096
-LIMIT = 1 << 40
+LIMIT = 1 << 38
 """Longer times (ns) are left to Python, whose sums have no limit."""
 
 # Kinds of hops to a place of a path.
@@ -95,7 +96,7 @@ class Work(NamedTuple):
     scalars: Vector
     counts: Vector
     threads: Matrix
-    open: Matrix
+    ongoing: Matrix
     slots: Matrix
     recent: Matrix
     callbacks: Matrix

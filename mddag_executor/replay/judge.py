@@ -107,6 +107,12 @@ class Judge(Observer):
         first, last = self.tables.first_vertex[dag:dag + 2]
         self._scheduler.expect(dag, [int(v in vertices) for v in range(first, last)])
 
+    @property
+    def expected(self) -> dict[str, list[int]]:
+        """Return the columns of the core's state that tell what is expected here."""
+        state = self._scheduler.state
+        return {'partial': state.partial, 'expected': state.expected}
+
     def released(self, dag: int, job: int, release: int, now: int) -> None:
         """Open the job."""
         self._newest[dag] = job

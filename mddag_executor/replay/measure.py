@@ -209,6 +209,13 @@ def _replay(path: str, limit: int) -> int:
     return TraceReader(path).message_count or 0
 
 
+def _replay_plain(path: str, limit: int) -> int:
+    from mddag_executor.replay import as_recorded
+    outcome = as_recorded.replay(path, compiled=False)
+    assert outcome.result()['dags']
+    return TraceReader(path).message_count or 0
+
+
 def _mcap(path: str, limit: int) -> int:
     from mcap.reader import make_reader
     count = 0
@@ -240,6 +247,7 @@ READERS: dict[str, Callable[[str, int], int]] = {
     'events in the order of time': _read_sorted,
     'read and linked': _link,
     'replayed as recorded': _replay,
+    'replayed in plain Python': _replay_plain,
     'mcap, undecoded': _mcap,
     'rosbags, undecoded': _rosbags,
 }

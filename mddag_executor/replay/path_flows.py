@@ -51,7 +51,7 @@ class Flows(NamedTuple):
     columns: list[FlowColumns]
 
     def figures(self) -> dict[str, Any]:
-        """Return by path its figures (see ``path_results``)."""
+        """Return by path what ``path_results`` returns."""
         return {path.name: {
             'callbacks': list(path.callbacks), 'hops': [hop.kind for hop in hops],
             **figures(columns)}

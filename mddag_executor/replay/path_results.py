@@ -20,7 +20,7 @@ from typing import Any
 
 from mddag_executor.replay.path_cases import cases, Record, statistics
 from mddag_executor.replay.path_flows import Flows
-from mddag_executor.replay.paths import Flow, PathBook
+from mddag_executor.replay.paths import PathBook
 
 
 def path_results(book: PathBook | Flows) -> dict[str, Any]:
@@ -38,13 +38,22 @@ def path_results(book: PathBook | Flows) -> dict[str, Any]:
 
 
 def _result(book: PathBook, number: int) -> dict[str, Any]:
-    flows = book.flows(number)
-    response = cases(inner_records(flows))
-    whole = cases(whole_records(flows))
+    inner: list[Record] = []
+    outer: list[Record] = []
+    flows = arrived = 0
+    for first, arrival, begin, end in book.ends(number):
+        flows += 1
+        arrived += arrival is not None
+        if first is not None:
+            inner.append((first, arrival))
+        if begin is not None:
+            outer.append((begin, end))
+    response = cases(inner)
+    whole = cases(outer)
     return {
         'callbacks': list(book.paths[number].callbacks),
         'hops': [hop.kind for hop in book.hops(number)],
-        'flows': len(flows), 'arrived': sum(_arrival(flow) is not None for flow in flows),
+        'flows': flows, 'arrived': arrived,
         'response_time': _cases(response), 'reaction_time':
             statistics(response.worst_with_external_latency),
         'data_age': statistics(response.data_age),
@@ -59,23 +68,3 @@ def _cases(found: Any) -> dict[str, Any]:
         'all': statistics(found.every), 'best': statistics(found.best),
         'worst': statistics(found.worst),
         'worst_with_external_latency': statistics(found.worst_with_external_latency)}
-
-
-def _arrival(flow: Flow) -> int | None:
-    """Return the start of the last callback's execution."""
-    return flow.columns[-1][3]
-
-
-def inner_records(flows: list[Flow]) -> list[Record]:
-    """Return the records from the first publication to the start of the last callback."""
-    records: list[Record] = []
-    for flow in flows:
-        first = flow.columns[0][0] or flow.columns[0][3]
-        if first is not None:
-            records.append((first, _arrival(flow)))
-    return records
-
-
-def whole_records(flows: list[Flow]) -> list[Record]:
-    """Return the records from the start of the first callback to the end of the last."""
-    return [(flow.begin, flow.end) for flow in flows if flow.begin is not None]

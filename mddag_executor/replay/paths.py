@@ -44,7 +44,7 @@ end of the last one's.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Literal, NamedTuple
 
 from msg_graph import Callback, Path, TaskSet
@@ -74,6 +74,20 @@ class Flow(NamedTuple):
     """
 
     columns: list[tuple[int | None, int | None, int | None, int | None]]
+    begin: int | None
+    end: int | None
+
+
+class Ends(NamedTuple):
+    """
+    The ends of a flow, ns, None for what there is not.
+
+    :ivar first: the first publication, or where it is not recorded the first start.
+    :ivar arrival: start of the last callback's execution.
+    """
+
+    first: int | None
+    arrival: int | None
     begin: int | None
     end: int | None
 
@@ -222,6 +236,11 @@ class PathBook:
         rows = [_flow(book, leaf) for leaf in _leaves(book)]
         return sorted(rows, key=_order)
 
+    def ends(self, number: int) -> Iterator[Ends]:
+        """Yield of each flow along a path its ends, in no order."""
+        book = self._books[number]
+        return (_ends(book, leaf) for leaf in _leaves(book))
+
     @property
     def paths(self) -> list[Path]:
         """Return the declared paths."""
@@ -292,6 +311,26 @@ def _flow(book: _Book, leaf: int) -> Flow:
             columns[position] = first or None, second or None, third or None, start
         step = book.parent[step]
     return Flow(columns, begin, end)
+
+
+def _ends(book: _Book, leaf: int) -> Ends:
+    last = len(book.path.callbacks) - 1
+    first = arrival = begin = end = None
+    step = leaf
+    while step != _NONE:
+        position = book.position[step]
+        if position == 0 or position == last:
+            time, second = book.times[3 * step], book.times[3 * step + 1]
+            if not book.is_run[step]:
+                first = time or None if position == 0 else first
+            else:
+                if position == last:
+                    arrival = time
+                    end = second if second != _NONE else end
+                if position == 0:
+                    begin = time
+        step = book.parent[step]
+    return Ends(begin if first is None else first, arrival, begin, end)
 
 
 def _order(flow: Flow) -> tuple[int, ...]:

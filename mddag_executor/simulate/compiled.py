@@ -36,7 +36,7 @@ and ends.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 import ctypes
 from functools import cache
@@ -176,6 +176,11 @@ def entries_of(
     return _compiled_entries(kernels, names, _stamp(sources))
 
 
+def keeps_entries(sources: tuple[str, ...]) -> bool:
+    """Tell whether there is a folder to keep what is compiled (see ``entries_of``)."""
+    return _stamp(sources) is not None
+
+
 def cached_entries(sources: tuple[str, ...], name: str) -> bool:
     """Tell whether an entry point of a driver (see ``entries_of``) has been compiled before."""
     folder = _folder(sources)
@@ -285,6 +290,13 @@ class Empty:
     def length(self, field: int) -> int:
         """Return how many elements a field has, which is a vector."""
         return int(self._words[3 * field + 1])
+
+    def write(self, field: int, values: Sequence[int]) -> None:
+        """Write a field, which is a vector of so many numbers."""
+        address, length = self._words[3 * field:3 * field + 2].tolist()
+        assert length == len(values)
+        data = (ctypes.c_int64 * length).from_address(address)
+        data[:] = list(values)
 
     def rows(self, field: int, width: int) -> list[tuple[int, ...]]:
         """Return a copy of a field, which is a vector of tuples."""

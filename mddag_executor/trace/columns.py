@@ -146,7 +146,7 @@ class ColumnReading(Reading):
     def _classify(self) -> None:
         """Take in what the channels hold that have been defined."""
         channels = self._channels
-        layouts = []
+        layouts: list[list[int]] = []
         for number in channels.passed_over:
             self._classes[number] = cl.PASSED_OVER
         for number, (head, size, unpack) in channels.fast.items():

@@ -104,8 +104,9 @@ def scan_records(
                     rows[count, cl.KIND] = layouts[layout, cl.L_KIND]
                     place = cl.L_FIRST
                     for i in range(layouts[layout, cl.L_FIELDS]):
-                        value = read_number(fields + layouts[layout, place],
-                                       layouts[layout, place + 1], layouts[layout, place + 2])
+                        value = read_number(
+                            fields + layouts[layout, place],
+                            layouts[layout, place + 1], layouts[layout, place + 2])
                         # time, process, thread: as they stand in the message
                         column = i
                         if i == 1:

@@ -76,16 +76,6 @@ def test_text_that_is_not_utf8_names_the_line(tmp_path: Path) -> None:
     assert (caught.value.file, caught.value.line) == (str(path), 2)
 
 
-def test_json_that_is_none_names_the_line(tmp_path: Path) -> None:
-    path = tmp_path / 'times.json'
-    path.write_text('{\n"a": }\n')
-    with pytest.raises(InputError, match='times.json:2: this is not JSON'):
-        common.read_json(str(path))
-    path.write_text('[' * 100_000)
-    with pytest.raises(InputError, match='nested too deeply|not JSON'):
-        common.read_json(str(path))
-
-
 def test_json_is_written_whole(tmp_path: Path) -> None:
     path = tmp_path / 'result.json'
     value = {'name': 'ä\x1b', 'ns': numpy.int64(3), 'list': numpy.arange(2), 'path': Path('a')}

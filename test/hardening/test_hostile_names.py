@@ -37,7 +37,7 @@ import yaml
 
 TOP = Path(__file__).resolve().parents[2]
 BAG = TOP / 'bags' / 'demo_short.mcap'
-Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+Mddag = Callable[..., subprocess.CompletedProcess[str]]
 
 HOSTILE = [
     '\x1b]0;owned\x07', '\x1b[2J\x1b[31m', '\x9b31m', '\r\n\x08', '\x00', '\u202e\u2066',

@@ -323,21 +323,6 @@ def test_of_timers_due_at_one_instant_the_most_urgent_starts_first(make_executor
     assert pairs.count(('urgent', 'calm')) > 10, pairs
 
 
-def test_default_deadline_orders_undeclared_callbacks(make_executor, make_node):
-    """Undeclared ones go by ready time plus default_deadline: before a later declared deadline."""
-    executor = make_executor(loads(ORDER), num_workers=1, default_deadline='100ms')
-    ran: list[int] = []
-    gate = threading.Event()
-    with Spinning(executor):
-        assert wait_for(lambda: executor._pool.running)
-        executor.create_task(gate.wait, 5.0)
-        for i in range(5):
-            executor.create_task(ran.append, i)
-        gate.set()
-        assert wait_for(lambda: len(ran) == 5)
-    assert ran == [0, 1, 2, 3, 4]
-
-
 def with_source(more: str) -> TaskSet:
     return loads(CHAIN.replace('dag: chain', f'dag: chain, {more}'))
 

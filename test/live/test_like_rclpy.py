@@ -16,12 +16,14 @@
 
 from __future__ import annotations
 
+import threading
+
 from rclpy.action import ActionClient, ActionServer
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 from test_msgs.action import Fibonacci
 
-from .conftest import wait_for
+from .conftest import Spinning, wait_for
 
 
 def test_tasks_created_while_nobody_spins_run_newest_first(make_executor):
@@ -81,3 +83,18 @@ def test_feedback_is_handled_before_a_goals_future_ends_the_spin(make_executor, 
         assert len(feedback) == number
     server.destroy()
     client.destroy()
+
+
+def test_default_deadline_orders_undeclared_callbacks(make_executor):
+    """Undeclared ones go by ready time plus default_deadline: in the order of becoming ready."""
+    executor = make_executor(num_workers=1, default_deadline='100ms')
+    ran: list[int] = []
+    gate = threading.Event()
+    with Spinning(executor):
+        assert wait_for(lambda: executor._pool.running)
+        executor.create_task(gate.wait, 5.0)
+        for i in range(5):
+            executor.create_task(ran.append, i)
+        gate.set()
+        assert wait_for(lambda: len(ran) == 5)
+    assert ran == [0, 1, 2, 3, 4]

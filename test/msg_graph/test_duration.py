@@ -19,6 +19,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 from msg_graph import DurationError, format_duration, parse_duration
+from msg_graph.duration import DAY, exact_duration
 import pytest
 
 
@@ -116,3 +117,14 @@ def test_formats_times(ns: int, text: str) -> None:
 def test_format_reads_back(us: int) -> None:
     exact = parse_duration(f'{us}us')
     assert abs(parse_duration(format_duration(exact)) - exact) <= exact * 0.0005
+
+
+@pytest.mark.parametrize('ns', [0, 1, 999, 1_234_567_891, DAY - 1, DAY])
+def test_an_exact_text_reads_back(ns: int) -> None:
+    assert parse_duration(exact_duration(ns), minimum_ns=0) == ns
+
+
+@pytest.mark.parametrize('ns', [-1, -2**63, DAY + 1, 2**63 - 1])
+def test_what_no_declaration_can_say_has_an_exact_text_too(ns: int) -> None:
+    """Traces say such things; the reader of the text then says what is wrong."""
+    assert exact_duration(ns) == f'{ns}ns'

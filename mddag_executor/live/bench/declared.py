@@ -18,9 +18,10 @@ from __future__ import annotations
 
 from typing import Any, cast
 
+from mddag_executor.core.tally import quantiles_us
 from mddag_executor.live import current_job
 from mddag_executor.live.bench.executors import make_executor, UnfinishedSession
-from mddag_executor.live.bench.latency import quantiles_us, Starts
+from mddag_executor.live.bench.latency import Starts
 from mddag_executor.live.bench.spec import BenchError, OURS, Spec
 from mddag_executor.live.bodies import no_job
 from mddag_executor.live.execution import ExecutionPlan, Mode

@@ -27,7 +27,6 @@ import inspect
 import time
 from typing import Any
 
-from mddag_executor.core.tally import quantile
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
@@ -122,13 +121,3 @@ class Starts:
             # order here than there, which can matter only at the edges of the window.
             found += [late for at, late in zip(list(starts), delays) if begin <= at <= end]
         return found
-
-
-def quantiles_us(values: list[int]) -> dict[str, float] | None:
-    """Return p50, p99 and max in us of values in ns; None when there are none."""
-    if not values:
-        return None
-    ordered = sorted(values)
-    return {
-        'p50': quantile(ordered, 0.5) / 1000, 'p99': quantile(ordered, 0.99) / 1000,
-        'max': ordered[-1] / 1000}

@@ -27,9 +27,10 @@ import os
 import time
 from typing import Any
 
+from mddag_executor.core.tally import quantiles_us
 from mddag_executor.live.bench.cpu import middleware_cpu_ns
 from mddag_executor.live.bench.executors import make_executor, UnfinishedSession
-from mddag_executor.live.bench.latency import quantiles_us, Starts
+from mddag_executor.live.bench.latency import Starts
 from mddag_executor.live.bench.publisher import make_node, PublisherProcess
 from mddag_executor.live.bench.spec import BenchError, Spec
 from mddag_executor.live.session import MATCH_TIMEOUT_S

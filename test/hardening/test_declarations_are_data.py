@@ -1,0 +1,164 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Declarations and what else is read as a whole are data: bounded, and nothing in them is obeyed.
+
+What the language refuses, error by error, stands in `test/msg_graph`; here are the files that mean
+harm, at every verb that reads one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import os
+from pathlib import Path
+import subprocess
+
+from mddag_executor.cli import main as program
+import msg_graph
+import numpy as np
+import pytest
+
+Mddag = Callable[..., subprocess.CompletedProcess[str]]
+TOP = Path(__file__).resolve().parents[2]
+AUTOWARE = TOP / 'config' / 'autoware.yaml'
+HEAD = 'mddag: 1\n'
+
+
+def laughs(head: str) -> str:
+    """Return YAML of a kilobyte whose aliases stand for 9**12 values."""
+    text = head + 'x0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n'
+    for i in range(1, 12):
+        text += f'x{i}: &a{i} [{", ".join([f"*a{i - 1}"] * 9)}]\n'
+    return text
+
+
+HARMFUL = {
+    'aliases': laughs(HEAD),
+    'aliases without a head': laughs(''),
+    'own anchor': HEAD + 'nodes: &n [*n]\n',
+    'merge keys': HEAD + 'a: &a {b: 1}\nnodes: [{<<: *a, <<: *a}]\n',
+    'deep': HEAD + 'nodes: ' + '[' * 100_000,
+    'deep and closed': HEAD + 'nodes: ' + '[' * 3000 + ']' * 3000,
+    'deep mappings': HEAD + 'nodes: ' + '{a: ' * 50_000,
+    'deep blocks': HEAD + 'nodes:\n' + ''.join(' ' * i + '- \n' for i in range(1, 2000)),
+    'code': HEAD + 'nodes: !!python/object/apply:os.system ["touch owned"]\n',
+    'an object': HEAD + 'nodes: !!python/name:os.system\n',
+    'digits': HEAD + f'workers: {"9" * 100_000}\nnodes: []\n',
+    'an exponent': HEAD + 'nodes: [{node: /n, callbacks: [{name: t, timer: 1e999999999s}]}]\n',
+    'a long name': HEAD + f'nodes: [{{node: /{"n" * 1_000_000}, callbacks: []}}]\n',
+    'many anchors': HEAD + f'nodes: [{", ".join(f"&a{i} x" for i in range(50_000))}]\n',
+    'many errors': HEAD + f'nodes: [{", ".join(["{node: x, y: z}"] * 20_000)}]\n',
+    'long arguments': HEAD + f'arguments: {{a: {"x" * 4000}}}\nnodes: ["$(a)$(a)"]\n',
+    'open brackets': HEAD + f'arguments: {{a: b}}\nnodes: ["{"$(" * 1_000_000}"]\n',
+    'escapes': HEAD + 'nodes: [{node: "/\\e[2J", "\\e]0;x\\a": 1}]\n',
+}
+
+# `fmt` only lays a file with arguments out, and an architecture has no `workers`.
+HARMLESS = {('fmt', 'long arguments'), ('fmt', 'open brackets'), ('from-caret', 'digits')}
+
+
+def refused(done: subprocess.CompletedProcess[str], folder: Path) -> None:
+    """Check that something was refused, in lines, and did nothing."""
+    assert done.returncode == 2, done.stdout + done.stderr
+    lines = done.stderr.splitlines()
+    assert 1 <= len(lines) <= 60 and all(line.isprintable() for line in lines)
+    assert all(line.startswith('error: ') and len(line) < 2000 for line in lines)
+    assert not (folder / 'owned').exists() and not (folder / 'out.yaml').exists()
+
+
+@pytest.mark.parametrize('name', HARMFUL)
+@pytest.mark.parametrize('verb', ['check', 'fmt', 'from-caret'])
+def test_harmful_yaml_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    verb: str, name: str,
+) -> None:
+    if (verb, name) in HARMLESS:
+        pytest.skip('it is none for this verb')
+    monkeypatch.chdir(tmp_path)
+    Path('graph.yaml').write_text(HARMFUL[name])
+    output = ('-o', 'out.yaml') if verb == 'from-caret' else ()
+    status = program.main(('graph', verb, 'graph.yaml', *output))
+    printed = capsys.readouterr()
+    refused(subprocess.CompletedProcess((), status, printed.out, printed.err), tmp_path)
+
+
+@pytest.mark.parametrize('arguments', [
+    ('graph', 'check', '/dev/zero'), ('graph', 'fmt', '/dev/zero'),
+    ('graph', 'from-caret', '/dev/zero', '-o', 'out.yaml'),
+    ('simulate', AUTOWARE, '--execution-times', '/dev/zero'),
+    ('replay', '/dev/zero'), ('replay', '/dev/urandom'),
+], ids=lambda arguments: ' '.join(map(str, arguments[:2])).replace(str(AUTOWARE), ''))
+def test_endless_files(mddag: Mddag, tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    refused(mddag(*arguments, cwd=tmp_path, timeout=30), tmp_path)
+
+
+def test_layers_that_double_at_each_step() -> None:
+    """Two publishers for each topic, 25 times: 2**25 vertices, were they made."""
+    rows = ['{name: s, timer: 10ms, publishes: [/t0]}']
+    for i in range(25):
+        rows += [f'{{name: {c}{i}, subscription: /t{i}, publishes: [/t{i + 1}]}}' for c in 'ab']
+    rows.append('{name: e, subscription: /t25, deadline: 10ms}')
+    with pytest.raises(msg_graph.GraphError, match='more than 100000'):
+        msg_graph.loads(f'{HEAD}nodes: [{{node: /n, callbacks: [{", ".join(rows)}]}}]')
+
+
+@pytest.mark.parametrize('name', [
+    '/etc/passwd', '../secret.yaml', 'sub/../../secret.yaml', '~/secret.yaml', 'link', 'folder',
+    'folder/link', 'fifo', '/dev/zero', '.', '"a\\0b"', '"-"', 'file:///etc/passwd', '$(HOME)/x',
+    "''", 'null'])
+def test_includes_stay_in_their_folder(tmp_path: Path, name: str) -> None:
+    """And what is outside of it is not even looked at."""
+    secret = tmp_path / 'secret.yaml'
+    secret.write_text('mddag: 1\nnodes: [the secret]\n')
+    inside = tmp_path / 'inside'
+    (inside / 'folder').mkdir(parents=True)
+    (inside / 'sub').mkdir()
+    for link in (inside / 'link', inside / 'folder' / 'link'):
+        link.symlink_to(secret)
+    os.mkfifo(inside / 'fifo')
+    (inside / 'graph.yaml').write_text(f'{HEAD}include: [{name}]\n')
+    with pytest.raises(msg_graph.GraphError) as caught:
+        msg_graph.load(inside / 'graph.yaml')
+    assert caught.value.file == str(inside / 'graph.yaml')
+    assert 'the secret' not in str(caught.value) and 'root:' not in str(caught.value)
+
+
+@pytest.mark.parametrize('text', [
+    '[' * 200_000, '{"d": ' * 100_000, f'{{"d": {{"/n:x": 1{"0" * 5000}}}}}', 'NaN', '1e999', '',
+    '{"control": {"/x:y": "\\u001b[2J"}}', '\ud800'.encode('utf-8', 'replace').decode()])
+def test_harmful_tables_of_execution_times(mddag: Mddag, tmp_path: Path, text: str) -> None:
+    (tmp_path / 'times.json').write_text(text)
+    done = mddag('simulate', AUTOWARE, '--execution-times', 'times.json', cwd=tmp_path)
+    refused(done, tmp_path)
+
+
+class Owner:
+    """Does something when it is unpickled."""
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, ('touch owned',)
+
+
+@pytest.mark.parametrize('key', ['/n:t', 'control', 'x'])
+def test_samples_are_no_pickles(mddag: Mddag, tmp_path: Path, key: str) -> None:
+    (tmp_path / 'graph.yaml').write_text(
+        HEAD + 'nodes: [{node: /n, callbacks: [{name: t, timer: 1ms, deadline: 1ms}]}]\n')
+    np.savez(tmp_path / 'samples.npz', **{key: np.array([Owner()], dtype=object)})
+    done = mddag('evaluate', 'graph.yaml', '--runs', '2', '--samples', 'samples.npz', '--core',
+                 'plain', cwd=tmp_path)
+    refused(done, tmp_path)
+    (tmp_path / 'samples.npz').write_bytes(b'\x80\x04cos\nsystem\n(S"touch owned"\ntR.')
+    refused(mddag('evaluate', 'graph.yaml', '--runs', '2', '--samples', 'samples.npz',
+                  cwd=tmp_path), tmp_path)

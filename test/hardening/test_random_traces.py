@@ -1,0 +1,189 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Traces that are sound as files and say anything: every verb uses or refuses them, no traceback.
+
+`test/replay/test_fuzz.py` damages the bytes of traces. Here each event is whole and of a known
+kind, but what it says makes no sense: events are left out, doubled, swapped, and their fields
+changed into the numbers and texts that hurt most. One in eight is made of a recorded run, the
+others of a small simulated one. `HARDENING_EXAMPLES=10000` tries that many.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from pathlib import Path
+import random
+import tempfile
+from typing import Any
+
+from mddag_executor.cli import main as program
+from mddag_executor.cli.text import printable
+from mddag_executor.trace import read_events, TraceFile
+from mddag_executor.trace.cdr import FieldType
+from mddag_executor.trace.schema import EVENTS
+import pytest
+
+EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '64'))
+BATCHES = 4
+BAG = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'
+TEXTS = ['', 'rad', 'ros2', '/n', '/n:tick', '0,1', '-1', '9' * 30, ',,,', '\x1b[2J', '../..',
+         'x' * 999, 'mddag: 1', '{}', '<b>', '/trace/../x', 'timer', 'on_tick@dag']
+NUMBERS = [0, 1, 2, -1, -2, 7, 2**31 - 1, -2**31, 2**32, 2**53, 2**62, 2**63 - 1, -2**63]
+VERBS = (
+    ('replay', 'run.mcap'), ('replay', 'run.mcap', '--json', '-'),
+    ('replay', 'run.mcap', '--reschedule', '--workers', '2'),
+    ('replay', 'run.mcap', '--reschedule', '--policy', 'ros2'),
+    ('diff', 'run.mcap', 'run.mcap'), ('export', 'run.mcap', '-o', 'out.csv'),
+    ('graph', 'from-trace', 'run.mcap', '-o', 'graph.yaml'),
+)
+Row = tuple[str, int, int, int, list[Any]]
+
+
+GRAPH = """
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: tick, timer: 10ms, publishes: [/a, /b], execution_time: 2ms, dag: d}
+      - {name: left, subscription: /a, publishes: [/c], execution_time: 3ms}
+      - {name: right, subscription: /b, execution_time: 1ms, deadline: 9ms}
+  - node: /m
+    callbacks:
+      - {name: both, sync: [/c, /b], deadline: 10ms, execution_time: 1ms}
+      - {name: other, timer: 7ms, deadline: 7ms, execution_time: 3ms, on_miss: abort, dag: e}
+paths:
+  - {name: whole, callbacks: ['/n:tick', '/n:left', '/m:both']}
+"""
+
+
+@pytest.fixture(scope='module')
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Row]]:
+    """Give the events of a small run and the first ones of a recorded run, entities and all."""
+    folder = tmp_path_factory.mktemp('run')
+    (folder / 'graph.yaml').write_text(GRAPH)
+    assert program.main(('simulate', str(folder / 'graph.yaml'), '--duration', '60ms', '--workers',
+                         '2', '--trace', str(folder / 'run.mcap'))) == 0
+    return [rows_of(folder / 'run.mcap', 10_000), rows_of(BAG, 150)]
+
+
+def rows_of(path: Path, most: int) -> list[Row]:
+    """Return the events of a trace, up to so many that jobs consist of."""
+    found: list[Row] = []
+    at_work = 0
+    for event in read_events(path):
+        kind = EVENTS[event['_name']]
+        at_work += kind.name in ('dispatch', 'job_release', 'complete', 'rclcpp_publish')
+        found.append((event['_name'], event['_timestamp'], event['_vpid'], event['_vtid'],
+                      [event[name] for name, _ in kind.fields]))
+        if at_work > most:
+            break
+    return found
+
+
+def changed(rows: list[Row], dice: random.Random) -> list[Row]:
+    """Return the events with a few that lie."""
+    rows = list(rows)
+    for _ in range(dice.choice((1, 1, 2, 5, 40))):
+        at, to = dice.randrange(len(rows)), dice.randrange(len(rows))
+        how = dice.randrange(8)
+        name, time, pid, tid, values = rows[at]
+        if how == 0:
+            del rows[at]
+        elif how == 1:
+            rows.insert(to, rows[at])
+        elif how == 2:
+            rows[at], rows[to] = rows[to], rows[at]
+        elif how == 3:
+            rows[at] = (name, max(0, dice.choice(NUMBERS)), pid, tid, values)
+        elif how == 4:
+            name = dice.choice(list(EVENTS))
+            values = [lie(kind, dice) for _, kind in EVENTS[name].fields]
+            rows.insert(at, (name, time, dice.choice((pid, 0, -1)), tid, values))
+        elif EVENTS[name].fields:
+            place = dice.randrange(len(values))
+            values = [*values]
+            values[place] = lie(EVENTS[name].fields[place][1], dice) if how < 7 else \
+                other(rows, name, place, dice)
+            rows[at] = (name, time, pid, tid, values)
+    return rows
+
+
+def lie(kind: str, dice: random.Random) -> Any:
+    """Return a value of a type that nobody expects."""
+    if kind == 'string':
+        return dice.choice(TEXTS)
+    if kind == 'bool':
+        return dice.random() < 0.5
+    if kind.startswith(('int', 'uint')):
+        bits = int(kind.lstrip('uint'))
+        low, high = (0, 2**bits - 1) if kind[0] == 'u' else (-2**(bits - 1), 2**(bits - 1) - 1)
+        return min(high, max(low, dice.choice(NUMBERS)))
+    assert FieldType.parse(kind) and kind.startswith('float'), kind
+    return dice.choice((0.0, float('nan'), float('inf'), -1e308))
+
+
+def other(rows: list[Row], name: str, place: int, dice: random.Random) -> Any:
+    """Return what another event of the kind says there."""
+    return dice.choice([row[4][place] for row in rows if row[0] == name])
+
+
+def give(rows: list[Row], seed: int) -> int:
+    """Give a trace to all verbs; return how many used it."""
+    used = 0
+    with TraceFile('run.mcap') as file:
+        for name, time, pid, tid, values in rows:
+            file.add(name, time, pid, tid, *values)
+    for verb in VERBS:
+        out, err = (io.TextIOWrapper(io.BytesIO(), 'utf-8', newline='\n') for _ in range(2))
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            status = program.main(verb)
+        for stream in (out, err):
+            stream.seek(0)
+        printed, said = out.read(), err.read()
+        assert status in (0, 1, 2), f'seed {seed}: {verb}: {said}'
+        used += status != 2
+        assert 'Traceback' not in said
+        for line in (printed + said).split('\n'):
+            assert line == printable(line), f'seed {seed}: {verb}'
+        if status == 2:
+            assert printed == '' and said.splitlines()[-1].startswith('error: '), said
+    return used
+
+
+@pytest.mark.filterwarnings('ignore')
+@pytest.mark.parametrize('batch', range(BATCHES))
+def test_events_that_lie(runs: list[list[Row]], batch: int) -> None:
+    used = 0
+    first = batch * EXAMPLES // BATCHES
+    last = (batch + 1) * EXAMPLES // BATCHES
+    for seed in range(first, last):
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            used += give(changed(runs[seed % 8 == 0], random.Random(seed)), seed)
+    # Most lies leave a run that can be judged.
+    assert used > (last - first) * len(VERBS) // 3
+
+
+@pytest.mark.parametrize('period', [2**63 - 1, 86_400_000_000_001, 999, 0, -1, -2**63])
+def test_a_timer_that_no_declaration_could_have(
+    runs: list[list[Row]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, period: int
+) -> None:
+    """Such a period becomes a blank to fill in (seeds 872 and 1152 found a traceback)."""
+    monkeypatch.chdir(tmp_path)
+    lying = [(name, time, pid, tid, [values[0], period] if name == 'ros2:rcl_timer_init'
+              else values) for name, time, pid, tid, values in runs[1] if name != 'mddag:task_set']
+    assert give(lying, 0) > 0
+    assert str(period) not in Path('graph.yaml').read_text().split('FILL IN')[0]
