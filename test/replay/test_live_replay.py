@@ -221,7 +221,8 @@ def test_a_process_that_was_killed_loses_the_last_second_at_most(tmp_path: Path)
     result = outcome.result()
     assert result['dags']['/n']['jobs'] > 250
     sink = result['dags']['/n']['sinks']['/n:cb']
-    assert sink['completed'] >= result['dags']['/n']['jobs'] - 3
+    # expired: periods that a busy machine has missed
+    assert sink['completed'] + sink['expired'] >= result['dags']['/n']['jobs'] - 3
     with pytest.warns(UserWarning, match='without a finish record'):
         first, *_, last = [event['_timestamp'] for event in read_events(path)]
     assert last - first > 1.2e9
