@@ -25,6 +25,7 @@ import msg_graph
 TOP = Path(__file__).resolve().parent.parent
 TEXT = (TOP / 'README.md').read_text(encoding='utf-8')
 
+
 def block(language: str) -> str:
     found = re.findall(rf'^```{language}\n(.*?)^```$', TEXT, re.MULTILINE | re.DOTALL)
     assert len(found) == 1

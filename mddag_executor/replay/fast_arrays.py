@@ -32,7 +32,8 @@ from msg_graph import TaskSet
 import numpy as np
 
 _HOPS = {'trigger': fw.TRIGGER, 'topic': fw.TOPIC, 'variable': fw.VARIABLE}
-_TABLES = ('threads', 'ongoing', 'slots', 'recent', 'callbacks', 'pairs', 'path_jobs', 'publishers')
+_TABLES = (
+    'threads', 'ongoing', 'slots', 'recent', 'callbacks', 'pairs', 'path_jobs', 'publishers')
 _RUNS = 3       # of a vertex in a job that are kept at least
 _MOST_PLACES = 2 ** 16
 _MOST_NUMBERS = 2 ** 24     # that are kept of all jobs

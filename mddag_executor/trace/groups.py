@@ -54,7 +54,6 @@ GROUPS = {
 """The events that an entry stands for, in the order in which they are written."""
 
 
-
 def events_of(entry: Sequence[Any]) -> int:
     """Return how many events an entry stands for."""
     return len(GROUPS.get(entry[0], (0,)))
