@@ -187,7 +187,10 @@ class DirectTakes:
         publishers: dict[str, list[Any]] = {}
         for node in entities.nodes:
             for publisher in list(node.publishers):
-                publishers.setdefault(publisher.topic_name, []).append(publisher)
+                try:
+                    publishers.setdefault(publisher.topic_name, []).append(publisher)
+                except InvalidHandle:
+                    continue  # destroyed meanwhile
         takes: dict[int, list[Direct]] = {}
         states: dict[int, PublisherState] = {}
         chosen: list[Direct] = []

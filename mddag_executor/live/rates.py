@@ -34,6 +34,7 @@ from typing import Any
 
 from mddag_executor.live.entries import Entry
 from mddag_executor.live.registry import Registry
+from rclpy.exceptions import InvalidHandle
 from rclpy.logging import get_logger
 
 LOOK_S = 0.5
@@ -97,10 +98,13 @@ class RateWatch:
     def _tell(self, entry: Entry, known: _Known, now: float) -> None:
         skipped = entry.skipped - known.skipped
         ran, busy = entry.ran - known.ran, entry.busy_ns - known.busy_ns
+        try:
+            period = entry.entity.timer_period_ns
+        except InvalidHandle:
+            return  # destroyed meanwhile
         text = (
-            f'the timer of {entry.node} with a period of '
-            f'{entry.entity.timer_period_ns / 1e6:g} ms can not keep its rate: {skipped} of '
-            f'{skipped + ran} periods were skipped within {max(0.0, now - known.at):.1f} s')
+            f'the timer of {entry.node} with a period of {period / 1e6:g} ms can not keep its '
+            f'rate: {skipped} of {skipped + ran} periods were skipped within {max(0.0, now - known.at):.1f} s')
         if ran > 0:
             text += f', its callback takes {busy / ran / 1e6:.3g} ms'
         (self._warn or get_logger('mddag_executor').warning)(text)

@@ -27,6 +27,7 @@ from mddag_executor.live.entries import Entry, Work
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 from msg_graph import TaskSet
+from rclpy.exceptions import InvalidHandle
 from rclpy.subscription import Subscription
 
 WITH_INFO = Subscription.CallbackType.WithMessageInfo
@@ -69,9 +70,14 @@ class Receiver:
     def on_missed(self, timer: Any, due_ns: int, count: int) -> None:
         """Take in that periods were skipped since nobody was there to look at the timer."""
         entry = self._registry[timer]
-        if entry is not None:
-            self._dispatcher.timer_missed(
-                entry, due_ns + self._dispatcher.clock_offset, timer.timer_period_ns, count)
+        if entry is None:
+            return
+        try:
+            period = timer.timer_period_ns
+        except InvalidHandle:
+            return  # destroyed meanwhile
+        self._dispatcher.timer_missed(
+            entry, due_ns + self._dispatcher.clock_offset, period, count)
 
     def on_message(self, subscription: Any, message: Any, info: dict[str, Any]) -> None:
         """Take in a message with its info."""

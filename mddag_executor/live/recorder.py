@@ -24,6 +24,7 @@ from typing import Any
 from mddag_executor.live.entries import Entry, SERVICE, SUBSCRIPTION, TIMER
 from mddag_executor.trace.errors import TraceError
 from msg_graph import TaskSet
+from rclpy.exceptions import InvalidHandle
 from rclpy.logging import get_logger
 from rclpy.utilities import get_rmw_implementation_identifier
 
@@ -69,20 +70,28 @@ class Recorder:
         """Record new nodes, publishers and entities, with the tracepoints CARET expects."""
         by_name: dict[str, int] = {}
         for node in nodes:
-            address = id(node)
-            by_name[node.get_fully_qualified_name()] = address
-            if address not in self._known:
-                self._known.add(address)
-                self._say(
-                    'rcl_node_init', address, address, node.get_name(), node.get_namespace())
-            for publisher in node.publishers:
-                if id(publisher) not in self._known:
-                    self._known.add(id(publisher))
-                    self._say(
-                        'rcl_publisher_init', id(publisher), address, id(publisher),
-                        publisher.topic_name, publisher.qos_profile.depth)
+            try:
+                by_name[node.get_fully_qualified_name()] = id(node)
+                self._node(node)
+            except InvalidHandle:
+                continue  # destroyed meanwhile
         for entry in added:
-            self._entity(entry, by_name.get(entry.node, 0))
+            try:
+                self._entity(entry, by_name.get(entry.node, 0))
+            except InvalidHandle:
+                continue
+
+    def _node(self, node: Any) -> None:
+        address = id(node)
+        if address not in self._known:
+            self._known.add(address)
+            self._say('rcl_node_init', address, address, node.get_name(), node.get_namespace())
+        for publisher in list(node.publishers):
+            if id(publisher) not in self._known:
+                self._known.add(id(publisher))
+                self._say(
+                    'rcl_publisher_init', id(publisher), address, id(publisher),
+                    publisher.topic_name, publisher.qos_profile.depth)
 
     def _entity(self, entry: Entry, node: int) -> None:
         entity = id(entry.entity)

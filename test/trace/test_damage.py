@@ -362,6 +362,7 @@ ODD_BUT_SOUND = {'zstd of no bytes', 'a chunk in a chunk', 'a row of empty recor
 
 READ_ALL = """
 import resource, sys, time
+from mddag_executor.memory import peak_memory_mb
 from mddag_executor.trace import MessageReader, TraceError, TraceReader
 resource.setrlimit(resource.RLIMIT_AS, (900 << 20, 900 << 20))
 for path in sys.argv[1:]:
@@ -379,7 +380,7 @@ for path in sys.argv[1:]:
         list(MessageReader(path).messages({'/trace/ros2/callback_end'}))
     except TraceError as error:
         assert str(error).startswith(path)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+print(round(peak_memory_mb()))
 """
 
 
