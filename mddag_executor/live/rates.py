@@ -104,7 +104,8 @@ class RateWatch:
             return  # destroyed meanwhile
         text = (
             f'the timer of {entry.node} with a period of {period / 1e6:g} ms can not keep its '
-            f'rate: {skipped} of {skipped + ran} periods were skipped within {max(0.0, now - known.at):.1f} s')
+            f'rate: {skipped} of {skipped + ran} periods were skipped within '
+            f'{max(0.0, now - known.at):.1f} s')
         if ran > 0:
             text += f', its callback takes {busy / ran / 1e6:.3g} ms'
         (self._warn or get_logger('mddag_executor').warning)(text)
