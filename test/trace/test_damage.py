@@ -361,8 +361,7 @@ def hostile() -> dict[str, bytes]:
 ODD_BUT_SOUND = {'zstd of no bytes', 'a chunk in a chunk', 'a row of empty records'}
 
 READ_ALL = """
-import resource, sys, time
-from mddag_executor.memory import peak_memory_mb
+import mddag_executor.memory, resource, sys, time
 from mddag_executor.trace import MessageReader, TraceError, TraceReader
 resource.setrlimit(resource.RLIMIT_AS, (900 << 20, 900 << 20))
 for path in sys.argv[1:]:
@@ -380,7 +379,7 @@ for path in sys.argv[1:]:
         list(MessageReader(path).messages({'/trace/ros2/callback_end'}))
     except TraceError as error:
         assert str(error).startswith(path)
-print(round(peak_memory_mb()))
+print(round(mddag_executor.memory.peak_memory_mb()))
 """
 
 
