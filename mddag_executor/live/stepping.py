@@ -102,14 +102,14 @@ class Stepping(Upkeep):
             while not self._is_shutdown:
                 self._check_context()
                 self._look_after()
-                if self._one_step(deadline) or done():
+                if self._one_step(deadline, done) or done():
                     return
                 if deadline is not None and time.monotonic() >= deadline:
                     return
         finally:
             self._spinning.release()
 
-    def _one_step(self, deadline: float | None) -> bool:
+    def _one_step(self, deadline: float | None, done: Callable[[], bool]) -> bool:
         """Take in what is ready, waiting where nothing is; run one callback if there is one."""
         self._raise_error()
         if self._inline is None:
@@ -121,6 +121,8 @@ class Stepping(Upkeep):
         self._inline.poll(0.0)
         self._submit_tasks()
         if not self._pool.run_one():
+            if done():  # what it woke up for has just been polled away
+                return False
             left = None if deadline is None else max(0.0, deadline - time.monotonic())
             self._inline.poll(left)
             self._refresh()

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import threading
+import time
 
 from rclpy.action import ActionClient, ActionServer
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -98,3 +99,13 @@ def test_default_deadline_orders_undeclared_callbacks(make_executor):
         gate.set()
         assert wait_for(lambda: len(ran) == 5)
     assert ran == [0, 1, 2, 3, 4]
+
+
+def test_a_step_does_not_wait_for_a_future_that_is_done_already(make_executor):
+    """Also when what woke it up has been polled away by then."""
+    executor = make_executor()
+    future: Future = Future(executor=executor)
+    future.set_result(True)
+    begin = time.monotonic()
+    executor.spin_once_until_future_complete(future, 10)
+    assert time.monotonic() - begin < 5.0
