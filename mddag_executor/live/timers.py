@@ -38,6 +38,11 @@ Changes that nobody announces
     that happen anyway, and at the latest after the shortest period of a cancelled timer, since a
     reset timer is due no sooner than a period later.
 
+Rounds
+    Timers that come due while others are handed over are handed over with them before anything is
+    dispatched (``hold``, ``let_go``): nobody waits for them, but a callback of little urgency that
+    came due some microseconds earlier would else take the last worker, and keep it.
+
 Simulated time
     Timers of a clock whose time is overridden have no due time on the monotonic clock. They are
     asked after each jump of their clock (its jump callbacks wake the queue's thread).
@@ -62,6 +67,9 @@ from rclpy.timer import Timer
 # are repeated only after so many times what the last one took, so they have 1 % of a CPU at most.
 SCAN_GAP_NS, SCAN_LATEST_NS, SCAN_CANCELLED_NS = 10_000_000, 100_000_000, 5_000_000
 SCAN_SHARE = 100
+
+# A round is begun where another timer is due this soon: handing over one takes about as long.
+ROUND_NS = 100_000
 
 # A timer without a period is always due; so often it is handed over.
 ZERO_PERIOD_NS = 1_000_000
@@ -178,12 +186,14 @@ class TimerQueue:
         return self._scan_latest
 
     def fire(self, now: int) -> int:
-        """Hand over the timers that are due; return how many."""
+        """Hand over what is due, and what comes due meanwhile; return how many it were."""
         if self._jumped or (now >= self._scan_early and self._slots):
             self.scan()
         heap = self._heap
-        # The root's children are the next two: with neither due, there is at most one.
-        if not any(entry[0] <= now for entry in heap[1:3]):
+        if not heap or heap[0][0] > now:
+            return 0
+        # The root's children are the next two: with neither due soon, there is at most one.
+        if not any(entry[0] <= now + ROUND_NS for entry in heap[1:3]):
             return self._fire_due(now)
         self._hold()
         try:
@@ -194,8 +204,9 @@ class TimerQueue:
     def _fire_due(self, now: int) -> int:
         count = 0
         heap = self._heap
-        # An entry made meanwhile is of the next call, so this ends.
-        while heap and heap[0][0] <= now:
+        # An entry made meanwhile is of the next round, so this ends.
+        last = self._entries
+        while heap and heap[0][1] <= last and (heap[0][0] <= now or heap[0][0] <= _now()):
             _, entry, slot = heappop(heap)
             if slot.entry == entry:
                 slot.entry = 0

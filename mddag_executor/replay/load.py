@@ -21,8 +21,8 @@ Theory of operation
   recording, which is a little after a timer's release, or long after that of a message whose
   header carries it.
 * The executor looks for timers in rounds and dispatches no job of a round before it has noticed
-  all of it: a more urgent one may follow.  The timers that were due when the first of a round was
-  noticed are one round.
+  all of it: a more urgent one may follow.  A timer that was due when the one before it was noticed
+  is of the same round.
 * The execution time of a vertex in a job is what its execution took, the pieces of a coroutine
   added up.  Where it did not complete (the job was dropped, expired, or open at the end) it is the
   median of the callback's executions in the recording, or else the declared mean.
@@ -31,9 +31,8 @@ Theory of operation
   DAG, ready when it was in the recording.  Callback groups of undeclared callbacks are not kept.
 * *Transport*: a message is there some time after the callback that published it has ended (or
   before that: it published early).  That is the time from its end to the successor's readiness.
-* *Dispatch*: the time from when an execution could have started (it was ready, its worker and its
-  callback group had nothing else) to when it did.  It is added to the execution time, because the
-  worker is taken.
+* *Dispatch*: the time from when an execution could have started to when it did (see
+  ``dispatches``).  It is added to the execution time, because the worker is taken.
 * Where there is no such time in a job, the median of the edge, or of all executions, stands in.
 
 Without overheads (``overheads=False``) transport and dispatch take no time and a timer's source is
@@ -49,6 +48,7 @@ from array import array
 from typing import NamedTuple
 
 from mddag_executor.core import quantile, Tables
+from mddag_executor.replay.dispatches import Dispatches
 from mddag_executor.replay.follower import Execution, Observer, Piece
 from mddag_executor.replay.groups import RecordedGroups
 from mddag_executor.replay.timed import edges_of, Transports
@@ -56,7 +56,7 @@ from mddag_executor.simulate import Load
 from msg_graph import Dag, TaskSet
 
 _UNKNOWN = -1
-_UNTOLD = -2
+_NO_GROUP, _UNTOLD = -1, -2
 
 
 class RecordedLoad(NamedTuple):
@@ -92,7 +92,7 @@ class _Jobs:
         self.release = array('q')
         self.noticed = array('q')
         self.round = array('q')
-        self.took, self.start, self.end, self.late = (array('q') for _ in range(4))
+        self.took, self.start, self.end, self.dispatch = (array('q') for _ in range(4))
         self.arrived = array('q')
         self._new = array('q', [_UNKNOWN]) * self.size
         self._new_edges = array('q', [_UNKNOWN]) * n_edges
@@ -104,7 +104,7 @@ class _Jobs:
         self.release.append(release)
         self.noticed.append(max(release, now))
         self.round.append(number)
-        for column in (self.took, self.start, self.end, self.late):
+        for column in (self.took, self.start, self.end, self.dispatch):
             column.extend(self._new)
         self.arrived.extend(self._new_edges)
 
@@ -114,25 +114,27 @@ class LoadBuilder(Observer):
     Collects a load while it is told what happened.
 
     :param groups: the callback groups, as far as the recording has told of them.
+    :param n_workers: how many workers it was recorded with.
     """
 
-    def __init__(self, task_set: TaskSet, tables: Tables, groups: RecordedGroups) -> None:
+    def __init__(
+        self, task_set: TaskSet, tables: Tables, groups: RecordedGroups, n_workers: int
+    ) -> None:
         self._task_set = task_set
         self._first = tables.first_vertex
         self._declared_group = tables.group
         self._groups = groups
         self._jobs = [_Jobs(dag, n) for dag, n in zip(task_set.dags, edges_of(tables))]
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
-        # when each round of timers ended, and when the last one began
+        # when each round of timers ended
         self._rounds = array('q')
-        self._round_began = _UNKNOWN
         # by global vertex and leg: the edges (numbers in their DAG) that its message makes true
         self._edges_into = [legs for dag in task_set.dags for legs in _edges_into(dag)]
-        # (time when ready, what it took): undeclared callbacks, and legs that completed nothing
-        self._others: list[tuple[int, int]] = []
-        self._leg: tuple[Execution, tuple[int, int]] | None = None
-        self._worker_free: dict[int, int] = {}
-        self._group_free: dict[int, int] = {}
+        # (time when ready, what it took, its dispatch or -1): undeclared callbacks, and legs that
+        # completed nothing
+        self._others: list[tuple[int, int, int]] = []
+        self._leg: tuple[Execution, tuple[int, int, int]] | None = None
+        self._dispatches = Dispatches(n_workers)
         #: By global vertex: the address of the callback that ran as it.
         self.callback_of: dict[int, int] = {}
 
@@ -140,8 +142,7 @@ class LoadBuilder(Observer):
         """Take in a job."""
         number = _UNKNOWN
         if self._timer[dag]:
-            if release > self._round_began:
-                self._round_began = now
+            if not self._rounds or release > self._rounds[-1]:
                 self._rounds.append(now)
             self._rounds[-1] = now
             number = len(self._rounds) - 1
@@ -153,23 +154,19 @@ class LoadBuilder(Observer):
         row = -1 if vertex < 0 else self._jobs[dag].row.get(job, -1)
         if row >= 0 and not self._edges_into[vertex]:
             ready = max(ready, self._round_end(self._jobs[dag], row))
-        group = self._groups.by_callback().get(callback, _UNTOLD)
+        group: int | None = self._groups.by_callback().get(callback, _UNTOLD)
         if group == _UNTOLD and vertex >= 0 and self._declared_group[vertex] >= 0:
             group = _UNTOLD - 1 - self._declared_group[vertex]
-        could = max(ready, self._worker_free.get(worker, 0))
-        if worker >= 0:
-            self._worker_free[worker] = end
-        if group >= 0 or group < _UNTOLD:
-            could = max(could, self._group_free.get(group, 0))
-            self._group_free[group] = end
-        late = max(0, start - could) if first else 0
+        if group in (_NO_GROUP, _UNTOLD):
+            group = None
+        number = self._dispatches.add(worker, group, ready if first else start, start, end)
         if vertex < 0:
-            self._others.append((ready if first else start, end - start + late))
+            self._others.append((ready if first else start, end - start, number))
             return
         self.callback_of.setdefault(vertex, callback)
         if first and row >= 0:
             jobs = self._jobs[dag]
-            jobs.late[row * jobs.size + vertex - self._first[dag]] = late
+            jobs.dispatch[row * jobs.size + vertex - self._first[dag]] = number
 
     def _round_end(self, jobs: _Jobs, row: int) -> int:
         number = jobs.round[row]
@@ -192,7 +189,7 @@ class LoadBuilder(Observer):
         for edge in legs[leg] if leg < len(legs) else ():
             jobs.arrived[row * jobs.n_edges + edge] = execution.ready
         if not whole:
-            self._leg = execution, (execution.ready, execution.busy)
+            self._leg = execution, (execution.ready, execution.busy, -1)
             return
         place = row * jobs.size + vertex - self._first[dag]
         jobs.took[place] = execution.busy
@@ -222,9 +219,11 @@ class LoadBuilder(Observer):
         estimated = 0
         costs: list[int] = []
         bases: list[int] = []
-        late = np.concatenate([np.asarray(jobs.late) for jobs in self._jobs])
-        late = late[late >= 0]
-        usual = quantile(np.sort(late).tolist(), 0.5) if len(late) else 0
+        late = self._dispatches.late()
+        measured = np.concatenate([np.asarray(jobs.dispatch) for jobs in self._jobs])
+        measured = measured[measured >= 0]
+        usual = quantile(np.sort(late[measured]).tolist(), 0.5) if len(measured) else 0
+        late = np.append(late, usual)  # number -1
         demand = 0
         for dag, jobs in zip(self._task_set.dags, self._jobs):
             bases.append(len(costs))
@@ -239,18 +238,18 @@ class LoadBuilder(Observer):
                     took[missing[:, vertex.index], vertex.index] = typical.get(key, 0)
             demand += int(took.sum())
             if overheads:
-                own = np.array(jobs.late, dtype=np.int64).reshape(-1, jobs.size)
-                took += np.where(own < 0, usual, own)
+                took += late[np.array(jobs.dispatch, dtype=np.int64).reshape(-1, jobs.size)]
             costs.extend(took.ravel().tolist())
         executions = len(costs)
         bases.append(len(costs))
         others = sorted(self._others)
-        costs.extend(max(0, took) for _, took in others)
+        costs.extend(max(0, took) + (int(late[number]) if number >= 0 else 0)
+                     for _, took, number in others)
         transports, transport = self._transports(overheads)
         return RecordedLoad(
-            self._load(costs, bases, [ready for ready, _ in others], overheads),
+            self._load(costs, bases, [ready for ready, _, _ in others], overheads),
             [jobs.numbers for jobs in self._jobs], demand, executions, estimated, list(unknown),
-            transports, usual if len(late) else None, transport)
+            transports, usual if len(measured) else None, transport)
 
     def _load(
         self, costs: list[int], bases: list[int], others: list[int], overheads: bool

@@ -192,7 +192,7 @@ def reschedule(
     judge = Judge(mapping.task_set, compare=mapping.same)
     usage = Usage(mapping.task_set)
     groups = RecordedGroups()
-    builder = LoadBuilder(mapping.task_set, tables, groups)
+    builder = LoadBuilder(mapping.task_set, tables, groups, head.workers)
     follower = make_follower(recording, mapping, [judge, usage, builder], groups.handlers())
     follower.run(progress)
     recorded = Replay(recording, mapping, judge, usage, follower)

@@ -20,6 +20,7 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.live.timers import ROUND_NS, TimerQueue
 from mddag_executor.live.waitset import WaitSetIntake
 import pytest
 from rclpy.clock import Clock
@@ -46,6 +47,27 @@ def node(bare_node: Node) -> Node:
 @pytest.fixture
 def intake(timer_intake: WaitSetIntake) -> WaitSetIntake:
     return timer_intake
+
+
+def test_timers_that_come_due_meanwhile_are_of_the_same_round(
+    node: Node, recorder: Recorder
+) -> None:
+    timers = [node.create_timer(0.010, nothing) for _ in range(2)]
+    queue = TimerQueue(recorder, nothing)
+    held: list[int] = []
+    recorder.react['timer'] = lambda *_: held.append(recorder.held)
+    for _ in range(1000):  # until the two resets were not interrupted
+        for timer in timers:
+            timer.reset()
+        queue.update(timers)
+        first = queue.next_look() or 0
+        time.sleep(0.0105)
+        assert queue.fire(first) == len(held)  # to this clock only the first one is due
+        if len(held) == 2 and abs(recorder.dues(timers[1])[-1] - first) < ROUND_NS:
+            break
+        held.clear()
+    assert held == [1, 1]
+    assert recorder.held == 0
 
 
 # --- the phase grid ------------------------------------------------------------------------------

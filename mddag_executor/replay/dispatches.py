@@ -1,0 +1,82 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How late executions were dispatched: what the executor itself took.
+
+Theory of operation
+-------------------
+An execution could have started as soon as it was ready, its callback group had nothing else and a
+worker was idle; it is late by what passed from then until it did.
+
+Which workers were idle is counted: at an instant, as many executions as have started and not ended
+are on workers, and as many as are ready and have not started are about to be, or wait for one.
+When these are fewer than the workers at the instant at which an execution becomes ready, it could
+have started at once.  (It may still have waited: a worker that is about to end is left to take
+what it has started itself.)  Else it had to wait for the worker that took it, until that had ended
+what it did before.
+"""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+
+class Dispatches:
+    """
+    Collects executions, in the order of their ends on each worker, and tells how late they were.
+
+    :param n_workers: how many there were.
+    """
+
+    def __init__(self, n_workers: int) -> None:
+        self._n_workers = n_workers
+        self._worker_free: dict[int, int] = {}
+        self._group_free: dict[int, int] = {}
+        # when it was ready, and free to start as far as its group and as its worker goes
+        self._ready, self._group, self._worker = array('q'), array('q'), array('q')
+        self._start, self._end = array('q'), array('q')
+
+    def add(self, worker: int, group: int | None, ready: int, start: int, end: int) -> int:
+        """
+        Take in an execution; times in ns.
+
+        :param worker: which one ran it, -1 where that is not known.
+        :param group: what identifies its mutually exclusive callback group, or None.
+        :return: its number.
+        """
+        could = ready
+        if group is not None:
+            could = max(could, self._group_free.get(group, 0))
+            self._group_free[group] = end
+        self._group.append(could)
+        if worker >= 0:
+            could = max(could, self._worker_free.get(worker, 0))
+            self._worker_free[worker] = end
+        self._worker.append(could)
+        for column, time in ((self._ready, ready), (self._start, start), (self._end, end)):
+            column.append(time)
+        return len(self._start) - 1
+
+    def late(self) -> Any:
+        """Return by number how late it was dispatched, ns, as an array."""
+        import numpy as np
+        ready, start, end, group, worker = (
+            np.array(column, dtype=np.int64) for column in (
+                self._ready, self._start, self._end, self._group, self._worker))
+        n_ready, n_ended = (
+            np.searchsorted(np.sort(times), ready, 'right') for times in (ready, end))
+        could = np.where(n_ready - n_ended <= self._n_workers, group, worker)
+        return np.maximum(0, start - could)

@@ -1,0 +1,64 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How late executions were dispatched: what could have started when."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+from mddag_executor.replay.dispatches import Dispatches
+
+
+def late(n_workers: int, *executions: tuple[int, int | None, int, int, int]) -> list[int]:
+    dispatches = Dispatches(n_workers)
+    for number, execution in enumerate(executions):
+        assert dispatches.add(*execution) == number
+    return [int(x) for x in dispatches.late()]
+
+
+def test_an_idle_worker_could_have_taken_it_at_once() -> None:
+    assert late(2, (0, None, 100, 130, 500)) == [30]
+
+
+def test_all_busy_it_waits_for_its_worker() -> None:
+    assert late(1, (0, None, 0, 0, 400), (0, None, 100, 430, 500)) == [0, 30]
+
+
+def test_left_to_a_busy_worker_although_another_was_idle() -> None:
+    # the first one's worker takes what it started itself: the second one has nothing to do
+    assert late(2, (0, None, 0, 0, 400), (0, None, 350, 430, 500)) == [0, 80]
+
+
+def test_those_that_are_ready_before_it_take_the_idle_workers() -> None:
+    executions = (0, None, 0, 0, 400), (1, None, 90, 150, 420), (0, None, 100, 430, 500)
+    assert late(2, *executions) == [0, 60, 30]
+
+
+def test_it_waits_for_its_group_beside_idle_workers() -> None:
+    assert late(7, (0, 5, 0, 0, 400), (1, 5, 100, 410, 500)) == [0, 10]
+
+
+def test_an_unknown_worker_is_not_waited_for() -> None:
+    assert late(1, (-1, None, 0, 0, 400), (-1, None, 100, 430, 500)) == [0, 330]
+
+
+@given(st.lists(st.tuples(st.integers(0, 50), st.integers(1, 40)), max_size=20))
+def test_a_schedule_without_overhead_has_none(jobs: list[tuple[int, int]]) -> None:
+    free = [0, 0, 0]
+    executions = []
+    for ready, takes in sorted(jobs):  # first come, first served
+        worker = free.index(min(free))
+        start = max(ready, free[worker])
+        free[worker] = start + takes
+        executions.append((worker, None, ready, start, free[worker]))
+    assert late(3, *executions) == [0] * len(jobs)
