@@ -20,7 +20,7 @@ import re
 from setuptools import find_packages, setup
 
 NAME = 'mddag_executor'
-BATCH = ['matplotlib>=3.7', 'numba>=0.60']
+BATCH = ['matplotlib>=3.6', 'numba>=0.59']
 DASK = ['distributed>=2023.5']
 DOCS = ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26']
 EXPORT = ['perfetto>=0.11', 'pyarrow>=14']
@@ -73,7 +73,7 @@ setup(
         'mcap>=1.0',
         'numpy>=1.21',
         'rosbags>=0.10',
-        'ruamel.yaml>=0.17',
+        'ruamel.yaml>=0.17.21',
         'zstandard>=0.18',
     ],
     extras_require={

@@ -17,8 +17,9 @@ Run the paper's Autoware workload under the executor, as `mddag run` does, and r
 
     ros2 launch mddag_executor autoware_demo.launch.py utilisation:=0.8 trace:=/tmp/run.mcap
 
-The program is started as a node, so remappings, namespaces and parameters of an including launch
-file reach it. Every argument below has the meaning of the option of `mddag run` of that name.
+The nodes have the names that the declaration gives them, so remappings and namespaces of an
+including launch file do not reach them. Every argument below has the meaning of the option of
+`mddag run` of that name.
 """
 
 ARGUMENTS = (

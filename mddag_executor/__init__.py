@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mddag_executor.live.verdicts import DeadlineMiss
 
 __all__ = ['DeadlineMiss', 'MultiDeadlineExecutor', '__version__']
-__version__ = '0.1.0'
+__version__ = '1.0.0'
 
 _LAZY = {
     'DeadlineMiss': 'mddag_executor.live',

@@ -46,24 +46,6 @@ def path_lengths(dag: Dag, weights: Sequence[int]) -> list[int]:
     return lengths
 
 
-def longest_path(dag: Dag, weights: Sequence[int], end: int | None = None) -> tuple[int, ...]:
-    """
-    Return the vertices along a longest path (critical path), from the source on.
-
-    Of several the one whose vertices have the smallest indices, looking back from the end.
-
-    :param weights: weight of each vertex, by its index in the DAG.
-    :param end: the vertex that it ends at; None for the sink with the longest path.
-    """
-    lengths = path_lengths(dag, weights)
-    at = max(dag.sinks, key=lengths.__getitem__) if end is None else end
-    path = [at]
-    while dag.vertices[at].predecessors:
-        at = max(dag.vertices[at].predecessors, key=lengths.__getitem__)
-        path.append(at)
-    return tuple(reversed(path))
-
-
 def mean_execution_times(dag: Dag) -> list[int] | None:
     """Return each vertex's mean execution time in ns, or None where one is not declared."""
     means = []

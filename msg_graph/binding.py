@@ -113,12 +113,6 @@ class Binder:
             bound.remove(start)
             heappush(self._free[callback.node, kinds[start], start], place)
 
-    def unbound(self) -> tuple[Callback, ...]:
-        """Return the callbacks that are not bound, or not by all their legs, in file order."""
-        return tuple(
-            callback for callback, bound in zip(self._callbacks, self._bound, strict=True)
-            if len(bound) < len(_legs(callback)))
-
     def _take(self, node: str, kind: str, start: str) -> Callback | None:
         free = self._free.get((node, kind, start))
         if not free:

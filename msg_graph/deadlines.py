@@ -30,14 +30,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from msg_graph.duration import MICROSECOND, MILLISECOND
+from msg_graph.duration import SECOND, short_duration
 from msg_graph.errors import GraphError
 from msg_graph.layout import refused, without_lines
 from msg_graph.model import TaskSet
 import yaml
 
 _LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-_PLACEHOLDER_NS = 1_000_000_000
+_PLACEHOLDER_NS = SECOND
 
 
 def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, str]:
@@ -117,7 +117,7 @@ def _changed(text: str, deadlines: Mapping[str, int]) -> str:
     for key, callback, entries in _callbacks(text):
         if key not in deadlines:
             continue
-        value = _exactly(deadlines[key])
+        value = short_duration(deadlines[key])
         if 'deadline' in entries:
             begin, end = entries['deadline'].start_mark, entries['deadline'].end_mark
             edits.append((begin.line, begin.column, end.column, value))
@@ -132,15 +132,6 @@ def _changed(text: str, deadlines: Mapping[str, int]) -> str:
     for row, first, last, new in sorted(edits, reverse=True):
         lines[row] = lines[row][:first] + new + lines[row][last:]
     return ''.join(lines)
-
-
-def _exactly(ns: int) -> str:
-    """Return a time in the largest of ms, us, ns that needs three decimals at most."""
-    for unit, factor in (('ms', MILLISECOND), ('us', MICROSECOND)):
-        if ns >= factor and ns % (factor // 1000) == 0:
-            whole, part = divmod(ns // (factor // 1000), 1000)
-            return f'{whole}.{part:03d}'.rstrip('0').rstrip('.') + unit
-    return f'{ns}ns'
 
 
 def with_deadlines(task_set: TaskSet, deadlines: Mapping[str, int]) -> TaskSet:

@@ -105,6 +105,24 @@ def format_duration(ns: int) -> str:
     return f'{ns}ns'
 
 
+def whole_us(ns: float) -> int:
+    """Return a time as a deadline can be: rounded up to whole us, at least one, at most a day."""
+    return max(1, -int(-min(DAY, ns) // 1000)) * 1000
+
+
+def short_duration(ns: int) -> str:
+    """
+    Return just this time in the largest of ms, us and ns that needs three decimals at most.
+
+    What the program writes into declarations; no seconds, so that columns of deadlines compare.
+    """
+    for unit, factor in (('ms', MILLISECOND), ('us', MICROSECOND)):
+        if ns >= factor and ns % (factor // 1000) == 0:
+            whole, part = divmod(ns // (factor // 1000), 1000)
+            return f'{whole}.{part:03d}'.rstrip('0').rstrip('.') + unit
+    return f'{ns}ns'
+
+
 def exact_duration(ns: int) -> str:
     """Return a time that ``parse_duration`` reads back as just this one, if it is one at all."""
     text = format_duration(ns)

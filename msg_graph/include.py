@@ -19,11 +19,10 @@ Theory of operation
 -------------------
 1. ``include:`` lists files. Their nodes and paths come before those of the file itself, in that
    order, each time that the file is listed. A ``workers:`` of an included file does not count.
-2. ``arguments:`` names what a file can be told, with default values (none: it must be told), and
-   ``$(name)`` in any value of the file stands for it. ``set:`` of an include tells it.
-3. Names in an included file are put below the ``namespace:`` of the include: nodes, topics,
-   services, names of DAGs and (with dots) of paths. A name that ``remap:`` lists, as it stands in
-   the included file, becomes the other name instead, which the including file knows.
+2. ``arguments:`` names what a file can be told, and ``set:`` of an include tells it (see
+   ``arguments``).
+3. Names in an included file are put below the ``namespace:`` of the include, or become others by
+   its ``remap:`` (see ``renaming``).
 4. So an included file is worked from the inside out: its own includes, its arguments, then the
    names, as the file that includes it wants them. The result is a tree like that of one file, and
    every part of it knows its file and line.
@@ -34,34 +33,20 @@ Theory of operation
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 import os
-import re
 import stat
 
-from msg_graph.errors import did_you_mean, GraphError, listed, shown
-from msg_graph.fields import Check, check_node, check_topic, Fields
-from msg_graph.yamltext import (
-    decode,
-    Mapping,
-    MAX_BYTES,
-    MAX_SIZE,
-    parse_yaml,
-    Scalar,
-    Sequence,
-    Tree,
-)
+from msg_graph.arguments import argument_values, pairs, substituted
+from msg_graph.errors import GraphError, shown
+from msg_graph.fields import Check, Fields
+from msg_graph.renaming import Names
+from msg_graph.yamltext import decode, Mapping, MAX_BYTES, MAX_SIZE, parse_yaml, Scalar, Tree
 
 MOST_FILES = 2_000
 MOST_DEPTH = 16
-LONGEST_VALUE = 4_096
 
 INCLUDE_KEYS = ('file', 'namespace', 'remap', 'set')
-ARGUMENT = re.compile(r'[A-Za-z_][A-Za-z0-9_]*')
-_SUBSTITUTION = re.compile(r'\$\(([^()]*)\)')
-_NAMES = ('subscription', 'service')
-_LISTS = ('sync', 'publishes', 'reads')
 
 Part = tuple[Tree, str]
 """A tree and the name of its file."""
@@ -112,8 +97,8 @@ class Assembler:
         self, tree: Mapping, file: str, given: dict[str, str], chain: list[tuple[str, str]]
     ) -> tuple[Mapping, Parts]:
         fields = Fields(tree, file, 'the declaration', self._known)
-        values = _arguments(fields, tree, given)
-        own = _substituted(tree, file, values)
+        values = argument_values(fields, tree, given)
+        own = substituted(tree, file, values)
         assert isinstance(own, Mapping)
         self._size += own.size
         fields = Fields(own, file, 'the declaration', self._known)
@@ -143,9 +128,9 @@ class Assembler:
         fields = Fields(tree, file, f'include {place}', INCLUDE_KEYS)
         path, name = self._locate(fields, file, chain)
         included = self._read(fields, path, name)
-        values = {key: text for key, text, _ in _pairs(fields, 'set', None)}
+        values = {key: text for key, text, _ in pairs(fields, 'set')}
         _, parts = self._file(included, name, values, [*chain, (path, name)])
-        names = _Names(fields)
+        names = Names(fields)
         parts = Parts([(names.node(tree), source) for tree, source in parts.nodes],
                       [(names.path(tree), source) for tree, source in parts.paths])
         names.check()
@@ -204,177 +189,3 @@ def _check_path(text: str) -> tuple[str, str] | None:
         return (f'{shown(text)} is no relative path',
                 'write it as seen from the file that includes it')
     return None
-
-
-def _pairs(
-    fields: Fields, key: str, check: Check | None
-) -> list[tuple[str, str, int]]:
-    """Return the entries of a mapping of texts, each with its line."""
-    tree = fields.tree_or_none(key)
-    if tree is None:
-        return []
-    if not isinstance(tree, Mapping):
-        raise fields.error(key, f"'{key}' is no mapping", f'write {key}: {{name: value}}')
-    inner = Fields(tree, fields.file, f"{fields.entry}: '{key}'", tuple(tree.entries))
-    return [(name, inner.text(name, check or (lambda _: None)), inner.line_of(name))
-            for name in tree.entries]
-
-
-def _arguments(fields: Fields, tree: Mapping, given: dict[str, str]) -> dict[str, str]:
-    """Return the values of a file's arguments."""
-    declared = tree.entries.get('arguments', Mapping(tree.line))
-    if not isinstance(declared, Mapping):
-        raise fields.error('arguments', "'arguments' is no mapping",
-                           'write arguments: {name: default value}')
-    values: dict[str, str] = {}
-    for name, value in declared.entries.items():
-        if not ARGUMENT.fullmatch(name):
-            raise GraphError(fields.file, declared.key_lines[name],
-                             f'{shown(name)} is no name for an argument',
-                             "use letters, digits and '_', and no digit first")
-        if not isinstance(value, Scalar):
-            raise GraphError(fields.file, value.line,
-                             f'the default value of the argument {shown(name)} is no text',
-                             'write a text, a number or a time')
-        if name in given:
-            values[name] = given[name]
-        elif value.is_null:
-            raise GraphError(fields.file, declared.key_lines[name],
-                             f'the argument {shown(name)} has no value',
-                             "tell it with 'set:' of the include, or give it a default here")
-        else:
-            values[name] = value.text
-    for name in given:
-        if name not in values:
-            raise fields.error(
-                'arguments', f'an include sets {shown(name)}, which is no argument of this file',
-                did_you_mean(name, values, "add it to 'arguments:'"))
-    return values
-
-
-def _substituted(tree: Tree, file: str, values: dict[str, str]) -> Tree:
-    """Return a tree with arguments replaced by their values; what has none is shared."""
-    def value(found: re.Match[str], line: int) -> str:
-        if found[1] not in values:
-            raise GraphError(
-                file, line, f'{shown(found[0])} stands for no argument of this file',
-                did_you_mean(found[1], values, f"add it to 'arguments:' ({listed(values)})"
-                             if values else "add it to 'arguments:'"))
-        return values[found[1]]
-
-    def scalar(old: Scalar) -> Scalar:
-        if '$(' not in old.text:
-            return old
-        text = _SUBSTITUTION.sub(lambda found: value(found, old.line), old.text)
-        if len(text) > LONGEST_VALUE:
-            raise GraphError(file, old.line, 'with its arguments this value is too long',
-                             f'use at most {LONGEST_VALUE} characters')
-        return Scalar(old.line, text, old.plain)
-
-    return _mapped(tree, scalar)
-
-
-def _mapped(tree: Tree, change: Callable[[Scalar], Scalar]) -> Tree:
-    """Return a tree with every value changed; nesting is bounded, so this may recurse."""
-    if isinstance(tree, Scalar):
-        return change(tree)
-    if isinstance(tree, Sequence):
-        items = Sequence(tree.line)
-        items.items = [_mapped(item, change) for item in tree.items]
-        items.size = tree.size
-        return items
-    return _with(tree, {key: _mapped(value, change) for key, value in tree.entries.items()})
-
-
-def _with(tree: Mapping, entries: dict[str, Tree]) -> Mapping:
-    """Return a mapping with other values of the same keys."""
-    result = Mapping(tree.line)
-    result.entries, result.key_lines, result.size = entries, tree.key_lines, tree.size
-    return result
-
-
-class _Names:
-    """Gives names of an included file those that the including one knows."""
-
-    def __init__(self, fields: Fields) -> None:
-        self._fields = fields
-        self._space = fields.text_or_none('namespace', check_node) or ''
-        self._remap = {old: (new, line) for old, new, line in _pairs(fields, 'remap', check_topic)}
-        self._used: set[str] = set()
-        self._seen: set[str] = set()
-
-    def check(self) -> None:
-        """Raise where a name is remapped that the included file does not have."""
-        for name, (_, line) in self._remap.items():
-            if name not in self._used:
-                raise GraphError(
-                    self._fields.file, line, f'{self._fields.entry}: it remaps {shown(name)}, '
-                    'which the included file does not name',
-                    did_you_mean(name, self._seen, "remove it from 'remap:'"))
-
-    def _name(self, text: str) -> str:
-        if not text.startswith('/'):
-            return text
-        self._seen.add(text)
-        if text in self._remap:
-            self._used.add(text)
-            return self._remap[text][0]
-        return self._space + text
-
-    def _scalar(self, tree: Tree, change: Callable[[str], str]) -> Tree:
-        if not isinstance(tree, Scalar) or tree.is_null:
-            return tree
-        return Scalar(tree.line, change(tree.text), tree.plain)
-
-    def _list(self, tree: Tree, change: Callable[[str], str]) -> Tree:
-        if not isinstance(tree, Sequence):
-            return tree
-        items = Sequence(tree.line)
-        items.items = [self._scalar(item, change) for item in tree.items]
-        items.size = tree.size
-        return items
-
-    def node(self, tree: Tree) -> Tree:
-        """Return an entry of ``nodes`` with its names changed."""
-        if not isinstance(tree, Mapping):
-            return tree
-        entries = dict(tree.entries)
-        if 'node' in entries:
-            entries['node'] = self._scalar(entries['node'], self._name)
-        callbacks = entries.get('callbacks')
-        if isinstance(callbacks, Sequence):
-            items = Sequence(callbacks.line)
-            items.items = [self._callback(item) for item in callbacks.items]
-            items.size = callbacks.size
-            entries['callbacks'] = items
-        return _with(tree, entries)
-
-    def _callback(self, tree: Tree) -> Tree:
-        if not isinstance(tree, Mapping):
-            return tree
-        entries = dict(tree.entries)
-        for key, value in tree.entries.items():
-            if key in _NAMES:
-                entries[key] = self._scalar(value, self._name)
-            elif key in _LISTS:
-                entries[key] = self._list(value, self._name)
-            elif key == 'dag' and self._space:
-                entries[key] = self._scalar(
-                    value, lambda text: f'{self._space}/{text.lstrip("/")}')
-        return _with(tree, entries)
-
-    def path(self, tree: Tree) -> Tree:
-        """Return an entry of ``paths`` with its names changed."""
-        if not isinstance(tree, Mapping):
-            return tree
-        entries = dict(tree.entries)
-        if 'name' in entries and self._space:
-            before = self._space.strip('/').replace('/', '.')
-            entries['name'] = self._scalar(entries['name'], lambda text: f'{before}.{text}')
-        if 'callbacks' in entries:
-            entries['callbacks'] = self._list(entries['callbacks'], self._key)
-        return _with(tree, entries)
-
-    def _key(self, text: str) -> str:
-        node, colon, name = text.rpartition(':')
-        return self._name(node) + colon + name

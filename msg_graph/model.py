@@ -71,11 +71,6 @@ class ExecutionTime:
             area += (quantiles[i - 1] + quantiles[i]) / 2 * (percent[i] - percent[i - 1])
         return round(area / 100.0)
 
-    @property
-    def median_ns(self) -> int:
-        """Return the median of the distribution, in ns."""
-        return self.draw(0.5)
-
 
 @dataclass(frozen=True, slots=True)
 class Callback:

@@ -34,8 +34,9 @@ from typing import Any
 
 from msg_graph import declaration as language
 from msg_graph import fields
+from msg_graph.arguments import ARGUMENT
 from msg_graph.duration import UNITS
-from msg_graph.include import ARGUMENT, INCLUDE_KEYS
+from msg_graph.include import INCLUDE_KEYS
 
 _Schema = dict[str, Any]
 

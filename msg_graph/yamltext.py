@@ -75,6 +75,12 @@ class Sequence:
         self.size = 1
         self.closed = False
 
+    def with_items(self, items: list[Tree]) -> Sequence:
+        """Return a list in the same place with as many other items."""
+        result = Sequence(self.line)
+        result.items, result.size = items, self.size
+        return result
+
 
 class Mapping:
     """Trees by key, in file order, and the line of each key."""
@@ -87,6 +93,12 @@ class Mapping:
         self.key_lines: dict[str, int] = {}
         self.size = 1
         self.closed = False
+
+    def with_entries(self, entries: dict[str, Tree]) -> Mapping:
+        """Return a mapping in the same place with other values of its keys."""
+        result = Mapping(self.line)
+        result.entries, result.key_lines, result.size = entries, self.key_lines, self.size
+        return result
 
 
 Tree = Scalar | Sequence | Mapping

@@ -26,12 +26,14 @@ import contextlib
 import fcntl
 import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 import traceback
+from types import ModuleType
 from typing import Any
 
 import hypothesis
@@ -46,6 +48,14 @@ ORDER = ('msg_graph', 'core', 'trace', 'simulate', 'analysis', 'replay', 'report
 DOMAINS = range(40, 102)
 
 _session = contextlib.ExitStack()
+
+if __name__ == 'test.conftest':
+    # Before its version 8, pytest takes the standard library's `test` for the package that these
+    # are in, and a relative import finds no neighbour there.
+    _package = sys.modules.setdefault('test', ModuleType('test'))
+    _paths = [*getattr(_package, '__path__', ())]
+    if str(HERE) not in _paths:
+        _package.__path__ = [str(HERE), *_paths]
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -149,9 +159,25 @@ def mddag() -> Callable[..., subprocess.CompletedProcess[str]]:
     """Give a function that runs `mddag` with arguments in a process of its own."""
     def call(*arguments: str | Path, timeout: float = 60.0,
              **options: Any) -> subprocess.CompletedProcess[str]:
-        if 'input' not in options:
-            options.setdefault('stdin', subprocess.DEVNULL)
-        return subprocess.run(
-            [sys.executable, '-m', 'mddag_executor', *map(str, arguments)],
-            capture_output=True, text=True, timeout=timeout, check=False, **options)
+        given = options.pop('input', None)
+        options.setdefault('stdin', subprocess.DEVNULL if given is None else subprocess.PIPE)
+        environment = {**(options.pop('env', None) or os.environ), 'PYTHONFAULTHANDLER': '1'}
+        command = [sys.executable, '-m', 'mddag_executor', *map(str, arguments)]
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+            **options,
+        ) as process:
+            try:
+                out, err = process.communicate(given, timeout)
+            except subprocess.TimeoutExpired:
+                process.send_signal(signal.SIGABRT)  # has it tell where each thread stands
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.communicate(timeout=10)
+                process.kill()
+                out, err = process.communicate()
+                pytest.fail(f'{command} has not ended within {timeout:g} s\n{out}\n{err}')
+            except BaseException:
+                process.kill()
+                raise
+        return subprocess.CompletedProcess(command, process.returncode, out, err)
     return call

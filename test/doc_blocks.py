@@ -150,7 +150,8 @@ class Folder:
             program.write_text(f'#!/bin/sh\nexec {sys.executable} {command} "$@"\n')
             program.chmod(0o755)
         self._environment = {
-            **os.environ, 'PYTHONPATH': os.pathsep.join([str(path), str(TOP)]),
+            **os.environ, 'PYTHONPATH': os.pathsep.join(
+                [str(path), str(TOP), *filter(None, [os.environ.get('PYTHONPATH')])]),
             'PATH': os.pathsep.join([str(programs), os.environ['PATH']])}
 
     def write(self, name: str, text: str) -> Path:

@@ -41,6 +41,10 @@ pytestmark = [
         any(find_spec(name) is None for name in NEEDED),
         reason='colcon is not installed here: pip install colcon-common-extensions')]
 
+needs_ros2 = pytest.mark.skipif(
+    any(find_spec(name) is None for name in ('ros2cli', 'ros2launch', 'ros2pkg', 'ros2run'))
+    or shutil.which('ros2') is None, reason='ros2 is not installed here')
+
 
 @pytest.fixture(scope='module')
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -52,6 +56,9 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
             'install', 'log', '*.orig'))
     done = colcon(place, 'build', '--packages-select', NAME)
     assert done.returncode == 0 and f'Finished <<< {NAME}' in done.stdout, done.stderr
+    # What is there goes to every user's screen.
+    assert [line for line in done.stderr.splitlines()
+            if 'previously-included' in line or 'deprecated' in line.lower()] == []
     return place
 
 
@@ -61,10 +68,12 @@ def colcon(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         timeout=170, check=False, stdin=subprocess.DEVNULL)
 
 
-def in_workspace(place: Path, command: str) -> subprocess.CompletedProcess[str]:
-    """Run a command in a shell that has sourced the workspace, somewhere else."""
+def in_workspace(
+    place: Path, command: str, folder: Path = Path('/')
+) -> subprocess.CompletedProcess[str]:
+    """Run a command in a shell that has sourced the workspace."""
     return subprocess.run(
-        ['bash', '-c', f'. "{place}/install/setup.bash" && cd / && {command}'],
+        ['bash', '-c', f'. "{place}/install/setup.bash" && cd "{folder}" && {command}'],
         capture_output=True, text=True, timeout=60, check=False, stdin=subprocess.DEVNULL,
         env={**os.environ, 'COLCON_TRACE': '', 'PYTHON': sys.executable})
 
@@ -88,6 +97,35 @@ def test_what_others_look_up_is_installed(workspace: Path):
     assert (share / 'ament_index/resource_index/packages' / NAME).is_file()
     for name in ('package.xml', 'launch/autoware_demo.launch.py', 'config/autoware.yaml'):
         assert (share / NAME / name).is_file()
+
+
+@needs_ros2
+def test_ros2_finds_and_runs_it(workspace: Path, tmp_path: Path):
+    def said(command: str) -> str:
+        done = in_workspace(workspace, command, tmp_path)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    assert said(f'ros2 pkg executables {NAME}') == f'{NAME} mddag\n'
+    assert said(f'ros2 pkg prefix --share {NAME}').startswith(str(workspace / 'install'))
+    assert said(f'ros2 run {NAME} mddag --version').startswith('mddag ')
+    launch = f'ros2 launch {NAME} autoware_demo.launch.py'
+    assert "'utilisation':" in said(f'{launch} --show-args')
+    text = said(f'{launch} duration:=1s utilisation:=0.2 trace:=out.mcap')
+    assert 'sink jobs due' in text and 'process has finished cleanly' in text
+    assert said(f'ros2 run {NAME} mddag replay out.mcap')
+
+
+@needs_ros2
+def test_ctrl_c_ends_ros2_launch_and_what_it_started(workspace: Path, tmp_path: Path):
+    # To all processes, as a terminal does; reading from none, `ros2 launch` sends one more.
+    done = in_workspace(
+        workspace, f'timeout --kill-after=20 -s INT 5 ros2 launch {NAME} autoware_demo.launch.py '
+        'utilisation:=0.2 trace:=out.mcap', tmp_path)
+    assert 'sink jobs due' in done.stdout and 'process has finished cleanly' in done.stdout
+    assert 'Traceback' not in done.stdout + done.stderr
+    replayed = in_workspace(workspace, f'ros2 run {NAME} mddag replay out.mcap', tmp_path)
+    assert (replayed.returncode, replayed.stderr) == (0, '')
 
 
 def test_colcon_test_runs_the_tests(workspace: Path):

@@ -35,6 +35,7 @@ LEVELS = {
     'msg_graph': 0,
     'mddag_executor.errors': 1,
     'mddag_executor.memory': 1,
+    'mddag_executor.defaults': 1,
     'mddag_executor.resources': 2,
     'mddag_executor': 3,  # its __init__.py, to those who want the version
     'mddag_executor.core': 4,

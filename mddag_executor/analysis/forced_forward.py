@@ -44,7 +44,7 @@ from heapq import heapify, heapreplace
 from typing import NamedTuple
 
 from mddag_executor.analysis.model import Task
-from mddag_executor.analysis.sufficient import bonifaci, Demand, demand_limits, factors, GRID
+from mddag_executor.analysis.sufficient import bonifaci, demand_limits, factors, GRID, Slowdown
 from msg_graph.analysis import topological_order
 
 _MOST_POINTS = 30_000
@@ -69,7 +69,7 @@ class _Profile(NamedTuple):
         return self.task.volume - self.done[place] - self.slope[place] * (z - self.at[place])
 
 
-def forced_forward(tasks: Sequence[Task], workers: int) -> Demand | None:
+def forced_forward(tasks: Sequence[Task], workers: int) -> Slowdown | None:
     """Return the value of a with which the test holds; None where none does that was tried."""
     simple = bonifaci(tasks, workers)
     if simple is not None:
@@ -79,7 +79,7 @@ def forced_forward(tasks: Sequence[Task], workers: int) -> Demand | None:
     for numerator in factors(tasks):
         points, holds = _holds(profiles, tasks, workers, numerator, left)
         if holds:
-            return Demand(numerator / GRID, points)
+            return Slowdown(numerator / GRID, points)
         left -= points
         if left <= 0:
             return None

@@ -44,9 +44,11 @@ from heapq import heappop, heappush
 from mddag_executor.analysis.model import Task
 from mddag_executor.analysis.sufficient import (
     Bound,
+    bounds_of_sinks,
+    least_response,
     own_jobs,
     own_urgent,
-    urgent,
+    Urgent,
     workload,
 )
 from msg_graph.analysis import path_lengths
@@ -55,31 +57,24 @@ from msg_graph.analysis import path_lengths
 def rad_non_preemptive(tasks: Sequence[Task], workers: int) -> list[Bound]:
     """Return the bounds, up to the first sink that has none."""
     blocking = _Blocking(tasks, workers)
-    known: dict[tuple[int, int], int] = {}
-    bounds = []
-    for task in tasks:
+    urgent_of = Urgent()
+    chains = {task.dag.index: path_lengths(task.dag, [1] * len(task.costs)) for task in tasks}
+
+    def response(task: Task, sink: int, deadline: int, length: int) -> int:
+        def work(window: int) -> int:
+            loads = [workload(other, window, workers) for other in others]
+            some = own + sum(min(pair) for pair in zip(most, loads))
+            some += steps * blocking(deadline - window)
+            every = task.volume - length + own_jobs(task, window, workers) + sum(loads)
+            return min(some, every)
+
         others = [other for other in tasks if other is not task]
-        steps = path_lengths(task.dag, [1] * len(task.costs))
-        for sink, deadline, length in task.sinks:
-            own = own_urgent(task, deadline) - length
-            for other in others:
-                if (other.dag.index, deadline) not in known:
-                    known[other.dag.index, deadline] = urgent(other, deadline)
-            most = [known[other.dag.index, deadline] for other in others]
-            response = length
-            while response <= deadline:
-                loads = [workload(other, response, workers) for other in others]
-                some = own + sum(min(pair) for pair in zip(most, loads))
-                some += steps[sink] * blocking(deadline - response)
-                every = task.volume - length + own_jobs(task, response, workers) + sum(loads)
-                after = length + min(some, every) // workers
-                if after <= response:
-                    break
-                response = after
-            bounds.append(Bound(task, sink, deadline, response if response <= deadline else None))
-            if response > deadline:
-                return bounds
-    return bounds
+        most = [urgent_of(other, deadline) for other in others]
+        own = own_urgent(task, deadline) - length
+        steps = chains[task.dag.index][sink]
+        return least_response(length, deadline, workers, work)
+
+    return bounds_of_sinks(tasks, response)
 
 
 class _Blocking:

@@ -54,7 +54,7 @@ None of these tests looks at overheads.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from heapq import heapify, heapreplace
 import math
@@ -85,24 +85,52 @@ def graham(task: Task, workers: int) -> list[Bound]:
             for (sink, deadline, _), response in zip(task.sinks, responses)]
 
 
-def work_conserving(tasks: Sequence[Task], workers: int) -> list[Bound]:
-    """Return the bounds of test 2, up to the first sink that has none."""
+def least_response(length: int, deadline: int, workers: int, work: Callable[[int], int]) -> int:
+    """
+    Return the least x from ``length`` on with length + work(x) / m <= x: tests 2 and 3.
+
+    What is beyond the deadline is no bound, but tells that there is none.
+
+    :param work: what is done beside the longest path in a window, ns; it grows with the window.
+    """
+    response = length
+    while response <= deadline:
+        after = length + work(response) // workers
+        if after <= response:
+            break
+        response = after
+    return response
+
+
+def bounds_of_sinks(
+    tasks: Sequence[Task], response: Callable[[Task, int, int, int], int]
+) -> list[Bound]:
+    """
+    Return the bounds, up to the first sink that has none: those after it would mean nothing.
+
+    :param response: of a task, its sink, deadline and longest path there (see ``least_response``).
+    """
     bounds = []
     for task in tasks:
-        others = [other for other in tasks if other is not task]
         for sink, deadline, length in task.sinks:
-            response = length
-            while response <= deadline:
-                work = task.volume - length + own_jobs(task, response, workers)
-                work += sum(workload(other, response, workers) for other in others)
-                after = length + work // workers
-                if after <= response:
-                    break
-                response = after
-            bounds.append(Bound(task, sink, deadline, response if response <= deadline else None))
-            if response > deadline:
+            found = response(task, sink, deadline, length)
+            bounds.append(Bound(task, sink, deadline, found if found <= deadline else None))
+            if found > deadline:
                 return bounds
     return bounds
+
+
+def work_conserving(tasks: Sequence[Task], workers: int) -> list[Bound]:
+    """Return the bounds of test 2, up to the first sink that has none."""
+    def response(task: Task, sink: int, deadline: int, length: int) -> int:
+        def work(window: int) -> int:
+            own = task.volume - length + own_jobs(task, window, workers)
+            return own + sum(workload(other, window, workers) for other in others)
+
+        others = [other for other in tasks if other is not task]
+        return least_response(length, deadline, workers, work)
+
+    return bounds_of_sinks(tasks, response)
 
 
 def workload(task: Task, window: int, workers: int) -> int:
@@ -126,30 +154,17 @@ def own_jobs(task: Task, window: int, workers: int) -> int:
 
 def rad_preemptive(tasks: Sequence[Task], workers: int) -> list[Bound]:
     """Return the bounds of test 3, up to the first sink that has none."""
-    bounds = []
-    known: dict[tuple[int, int], int] = {}
-    for task in tasks:
-        for sink, deadline, length in task.sinks:
-            own = own_urgent(task, deadline) - length
-            fixed = []
-            for other in tasks:
-                if other is not task:
-                    key = (other.dag.index, deadline)
-                    if key not in known:
-                        known[key] = urgent(other, deadline)
-                    fixed.append((other, known[key]))
-            response = length
-            while response <= deadline:
-                work = own + sum(
-                    min(most, workload(other, response, workers)) for other, most in fixed)
-                after = length + work // workers
-                if after <= response:
-                    break
-                response = after
-            bounds.append(Bound(task, sink, deadline, response if response <= deadline else None))
-            if response > deadline:
-                return bounds
-    return bounds
+    urgent_of = Urgent()
+
+    def response(task: Task, sink: int, deadline: int, length: int) -> int:
+        def work(window: int) -> int:
+            return own + sum(min(most, workload(other, window, workers)) for other, most in fixed)
+
+        own = own_urgent(task, deadline) - length
+        fixed = [(other, urgent_of(other, deadline)) for other in tasks if other is not task]
+        return least_response(length, deadline, workers, work)
+
+    return bounds_of_sinks(tasks, response)
 
 
 def urgent(task: Task, deadline: int) -> int:
@@ -159,6 +174,20 @@ def urgent(task: Task, deadline: int) -> int:
     return sum(
         sum(min(cost, left) for cost in task.costs)
         for left in range(deadline, 0, -task.period))
+
+
+class Urgent:
+    """``urgent`` of a task set's tasks, remembered: many sinks have the same deadline."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, int], int] = {}
+
+    def __call__(self, task: Task, deadline: int) -> int:
+        """Return it, ns."""
+        key = (task.dag.index, deadline)
+        if key not in self._known:
+            self._known[key] = urgent(task, deadline)
+        return self._known[key]
 
 
 def own_urgent(task: Task, deadline: int) -> int:
@@ -176,7 +205,7 @@ def own_urgent(task: Task, deadline: int) -> int:
     return work
 
 
-class Demand(NamedTuple):
+class Slowdown(NamedTuple):
     """The value of a with which test 4 holds, and how many points were looked at."""
 
     factor: float
@@ -192,12 +221,12 @@ def factors(tasks: Sequence[Task]) -> list[int]:
     return [math.floor((1 + (largest - 1) * step / _TRIES) * GRID) for step in range(_TRIES + 1)]
 
 
-def bonifaci(tasks: Sequence[Task], workers: int) -> Demand | None:
+def bonifaci(tasks: Sequence[Task], workers: int) -> Slowdown | None:
     """Return how test 4 holds; None where it does not, or not within a bounded search."""
     for numerator in factors(tasks):
         points = _demand_holds(tasks, workers, numerator)
         if points:
-            return Demand(numerator / GRID, points)
+            return Slowdown(numerator / GRID, points)
     return None
 
 

@@ -39,7 +39,7 @@ from mddag_executor.analysis.forced_forward import forced_forward
 from mddag_executor.analysis.model import AnalysisError, Task, tasks_of
 from mddag_executor.analysis.non_preemptive import rad_non_preemptive
 from mddag_executor.analysis.sag import Answer, JobSet
-from mddag_executor.analysis.sufficient import Bound, Demand
+from mddag_executor.analysis.sufficient import Bound, Slowdown
 from msg_graph import format_duration, TaskSet
 
 SHARED = (
@@ -288,18 +288,18 @@ def _rad_live(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verd
 
 
 def _gedf_demand(
-    name: str, source: str, test: Callable[[Sequence[Task], int], Demand | None],
+    name: str, source: str, test: Callable[[Sequence[Task], int], Slowdown | None],
     tasks: Sequence[Task], workers: int, obstacle: str | None,
 ) -> Verdict:
     obstacle = obstacle or _several_deadlines(tasks)
     verdict, figure, reason = NOTHING, '-', obstacle
     if obstacle is None:
-        demand = test(tasks, workers)
-        if demand is None:
+        slowdown = test(tasks, workers)
+        if slowdown is None:
             reason = 'too much work in some interval, at each speed that was tried'
         else:
             verdict = HOLDS
-            figure = f'speed 1/{demand.factor:.3f}, {demand.points} instants'
+            figure = f'speed 1/{slowdown.factor:.3f}, {slowdown.points} instants'
             reason = 'in no interval the work that EDF would have to be behind with'
     return Verdict(
         name, 'sufficient', source, 'gedf or rad, preemptive',

@@ -23,13 +23,7 @@ from __future__ import annotations
 
 from mddag_executor.analysis.model import tasks_of
 from msg_graph import TaskSet
-
-_LONGEST_NS = 86_400_000_000_000
-
-
-def _up(ns: float) -> int:
-    """Return a time in whole us, at least one, at most a day."""
-    return int(min(_LONGEST_NS, max(1, -(-ns // 1000)) * 1000))
+from msg_graph.duration import whole_us
 
 
 def proportional(
@@ -51,7 +45,7 @@ def proportional(
         for index, _, length in task.sinks:
             share = length / longest if longest else 1.0
             key = task.dag.vertices[index].callback.key
-            deadline = _up(whole * factor * share)
+            deadline = whole_us(whole * factor * share)
             deadlines[key] = min(deadline, deadlines.get(key, deadline))
     return deadlines
 
@@ -68,5 +62,5 @@ def scaled(task_set: TaskSet, budget: str, scale: float) -> dict[str, int]:
     for task in tasks_of(task_set, budget):
         for index, _, length in task.sinks:
             key = task.dag.vertices[index].callback.key
-            deadlines[key] = max(_up(length * scale), deadlines.get(key, 0))
+            deadlines[key] = max(whole_us(length * scale), deadlines.get(key, 0))
     return deadlines

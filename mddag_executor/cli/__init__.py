@@ -19,13 +19,14 @@ A verb's module has these names, and is imported only when its verb is run:
 
 | name | meaning |
 | --- | --- |
-| `NAME` | the verb |
-| `HELP` | one line for the list of verbs (the same as in the table of `main.py`) |
 | `EXAMPLE` | a command line, or several lines of them, shown by `--help` |
 | `add_arguments(parser)` | declares the arguments; a verb of verbs adds its sub-verbs here |
 | `main(args) -> int` | does it and returns the exit status (0, or 1 for `--fail-on-miss`) |
 
+Its one-line help is in the table of `main.py`. The module of a verb of a verb (`graph_…`,
+`bench_…`) has its own in `HELP`, and what its `--help` begins with in `DESCRIPTION`.
+
 A verb reports bad input by raising an error of `mddag_executor.errors` or `msg_graph`;
-`main.py` turns it into the one line on standard error and exit status 2. Helpers that the verbs
-share are in `common.py` (files, arguments) and `text.py` (tables, durations, progress).
+`main.py` turns it into the one line on standard error and exit status 2. What the verbs share is
+in `options.py` (arguments), `common.py` (files) and `text.py` (tables, warnings, progress).
 """

@@ -12,14 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The part of `replay` for ordinary bags: their messages as releases."""
+"""Ordinary bags, for the verbs that take recordings: their messages as releases."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
 
-from mddag_executor.cli import common
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress
 from mddag_executor.errors import UsageError
 
@@ -47,19 +47,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _overheads(text: str) -> int:
     if text == 'recorded':
         return RECORDED
-    return 0 if text == 'none' else common.duration(text)
+    return 0 if text == 'none' else options.duration(text)
 
 
-def check(args: argparse.Namespace) -> None:
+def check(args: argparse.Namespace, *files: str | None) -> None:
     """
     Check the arguments.
 
+    :param files: what else may be standard input.
     :raises mddag_executor.errors.UsageError: where they do not go together
     """
-    if args.execution_times == '-' and '-' in (args.trace, args.graph):
+    if args.execution_times == '-' and '-' in files:
         raise UsageError('-: standard input can be only one file: name the others')
     if args.execution_times is not None and args.graph is None:
         raise UsageError('--execution-times: they are of a declaration: give a GRAPH')
+
+
+def no_graph(name: str) -> UsageError:
+    """Return the error for a bag that is not rescheduled by a graph."""
+    return UsageError(
+        f'{name}: no run of this executor is recorded in it, so there are no jobs: to take its '
+        'messages as releases give a GRAPH and --reschedule')
 
 
 def reschedule_bag(
@@ -73,9 +81,7 @@ def reschedule_bag(
     from mddag_executor.replay.bags_reschedule import reschedule_bag as run
     from mddag_executor.simulate import read_execution_times
     if task_set is None or not args.reschedule:
-        raise UsageError(
-            f'{name}: no run of this executor is recorded in it, so there are no jobs: to take '
-            'its messages as releases give a GRAPH and --reschedule')
+        raise no_graph(name)
     if args.overheads == RECORDED:
         raise UsageError('--overheads: a bag has none: give a time for each dispatch')
     times = None

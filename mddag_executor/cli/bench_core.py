@@ -24,14 +24,14 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from mddag_executor.cli import common
+from mddag_executor import defaults
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress, table
 from mddag_executor.core import POLICIES
-from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
-from mddag_executor.resources import find
 
-HELP = 'measure the core in plain Python: CPU time for each event and each job of a vertex'
+HELP = 'measure the scheduler core'
+DESCRIPTION = 'Measure the core in plain Python: CPU time for each event and each job of a vertex.'
 EXAMPLE = """\
 mddag bench core
 mddag bench core --policies rad,ros2 --repeat 9 --json core.json"""
@@ -41,19 +41,14 @@ _LONGEST_NS = 60_000_000_000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    add = parser.add_argument
-    add('--graph', metavar='FILE',
-        help="a declaration to take instead of the paper's workload ('-': standard input)")
-    add('--policies', default=','.join(POLICIES), metavar='P,P…', help='(default: all)')
-    add('--workers', type=common.positive_int, metavar='M',
-        help="of the simulated runs (default: the declaration's, else 7)")
-    add('--duration', type=common.duration, default=3_000_000_000, metavar='TIME',
-        help='virtual time of each run (default: 3s)')
-    add('--seed', type=common.seed, default=0, metavar='N',
-        help='of the execution times (default: %(default)s)')
-    add('--repeat', type=common.positive_int, default=5, metavar='R',
-        help='measure everything R times, and take the medians (default: %(default)s)')
-    common.add_json(parser)
+    options.add_workload(parser)
+    parser.add_argument(
+        '--policies', default=','.join(POLICIES), metavar='P,P…', help='(default: all)')
+    options.add_workers(parser)
+    options.add_virtual_time(parser)
+    options.add_seed(parser, 'of the execution times')
+    options.add_repeat(parser, 5)
+    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -64,25 +59,19 @@ def main(args: argparse.Namespace) -> int:
     :raises mddag_executor.errors.MddagError: when anything else can not be used
     """
     common.check_output(args.json)
-    policies = [name.strip() for name in args.policies.split(',')]
-    for i, name in enumerate(policies):
-        find_policy(name)
-        if name in policies[:i]:
-            raise UsageError(f"--policies: '{name}' stands there twice: name each once")
+    policies = options.policies(args.policies)
     if args.duration > _LONGEST_NS:
         raise UsageError('--duration: that is too long: give at most 60s')
     result = _measure(args, policies)
-    if args.json is not None:
-        common.write_json(args.json, result)
-    if common.wants_tables(args):
+    if common.write_result(args, result):
         _show(result)
     return 0
 
 
-def _measure(args: argparse.Namespace, policies: list[str]) -> dict[str, Any]:
+def _measure(args: argparse.Namespace, policies: tuple[str, ...]) -> dict[str, Any]:
     from mddag_executor.simulate.measure_core import time_core
-    task_set = common.load_graph(args.graph or str(find('config/autoware.yaml')))
-    workers = args.workers or task_set.workers or 7
+    task_set = common.load_workload(args.graph)
+    workers = defaults.workers(args.workers, task_set)
     rows: list[dict[str, Any]] = []
     with Progress('measuring', len(policies)) as line:
         for name in policies:

@@ -22,18 +22,18 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 from statistics import linear_regression
 from typing import Any
 
-from mddag_executor.cli import common
+from mddag_executor import defaults
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress, table
-from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
 from mddag_executor.memory import peak_memory_mb
-from mddag_executor.resources import find
 
-HELP = 'measure the batch evaluation: time for each run and policy, and for each vertex job'
+HELP = 'measure the batch evaluation'
+DESCRIPTION = """\
+Measure the batch evaluation: time for each run and policy, and for each vertex job."""
 EXAMPLE = """\
 mddag bench evaluate
 mddag bench evaluate --runs 5000 --jobs 1,2,4 --repeat 5 --json evaluate.json"""
@@ -48,22 +48,16 @@ _VERTEX_JOBS = {'compiled': 200_000, 'plain': 20_000}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('--graph', metavar='FILE',
-        help="a declaration to take instead of the paper's workload ('-': standard input)")
-    add('--runs', type=common.positive_int, default=2000, metavar='N',
+    options.add_workload(parser)
+    add('--runs', type=options.positive_int, default=2000, metavar='N',
         help=f'for each measurement; one in {_PLAIN_SHARE} in plain Python (default: %(default)s)')
     add('--policies', default='rad,rm,wc', metavar='P,P…', help='(default: %(default)s)')
-    add('--jobs', type=_counts, metavar='N,N…',
+    add('--jobs', type=options.list_of(options.positive_int), metavar='N,N…',
         help='runs to simulate at a time (default: 1 and the number of processors)')
-    add('--vertices', type=_counts, default=SIZES, metavar='N,N…',
+    add('--vertices', type=options.list_of(options.positive_int), default=SIZES, metavar='N,N…',
         help='sizes of the random task sets (default: 10,100,1000,10000)')
-    add('--repeat', type=common.positive_int, default=3, metavar='R',
-        help='measure everything R times, and take the medians (default: %(default)s)')
-    common.add_json(parser)
-
-
-def _counts(text: str) -> list[int]:
-    return [common.positive_int(part.strip()) for part in text.split(',')]
+    options.add_repeat(parser, 3)
+    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -75,16 +69,12 @@ def main(args: argparse.Namespace) -> int:
     """
     from mddag_executor.simulate.compiled import available
     common.check_output(args.json)
-    policies = tuple(name.strip() for name in args.policies.split(','))
-    for name in policies:
-        find_policy(name)
+    policies = options.policies(args.policies)
     if max(args.vertices) > 100_000:
         raise UsageError('--vertices: that is too many: give at most 100000')
     cores = CORES if available() else CORES[1:]
     result = _measure(args, policies, cores)
-    if args.json is not None:
-        common.write_json(args.json, result)
-    if common.wants_tables(args):
+    if common.write_result(args, result):
         _show(result, cores)
     return 0
 
@@ -94,9 +84,9 @@ def _measure(
 ) -> dict[str, Any]:
     from mddag_executor.simulate.evaluate import Experiment
     from mddag_executor.simulate.measure import time_runs, time_vertex_jobs
-    task_set = common.load_graph(args.graph or str(find('config/autoware.yaml')))
-    experiment = Experiment(task_set, policies, workers=task_set.workers or 7)
-    jobs = args.jobs or sorted({1, len(os.sched_getaffinity(0))})
+    task_set = common.load_workload(args.graph)
+    experiment = Experiment(task_set, policies, workers=defaults.workers(None, task_set))
+    jobs = args.jobs or sorted({1, common.processors()})
     runs: list[dict[str, Any]] = []
     sizes: list[dict[str, Any]] = []
     steps = len(cores) * (len(jobs) + len(args.vertices))

@@ -21,16 +21,16 @@ Everything that can be wrong with the command line is found before the first mea
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-import sys
 import tempfile
-from typing import Any, TypeVar
+from typing import Any
 
-from mddag_executor.cli import common
-from mddag_executor.cli.text import Cell, printable, Progress, table
+from mddag_executor import defaults
+from mddag_executor.cli import common, options
+from mddag_executor.cli.text import Cell, Progress, table, warn
 from mddag_executor.core import POLICIES
 from mddag_executor.errors import UsageError
 from mddag_executor.live.bench.spec import (
@@ -45,6 +45,7 @@ from mddag_executor.report.tables import percent
 from mddag_executor.resources import find
 
 HELP = 'measure executors of rclpy nodes, this one and those of rclpy, side by side'
+DESCRIPTION = 'Measure executors of rclpy nodes, this one and those of rclpy, side by side.'
 EXAMPLE = """\
 mddag bench live --load autoware --utilisation 0.3,0.6,0.8 --seconds 10 --plot live.png
 mddag bench live --load autoware --executors rad-events,multi --policies rad,fifo,rm,wc,gedf
@@ -61,8 +62,7 @@ _LOADS_OF_OPTIONS = {
     'graph': ('autoware', 'reference-system'), 'utilisation': ('autoware', 'reference-system'),
     'bodies': ('autoware', 'reference-system'), 'topics': ('topics',),
     'rate': ('topics', 'entities'), 'idle': ('entities',), 'groups': ('topics', 'entities')}
-
-_T = TypeVar('_T')
+_SEED = 2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,45 +76,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'policy as rad-events:fifo (default: all)')
     add('--policies', metavar='P[,P…]',
         help=f'run this executor with each of these: {", ".join(POLICIES)} (default: rad)')
-    add('--utilisation', type=_list_of(common.positive_float), metavar='U[,U…]',
+    add('--utilisation', type=options.list_of(options.positive_float), metavar='U[,U…]',
         help='scale the execution times to these normalised utilisations, sum(C/T)/workers '
         '(default: 0.3,0.6,0.8 for autoware, as declared for reference-system)')
     add('--graph', metavar='FILE', help='a declaration to take instead of the one that ships '
         "with the package ('-': standard input)")
     add('--bodies', choices=('sleep', 'spin'),
         help='how the synthetic callbacks execute (default: sleep)')
-    add('--topics', type=common.positive_int, metavar='N',
+    add('--topics', type=options.positive_int, metavar='N',
         help='with --load topics: how many (default: both 20 at 50 Hz and 50 at 100 Hz)')
-    add('--rate', type=common.positive_float, metavar='HZ',
+    add('--rate', type=options.positive_float, metavar='HZ',
         help='how often each topic is published (default: see --topics; 100 for entities)')
-    add('--idle', type=_list_of(_natural), metavar='N[,N…]',
+    add('--idle', type=options.list_of(options.or_zero(options.positive_int)), metavar='N[,N…]',
         help='with --load entities: how many idle subscriptions (default: 1,10,100,1000)')
     add('--groups', choices=GROUPS,
         help="with topics and entities: the node's default callback group, one for each "
         'subscription, or a reentrant one (default: shared)')
-    add('--workers', type=common.positive_int, default=7, metavar='M',
+    add('--workers', type=options.positive_int, default=defaults.WORKERS, metavar='M',
         help='threads of this executor and of MultiThreadedExecutor (default: %(default)s)')
-    add('--seconds', type=common.positive_float, default=10.0, metavar='S',
+    add('--seconds', type=options.positive_float, default=10.0, metavar='S',
         help='how long each measurement is, after a warm-up of 1 s (default: 10)')
-    add('--seed', type=int, default=0, metavar='N',
-        help='of the execution times and phases, the same for all (default: %(default)s)')
-    add('--repeat', type=common.positive_int, default=1, metavar='R',
-        help='measure everything R times in turn, and take the medians (default: %(default)s)')
+    options.add_seed(
+        parser, 'of the execution times and phases, the same for all; the default is one with '
+        'which every deadline of the Autoware workload can be kept', int, default=_SEED)
+    options.add_repeat(parser, 1, 'measure everything R times in turn, and take the medians')
     add('--plot', metavar='OUT', help='draw a figure (.png, .svg or .pdf)')
-    common.add_json(parser)
-
-
-def _list_of(item: Callable[[str], _T]) -> Callable[[str], list[_T]]:
-    def parse(text: str) -> list[_T]:
-        return [item(part.strip()) for part in text.split(',')]
-
-    return parse
-
-
-def _natural(text: str) -> int:
-    if text != '0':
-        return common.positive_int(text)
-    return 0
+    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -182,10 +169,9 @@ def _graph(args: argparse.Namespace) -> Iterator[str | None]:
         for utilisation in _utilisations(args):
             plan = ExecutionPlan(task_set, args.seed, utilisation, args.workers)
             if infeasible := plan.infeasible():
-                print(
-                    f'warning: at utilisation {plan.utilisation:.2f} with seed {args.seed} '
-                    f'{len(infeasible)} sinks have a critical path longer than their deadline: '
-                    'no scheduler can keep these', file=sys.stderr)
+                warn(f'at utilisation {plan.utilisation:.2f} with seed {args.seed} '
+                     f'{len(infeasible)} sinks have a critical path longer than their deadline: '
+                     'no scheduler can keep these')
         yield path
 
 
@@ -227,9 +213,6 @@ def _measure(specs: Sequence[Spec], repeat: int) -> list[dict[str, Any]]:
         def tick(spec: Spec, made: int, passed: float) -> None:
             note = f'({spec.name}, {made + 1} of {len(specs) * repeat})'
             progress.update(made * each + min(passed, each), note)
-
-        def warn(text: str) -> None:
-            print(f'warning: {printable(text)}', file=sys.stderr)
 
         return run_all(specs, repeat, tick, warn)
 

@@ -30,7 +30,7 @@ import sys
 import tempfile
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.cli import common
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import format_ns, one_line, printable, Progress, table
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.resources import find
@@ -38,8 +38,10 @@ from mddag_executor.resources import find
 if TYPE_CHECKING:
     from mddag_executor.replay.measure import Agreement
 
-HELP = 'measure the replayer: the speed and memory of reading and linking, beside other ' \
-    'readers; with --accuracy how well reschedule predicts a live run'
+HELP = 'measure the replayer'
+DESCRIPTION = """\
+Measure the replayer: the speed and memory of reading and linking, beside other readers; with
+--accuracy how well reschedule predicts a live run."""
 EXAMPLE = """\
 mddag bench replay
 mddag bench replay --events 10000000 --json replay.json
@@ -56,33 +58,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     add('--trace', metavar='FILE', help='a trace to read (default: one that is written for it)')
-    add('--events', type=common.positive_int, default=1_000_000, metavar='N',
+    add('--events', type=options.positive_int, default=1_000_000, metavar='N',
         help='how many events the trace is to have (default: %(default)s)')
-    add('--others', type=common.positive_int, default=200_000, metavar='N',
+    add('--others', type=options.positive_int, default=200_000, metavar='N',
         help="messages after which mcap's and rosbags' readers are stopped (default: %(default)s)")
-    add('--repeat', type=common.positive_int, default=3, metavar='R',
-        help='measure R times in turn: the best of speeds, the median of errors '
-        '(default: %(default)s)')
+    options.add_repeat(
+        parser, 3, 'measure R times in turn: the best of speeds, the median of errors')
     add('--accuracy', action='store_true',
         help='record live runs, reschedule them, and compare the response times of each sink')
-    add('--utilisation', type=_numbers, default=[0.3, 0.6, 0.8], metavar='U[,U…]',
+    add('--utilisation', type=options.list_of(options.positive_float),
+        default=[0.3, 0.6, 0.8], metavar='U[,U…]',
         help='with --accuracy: of the live runs (default: 0.3,0.6,0.8)')
-    add('--seconds', type=common.positive_float, default=10.0, metavar='S',
-        help='with --accuracy: how long each live run is (default: 10)')
-    add('--workers', type=_counts, default=[7], metavar='M[,M…]',
+    add('--seconds', type=options.positive_float, default=30.0, metavar='S',
+        help='with --accuracy: how long each live run is (default: 30)')
+    add('--workers', type=options.list_of(options.positive_int), default=[7], metavar='M[,M…]',
         help='with --accuracy: of the live runs; the runs with further numbers are predicted '
         'from the recording with the first (default: 7)')
-    add('--graph', metavar='FILE',
-        help="a declaration to take instead of the paper's workload ('-': standard input)")
-    common.add_json(parser)
-
-
-def _numbers(text: str) -> list[float]:
-    return [common.positive_float(part.strip()) for part in text.split(',')]
-
-
-def _counts(text: str) -> list[int]:
-    return [common.positive_int(part.strip()) for part in text.split(',')]
+    options.add_workload(parser)
+    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -97,9 +90,7 @@ def main(args: argparse.Namespace) -> int:
         raise UsageError('--accuracy: it records its own runs: leave --trace out')
     with tempfile.TemporaryDirectory(prefix='mddag-bench-') as folder:
         result = _accuracy(args, folder) if args.accuracy else _speed(args, folder)
-    if args.json is not None:
-        common.write_json(args.json, result)
-    if common.wants_tables(args):
+    if common.write_result(args, result):
         if args.accuracy:
             _show_accuracy(result)
         else:
@@ -116,7 +107,7 @@ def _speed(args: argparse.Namespace, folder: str) -> dict[str, Any]:
     path = args.trace
     if path is None:
         path = os.path.join(folder, 'long.mcap')
-        task_set = common.load_graph(args.graph or str(find('config/autoware.yaml')))
+        task_set = common.load_workload(args.graph)
         with Progress('writing the trace', args.events) as line:
             write_long_trace(path, task_set, args.events, progress=line.update)
     events = TraceReader(path).message_count

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What the verbs share: reading files and standard input, writing results, kinds of arguments.
+What the verbs share: reading files and standard input, and writing results (see `options`, too).
 
 Theory of operation for outputs: a result goes to a temporary file beside its target and takes the
 target's name in one step when it is whole, so an interrupted or failed run never leaves half a
@@ -27,7 +27,6 @@ import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import json
-import math
 import os
 from pathlib import Path
 import shutil
@@ -37,6 +36,7 @@ import tempfile
 from typing import Any, BinaryIO, cast, TYPE_CHECKING
 
 from mddag_executor.errors import InputError, UsageError
+from mddag_executor.resources import find
 
 if TYPE_CHECKING:
     from mddag_executor.report.html import Watch
@@ -96,6 +96,11 @@ def load_graph(path: str) -> TaskSet:
         return msg_graph.load(path)
     name, text = read_text(path)
     return msg_graph.loads(text, name=name)
+
+
+def load_workload(given: str | None) -> TaskSet:
+    """Return the task set of a declaration, of the paper's workload where none is given."""
+    return load_graph(str(find('config/autoware.yaml')) if given is None else given)
 
 
 @contextmanager
@@ -198,6 +203,23 @@ def output_file(path: str) -> Iterator[BinaryIO]:
         raise
 
 
+@contextmanager
+def output_trace(path: str) -> Iterator[str]:
+    """
+    Give the path of a file that becomes `path` when the block ends well; errors speak of `path`.
+
+    :raises mddag_executor.trace.TraceError: when the trace cannot be written
+    """
+    from mddag_executor.trace import TraceError
+    with output_file(path) as file:
+        try:
+            yield file.name
+        except TraceError as error:
+            if error.file != file.name:
+                raise
+            raise TraceError(path, error.problem, error.remedy) from None
+
+
 def write_text(path: str, text: str) -> None:
     """Write a text file as a whole, or to standard output for `-`."""
     with output_file(path) as file:
@@ -220,26 +242,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     raise TypeError(f'{type(value).__name__} has no JSON form')
-
-
-def add_graph(parser: argparse.ArgumentParser) -> None:
-    """Declare the argument `GRAPH`."""
-    parser.add_argument(
-        'graph', metavar='GRAPH', help="the declaration, a YAML file ('-': standard input)")
-
-
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Declare `--json`."""
-    parser.add_argument('--json', metavar='FILE',
-                        help="write the whole result as JSON ('-': to standard output, "
-                             'instead of the tables)')
-
-
-def add_report(parser: argparse.ArgumentParser) -> None:
-    """Declare `--report`."""
-    parser.add_argument('--report', metavar='OUT.html',
-                        help='write tables and pictures of the run as one HTML file that needs no '
-                             "network (needs mddag_executor[report]; '-': to standard output)")
 
 
 def check_report(path: str | None) -> None:
@@ -276,40 +278,16 @@ def write_report(path: str, data: Callable[[], ReportData]) -> None:
             write(file, data())
 
 
+def write_result(args: argparse.Namespace, result: Any) -> bool:
+    """Write a result where `--json` says; tell whether tables are to be shown as well."""
+    if args.json is not None:
+        write_json(args.json, result)
+    return wants_tables(args)
+
+
 def wants_tables(args: argparse.Namespace) -> bool:
     """Tell whether standard output is for people, and not taken by a result."""
     return '-' not in (getattr(args, 'json', None), getattr(args, 'report', None))
-
-
-def duration(text: str) -> int:
-    """Return the nanoseconds of an argument such as `20s` or `100ms`."""
-    import msg_graph
-    try:
-        return msg_graph.parse_duration(text)
-    except (ValueError, msg_graph.GraphError) as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def positive_int(text: str) -> int:
-    """Return a whole number from 1 up."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'{text!r} is no whole number from 1 up')
-    return value
-
-
-def seed(text: str) -> int:
-    """Return a whole number from 0 to 2**64 - 1."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if not 0 <= value < 2 ** 64:
-        raise argparse.ArgumentTypeError(f'{text!r} is no whole number from 0 to 2**64 - 1')
-    return value
 
 
 def processors() -> int:
@@ -318,14 +296,3 @@ def processors() -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not every system has it
         return os.cpu_count() or 1
-
-
-def positive_float(text: str) -> float:
-    """Return a finite number above zero."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (value > 0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f'{text!r} is no number above zero')
-    return value

@@ -35,25 +35,24 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.cli import common
+from mddag_executor import defaults
+from mddag_executor.cli import common, options
 from mddag_executor.cli.run import summary
 from mddag_executor.cli.text import Cell, format_ns, printable, Progress, table
 from mddag_executor.errors import MddagError
 from mddag_executor.live.bench.spec import Spec
 from mddag_executor.report.tables import (
     counts,
+    each_sink,
     percent,
     response_cells,
-    short_names,
     sink_table,
 )
 from mddag_executor.resources import find
 
-NAME = 'demo'
-HELP = 'run the whole Autoware workload, record it and replay the recording'
 EXAMPLE = 'mddag demo --seconds 20 --utilisation 0.6'
 
-WORKERS = 7
+WORKERS = defaults.WORKERS
 DEFAULT_SEED = 0
 """The first seed; at utilisation 0.6 its draw is feasible (`ExecutionPlan.infeasible`)."""
 
@@ -65,17 +64,16 @@ class DemoError(MddagError):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('--seconds', type=common.positive_float, default=20.0, metavar='S',
+    add('--seconds', type=options.positive_float, default=20.0, metavar='S',
         help='how long to measure this executor (default: 20)')
-    add('--baseline-seconds', type=common.positive_float, default=10.0, metavar='S',
+    add('--baseline-seconds', type=options.positive_float, default=10.0, metavar='S',
         help="how long to measure rclpy's MultiThreadedExecutor (default: 10)")
-    add('--utilisation', type=common.positive_float, default=0.6, metavar='U',
+    add('--utilisation', type=options.positive_float, default=0.6, metavar='U',
         help='normalised utilisation that the execution times are scaled to (default: 0.6)')
-    add('--seed', type=int, default=DEFAULT_SEED, metavar='N',
-        help=f'what the execution times are drawn with (default: {DEFAULT_SEED})')
+    options.add_seed(parser, 'what the execution times are drawn with', int, DEFAULT_SEED)
     add('--output', default='build/demo', metavar='DIR',
         help='where trace and results are written (default: build/demo)')
-    common.add_json(parser)
+    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -216,11 +214,12 @@ def replay_table(
         'DAG', 'sink', 'live in time', 'recorded in time', 'rescheduled in time',
         'live p99', 'recorded p99', 'rescheduled p99', 'deadline')
     rows: list[list[Cell]] = []
-    for dag, name, shown_dag, shown_name in _sinks(live['dags']):
-        results = [r['dags'][dag]['sinks'][name] for r in (live, recorded, rescheduled)]
+    for sink in each_sink(live['dags']):
+        results = [
+            r['dags'][sink.dag]['sinks'][sink.name] for r in (live, recorded, rescheduled)]
         verdicts = [counts(result) for result in results]
         rows.append([
-            shown_dag, shown_name, *(f'{v.in_time} of {v.due}' for v in verdicts),
+            sink.shown_dag, sink.shown_name, *(f'{v.in_time} of {v.due}' for v in verdicts),
             *(response_cells(r['response_ns'])[1] for r in results),
             format_ns(results[0]['relative_deadline_ns'])])
     return table(header, rows)
@@ -230,8 +229,8 @@ def agreement(live: dict[str, Any], recorded: dict[str, Any]) -> str:
     """Say for how many sinks the replayer counts what the executor counted."""
     wrong = []
     n = 0
-    for dag, name, _, _ in _sinks(live['dags']):
-        ours, theirs = (r['dags'][dag]['sinks'][name] for r in (live, recorded))
+    for dag, _, name, _, ours in each_sink(live['dags']):
+        theirs = recorded['dags'][dag]['sinks'][name]
         n += 1
         if any(ours[key] != theirs[key] for key in ('completed', 'late')):
             wrong.append(
@@ -246,12 +245,9 @@ def side_by_side(ours: dict[str, Any], baseline: dict[str, Any]) -> str:
     """Return a table of both executors: each sink's share in time, then the totals."""
     header = ('DAG', 'sink', 'deadline', 'this: in time', 'p99', 'Multi: in time', 'p99')
     rows: list[list[Cell]] = []
-    for dag, name, shown_dag, shown_name in _sinks(ours['dags']):
-        row: list[Cell] = [
-            shown_dag, shown_name,
-            format_ns(ours['dags'][dag]['sinks'][name]['relative_deadline_ns'])]
-        for result in (ours, baseline):
-            sink = result['dags'][dag]['sinks'][name]
+    for dag, shown_dag, name, shown_name, own in each_sink(ours['dags']):
+        row: list[Cell] = [shown_dag, shown_name, format_ns(own['relative_deadline_ns'])]
+        for sink in (own, baseline['dags'][dag]['sinks'][name]):
             row += [percent(sink['on_time'], sink['due']), response_cells(sink['response_ns'])[1]]
         rows.append(row)
     totals = [
@@ -268,13 +264,3 @@ def side_by_side(ours: dict[str, Any], baseline: dict[str, Any]) -> str:
 def _cpu(result: dict[str, Any]) -> str:
     cpu = result['cpu_us_per_callback']
     return '-' if cpu is None else f'{cpu:.0f} us'
-
-
-def _sinks(dags: dict[str, Any]) -> Iterator[tuple[str, str, str, str]]:
-    """Yield DAG and sink by name, and as a table shows them: a DAG only in its first row."""
-    short = short_names(name for dag in dags.values() for name in dag['sinks'])
-    for dag_name, dag in dags.items():
-        shown = dag_name
-        for name in dag['sinks']:
-            yield dag_name, name, shown, short[name]
-            shown = ''

@@ -15,6 +15,10 @@
 """
 The verb `diff`: two recorded runs, sink by sink.
 
+The runs are of every kind that `replay` takes: traces of this executor, imported recordings, and
+with `--reschedule`, which is for the second run, ordinary bags.  Without a graph each is judged by
+the declaration that it was recorded with, and an imported one by the other run's.
+
 Exit status: 0 when compared, whatever came of it; with `--fail-on-worse` 1 if a sink missed a
 larger share of its deadlines in the second run, or (with `--tolerance`) if its p99 response time
 grew by more than that; 2 on bad input.
@@ -23,22 +27,26 @@ grew by more than that; 2 on bad input.
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
 import math
 import sys
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.cli import common
-from mddag_executor.cli.text import one_line, Progress
+from mddag_executor.cli import common, options, recorded
+from mddag_executor.cli.text import one_line
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
+    from mddag_executor.replay import Replay, Reschedule
+    from mddag_executor.replay.bags_reschedule import BagReschedule
     from msg_graph import TaskSet
 
-NAME = 'diff'
-HELP = 'compare two recorded runs sink by sink'
+Trace = tuple[str, str]     # its path, and what messages call it
+
 EXAMPLE = """\
 mddag diff before.mcap after.mcap
 mddag diff before.mcap after.mcap graph.yaml --fail-on-worse --tolerance 10% --json diff.json
+mddag diff run.mcap run.mcap --reschedule --workers 2
 
 exit status: 0 compared; 1 with --fail-on-worse when a sink got worse; 2 bad input"""
 
@@ -46,11 +54,16 @@ exit status: 0 compared; 1 with --fail-on-worse when a sink got worse; 2 bad inp
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('first', metavar='A.mcap', help="the run to compare with ('-': standard input)")
+    add('first', metavar='A.mcap',
+        help="the run to compare with: a trace, also an imported one ('-': standard input); with "
+        '--reschedule also an ordinary bag')
     add('second', metavar='B.mcap', help="the run to compare ('-': standard input)")
     add('graph', metavar='GRAPH', nargs='?',
         help="the declaration that judges both ('-': standard input; default: each by the one "
-        'that it was recorded with)')
+        "that it was recorded with, an imported one by the other's)")
+    recorded.add_arguments(
+        parser, 'compare with what the scheduler would have done in B with the recorded releases '
+        'and execution times (in an ordinary bag A, too)')
     add('--callbacks', action='store_true', help='show a table of all callbacks, too')
     add('--fail-on-worse', action='store_true',
         help='exit with status 1 if a sink missed a larger share of its deadlines in B, or its '
@@ -58,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--tolerance', type=_share, metavar='P%',
         help='with --fail-on-worse and in the tables: how much the p99 response time of a sink '
         'may grow, as 10%% (default: by any amount)')
-    common.add_json(parser)
+    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -70,12 +83,13 @@ def main(args: argparse.Namespace) -> int:
     :raises mddag_executor.errors.MddagError: when anything else can not be used
     """
     from mddag_executor.report import diff
-    if (args.first, args.second, args.graph).count('-') > 1:
-        raise UsageError('-: standard input can be only one of A, B and GRAPH: name the others')
-    common.check_output(args.json)
+    _check_arguments(args)
     task_set = None if args.graph is None else common.load_graph(args.graph)
-    difference = diff.compare(
-        _replay(args.first, task_set), _replay(args.second, task_set), args.tolerance)
+    with ExitStack() as files:
+        first, second = (files.enter_context(common.input_trace(given))
+                         for given in (args.first, args.second))
+        before, after = _results(args, first, second, task_set)
+    difference = diff.compare(before, after, args.tolerance)
     if args.json is not None:
         common.write_json(args.json, difference)
     if common.wants_tables(args):
@@ -87,15 +101,50 @@ def main(args: argparse.Namespace) -> int:
     return 1 if args.fail_on_worse and difference['worse'] else 0
 
 
-def _replay(given: str, task_set: TaskSet | None) -> dict[str, Any]:
-    from mddag_executor.replay import replay
-    with common.input_trace(given) as (path, name), Progress(f'replaying {given}') as line:
-        outcome = replay(
-            path, task_set, name=name,
-            progress=lambda events: line.update(round(events / 1e6, 1), 'million events'))
+def _check_arguments(args: argparse.Namespace) -> None:
+    if (args.first, args.second, args.graph).count('-') > 1:
+        raise UsageError('-: standard input can be only one of A, B and GRAPH: name the others')
+    common.check_output(args.json)
+    recorded.check(args, args.first, args.second, args.graph)
+    if args.reschedule and args.callbacks:
+        raise UsageError('--callbacks: it shows what was recorded: leave it or --reschedule out')
+
+
+def _results(
+    args: argparse.Namespace, first: Trace, second: Trace, task_set: TaskSet | None
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the results of both runs, in their order."""
+    if task_set is None and not _has_declaration(first):
+        # without one of its own it is judged by the other's, and that must have one
+        if not _has_declaration(second):
+            recorded.check_declared(*first)
+            recorded.check_declared(*second)
+        after, declared = _result(second, task_set, args, args.reschedule)
+        return _result(first, declared, args, False)[0], after
+    before, declared = _result(first, task_set, args, False)
+    if task_set is None and not _has_declaration(second):
+        task_set = declared
+    return before, _result(second, task_set, args, args.reschedule)[0]
+
+
+def _has_declaration(trace: Trace) -> bool:
+    from mddag_executor.replay.following import is_own
+    return not recorded.is_bag(trace[0]) and is_own(*trace)
+
+
+def _result(
+    trace: Trace, task_set: TaskSet | None, args: argparse.Namespace, reschedule: bool
+) -> tuple[dict[str, Any], TaskSet]:
+    """Return the result of a run, and the declaration that judged it."""
+    path, name = trace
+    outcome: Replay | Reschedule | BagReschedule
+    if reschedule or recorded.is_bag(path):
+        outcome = recorded.rescheduled(args, path, name, task_set)
+    else:
+        outcome, _ = recorded.as_recorded(path, name, task_set, doing=f'replaying {name}')
     for warning in outcome.warnings:
         print(f'warning: {one_line(warning)}', file=sys.stderr)
-    return outcome.result()
+    return outcome.result(), outcome.task_set
 
 
 def _share(text: str) -> float:

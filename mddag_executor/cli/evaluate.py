@@ -28,14 +28,13 @@ from contextlib import ExitStack
 import csv
 import io
 from pathlib import Path
-import sys
 import time
 from typing import TYPE_CHECKING
 
-from mddag_executor.cli import common
-from mddag_executor.cli.text import Cell, one_line, Progress, table
+from mddag_executor import defaults
+from mddag_executor.cli import common, options
+from mddag_executor.cli.text import Cell, Progress, table, warn
 from mddag_executor.core import POLICIES
-from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -43,8 +42,6 @@ if TYPE_CHECKING:
     from mddag_executor.simulate.evaluate import Evaluation
     from msg_graph import TaskSet
 
-NAME = 'evaluate'
-HELP = 'measure acceptance ratios over many simulated runs'
 EXAMPLE = """\
 mddag evaluate config/autoware.yaml --runs 5000 --plot acceptance.png
 mddag evaluate graph.yaml --policies rad,gedf --workers 4 --samples measured.npz --json out.json
@@ -52,7 +49,6 @@ mddag evaluate graph.yaml --non-preemptive --overhead 50us --csv -
 mddag evaluate graph.yaml --runs 1000000 --resume kept.npz --dask tcp://head:8786
 mddag generate --sets 400 --utilisation 0.1:1.0 -o sets && mddag evaluate sets --plot sets.svg"""
 
-_DEFAULT = ('rad', 'rm', 'wc', 'fifo')
 _RUNS, _RUNS_OF_EACH = 5000, 1
 _EXIT_INTERRUPTED = 130
 
@@ -62,30 +58,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('graph', metavar='GRAPH', nargs='+',
         help="declaration ('-': standard input), or several, or a folder of them (*.yaml)")
-    add('--runs', type=common.positive_int, metavar='N',
+    add('--runs', type=options.positive_int, metavar='N',
         help='runs of each GRAPH, each with execution times of its own (default: '
         f'{_RUNS}; {_RUNS_OF_EACH} if there are several)')
-    add('--policies', default=','.join(_DEFAULT), metavar='P,P…',
+    add('--policies', default=','.join(defaults.POLICIES), metavar='P,P…',
         help=f'any of {", ".join(POLICIES)} (default: %(default)s)')
-    add('--workers', type=common.positive_int, metavar='M',
-        help="threads that run callbacks (default: the declaration's, else 7)")
-    add('--duration', type=common.duration, default=3_000_000_000, metavar='TIME',
-        help='virtual time of each run (default: 3s)')
-    add('--seed', type=common.seed, default=0, metavar='N',
-        help='of the draws (default: %(default)s)')
+    options.add_workers(parser)
+    options.add_virtual_time(parser)
+    options.add_seed(parser, 'of the draws')
     add('--samples', metavar='FILE.npz',
         help="measured execution times, an array of ns for each 'node:callback' (default: the "
         'quantile tables of the declaration)')
     add('--non-preemptive', action='store_true',
         help='run all policies as an executor of callbacks can; else '
         f'{", ".join(name for name, row in POLICIES.items() if row.preemptive)} preempt')
-    add('--overhead', type=_overhead, default=0, metavar='TIME',
-        help='what each dispatch of a callback takes more (default: 0)')
+    options.add_overhead(parser)
     add('--judge', choices=('completions', 'horizon'), default='completions',
         help="which deadlines count: those of sinks that completed (the paper's way), or also "
         'those that passed before the end (default: %(default)s)')
-    add('--jobs', type=common.positive_int, metavar='N',
-        help='runs to simulate at a time (default: the number of processors)')
+    options.add_jobs(parser)
     add('--dask', metavar='ADDRESS',
         help="let the workers of a Dask cluster do the runs; ADDRESS is its scheduler's, as "
         "tcp://host:8786, or 'local' for --jobs processes of this machine (extra 'dask')")
@@ -97,11 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'results are the same (default: the one that is sooner done)')
     add('--plot', metavar='OUT', help="draw the paper's figure (.png, .svg or .pdf)")
     add('--csv', metavar='FILE', help="write the table as CSV ('-': to standard output)")
-    common.add_json(parser)
-
-
-def _overhead(text: str) -> int:
-    return 0 if text == '0' else common.duration(text)
+    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -111,26 +98,16 @@ def main(args: argparse.Namespace) -> int:
     :raises msg_graph.GraphError: when the declaration is wrong
     :raises mddag_executor.errors.MddagError: when anything else can not be used
     """
-    policies = _policies(args.policies)
+    policies = options.policies(args.policies)
     _check_outputs(args)
     task_sets = _load(_graphs(args.graph))
     outcome = _evaluate(args, task_sets, policies)
     if outcome.interrupted:
         kept = '' if args.resume is None else f', and kept in {args.resume}'
-        print(one_line(f'warning: interrupted: {outcome.runs} of {outcome.asked} runs are '
-                       f'done{kept}'), file=sys.stderr)
+        warn(f'interrupted: {outcome.runs} of {outcome.asked} runs are done{kept}')
     if outcome.runs > 0:
         _write(args, outcome)
     return _EXIT_INTERRUPTED if outcome.interrupted else 0
-
-
-def _policies(text: str) -> tuple[str, ...]:
-    names = [name.strip() for name in text.split(',')]
-    for i, name in enumerate(names):
-        find_policy(name)
-        if name in names[:i]:
-            raise UsageError(f"--policies: '{name}' stands there twice: name each once")
-    return tuple(names)
 
 
 def _check_outputs(args: argparse.Namespace) -> None:
@@ -182,7 +159,7 @@ def _evaluate(
     samples = _samples(args.samples, task_sets)
     experiments = [
         Experiment(
-            task_set, policies, workers=args.workers or task_set.workers or 7,
+            task_set, policies, workers=defaults.workers(args.workers, task_set),
             duration_ns=args.duration, seed=args.seed, samples=its_samples,
             preemptive=False if args.non_preemptive else None, overhead_ns=args.overhead,
             judge=args.judge)

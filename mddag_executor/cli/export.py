@@ -16,7 +16,8 @@
 The verb `export`: a trace as a file for other tools.
 
 The end of the file's name says which: `.pftrace` for Perfetto's viewer, `.csv` for spreadsheets,
-`.parquet` for data frames.  The run is judged as `replay` does it.
+`.parquet` for data frames.  The run is judged as `replay` does it, and recordings are of the same
+kinds: traces of this executor, imported ones, and with `--reschedule` ordinary bags.
 """
 
 from __future__ import annotations
@@ -24,17 +25,21 @@ from __future__ import annotations
 import argparse
 from pathlib import PurePath
 import sys
+from typing import TYPE_CHECKING
 
-from mddag_executor.cli import common
-from mddag_executor.cli.text import one_line, printable, Progress
+from mddag_executor.cli import common, recorded
+from mddag_executor.cli.text import one_line, printable
 from mddag_executor.errors import UsageError
 
-NAME = 'export'
-HELP = 'turn a trace into a file for Perfetto, spreadsheets or data frames'
+if TYPE_CHECKING:
+    from mddag_executor.report.export import Target
+    from msg_graph import TaskSet
+
 EXAMPLE = """\
 mddag export run.mcap -o run.pftrace
 mddag export run.mcap graph.yaml -o jobs.csv --rows jobs
-mddag export run.mcap -o executions.parquet"""
+mddag export run.mcap -o executions.parquet
+mddag export drive/ graph.yaml --reschedule --workers 4 -o drive.pftrace"""
 
 FORMS = ('pftrace', 'csv', 'parquet')
 
@@ -42,7 +47,9 @@ FORMS = ('pftrace', 'csv', 'parquet')
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('trace', metavar='TRACE', help="a recorded run, an MCAP file ('-': standard input)")
+    add('trace', metavar='TRACE',
+        help="a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
+        'ordinary bag, a folder or a file')
     add('graph', metavar='GRAPH', nargs='?',
         help="the declaration that judges, a YAML file ('-': standard input; default: the one "
         'that the trace was recorded with)')
@@ -52,6 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--rows', choices=('executions', 'jobs'),
         help='for CSV and Parquet: one row for each execution of a callback (default), or for '
         'each job at each sink')
+    recorded.add_arguments(
+        parser, 'export what the scheduler would have done with the recorded releases and '
+        'execution times')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -62,24 +72,37 @@ def main(args: argparse.Namespace) -> int:
     :raises msg_graph.GraphError: when the declaration is wrong
     :raises mddag_executor.errors.MddagError: when anything else can not be used
     """
-    from mddag_executor.report.export import check_available, Exporter, target
+    from mddag_executor.report.export import check_available, target
     form = _form(args)
     common.check_output(args.output)
     check_available(form)
     task_set = None if args.graph is None else common.load_graph(args.graph)
     with common.input_trace(args.trace) as (path, name), \
-            common.output_file(args.output) as file, Progress('exporting') as line:
-        from mddag_executor.replay import replay
-        exporter = Exporter(target(form, file, args.rows == 'jobs'))
-        outcome = replay(
-            path, task_set, name=name, watcher=exporter,
-            progress=lambda events: line.update(round(events / 1e6, 1), 'million events'))
-        exporter.finish()
-    for warning in outcome.warnings:
+            common.output_file(args.output) as file:
+        warnings = _export(args, path, name, task_set, target(form, file, args.rows == 'jobs'))
+    for warning in warnings:
         print(f'warning: {one_line(warning)}', file=sys.stderr)
     if args.output != '-':
         print(f'exported: {printable(args.output)}')
     return 0
+
+
+def _export(
+    args: argparse.Namespace, path: str, name: str, task_set: TaskSet | None, target: Target
+) -> list[str]:
+    """Write what a recording holds; return what is missing or doubtful of it."""
+    from mddag_executor.report.export import export_schedule, Exporter
+    from mddag_executor.report.timeline_log import of_rescheduled
+    if args.reschedule or recorded.is_bag(path):
+        computed = recorded.rescheduled(args, path, name, task_set)
+        export_schedule(of_rescheduled(computed), target)
+        return computed.warnings
+    if args.rows == 'jobs' and task_set is None:
+        recorded.check_declared(path, name)
+    exporter = Exporter(target)
+    outcome, _ = recorded.as_recorded(path, name, task_set, exporter, doing='exporting')
+    exporter.finish()
+    return outcome.warnings
 
 
 def _form(args: argparse.Namespace) -> str:
@@ -93,4 +116,5 @@ def _form(args: argparse.Namespace) -> str:
             f'{", ".join("." + each for each in FORMS[:-1])} or .{FORMS[-1]}')
     if form == 'pftrace' and args.rows is not None:
         raise UsageError('--rows: Perfetto gets both, executions and jobs: leave it out')
+    recorded.check(args, args.trace, args.graph)
     return form

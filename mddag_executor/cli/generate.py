@@ -23,13 +23,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
-import math
 import os
 from pathlib import Path
 import shutil
 from typing import TYPE_CHECKING
 
-from mddag_executor.cli import common
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress
 from mddag_executor.errors import InputError, UsageError
 from mddag_executor.generate import BASES, METHODS, Options
@@ -37,8 +36,6 @@ from mddag_executor.generate import BASES, METHODS, Options
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-NAME = 'generate'
-HELP = 'make random multi-deadline, multi-rate DAG sets'
 EXAMPLE = """\
 mddag generate --utilisation 0.6 --seed 7 -o random.yaml
 mddag generate --sets 400 --utilisation 0.1:1.0 --sinks 2:4 --tightness 0.3:1.0 -o sets
@@ -53,27 +50,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('-o', '--output', metavar='OUT', default='-',
         help="the declaration ('-': standard output, the default); with --sets a new folder")
-    add('--sets', type=common.positive_int, metavar='N',
+    add('--sets', type=options.positive_int, metavar='N',
         help='make N task sets, OUT/set_0000.yaml and so on (default: one, OUT itself)')
     add('--utilisation', type=_numbers, default=(0.5, 0.5), metavar='U[:U]',
         help='normalised: of all DAGs, by workers, with mean execution times; with --sets two '
         'bounds, over which the sets are spread evenly (default: 0.5)')
-    add('--workers', type=common.positive_int, default=_DEFAULT.workers, metavar='M',
+    add('--workers', type=options.positive_int, default=_DEFAULT.workers, metavar='M',
         help='declared number of workers (default: %(default)s)')
-    _add_pair(add, '--dags', common.positive_int, _DEFAULT.dags, 'number of DAGs')
-    _add_pair(add, '--vertices', common.positive_int, _DEFAULT.vertices,
+    _add_pair(add, '--dags', options.positive_int, _DEFAULT.dags, 'number of DAGs')
+    _add_pair(add, '--vertices', options.positive_int, _DEFAULT.vertices,
               'number of callbacks of each DAG')
-    _add_pair(add, '--sinks', common.positive_int, _DEFAULT.sinks,
+    _add_pair(add, '--sinks', options.positive_int, _DEFAULT.sinks,
               'number of sinks of each DAG, each with its own deadline')
-    add('--edge-probability', type=_number, default=_DEFAULT.edge_probability, metavar='P',
+    add('--edge-probability', type=options.number, default=_DEFAULT.edge_probability, metavar='P',
         help='of an edge between two callbacks of a DAG (default: %(default)s)')
-    add('--or-share', type=_number, default=_DEFAULT.or_share, metavar='P',
+    add('--or-share', type=options.number, default=_DEFAULT.or_share, metavar='P',
         help='part of the callbacks with several predecessors that run once for each message '
         '(OR), and so are several vertices; the others join the messages (default: %(default)s)')
     add('--method', choices=METHODS, default=_DEFAULT.method,
         help='how the utilisation is dealt out to DAGs and callbacks: Dirichlet-rescale or '
         'UUniFast(-Discard) (default: %(default)s)')
-    add('--max-dag-utilisation', type=_number, default=_DEFAULT.most_per_dag, metavar='U',
+    add('--max-dag-utilisation', type=options.number, default=_DEFAULT.most_per_dag, metavar='U',
         help='the largest utilisation of one DAG (default: %(default)s)')
     add('--periods', type=_periods, default=_DEFAULT.periods_ns, metavar='TIME,TIME…',
         help='each DAG gets one of these (default: 10ms,20ms,50ms,100ms,200ms)')
@@ -81,11 +78,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='each deadline by its base, drawn between the bounds (default: 0.5:1.0)')
     add('--deadline-of', choices=BASES, default=_DEFAULT.deadline_of,
         help="that base: the DAG's period, or the longest path to the sink (default: %(default)s)")
-    add('--spread', type=_number, default=_DEFAULT.spread, metavar='F',
+    add('--spread', type=options.number, default=_DEFAULT.spread, metavar='F',
         help='execution times are uniform within this part of their mean on either side '
         '(default: %(default)s, always the same)')
-    add('--seed', type=int, default=_DEFAULT.seed, metavar='N',
-        help='the same seed and options give the same files (default: %(default)s)')
+    options.add_seed(
+        parser, 'the same seed and options give the same files', int, _DEFAULT.seed)
 
 
 def _add_pair(
@@ -100,23 +97,13 @@ def _add_pair(
     add(option, type=pair, default=default, metavar='N[:N]', help=f'{what} (default: {shown})')
 
 
-def _number(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f'{text!r} is no number')
-    return value
-
-
 def _numbers(text: str) -> tuple[float, float]:
     low, _, high = text.partition(':')
-    return _number(low), _number(high or low)
+    return options.number(low), options.number(high or low)
 
 
 def _periods(text: str) -> tuple[int, ...]:
-    return tuple(common.duration(part.strip()) for part in text.split(','))
+    return tuple(options.duration(part.strip()) for part in text.split(','))
 
 
 def main(args: argparse.Namespace) -> int:
@@ -127,8 +114,8 @@ def main(args: argparse.Namespace) -> int:
     """
     from mddag_executor.generate import generate
     every = list(_every(args))
-    for options in (every[0], every[-1]):
-        options.check()
+    for each in (every[0], every[-1]):
+        each.check()
     if args.sets is None:
         common.check_output(args.output)
         common.write_text(args.output, generate(every[0]))
@@ -138,8 +125,8 @@ def main(args: argparse.Namespace) -> int:
     part.mkdir()
     try:
         with Progress('generating', len(every)) as line:
-            for number, options in enumerate(every):
-                text = generate(options, number)
+            for number, each in enumerate(every):
+                text = generate(each, number)
                 (part / f'set_{number:04d}.yaml').write_text(text, encoding='utf-8')
                 line.update(number, f'of {len(every)} task sets')
         if target.is_dir():

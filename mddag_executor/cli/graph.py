@@ -23,8 +23,8 @@ from __future__ import annotations
 import argparse
 from importlib import import_module
 
-NAME = 'graph'
-HELP = 'check, draw, derive and analyse declarations'
+from mddag_executor.cli.options import add_verb
+
 EXAMPLE = """\
 mddag graph check config/autoware.yaml
 mddag graph draw config/autoware.yaml -o autoware.svg
@@ -40,18 +40,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     verbs = parser.add_subparsers(dest='graph_verb', metavar='VERB', required=True, title='verbs')
     for name in VERBS:
         module = import_module(f'mddag_executor.cli.graph_{name.replace("-", "_")}')
-        examples = ''.join(f'\n  {line}' for line in module.EXAMPLE.strip().splitlines())
-        own = verbs.add_parser(
-            name, help=module.HELP, allow_abbrev=False, description=module.DESCRIPTION,
-            epilog=f'example:{examples}', formatter_class=argparse.RawDescriptionHelpFormatter)
-        module.add_arguments(own)
-        own.set_defaults(graph_main=module.main)
-
-
-def main(args: argparse.Namespace) -> int:
-    """
-    Run the verb that `args.graph_verb` names.
-
-    :raises msg_graph.GraphError: when the declaration is wrong
-    """
-    return int(args.graph_main(args))
+        add_verb(verbs, name, module, module.HELP, module.DESCRIPTION)

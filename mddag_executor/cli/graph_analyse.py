@@ -23,7 +23,8 @@ from pathlib import Path
 import tempfile
 from typing import TYPE_CHECKING
 
-from mddag_executor.cli import common
+from mddag_executor import defaults
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, Progress, table
 from mddag_executor.errors import UsageError
 
@@ -44,20 +45,17 @@ longer than its budget. A sufficient test that does not hold says nothing. Overh
 are not part of any test. The live executor does not preempt callbacks: of it speak only the tests
 whose scheduler says so."""
 
-_WORKERS = 7
 _HEADER = ('test', 'kind', 'verdict', 'figure', 'why')
 _ABOUT = ('test', 'source', 'scheduler', 'assumption')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    common.add_graph(parser)
+    options.add_graph(parser)
     parser.add_argument(
         '--budget', choices=('max', 'p99', 'mean'), default='max',
         help='what of each execution time counts: its maximum (default), 99 %% quantile or mean')
-    parser.add_argument(
-        '--workers', type=common.positive_int, metavar='M',
-        help=f'number of workers; default: the declared one, else {_WORKERS}')
+    options.add_workers(parser)
     parser.add_argument(
         '--sag', metavar='DIR',
         help='write the jobs of one hyperperiod there, for schedule-abstraction analysis: '
@@ -67,12 +65,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='run this program (nptest, from np-schedulability-analysis) on them, and show its '
         'verdict among the others')
     parser.add_argument(
-        '--sag-timeout', type=common.positive_int, default=60, metavar='SECONDS',
+        '--sag-timeout', type=options.positive_int, default=60, metavar='SECONDS',
         help='processor time that it may take (default: 60)')
     parser.add_argument(
-        '--horizon', type=common.duration, metavar='TIME',
+        '--horizon', type=options.duration, metavar='TIME',
         help='with --sag or --sag-binary: only the releases before this, not of a hyperperiod')
-    common.add_json(parser)
+    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -89,13 +87,11 @@ def main(args: argparse.Namespace) -> int:
         raise UsageError('--horizon: it is about job sets: add --sag or --sag-binary')
     with Progress('analysing') as line:
         analysis = analyse(
-            task_set, args.workers or task_set.workers or _WORKERS, args.budget,
+            task_set, defaults.workers(args.workers, task_set), args.budget,
             lambda tests: line.update(tests, 'tests'))
     if args.sag is not None or args.sag_binary is not None:
         analysis = _sag(args, task_set, analysis)
-    if args.json is not None:
-        common.write_json(args.json, analysis.result())
-    if common.wants_tables(args):
+    if common.write_result(args, analysis.result()):
         about = ((v.name, v.source, v.scheduler, v.assumption) for v in analysis.verdicts)
         print(table(_HEADER, _rows(analysis)))
         print(table(_ABOUT, about))

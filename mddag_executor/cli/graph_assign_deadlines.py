@@ -20,7 +20,8 @@ import argparse
 import sys
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.cli import common
+from mddag_executor import defaults
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, format_ns, one_line, Progress, table
 from mddag_executor.errors import InputError, UsageError
 
@@ -44,7 +45,6 @@ lower end of its 95 % confidence interval. Either way the acceptance of the resu
 reported with its confidence interval, number of runs and seed; after a search with draws that
 took no part in it."""
 
-_WORKERS = 7
 _TARGET = 0.95
 _BUDGETS = ('mean', 'p99', 'max')
 
@@ -52,7 +52,7 @@ _BUDGETS = ('mean', 'p99', 'max')
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    common.add_graph(parser)
+    options.add_graph(parser)
     add('-o', '--output', metavar='OUT', default='-',
         help="the declaration ('-': standard output, the default)")
     add('--by', choices=('path', 'search'), default='path',
@@ -60,28 +60,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--base', choices=('period', 'deadline'),
         help="with --by path: what each DAG's longest path gets, its period (the default) or the "
         'longest deadline that it declares')
-    add('--factor', type=common.positive_float, metavar='F',
+    add('--factor', type=options.positive_float, metavar='F',
         help='with --by path: the longest deadline of a DAG by that base (default: 1)')
-    add('--target', type=common.positive_float, metavar='RATIO',
+    add('--target', type=options.positive_float, metavar='RATIO',
         help=f'with --by search: the least acceptance ratio (default: {_TARGET})')
     add('--budget', choices=_BUDGETS, default='p99',
         help='what of each execution time makes the critical path (default: %(default)s)')
     add('--policy', default='rad', metavar='P', help='to simulate (default: %(default)s)')
-    add('--workers', type=common.positive_int, metavar='M',
-        help=f"threads that run callbacks (default: the declaration's, else {_WORKERS})")
+    options.add_workers(parser)
     add('--non-preemptive', action='store_true',
         help="simulate as an executor of callbacks runs them, not in the policy's own mode")
-    add('--overhead', type=common.duration, default=0, metavar='TIME',
-        help='what each dispatch of a callback takes more (default: 0)')
-    add('--runs', type=common.positive_int, default=1000, metavar='N',
+    options.add_overhead(parser)
+    add('--runs', type=options.positive_int, default=1000, metavar='N',
         help='runs that measure the acceptance of each scale (default: %(default)s)')
-    add('--duration', type=common.duration, default=3_000_000_000, metavar='TIME',
-        help='virtual time of each run (default: 3s)')
-    add('--seed', type=common.seed, default=0, metavar='N',
-        help='of the draws (default: %(default)s)')
-    add('--jobs', type=common.positive_int, metavar='N',
-        help='runs to simulate at a time (default: the number of processors)')
-    common.add_json(parser)
+    options.add_virtual_time(parser)
+    options.add_seed(parser, 'of the draws')
+    options.add_jobs(parser)
+    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -121,7 +116,7 @@ def _assign(
     from mddag_executor.assign import measure, proportional, Search
     from mddag_executor.simulate.evaluate import Experiment
     experiment = Experiment(
-        task_set, (args.policy,), workers=args.workers or task_set.workers or _WORKERS,
+        task_set, (args.policy,), workers=defaults.workers(args.workers, task_set),
         duration_ns=args.duration, seed=args.seed, overhead_ns=args.overhead,
         preemptive=False if args.non_preemptive else None)
     jobs = args.jobs or common.processors()

@@ -25,7 +25,7 @@ import argparse
 from collections.abc import Iterator
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.cli import common
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, format_ns, table
 
 if TYPE_CHECKING:
@@ -46,8 +46,8 @@ _HEADER = ('DAG', 'period', 'vertices', 'critical path', 'utilisation', 'sink', 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    common.add_graph(parser)
-    common.add_json(parser)
+    options.add_graph(parser)
+    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -59,9 +59,7 @@ def main(args: argparse.Namespace) -> int:
     common.check_output(args.json)
     task_set = common.load_graph(args.graph)
     result = check_result(task_set)
-    if args.json is not None:
-        common.write_json(args.json, result)
-    if common.wants_tables(args):
+    if common.write_result(args, result):
         print(table(_HEADER, _rows(result)) + '\n' + _summary(task_set, result))
     return 0
 

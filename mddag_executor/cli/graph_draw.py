@@ -21,7 +21,7 @@ from pathlib import Path
 import shutil
 import subprocess
 
-from mddag_executor.cli import common
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import one_line, Progress
 from mddag_executor.errors import InputError, UsageError
 
@@ -49,7 +49,7 @@ _ENDINGS = (*_BY_GRAPHVIZ, '.dot', '.mmd')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    common.add_graph(parser)
+    options.add_graph(parser)
     parser.add_argument(
         '-o', '--output', metavar='OUT', required=True,
         help=f'the picture; its name ends in {", ".join(_ENDINGS)}')

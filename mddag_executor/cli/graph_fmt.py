@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from mddag_executor.cli import common
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import one_line
 
 HELP = 'lay a declaration out evenly; comments and order stay'
@@ -35,7 +35,7 @@ broken near column 90. Comments, quotes, order and meaning stay. The file is rep
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    common.add_graph(parser)
+    options.add_graph(parser)
     parser.add_argument(
         '--check', action='store_true',
         help='change nothing; exit with 1 if the declaration is not in its normal form')

@@ -17,11 +17,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common
-from mddag_executor.cli.text import one_line
+from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -77,8 +76,7 @@ def main(args: argparse.Namespace) -> int:
         system = recorded_system(args.trace)
         every, count = len(list(sketch.callbacks())), system.measure(sketch)
         if count < every:
-            print(f'warning: {one_line(system.name)}: {every - count} of {every} callbacks did '
-                  f'not run in it', file=sys.stderr)
+            warn(f'{system.name}: {every - count} of {every} callbacks did not run in it')
 
     result = declaration_from_caret(text, name, measure)
     write_declaration(args.output, result)

@@ -17,10 +17,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
-from mddag_executor.cli import common
-from mddag_executor.cli.text import one_line, Progress
+from mddag_executor.cli import common, options
+from mddag_executor.cli.text import Progress, warn
 from mddag_executor.errors import InputError
 
 HELP = 'make a declaration to fill in from the nodes that run now'
@@ -40,7 +39,7 @@ from the callbacks of its node that run as often, else from a timer. All of that
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument(
-        '--timeout', type=common.positive_float, default=5.0, metavar='SECONDS',
+        '--timeout', type=options.positive_float, default=5.0, metavar='SECONDS',
         help='how long to look and to measure rates (default: 5)')
     parser.add_argument('-o', '--output', metavar='GRAPH', default='-',
                         help="the declaration ('-': standard output, the default)")
@@ -59,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
     with Progress('looking at the nodes', args.timeout) as line:
         found = probe(args.timeout, line.update)
     for warning in found.warnings:
-        print(f'warning: {one_line(warning)}', file=sys.stderr)
+        warn(warning)
     sketch = sketch_of(found)
     if not sketch.nodes:
         raise InputError(

@@ -27,8 +27,6 @@ from mddag_executor.errors import UsageError
 if TYPE_CHECKING:
     from mddag_executor.trace import Imported
 
-NAME = 'import'
-HELP = 'turn a CARET or ros2_tracing recording into a trace'
 EXAMPLE = """\
 mddag import ctf ~/.ros/tracing/session-20261121101500 -o drive.mcap
 mddag replay drive.mcap graph.yaml"""

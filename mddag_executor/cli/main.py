@@ -38,7 +38,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.util import find_spec
 import io
 import os
 import sys
@@ -46,10 +45,10 @@ from types import ModuleType
 from typing import Any, NamedTuple, NoReturn
 
 from mddag_executor import __version__
+from mddag_executor.cli.options import add_verb
 from mddag_executor.cli.text import one_line
 from mddag_executor.errors import MddagError, UsageError
 
-EXIT_DONE = 0
 EXIT_BAD_INPUT = 2
 EXIT_DEFECT = 70
 EXIT_INTERRUPTED = 130
@@ -79,10 +78,6 @@ VERBS = {
 }
 # What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.
 _ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_python')
-# Where the error classes of the neighbours are, of which not all derive from MddagError (msg_graph
-# stands below this package). They are looked up in sys.modules: a module that was not imported
-# cannot have raised.
-_ERRORS = (('msg_graph', 'GraphError'), ('mddag_executor.trace', 'TraceError'))
 
 
 class Parser(argparse.ArgumentParser):
@@ -91,12 +86,6 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise instead of printing the usage over several lines and exiting."""
         raise UsageError(f"{self.prog}: {message}: see '{self.prog} --help'")
-
-
-def available() -> dict[str, Verb]:
-    """Return the verbs that this installation has."""
-    return {name: verb for name, verb in VERBS.items()
-            if find_spec(f'mddag_executor.cli.{verb.module}') is not None}
 
 
 def load(verb: Verb) -> ModuleType:
@@ -112,18 +101,12 @@ def build_parser(chosen: str | None) -> Parser:
         epilog="'mddag VERB --help' explains a verb and shows an example.")
     parser.add_argument('--version', action='version', version=f'mddag {__version__}')
     verbs = parser.add_subparsers(dest='verb', metavar='VERB', required=True, title='verbs')
-    for name, verb in available().items():
-        if name != chosen:
+    for name, verb in VERBS.items():
+        if name == chosen:
+            sentence = f'{verb.summary[:1].upper()}{verb.summary[1:]}.'
+            add_verb(verbs, name, load(verb), verb.summary, sentence)
+        else:
             verbs.add_parser(name, help=verb.summary, add_help=False)
-            continue
-        module = load(verb)
-        examples = ''.join(f'\n  {line}' for line in module.EXAMPLE.strip().splitlines())
-        own = verbs.add_parser(
-            name, help=verb.summary, allow_abbrev=False,
-            description=module.HELP[:1].upper() + module.HELP[1:].rstrip('.') + '.',
-            epilog=f'example:{examples}', formatter_class=argparse.RawDescriptionHelpFormatter)
-        module.add_arguments(own)
-        own.set_defaults(main=module.main)
     return parser
 
 
@@ -208,13 +191,14 @@ _REMEDIES: dict[type[BaseException], str] = {
 
 
 def known_errors() -> tuple[type[BaseException], ...]:
-    """Return the base classes of the errors that are the user's to mend."""
-    found: list[type[BaseException]] = [MddagError]
-    for module, name in _ERRORS:
-        error = getattr(sys.modules.get(module), name, None)
-        if isinstance(error, type) and issubclass(error, BaseException):
-            found.append(error)
-    return tuple(found)
+    """
+    Return the base classes of the errors that are the user's to mend.
+
+    That of ``msg_graph``, which stands below this package, derives from none of its own. It is
+    looked up in sys.modules: a module that was not imported cannot have raised.
+    """
+    msg_graph = sys.modules.get('msg_graph')
+    return (MddagError,) if msg_graph is None else (MddagError, msg_graph.GraphError)
 
 
 def _silence_stdout() -> None:

@@ -28,10 +28,8 @@ import argparse
 import sys
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.cli import bags, common, verdicts
-from mddag_executor.cli.text import one_line, printable, Progress
-from mddag_executor.core import POLICIES
-from mddag_executor.core import policy as find_policy
+from mddag_executor.cli import common, options, recorded, verdicts
+from mddag_executor.cli.text import one_line, printable
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -41,8 +39,6 @@ if TYPE_CHECKING:
     from msg_graph import TaskSet
     from msg_graph.drift import Drift
 
-NAME = 'replay'
-HELP = 'check a recorded run against its deadlines, or reschedule it'
 EXAMPLE = """\
 mddag replay run.mcap
 mddag replay run.mcap graph.yaml --fail-on-miss
@@ -60,19 +56,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('graph', metavar='GRAPH', nargs='?',
         help="the declaration that judges, a YAML file ('-': standard input; default: the one "
         'that the trace was recorded with)')
-    add('--reschedule', action='store_true',
-        help='run the scheduler over the recorded releases and execution times')
-    add('--workers', type=common.positive_int, metavar='M',
-        help='with --reschedule: threads that run callbacks (default: as recorded)')
-    add('--policy', metavar='P',
-        help=f'with --reschedule: one of {", ".join(POLICIES)} (default: as recorded)')
-    add('--preemptive', action='store_true',
-        help='with --reschedule: what is more urgent takes the worker of what runs')
-    bags.add_arguments(parser)
+    recorded.add_arguments(
+        parser, 'run the scheduler over the recorded releases and execution times')
     add('--callbacks', action='store_true', help='show a table of all callbacks, too')
     verdicts.add_arguments(parser)
-    common.add_report(parser)
-    common.add_json(parser)
+    options.add_report(parser)
+    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -88,15 +77,14 @@ def main(args: argparse.Namespace) -> int:
     verdicts.check(args)
     _check_arguments(args)
     task_set = None if args.graph is None else common.load_graph(args.graph)
-    from mddag_executor.replay.bags import is_ordinary
     with common.input_trace(args.trace) as (path, name):
         watch = common.report_watch(args.report)
         drift: list[Drift] = []
         outcome: Replay | Reschedule | BagReschedule
-        if is_ordinary(path):
-            outcome = bags.reschedule_bag(args, path, name, task_set)
+        if args.reschedule or recorded.is_bag(path):
+            outcome = recorded.rescheduled(args, path, name, task_set)
         else:
-            outcome = _replay(args, path, name, task_set, watch, drift)
+            outcome = _replay(path, name, task_set, watch, drift)
     for warning in outcome.warnings:
         print(f'warning: {one_line(warning)}', file=sys.stderr)
     result = outcome.result()
@@ -117,51 +105,22 @@ def main(args: argparse.Namespace) -> int:
 def _check_arguments(args: argparse.Namespace) -> None:
     if args.trace == '-' and args.graph == '-':
         raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
-    if args.policy is not None:
-        find_policy(args.policy)
-    bags.check(args)
-    if args.reschedule:
-        if args.callbacks:
-            raise UsageError(
-                '--callbacks: it shows what was recorded: leave it or --reschedule out')
-        return
-    for option in ('workers', 'policy', 'preemptive', 'overheads', 'execution_times'):
-        if getattr(args, option) not in (None, False):
-            raise UsageError(
-                f'--{option.replace("_", "-")}: a run is replayed as it was recorded: add '
-                '--reschedule')
+    recorded.check(args, args.trace, args.graph)
+    if args.reschedule and args.callbacks:
+        raise UsageError('--callbacks: it shows what was recorded: leave it or --reschedule out')
 
 
 def _replay(
-    args: argparse.Namespace, path: str, name: str, task_set: TaskSet | None,
-    watch: Watch | None, drift: list[Drift],
-) -> Replay | Reschedule:
-    from mddag_executor.replay import reschedule
-    from mddag_executor.replay.as_recorded import replay_recording
-    from mddag_executor.replay.drift import WatchedRecording
-    from mddag_executor.replay.following import open_recording
-    with Progress('replaying') as line:
-        def progress(events: int) -> None:
-            line.update(round(events / 1e6, 1), 'million events')
-
-        if args.execution_times is not None:
-            raise UsageError('--execution-times: a trace has its own: leave the option out')
-        if args.reschedule:
-            recorded = args.overheads in (None, bags.RECORDED)
-            return reschedule(
-                path, task_set, policy=args.policy, workers=args.workers,
-                preemptive=args.preemptive, overheads=recorded,
-                dispatch_overhead=0 if recorded else args.overheads, name=name,
-                progress=progress)
-        recording = open_recording(path, name, WatchedRecording)
-        outcome = replay_recording(recording, task_set, progress, watch)
-        if isinstance(recording, WatchedRecording):
-            drift.extend(recording.drift(outcome.task_set))
-        elif task_set is not None:
-            from mddag_executor.replay.drift import drift_of_import
-            from mddag_executor.replay.sketching import System
-            drift.extend(drift_of_import(System(path, name).census, task_set))
-        return outcome
+    path: str, name: str, task_set: TaskSet | None, watch: Watch | None, drift: list[Drift]
+) -> Replay:
+    from mddag_executor.replay.drift import drift_of_import, WatchedRecording
+    outcome, recording = recorded.as_recorded(path, name, task_set, watch, WatchedRecording)
+    if isinstance(recording, WatchedRecording):
+        drift.extend(recording.drift(outcome.task_set))
+    elif task_set is not None:
+        from mddag_executor.replay.sketching import System
+        drift.extend(drift_of_import(System(path, name).census, task_set))
+    return outcome
 
 
 def _show(args: argparse.Namespace, result: dict[str, Any]) -> None:

@@ -24,7 +24,7 @@ programs have ended; however it ends, its summary is printed.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 import os
 from pathlib import Path
@@ -33,9 +33,13 @@ import signal
 import sys
 import tempfile
 import threading
+import time
+from types import FrameType
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.cli import common
+from mddag_executor import defaults
+from mddag_executor.cli import common, options
+from mddag_executor.cli.stuck import told_when_stuck
 from mddag_executor.cli.text import printable, Progress
 from mddag_executor.core import POLICIES
 from mddag_executor.core import policy as find_policy
@@ -50,13 +54,14 @@ if TYPE_CHECKING:
     from mddag_executor.live.session import Session
     from msg_graph import TaskSet
 
-NAME = 'run'
-HELP = 'run rclpy nodes, or nodes made from the declaration, and record them'
 EXAMPLE = """\
 mddag run graph.yaml --node my_package/driver --node my_package.filter:main --trace run.mcap
 mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20s"""
 
 _LONGEST_LIST = 10
+# SIGINTs within this time are one: who ends a process group sends it to all processes of it, and
+# `ros2 launch`, where it reads from no terminal, then once more to those that it started.
+_SAME_INTERRUPT_S = 1.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,32 +77,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--synthetic', choices=('sleep', 'spin'),
         help='make the nodes from the declaration; their callbacks sleep, or take CPU, for the '
         'declared execution times')
-    add('--utilisation', type=common.positive_float, metavar='U',
+    add('--utilisation', type=options.positive_float, metavar='U',
         help='with --synthetic: scale the execution times to this normalised utilisation, '
         'sum(C/T)/workers')
     add('--seed', type=int, default=0, metavar='N',
         help='with --synthetic: draw the execution times with this (default: 0)')
-    add('--duration', type=common.duration, metavar='TIME',
+    add('--duration', type=options.duration, metavar='TIME',
         help='end after this time, as 20s (default: with Ctrl-C); with --synthetic after a '
         'warm-up of 1 s')
-    add('--workers', type=common.positive_int, metavar='M',
+    add('--workers', type=options.positive_int, metavar='M',
         help='threads that run callbacks (default: what the declaration says, else 7)')
     add('--policy', default='rad', metavar='P',
         help=f'one of {", ".join(POLICIES)} (default: rad)')
     add('--intake', choices=('auto', 'events', 'waitset'), default='auto',
         help='how the executor learns what is ready (default: auto)')
+    add('--one-cpu', action='store_true',
+        help='keep the threads that hold the interpreter lock on one CPU, but for callbacks that '
+        'take much CPU')
     add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
         help="publish the executor's state on /diagnostics so often, for mddag top and other "
         "tools; 'off': not at all (default: 1s)")
     add('--trace', metavar='OUT.mcap', help='record the run to this file')
-    common.add_json(parser)
+    options.add_json(parser)
     add('--ros-args', nargs=argparse.REMAINDER, metavar='…',
         help='the rest of the command line goes to rclpy.init, as -r from:=to')
 
 
 def _or_off(text: str) -> int:
     """Return the nanoseconds of a time, 0 for `off`."""
-    return 0 if text == 'off' else common.duration(text)
+    return 0 if text == 'off' else options.duration(text)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -110,7 +118,7 @@ def main(args: argparse.Namespace) -> int:
     common.check_output(args.json)
     _check_arguments(args)
     task_set = common.load_graph(args.graph)
-    workers = args.workers or task_set.workers or 7
+    workers = defaults.workers(args.workers, task_set)
     plan = None
     programs: list[Program] = []
     if args.synthetic is not None:
@@ -119,22 +127,22 @@ def main(args: argparse.Namespace) -> int:
     else:
         from mddag_executor.live.loading import resolve
         programs = [resolve(spec) for spec in args.node]
-    with _rclpy(args.ros_args or []):
+    with told_when_stuck() as ends, _Signals() as signals, _rclpy(args.ros_args or []):
         from mddag_executor.live.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
-            intake=args.intake, freeze_gc=True,
+            intake=args.intake, freeze_gc=True, one_cpu=args.one_cpu,
             diagnostics_period=args.diagnostics)
         # With `--json -` what nodes print must not get into the JSON.
         output = sys.stdout if common.wants_tables(args) else sys.stderr
         try:
             with redirect_stdout(output):
-                result, error = _run(args, task_set, executor, programs, plan)
+                result, error = _run(args, task_set, executor, programs, plan, signals, ends)
         except MddagError:
             if args.trace is not None:  # nothing ran: leave no empty trace behind
                 Path(args.trace).unlink(missing_ok=True)
             raise
-    _report(args, result)
+        _report(args, result)
     _leave_threads_behind(error)
     if error is not None:
         raise error
@@ -166,13 +174,16 @@ def _check_arguments(args: argparse.Namespace) -> None:
             '--utilisation: it scales synthetic nodes only: add --synthetic or leave it out')
 
 
-def _warn(plan: ExecutionPlan) -> None:
-    """Tell what the draw makes impossible, whatever the executor does."""
+def _warn(plan: ExecutionPlan, remapped: bool) -> None:
+    """Tell what the draw makes impossible, whatever the executor does, and what is in vain."""
     for sink in plan.infeasible():
         print(
             f'warning: {printable(sink.vertex)}: with seed {plan.seed} its critical path takes '
             f'{sink.critical_path_ns / 1e6:.1f} ms, and its deadline is '
             f'{sink.deadline_ns / 1e6:.1f} ms: no scheduler can keep it', file=sys.stderr)
+    if remapped:
+        print('warning: --ros-args: nodes made from the declaration have the names that it gives '
+              'them: remappings do not reach them', file=sys.stderr)
     if plan.mode == 'spin' and plan.utilisation * plan.workers > 0.9:
         print(
             f'warning: spinning callbacks share the interpreter lock, so one core; these need '
@@ -221,18 +232,20 @@ def _init(arguments: list[str]) -> None:
 
 def _run(
     args: argparse.Namespace, task_set: TaskSet, executor: MultiDeadlineExecutor,
-    programs: list[Program], plan: ExecutionPlan | None,
+    programs: list[Program], plan: ExecutionPlan | None, signals: _Signals,
+    ends: Callable[[], None],
 ) -> tuple[dict[str, Any], BaseException | None]:
     """Run until the end; return the result, and what a node raised."""
     from mddag_executor.live.session import Session
     from mddag_executor.live.watch import Watch
-    session = Session(executor)
+    session = Session(executor, on_end=ends)
     watch = Watch(executor, task_set)
     seconds = None if args.duration is None else args.duration / 1e9
     measured: dict[str, Any] | None = None
-    with _signals(session), Progress('running', seconds) as progress:
+    signals.end_of(session)
+    with Progress('running', seconds) as progress:
         if plan is not None:
-            _warn(plan)
+            _warn(plan, not {'-r', '--remap'}.isdisjoint(args.ros_args or ()))
             measured = _run_synthetic(session, task_set, plan, seconds, progress)
         else:
             _run_programs(session, programs, args.ros_args or [], seconds, progress)
@@ -287,23 +300,43 @@ def _run_programs(
                   'ended in time; it is left behind', file=sys.stderr)
 
 
-@contextmanager
-def _signals(session: Session) -> Iterator[None]:
-    """Let SIGINT and SIGTERM end the run; the second SIGINT interrupts the program itself."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+class _Signals:
+    """
+    Let SIGINT and SIGTERM end the run, and its report be written; a context manager.
 
-    def handler(number: int, frame: object) -> None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        session.stop(hurried=True)
+    A SIGINT that comes a while after the first interrupts the program itself.
+    """
 
-    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
+    def __init__(self) -> None:
+        self._session: Session | None = None
+        self._first: float | None = None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> _Signals:
+        return self
+
+    def end_of(self, session: Session) -> None:
+        """From now on they end this session."""
+        self._session = session
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._handle)
+
+    def __exit__(self, *args: object) -> None:
+        for number, before in self._before.items():
+            signal.signal(number, before)
+        if self._first is not None and signal.SIGINT in self._before:
+            # The process is about to end by itself; it is not to look as if it was killed.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        if self._first is None:
+            self._first = now
+        elif number == signal.SIGINT and now - self._first > _SAME_INTERRUPT_S:
+            signal.default_int_handler(number, frame)
+        if self._session is not None:
+            self._session.stop(hurried=True)
 
 
 def _report(args: argparse.Namespace, result: dict[str, Any]) -> None:
@@ -330,7 +363,11 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
                if counts['skipped']}
     if skipped:
         yield f'{sum(skipped.values())} timer releases skipped' + _details(skipped)
-    yield f'{result["undeclared"]} runs of undeclared callbacks'
+    undeclared = {
+        name: counts['unattributed' if counts['declared'] else 'ran']
+        for name, counts in result['callbacks'].items()}
+    yield (f'{result["undeclared"]} runs of undeclared callbacks'
+           + _details({name: count for name, count in undeclared.items() if count}))
     never = [*result['never_ran'], *(
         name for name, counts in result['callbacks'].items()
         if counts['declared'] and not counts['ran'])]

@@ -24,46 +24,37 @@ import argparse
 from collections.abc import Iterator
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.cli import common
-from mddag_executor.cli.text import Progress
+from mddag_executor import defaults
+from mddag_executor.cli import common, options
+from mddag_executor.cli.text import format_ns, printable, Progress
 from mddag_executor.core import POLICIES
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
-from mddag_executor.report.text import format_ns, printable
 
 if TYPE_CHECKING:
     from mddag_executor.simulate import Load, Run, Settings
     from msg_graph import TaskSet
 
-NAME = 'simulate'
-HELP = 'run a declaration in virtual time'
 EXAMPLE = """\
 mddag simulate config/autoware.yaml --policy rad --workers 7 --duration 3s --preemptive
 mddag simulate graph.yaml --execution-times times.json --json - --fail-on-miss"""
-
-DEFAULT_DURATION_NS = 3_000_000_000
-DEFAULT_WORKERS = 7
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('graph', metavar='GRAPH', help="the declaration, a YAML file ('-': standard input)")
+    options.add_graph(parser)
     add('--policy', default='rad', metavar='P',
         help=f'one of {", ".join(POLICIES)} (default: rad)')
-    add('--workers', type=common.positive_int, metavar='M',
-        help='size of the pool (default: what the declaration says, else '
-        f'{DEFAULT_WORKERS})')
-    add('--duration', type=common.duration, default=DEFAULT_DURATION_NS, metavar='TIME',
-        help='virtual time to simulate, as 3s (default: 3s)')
+    options.add_workers(parser)
+    options.add_virtual_time(parser)
     add('--preemptive', action='store_true',
         help='what is more urgent takes the worker of what runs')
     add('--execution-times', metavar='FILE',
         help='JSON {"DAG": {"/node:callback": microseconds}}: the execution time of each vertex '
         "('-': standard input; default: drawn from the declaration)")
-    add('--seed', type=int, default=0, metavar='N',
-        help='draw the execution times with this (default: 0)')
-    add('--utilisation', type=common.positive_float, metavar='U',
+    options.add_seed(parser, 'draw the execution times with this', int)
+    add('--utilisation', type=options.positive_float, metavar='U',
         help='scale the execution times to this normalised utilisation, sum(C/T)/workers')
     add('--judge', choices=('horizon', 'completions'), default='horizon',
         help='what is overdue at the end is late (horizon, the default), or only what completed '
@@ -72,8 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='end the run with the first missed deadline')
     add('--trace', metavar='OUT.mcap', help='record the run to this file')
     add('--fail-on-miss', action='store_true', help='exit with status 1 if a deadline was missed')
-    common.add_report(parser)
-    common.add_json(parser)
+    options.add_report(parser)
+    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -86,7 +77,7 @@ def main(args: argparse.Namespace) -> int:
     from mddag_executor.simulate import periodic_load, Settings, utilisation
     _check_arguments(args)
     task_set = common.load_graph(args.graph)
-    workers = args.workers or task_set.workers or DEFAULT_WORKERS
+    workers = defaults.workers(args.workers, task_set)
     times = _execution_times(args, task_set, workers)
     settings = Settings(
         policy=args.policy, workers=workers, duration_ns=args.duration,
@@ -96,14 +87,14 @@ def main(args: argparse.Namespace) -> int:
     run = _simulate(task_set, load, settings, utilisation(task_set, times, workers),
                     log=args.trace is not None or args.report is not None)
     if args.trace is not None:
-        _write_trace(args.trace, task_set, load, run)
+        from mddag_executor.simulate.recording import write_trace
+        with common.output_trace(args.trace) as path:
+            write_trace(path, task_set, load, run)
     if args.report is not None:
         from mddag_executor.report.html import of_run
         common.write_report(args.report, lambda: of_run(task_set, load, run))
     result = _result(args, task_set, run)
-    if args.json is not None:
-        common.write_json(args.json, result)
-    if common.wants_tables(args):
+    if common.write_result(args, result):
         from mddag_executor.report.tables import sink_table
         print(sink_table(result['dags']))
         for line in summary(result):
@@ -150,17 +141,6 @@ def _simulate(
             task_set, load, settings, utilisation=utilisation, log=log, progress=line.update)
 
 
-def _write_trace(path: str, task_set: TaskSet, load: Load, run: Run) -> None:
-    """Write the trace as a whole or not at all."""
-    from mddag_executor.simulate.recording import write_trace
-    from mddag_executor.trace import TraceError
-    with common.output_file(path) as file:
-        try:
-            write_trace(file.name, task_set, load, run)
-        except TraceError as error:
-            raise TraceError(path, error.problem, error.remedy) from None
-
-
 def _result(args: argparse.Namespace, task_set: TaskSet, run: Run) -> dict[str, Any]:
     drawn = args.execution_times is None
     return {
@@ -171,15 +151,12 @@ def _result(args: argparse.Namespace, task_set: TaskSet, run: Run) -> dict[str, 
 
 def summary(result: dict[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the table of a run."""
-    from mddag_executor.report.tables import percent, total
-    every = total(result['dags'])
+    from mddag_executor.report.tables import verdicts_line
     jobs = sum(dag['jobs'] for dag in result['dags'].values())
     yield (f'{result["policy"]}, {result["workers"]} workers, '
            f'{"preemptive" if result["preemptive"] else "not preemptive"}, '
            f'{format_ns(result["duration_ns"])}, utilisation {result["utilisation"]:.3f}')
-    yield (f'{jobs} jobs, {every.due} sink jobs due, {every.in_time} in time '
-           f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
-           + (f', {every.aborted} aborted' if every.aborted else ''))
+    yield f'{jobs} jobs, {verdicts_line(result["dags"])}'
     if result['ended_ns'] < result['duration_ns']:
         yield f'stopped at {format_ns(result["ended_ns"], 9)}, with the first miss'
     miss = result['first_miss']

@@ -17,12 +17,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-import sys
 import tempfile
 from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common
-from mddag_executor.cli.text import one_line, Progress
+from mddag_executor.cli.text import Progress, warn
 
 if TYPE_CHECKING:
     from mddag_executor.replay.sketching import System
@@ -38,22 +37,19 @@ def recorded_system(given: str) -> System:
     """
     from mddag_executor.replay.sketching import System
     with Progress('reading the trace') as line:
-        def progress(events: int) -> None:
-            line.update(round(events / 1e6, 1), 'million events')
-
         if given != '-' and Path(given).is_dir():
             from mddag_executor.trace import import_ctf
             with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
                 trace = Path(folder, 'session.mcap')
-                warnings = import_ctf(given, trace, progress=progress).warnings
-                system = System(trace, given, progress)
+                warnings = import_ctf(given, trace, progress=line.events).warnings
+                system = System(trace, given, line.events)
             system.warnings = [*warnings, *system.warnings]
         else:
             name = common.STDIN if given == '-' else given
             with common.input_file(given) as path:
-                system = System(path if given == '-' else given, name, progress)
+                system = System(path if given == '-' else given, name, line.events)
     for warning in system.warnings:
-        print(f'warning: {one_line(warning)}', file=sys.stderr)
+        warn(warning)
     return system
 
 
@@ -64,5 +60,7 @@ def write_declaration(output: str, text: str) -> None:
     if output == '-':
         return
     count = sum(MARK in line for line in text.splitlines()[2:])
-    blanks = f'{count} blank{"" if count == 1 else "s"}' if count else 'no blank left'
-    print(f"{blanks} to fill in, marked '{MARK}'" if count else f'{blanks} to fill in')
+    if count:
+        print(f"{count} blank{'s' * (count > 1)} to fill in, marked '{MARK}'")
+    else:
+        print('no blank left to fill in')

@@ -24,12 +24,17 @@ from typing import TextIO
 
 from mddag_executor.report.text import Cell, format_ns, printable, table
 
-__all__ = ['Cell', 'Progress', 'format_ns', 'one_line', 'printable', 'table']
+__all__ = ['Cell', 'Progress', 'format_ns', 'one_line', 'printable', 'table', 'warn']
 
 
 def one_line(text: str) -> str:
     """Return a message as a single harmless line."""
     return printable(' '.join(text.split()))
+
+
+def warn(text: str) -> None:
+    """Print a warning on standard error, as a single harmless line."""
+    print(f'warning: {one_line(text)}', file=sys.stderr)
 
 
 class Progress:
@@ -91,3 +96,7 @@ class Progress:
         self._stream.write('\r' + line.ljust(self._shown))
         self._stream.flush()
         self._shown = max(self._shown, len(line))
+
+    def events(self, done: int) -> None:
+        """Tell how many events of a trace have been read so far."""
+        self.update(round(done / 1e6, 1), 'million events')

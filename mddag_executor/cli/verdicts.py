@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from mddag_executor.cli import common
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import printable
 from mddag_executor.errors import UsageError
 from mddag_executor.replay.tolerances import MissTally, Tolerance
@@ -30,27 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('--fail-on-miss', action='store_true',
         help='exit with status 1 if a deadline was missed, beyond what is tolerated')
-    add('--tolerate-ratio', type=_ratio, metavar='R',
+    add('--tolerate-ratio', type=options.ratio, metavar='R',
         help='with --fail-on-miss or --junit: the share of the jobs of a sink that may miss, '
         '0 to 1')
-    add('--tolerate-burst', type=_burst, metavar='B',
+    add('--tolerate-burst', type=options.or_zero(options.positive_int), metavar='B',
         help='the same: how many jobs of a sink may miss in a row')
     add('--junit', metavar='OUT.xml',
         help="write JUnit XML, a test case for each sink ('-': to standard output)")
-
-
-def _ratio(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f'{text!r} is no number from 0 to 1')
-    return value
-
-
-def _burst(text: str) -> int:
-    return 0 if text == '0' else common.positive_int(text)
 
 
 def check(args: argparse.Namespace) -> None:

@@ -61,6 +61,7 @@ class Scheduler:
             dispatch_overhead=dispatch_overhead, switch_overhead=switch_overhead,
             polling=self.policy.polling)
         self._key = self.policy.key
+        self._free_groups: list[int] = []
 
     def release(self, dag: int, job: int, release: int, now: int) -> int:
         """Open a job of a DAG and return its slot."""
@@ -150,7 +151,16 @@ class Scheduler:
 
     def new_group(self) -> int:
         """Add a mutually exclusive callback group and return its number."""
+        for place, group in enumerate(self._free_groups):
+            # What was dropped may stand in it for a while yet.
+            if self.state.group_owner[group] == -1 and not self.state.group_heap[group]:
+                del self._free_groups[place]
+                return group
         return add_group(self.state)
+
+    def free_group(self, group: int) -> None:
+        """Give a group's number back, to be used again once nothing of it runs or waits."""
+        self._free_groups.append(group)
 
     def decisions(self) -> list[Decision]:
         """Take away what has been decided since the last call."""

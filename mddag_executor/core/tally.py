@@ -21,8 +21,8 @@ mean the same.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Sequence
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from mddag_executor.core.state import (
@@ -59,6 +59,48 @@ def quantiles_us(values: list[int]) -> dict[str, float] | None:
         'max': ordered[-1] / 1000}
 
 
+class Latest:
+    """
+    The last ``keep`` of a series of numbers (None: all), 8 bytes each.
+
+    Numbers beyond 64 bits, which damaged recordings may give, are kept as the nearest within.
+    """
+
+    __slots__ = ('_keep', '_values', '_next')
+
+    def __init__(self, keep: int | None) -> None:
+        self._keep = keep
+        self._values = array('q')
+        self._next = 0
+
+    def append(self, value: int) -> None:
+        """Add a number, in place of the oldest where there are ``keep`` already."""
+        values = self._values
+        try:
+            if len(values) != self._keep:
+                values.append(value)
+            elif values:
+                values[self._next] = value
+                self._next = (self._next + 1) % len(values)
+        except OverflowError:
+            self.append(2 ** 63 - 1 if value > 0 else -2 ** 63)
+
+    def __len__(self) -> int:
+        """Return how many are kept."""
+        return len(self._values)
+
+    def __getitem__(self, index: int) -> int:
+        """Return one of them, the oldest with 0, the last with -1."""
+        length = len(self._values)
+        if not -length <= index < length:
+            raise IndexError(index)
+        return self._values[(self._next + index) % length]
+
+    def __iter__(self) -> Iterator[int]:
+        """Give them from the oldest to the last."""
+        return iter(self._values[self._next:] + self._values[:self._next])
+
+
 class SinkTally:
     """What came of one sink: counts, and response times (completion minus release, ns)."""
 
@@ -71,7 +113,7 @@ class SinkTally:
         self.overdue = 0
         self.shortest: int | None = None
         self.longest: int | None = None
-        self.responses: deque[int] = deque(maxlen=keep)
+        self.responses = Latest(keep)
 
     def done(self, response: int, late: bool) -> None:
         """Count a completion."""

@@ -35,8 +35,7 @@ from typing import NamedTuple
 from mddag_executor.generate.options import GenerateError, LEAST_NS, Options
 from mddag_executor.generate.shapes import draw_shape, Shape
 from mddag_executor.generate.shares import deal, Dice
-
-_LONGEST_NS = 86_400_000_000_000
+from msg_graph.duration import short_duration, whole_us
 
 
 class _Dag(NamedTuple):
@@ -112,8 +111,7 @@ def _deadlines(
     deadlines = []
     for sink in range(shape.first_sink, shape.count):
         base = period if options.deadline_of == 'period' else lengths[sink]
-        exact = base * dice.number(*options.tightness)
-        deadlines.append(min(_LONGEST_NS, max(1, -int(-exact // 1000)) * 1000))
+        deadlines.append(whole_us(base * dice.number(*options.tightness)))
     return deadlines
 
 
@@ -140,7 +138,7 @@ def _callback(dag: _Dag, place: int, spread: float) -> Iterator[str]:
     before = shape.predecessors[place]
     yield f'      - name: v{place}'
     if place == 0:
-        yield f'        timer: {_text(dag.period_ns)}'
+        yield f'        timer: {short_duration(dag.period_ns)}'
         yield f'        dag: {dag.name}'
     elif len(before) == 1 or shape.is_or[place]:
         topic = f'to_v{place}' if shape.is_or[place] else f'v{before[0]}'
@@ -153,7 +151,7 @@ def _callback(dag: _Dag, place: int, spread: float) -> Iterator[str]:
         yield '        publishes:'
         yield from (f'          - {topic}' for topic in topics)
     if place >= shape.first_sink:
-        yield f'        deadline: {_text(dag.deadlines[place - shape.first_sink])}'
+        yield f'        deadline: {short_duration(dag.deadlines[place - shape.first_sink])}'
     yield f'        execution_time: {_execution_time(dag.costs[place], spread)}'
 
 
@@ -168,12 +166,5 @@ def _published(dag: _Dag, place: int) -> list[str]:
 def _execution_time(cost: int, spread: float) -> str:
     half = int(cost * spread)
     if half == 0:
-        return _text(cost)
+        return short_duration(cost)
     return f'{{quantiles_us: [{(cost - half) / 1000:.3f}, {(cost + half) / 1000:.3f}]}}'
-
-
-def _text(ns: int) -> str:
-    """Return a time exactly, in ms where these have three decimals at most."""
-    if ns % 1000 == 0 and ns >= 1_000_000:
-        return f'{ns // 1_000_000}.{ns // 1000 % 1000:03d}'.rstrip('0').rstrip('.') + 'ms'
-    return f'{ns // 1000}.{ns % 1000:03d}'.rstrip('0').rstrip('.') + 'us'

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import math
 
 from mddag_executor.errors import MddagError
+from msg_graph.duration import DAY
 
 METHODS = ('dirichlet', 'uunifast')
 BASES = ('period', 'path')
@@ -28,7 +29,6 @@ LEAST_NS = 1_000
 
 _MOST_DAGS = 1_000
 _MOST_VERTICES = 1_000
-_LONGEST_NS = 86_400_000_000_000
 
 
 class GenerateError(MddagError):
@@ -95,7 +95,7 @@ class Options:
         if not self.periods_ns:
             raise GenerateError('--periods: there is none: give some, as 10ms,20ms')
         for period in self.periods_ns:
-            _bounds('--periods', (period, period), LEAST_NS, _LONGEST_NS)
+            _bounds('--periods', (period, period), LEAST_NS, DAY)
         self._check_together()
 
     def _check_together(self) -> None:

@@ -12,12 +12,19 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What ends or wakes the intakes when a context, or the interpreter, comes to its end."""
+"""
+What ends or wakes intakes and executors when a context, or the interpreter, comes to its end.
+
+A daemon thread that wants the interpreter back while that ends is ended by it.  Where it is in
+native code then (in a wait of rcl, a sleep of a clock), C++ calls ``terminate``: the process
+aborts after its work was done.  (rclpy's own executors do so when a daemon thread spins one.)
+"""
 
 from __future__ import annotations
 
 import atexit
 from functools import partial
+import os
 import time
 from typing import Protocol
 import weakref
@@ -26,6 +33,8 @@ from rclpy.context import Context
 
 FIRST_LOOK_NS = 5_000_000
 LAST_LOOK_NS = 500_000_000
+EXIT_PATIENCE_S = 1.0
+"""So long a program that ends waits for callbacks that still run in an executor's threads."""
 _now = time.monotonic_ns
 
 
@@ -36,7 +45,15 @@ class _Intake(Protocol):
     def stop(self) -> None: ...
 
 
+class _Executor(Protocol):
+
+    def halt(self) -> None: ...
+
+    def wait_halted(self, seconds: float) -> None: ...
+
+
 _started: weakref.WeakSet[_Intake] = weakref.WeakSet()
+_executors: weakref.WeakSet[_Executor] = weakref.WeakSet()
 _by_context: weakref.WeakKeyDictionary[Context, weakref.WeakSet[_Intake]] = (
     weakref.WeakKeyDictionary())
 
@@ -50,10 +67,30 @@ def stop_at_exit(intake: _Intake) -> None:
     _started.add(intake)
 
 
+def halt_at_exit(executor: _Executor) -> None:
+    """Have an executor stopped before the interpreter ends, in whichever thread it spins."""
+    _executors.add(executor)
+
+
 @atexit.register
 def _stop_all() -> None:
+    executors = list(_executors)
+    for executor in executors:
+        executor.halt()
+    end = _now() + int(EXIT_PATIENCE_S * 1e9)
+    for executor in executors:
+        executor.wait_halted(max(0.0, (end - _now()) / 1e9))
     for intake in list(_started):
         intake.stop()
+
+
+def _forget() -> None:
+    """Forget all in a forked child: it has none of the threads, and locks may be held for ever."""
+    _executors.clear()
+    _started.clear()
+
+
+os.register_at_fork(after_in_child=_forget)
 
 
 def wake_at_shutdown(context: Context, intake: _Intake) -> None:

@@ -67,9 +67,9 @@ class Entry:
 
     __slots__ = (
         'kind', 'entity', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
-        'topic', 'waiting', 'ready', 'ran', 'dropped', 'skipped', 'last_due', 'busy_ns',
+        'topic', 'waiting', 'ready', 'ran', 'dropped', 'skipped', 'busy_ns',
         'unattributed', 'removed', 'address', 'handle', 'enters', 'soon', 'soon_from',
-        'publishes')
+        'publishes', 'light')
 
     def __init__(
         self, kind: str, entity: Any, node: str, callback: Callback | None, group: int,
@@ -94,13 +94,14 @@ class Entry:
         self.ran = 0
         self.dropped = 0
         self.skipped = 0
-        self.last_due = 0
         self.busy_ns = 0
         self.unattributed = 0
         # how many times in a row its callback ended soon after it published
         self.soon = 0
         # from which number on that is expected again; grows each time it turns out wrong
         self.soon_from = SOON_FROM
+        # how many times in a row its callback took little CPU (see ``gathering``)
+        self.light = 0
         # the topics that its callback has published on
         self.publishes: set[str] = set()
         self.removed = False
@@ -147,7 +148,7 @@ class Work:
     """
     One execution of a callback: what to call, for which job, and where it stands.
 
-    ``origin`` is the vertex and job that it executes (UNDECLARED for others).
+    ``origin`` is the vertex and job that it executes (None for others).
     """
 
     __slots__ = ('entry', 'x', 'function', 'args', 'then', 'coroutine', 'origin', 'ready_ns')
@@ -207,12 +208,13 @@ class TaskWork(Work):
     def step(self) -> Any:
         """Run the task once; return None when it is done."""
         task: Any = self.function
+        task.waits_for = None
         task()
         if task.done() or task.cancelled():
             if self.then is not None:
                 self.then(task)
             return None
-        return awaited(self.coroutine)
+        return awaited(self.coroutine) if task.waits_for is None else task.waits_for
 
 
 UNKNOWN = object()
@@ -223,7 +225,7 @@ def awaited(coroutine: Any) -> Any:
     """
     Return the rclpy future that a suspended coroutine waits for, or UNKNOWN.
 
-    In rclpy of Jazzy ``Future.__await__`` is a generator that yields nothing, so the future is
+    In rclpy before 7.1.9 ``Future.__await__`` is a generator that yields nothing, so the future is
     looked up where the chain of awaits ends.
     """
     inner = coroutine

@@ -141,6 +141,7 @@ class _NativeThread:
         return True
 
     def _run(self) -> None:
+        self._receiver.on_thread()
         ended = broken = False
         failures = 0
         looks = SecondLooks()
@@ -339,6 +340,8 @@ class EventsIntake:
             self._ending = [part for part in parts.values() if isinstance(part, _NativeThread)]
         for part in parts.values():
             part.stop()
+            if isinstance(part, WaitSetIntake):
+                part.update(EMPTY)
         if looker is not None and looker is not threading.current_thread():
             looker.join()
 

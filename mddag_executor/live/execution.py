@@ -33,17 +33,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 import math
-import random
 import statistics
 import time
 from typing import Literal
 
 from mddag_executor.errors import MddagError
+from mddag_executor.simulate.workload import draw_execution_times
+from mddag_executor.simulate.workload import utilisation as normalised
 from msg_graph import Dag, TaskSet
 from msg_graph.analysis import path_lengths
 
 Mode = Literal['sleep', 'spin']
-MODES: tuple[Mode, ...] = ('sleep', 'spin')
 
 Emulate = Callable[[int], None]
 """
@@ -96,8 +96,8 @@ class ExecutionPlan:
         self.mode: Mode = mode
         self.asked = utilisation
         self._task_set = task_set
-        drawn = _draw(task_set, seed)
-        self.drawn_utilisation = _utilisation(task_set, drawn, workers)
+        drawn = draw_execution_times(task_set, seed, undeclared=0)
+        self.drawn_utilisation = normalised(task_set, drawn, workers)
         self.factor = 1.0
         if utilisation is not None:
             if not (utilisation > 0 and math.isfinite(utilisation)):
@@ -113,7 +113,7 @@ class ExecutionPlan:
     @property
     def utilisation(self) -> float:
         """Return the normalised utilisation that results: sum(C / T) / workers."""
-        return _utilisation(self._task_set, self._times, self.workers)
+        return normalised(self._task_set, self._times, self.workers)
 
     def execution_ns(self, dag: int, vertex: int) -> int:
         """Return the execution time of a vertex, by DAG index and local index, ns."""
@@ -134,26 +134,6 @@ class ExecutionPlan:
                 if deadline is not None and ends[sink] > deadline:
                     found.append(Infeasible(dag.name, vertex.name, ends[sink], deadline))
         return found
-
-
-def _draw(task_set: TaskSet, seed: int) -> list[list[int]]:
-    """Draw one execution time for each vertex, in the order of the file."""
-    generator = random.Random(seed)
-    times = []
-    for dag in task_set.dags:
-        row = []
-        for vertex in dag.vertices:
-            # Draws even where nothing is declared: declaring one more time changes no other.
-            share = generator.random()
-            declared = vertex.callback.execution_time
-            row.append(0 if declared is None else declared.draw(share))
-        times.append(row)
-    return times
-
-
-def _utilisation(task_set: TaskSet, times: list[list[int]], workers: int) -> float:
-    total = sum(sum(times[dag.index]) / dag.period_ns for dag in task_set.dags)
-    return total / workers
 
 
 def typical_oversleep_ns(samples: int = 100, asked_ns: int = 300_000) -> int:

@@ -37,12 +37,16 @@ import threading
 import time
 from typing import Any, TYPE_CHECKING
 
+from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.live import hooks
 from mddag_executor.live.diagnostics import Diagnostics
 from mddag_executor.live.dispatcher import Dispatcher
+from mddag_executor.live.endings import halt_at_exit
+from mddag_executor.live.entities import EMPTY
 from mddag_executor.live.entries import AtOnce, Entry, TASK, Work
 from mddag_executor.live.events import EventsIntake
+from mddag_executor.live.gathering import Gathering
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.rates import RateWatch
 from mddag_executor.live.receiver import Receiver
@@ -102,6 +106,8 @@ class MultiDeadlineExecutor(Stepping):
     :param worker_policy: real-time policy of the workers, ``SCHED_FIFO`` or ``SCHED_RR``.
     :param worker_priority: their priority under it.
     :param worker_cpus: the CPUs that they may use.
+    :param one_cpu: keep workers and intake on one of these CPUs, which saves much of what they
+        cost, except while callbacks run that take much CPU (see ``docs/real_time.md``).
     :param freeze_gc: when the first spin begins, collect garbage and have the collector leave
         alone what there is by then (``gc.freeze``): for programs that make their nodes first.
     :param diagnostics_period: how often to publish on ``/diagnostics`` while it spins: ns, or text
@@ -130,6 +136,7 @@ class MultiDeadlineExecutor(Stepping):
         worker_policy: str | None = None,
         worker_priority: int | None = None,
         worker_cpus: set[int] | None = None,
+        one_cpu: bool = False,
         freeze_gc: bool = False,
         diagnostics_period: int | str | None = None,
         thresholds: Thresholds | None = None,
@@ -137,6 +144,7 @@ class MultiDeadlineExecutor(Stepping):
         task_set, num_workers, deadline_ns = resolve(
             graph, num_workers, default_deadline, intake)
         prepare = thread_setting(worker_policy, worker_priority, worker_cpus)
+        self._gathering = Gathering(worker_cpus) if one_cpu else None
         every_ns = diagnostics_period_ns(diagnostics_period)
         max_active_jobs = whole('max_active_jobs', max_active_jobs, MOST_JOBS)
         call_back('on_deadline_miss', on_deadline_miss)
@@ -146,7 +154,7 @@ class MultiDeadlineExecutor(Stepping):
         # All is checked by now: nothing below leaves a trace or a thread of what can't be made.
         hooks.install()
         self._recorder = None
-        clock_offset = time.time_ns() - time.monotonic_ns()
+        clock_offset = epoch_offset_ns()
         if trace is not None:
             self._recorder = Recorder(
                 trace, task_set, policy, num_workers, deadline_ns, max_active_jobs,
@@ -165,12 +173,13 @@ class MultiDeadlineExecutor(Stepping):
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
             clock_offset=clock_offset, fail=self._fail,
             record=self._recorder.record if self._recorder else None, on_miss=on_deadline_miss)
-        self._pool = Pool(self._dispatcher, prepare)
+        self._pool = Pool(self._dispatcher, prepare, self._gathering)
         self._pool.pump = self._pump
         self._registry = Registry(
             task_set, self._dispatcher.tables, self._dispatcher.scheduler)
         self._receiver = Receiver(
-            self._dispatcher, self._registry, task_set, self, self._fail, self._recorder)
+            self._dispatcher, self._registry, task_set, self, self._fail, self._recorder,
+            self._gathering)
         self._new_tasks: deque[Work] = deque()
         self._task_entry = Entry(TASK, None, '', None, -1, 0, 'task')
         self._rates = RateWatch(self._registry)
@@ -183,6 +192,7 @@ class MultiDeadlineExecutor(Stepping):
                 self._context, task_set, self._dispatcher, self._pool, self._registry,
                 self._recorder, every_ns, thresholds)
         self._intake_kind = intake
+        halt_at_exit(self)
 
     # --- tasks -----------------------------------------------------------------------------------
 
@@ -202,12 +212,24 @@ class MultiDeadlineExecutor(Stepping):
             self._ring()
         return task
 
+    def create_future(self) -> Future:
+        """Return a future whose callbacks run in this executor (rclpy from 7.1.6 on)."""
+        return Future(executor=self)
+
+    def _call_task_in_next_spin(self, task: Task) -> None:
+        """Leave a task (rclpy 7.1.9) to the pool, which asks it again by itself."""
+
     def _submit_tasks(self) -> None:
         """Have the tasks run that were created while nobody spun: the newest first (rclpy)."""
         while self._new_tasks:
             self._dispatcher.undeclared_ready(self._task_entry, self._new_tasks.pop())
 
     # --- spinning --------------------------------------------------------------------------------
+
+    @property
+    def is_spinning(self) -> bool:
+        """Return whether somebody spins (rclpy from 7.1.9 on)."""
+        return self._spinning.locked()
 
     def spin(self) -> None:
         """
@@ -248,6 +270,7 @@ class MultiDeadlineExecutor(Stepping):
                 self._raise_error()
                 if done():
                     self._settle()
+                    self._raise_error()  # of what ran before it was done
                     return
                 self._check_context()
                 self._look_after()
@@ -293,7 +316,10 @@ class MultiDeadlineExecutor(Stepping):
     def _look_after(self) -> None:
         """Do what is to be done now and then while somebody spins."""
         self._submit_tasks()
-        self._rates.look()
+        if self._rates.look() and self._registry.retimed():
+            self._changed = True
+        if self._gathering is not None:
+            self._gathering.look()
         if self._diagnostics is not None:
             self._diagnostics.start()
 
@@ -319,6 +345,7 @@ class MultiDeadlineExecutor(Stepping):
         intake, self._intake = self._intake, None
         if intake is not None:
             intake.stop()
+            intake.update(EMPTY)  # its threads refer to it: until it is collected, to no entity
 
     def _fail(self, error: BaseException) -> None:
         """Take an exception from a worker or the intake; it comes out of the spin."""

@@ -41,6 +41,7 @@ from typing import Any
 
 from mddag_executor.live.interception import Interception
 from mddag_executor.live.loading import describe, LoadingError, Program
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import Executor
 from rclpy.node import Node
 
@@ -206,6 +207,7 @@ class Host:
             raise LoadingError(
                 guest.program.spec if guest else name, f'node {name} has a context of its own',
                 'let it use the default context')
+        self._forget_destroyed(guest)
         if not self._closed and node not in self.executor.get_nodes():
             self._local.adopting = True
             try:
@@ -218,6 +220,17 @@ class Host:
                     guest.nodes.append(node)
             guest.settled.set()
 
+    def _forget_destroyed(self, guest: Guest | None) -> None:
+        """Let go of nodes that a program has made for a while only and destroyed since."""
+        if guest is None:
+            return
+        with self._lock:
+            gone = [node for node in guest.nodes if _is_destroyed(node)]
+            for node in gone:
+                guest.nodes.remove(node)
+        for node in gone:
+            self.executor.remove_node(node)
+
     def wait(
         self, timeout_s: float | None, event: threading.Event | None = None,
         guest: Guest | None = None,
@@ -229,6 +242,14 @@ class Host:
             left = 0.05 if end is None else min(0.05, end - time.monotonic())
             if left <= 0 or guest is not None and guest.ended.is_set() or waits_for.wait(left):
                 return
+
+
+def _is_destroyed(node: Node) -> bool:
+    try:
+        with node.handle:
+            return False
+    except InvalidHandle:
+        return True
 
 
 def _nodes_in(program: Program, value: Any) -> list[Node]:

@@ -45,6 +45,7 @@ from dataclasses import dataclass, field
 import signal
 import threading
 from typing import Any, TYPE_CHECKING
+import weakref
 
 from mddag_executor.live.loading import LoadingError
 import rclpy
@@ -62,9 +63,8 @@ _STEP_S = 0.01
 
 @dataclass(eq=False)
 class Foreign:
-    """What is kept for an executor that a program made; it is kept alive with it."""
+    """What is kept for an executor that a program made."""
 
-    executor: Executor
     guest: Guest | None
     spins: int = 0
     stopped: threading.Event = field(default_factory=threading.Event)
@@ -76,7 +76,8 @@ class Interception:
     def __init__(self, host: Host) -> None:
         self._host = host
         self._lock = threading.Lock()
-        self._foreign: dict[int, Foreign] = {}
+        # programs may make an executor for each of many calls
+        self._foreign: weakref.WeakKeyDictionary[Executor, Foreign] = weakref.WeakKeyDictionary()
         self._saved: list[tuple[Any, str, Any]] = []
         self._original_init = rclpy.init
         self._add_node = Executor.add_node
@@ -207,10 +208,9 @@ class Interception:
 
     def _state(self, executor: Executor) -> Foreign:
         with self._lock:
-            state = self._foreign.get(id(executor))
+            state = self._foreign.get(executor)
             if state is None:
-                state = Foreign(executor, self._host.current_guest())
-                self._foreign[id(executor)] = state
+                state = self._foreign[executor] = Foreign(self._host.current_guest())
             return state
 
     def _adopt_all(self, executor: Executor, state: Foreign) -> None:

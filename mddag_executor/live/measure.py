@@ -41,27 +41,13 @@ from dataclasses import dataclass
 import time
 from typing import Any
 
+from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.core.tally import quantile, quantiles_us
 from mddag_executor.live.execution import ExecutionPlan
 from msg_graph import Dag, TaskSet, Vertex
 
 _EARLY_NS = 1_000_000
 """How much before its nominal time a release may be noted: clocks are read twice (ns)."""
-
-
-def epoch_offset_ns() -> int:
-    """
-    Return what turns ``time.monotonic_ns()`` into ns since the epoch, for a whole run.
-
-    The best of several readings, so that an interruption between the two clocks does no harm.
-    """
-    readings = []
-    for _ in range(20):
-        before = time.monotonic_ns()
-        now = time.time_ns()
-        after = time.monotonic_ns()
-        readings.append((after - before, now - (before + after) // 2))
-    return min(readings)[1]
 
 
 @dataclass(frozen=True)

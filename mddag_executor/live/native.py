@@ -246,3 +246,4 @@ class NodeStandIn:
             self._by_kind[kind] = {}
         self._show()
         self._let_go(self._updates)
+        self.wanted = self._applied = EMPTY

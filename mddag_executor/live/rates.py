@@ -77,11 +77,11 @@ class RateWatch:
         self._next = self._looked = clock()
         self._known: dict[Entry, _Known] = {}
 
-    def look(self) -> None:
-        """Look at all timers, unless that was done just now."""
+    def look(self) -> bool:
+        """Look at all timers, unless that was done just now; return whether it was not."""
         now = self._clock()
         if now < self._next:
-            return
+            return False
         since, self._looked, self._next = self._looked, now, now + LOOK_S
         before = self._known
         self._known = {
@@ -94,6 +94,7 @@ class RateWatch:
                 self._tell(entry, known, now)
             elif now - known.at >= AGAIN_S and skipped + ran >= 2 * FEWEST:
                 known.begin(entry, now)
+        return True
 
     def _tell(self, entry: Entry, known: _Known, now: float) -> None:
         skipped = entry.skipped - known.skipped

@@ -20,6 +20,7 @@ from collections.abc import Iterable
 import threading
 import time
 from typing import Any
+import weakref
 
 from mddag_executor.live.entries import Entry, SERVICE, SUBSCRIPTION, TIMER
 from mddag_executor.trace.errors import TraceError
@@ -54,7 +55,8 @@ class Recorder:
         self.record = self.writer.record
         self.path = path
         self._clock_offset = clock_offset
-        self._known: set[int] = set()
+        # by themselves: another one may have the address of one that is gone
+        self._known: weakref.WeakSet[Any] = weakref.WeakSet()
         self._say('caret_init', clock_offset, 'jazzy')
         self._say('rmw_implementation', get_rmw_implementation_identifier())
         self._say('construct_executor', id(self), 'multi_deadline_executor')
@@ -83,12 +85,12 @@ class Recorder:
 
     def _node(self, node: Any) -> None:
         address = id(node)
-        if address not in self._known:
-            self._known.add(address)
+        if node not in self._known:
+            self._known.add(node)
             self._say('rcl_node_init', address, address, node.get_name(), node.get_namespace())
         for publisher in list(node.publishers):
-            if id(publisher) not in self._known:
-                self._known.add(id(publisher))
+            if publisher not in self._known:
+                self._known.add(publisher)
                 self._say(
                     'rcl_publisher_init', id(publisher), address, id(publisher),
                     publisher.topic_name, publisher.qos_profile.depth)
@@ -110,8 +112,8 @@ class Recorder:
             return
         self._say('rclcpp_callback_register', entry.address, _symbol(entry.entity.callback))
         group = getattr(entry.entity, 'callback_group', None)
-        if group is not None and id(group) not in self._known:
-            self._known.add(id(group))
+        if group is not None and group not in self._known:
+            self._known.add(group)
             kind = 'reentrant' if entry.group < 0 else 'mutually_exclusive'
             self._say('add_callback_group', id(self), id(group), kind)
         if group is not None:

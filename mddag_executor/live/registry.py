@@ -35,6 +35,7 @@ from mddag_executor.live.entries import (
 from msg_graph import Callback, TaskSet
 from msg_graph.binding import Binder
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.exceptions import InvalidHandle
 from rclpy.qos import HistoryPolicy
 
 KINDS = (
@@ -45,6 +46,10 @@ KINDS = (
 def source_depth(period_ns: int, deadline_ns: int) -> int:
     """Return how many releases of a timer source may wait: as many as can still be in time."""
     return max(1, -(-deadline_ns // period_ns))
+
+
+def _timer_label(period_ns: int) -> str:
+    return f'timer {period_ns} ns'
 
 
 def looked_after(entity: Any) -> bool:
@@ -71,7 +76,9 @@ class Registry:
         self._tables = tables
         self._scheduler = scheduler
         self._binder = Binder(task_set) if task_set is not None else None
+        # the core's numbers of callback groups, and all that are not given back yet
         self._groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
+        self._numbers: set[int] = set()
         self._entries: dict[int, Entry] = {}
         # entries of destroyed entities whose last executions are not done yet, and the counts
         # of those before
@@ -105,7 +112,7 @@ class Registry:
             for attribute, kind in KINDS:
                 for entity in getattr(node, attribute):
                     entry = self._entries.get(id(entity))
-                    if entry is None or entry.entity is not entity:
+                    if entry is None or entry.entity is not entity or self._retimed(entry):
                         entry = self._new_entry(kind, entity, name)
                         if entry is None:
                             continue
@@ -119,7 +126,20 @@ class Registry:
         self._entries = present
         self._retired.extend(gone)
         self._fold()
+        self._free_groups()
         return added, gone
+
+    def retimed(self) -> bool:
+        """Return whether an undeclared timer has another period now: it may be declared."""
+        return any(self._retimed(entry) for entry in self.timers())
+
+    def _retimed(self, entry: Entry) -> bool:
+        if entry.kind != TIMER or entry.callback is not None or self._binder is None:
+            return False
+        try:
+            return entry.label != _timer_label(entry.entity.timer_period_ns)
+        except InvalidHandle:
+            return False  # destroyed meanwhile
 
     def _name(self, node: Any) -> str:
         """Return a node's name, also when it has been destroyed and not removed."""
@@ -189,7 +209,7 @@ class Registry:
         try:
             if kind == TIMER:
                 period = entity.timer_period_ns
-                depth, label = 1, f'timer {period} ns'
+                depth, label = 1, _timer_label(period)
                 callback = self._binder.bind_timer(node, period) if self._binder else None
             elif kind == SUBSCRIPTION:
                 topic = label = entity.topic_name
@@ -221,7 +241,15 @@ class Registry:
         number = self._groups.get(group)
         if number is None:
             number = self._groups[group] = self._scheduler.new_group()
+            self._numbers.add(number)
         return number
+
+    def _free_groups(self) -> None:
+        """Give the numbers back of groups that are gone, as memory is bounded."""
+        if len(self._groups) < len(self._numbers):
+            for number in self._numbers.difference(list(self._groups.values())):
+                self._numbers.remove(number)
+                self._scheduler.free_group(number)
 
     def _unbind(self, entry: Entry) -> None:
         if self._binder is not None and entry.callback is not None:

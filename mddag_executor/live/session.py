@@ -19,7 +19,11 @@ Theory of operation
 -------------------
 The executor spins in a thread of its own; the thread that made the ``Session`` only waits, so
 that Python delivers signals to it at once whatever the executor does.  Everything that can end a
-run (time, a signal, an exception of a callback, the end of the programs) sets one event.
+run (time, a signal, an exception of a callback, the end of the programs) calls ``stop``.
+
+That notes the end and releases a lock on which ``wait`` sleeps.  No ``threading.Event``: a
+signal's handler runs in the thread that waits, between any two of its steps, also while that holds
+the event's inner lock, and ``set`` would then wait for that lock for ever.
 
 A synthetic run has these steps: wait until publishers and subscriptions have met, start all timers
 and sensors together, let ``WARM_UP_S`` pass, read the counters, wait for the measured window, read
@@ -57,15 +61,22 @@ class Session:
 
     :param executor: any rclpy executor, its nodes added or not.
     :param spin: what spins it, if that isn't ``executor.spin``.
+    :param on_end: called when its end begins.
     """
 
-    def __init__(self, executor: Executor, spin: Callable[[], None] | None = None) -> None:
+    def __init__(
+        self, executor: Executor, spin: Callable[[], None] | None = None,
+        on_end: Callable[[], None] | None = None,
+    ) -> None:
         self.executor = executor
         self.error: BaseException | None = None
         self.clean = True
         self._ended = False
+        self._on_end = on_end
         self._patience_s = END_TIMEOUT_S
-        self._stop = threading.Event()
+        self._stopped = False
+        self._bell = threading.Lock()
+        self._bell.acquire()
         self._spin = executor.spin if spin is None else spin
         self._thread = threading.Thread(target=self._run, name='mddag-spin', daemon=True)
 
@@ -86,7 +97,7 @@ class Session:
         except BaseException as error:
             self.error = error
         finally:
-            self._stop.set()
+            self.stop()
 
     def stop(self, hurried: bool = False) -> None:
         """
@@ -96,12 +107,16 @@ class Session:
         """
         if hurried:
             self._patience_s = HURRIED_END_TIMEOUT_S
-        self._stop.set()
+        self._stopped = True
+        try:
+            self._bell.release()
+        except RuntimeError:
+            pass  # it has rung already
 
     @property
     def stopped(self) -> bool:
         """Tell whether the run is to end."""
-        return self._stop.is_set()
+        return self._stopped
 
     def wait(self, seconds: float | None, tick: Tick | None = None) -> bool:
         """Wait, for ever with None; return whether the run is to end."""
@@ -109,8 +124,10 @@ class Session:
         while True:
             passed = time.monotonic() - begin
             left = 0.5 if seconds is None else min(0.5, seconds - passed)
-            if left <= 0 or self._stop.wait(left):
-                return self._stop.is_set()
+            if left > 0 and not self._stopped:
+                self._bell.acquire(True, left)
+            if left <= 0 or self._stopped:
+                return self._stopped
             if tick is not None:
                 tick(time.monotonic() - begin)
 
@@ -120,10 +137,12 @@ class Session:
 
         ``clean`` tells whether all callbacks have ended; one that doesn't is left behind.
         """
-        self._stop.set()
+        self.stop()
         if self._ended:
             return
         self._ended = True
+        if self._on_end is not None:
+            self._on_end()
         begin = time.monotonic()
         # In steps: a signal may shorten the patience meanwhile.
         while self.executor.shutdown(0.1) is False:

@@ -22,6 +22,7 @@ import operator
 import os
 from typing import Any
 
+from mddag_executor.defaults import WORKERS, workers
 from mddag_executor.errors import UsageError
 from msg_graph import load, parse_duration, TaskSet
 from msg_graph.duration import DAY
@@ -30,8 +31,7 @@ from rclpy.exceptions import NotInitializedException
 from rclpy.utilities import get_default_context
 
 INTAKES = ('auto', 'events', 'waitset')
-DEFAULT_WORKERS = 7
-POLICIES = ('SCHED_OTHER', 'SCHED_BATCH', 'SCHED_FIFO', 'SCHED_RR')
+THREAD_POLICIES = ('SCHED_OTHER', 'SCHED_BATCH', 'SCHED_FIFO', 'SCHED_RR')
 SHORTEST_DIAGNOSTICS_NS = 10_000_000
 MOST_WORKERS = 4096
 MOST_JOBS = 1_000_000
@@ -157,7 +157,7 @@ def resolve(
         raise UsageError(f'graph: {graph!r} is no declaration: give the path of one, a TaskSet, '
                          'or None')
     if num_workers is None:
-        num_workers = (task_set.workers if task_set is not None else None) or DEFAULT_WORKERS
+        num_workers = WORKERS if task_set is None else workers(None, task_set)
     num_workers = whole('num_workers', num_workers, MOST_WORKERS)
     if isinstance(default_deadline, str):
         default_deadline = parse_duration(default_deadline)
@@ -181,9 +181,9 @@ def thread_setting(
             raise UsageError(
                 'worker_priority: there is no policy for it: give worker_policy too')
         return None
-    if policy is not None and policy not in POLICIES:
+    if policy is not None and policy not in THREAD_POLICIES:
         raise UsageError(
-            f"worker_policy: '{policy}' is unknown: give one of {', '.join(POLICIES)}")
+            f"worker_policy: '{policy}' is unknown: give one of {', '.join(THREAD_POLICIES)}")
     if not hasattr(os, 'sched_setscheduler'):
         raise UsageError('worker_policy: this system has none: leave it out')
     if priority is not None and priority != 0:  # 0: the one of SCHED_OTHER

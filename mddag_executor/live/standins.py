@@ -67,12 +67,15 @@ class StandIn:
         """Take what is there."""
         try:
             for _ in range(DRAIN_TURNS if self.live else 0):
-                if not self.take():
+                if not self._take():
                     return
         except InvalidHandle:
             pass
         except Exception as error:
             self._on_error(error)
+
+    def _take(self) -> int:
+        return self.take()
 
     def withdraw(self) -> None:
         """Hand over nothing any more."""
@@ -194,7 +197,6 @@ class EventStandIn(StandIn):
         capture = _Capture()
         event.add_to_wait_set(capture)
         super().__init__('waitable', event, capture.handle, receiver)
-        self.take = self._take
         self._event = event
         self._counts: list[int] | None = None
         self._on_waitable = receiver.on_waitable

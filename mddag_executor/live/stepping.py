@@ -56,6 +56,7 @@ class Stepping(Upkeep):
     _receiver: Receiver
     _spinning: threading.Lock
     _is_shutdown: bool
+    _left = False
 
     def _check_context(self) -> None:
         raise NotImplementedError
@@ -132,3 +133,19 @@ class Stepping(Upkeep):
                 return False
         self._raise_error()
         return True
+
+    def halt(self) -> None:
+        """Start nothing more, since the interpreter ends; see ``wait_halted``."""
+        self._left = self._is_shutdown
+        self._is_shutdown = True
+        self._pool.pause()
+        self.wake()
+
+    def wait_halted(self, seconds: float) -> None:
+        """Wait until what runs has ended and nobody spins, at most for a time."""
+        end = time.monotonic() + seconds
+        if not self._left:  # else a shutdown has waited for what runs, as long as it was to
+            self._pool.close(seconds)
+        # Not by taking the lock: a thread that steps once more meanwhile would get an exception.
+        while self._spinning.locked() and time.monotonic() < end:
+            time.sleep(0.001)

@@ -243,9 +243,10 @@ class SyntheticWorkload:
 
     def _make_node(self, full_name: str) -> Node:
         namespace, _, name = full_name.rpartition('/')
+        # Without the process' arguments: a remapped node would not be the declared one any more.
         return Node(
             name, namespace=namespace or '/', context=self._context, enable_rosout=False,
-            start_parameter_services=False,
+            start_parameter_services=False, use_global_arguments=False,
             parameter_overrides=[Parameter('start_type_description_service', value=False)])
 
     def _publisher(self, node: Node, topic: str) -> Publisher:

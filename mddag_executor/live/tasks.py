@@ -26,16 +26,25 @@ from rclpy.task import Future, Task
 
 
 class ObservedTask(Task):
-    """A task that knows whether somebody waits for it, and so takes care of its exception."""
+    """
+    A task that knows whether somebody waits for it, and so takes care of its exception.
+
+    :ivar waits_for: the future that its coroutine waits for, where rclpy says so (7.1.9).
+    """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.observed = False
+        self.waits_for: Future | None = None
         super().__init__(*args, **kwargs)  # type: ignore[no-untyped-call]
 
     def add_done_callback(self, callback: Callable[[Future], None]) -> None:
         """Add a callback for when the task is done."""
         self.observed = True
         super().add_done_callback(callback)  # type: ignore[no-untyped-call]
+
+    def _add_resume_callback(self, future: Future, executor: Any) -> None:
+        """Leave it to the pool to go on: rclpy's own way (7.1.9) would be a second one."""
+        self.waits_for = future
 
 
 def make_task(

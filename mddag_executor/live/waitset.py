@@ -184,8 +184,9 @@ class WaitSetIntake:
             kinds = self._kinds - {'event'} if self._threaded else self._kinds
             self._filled = RefilledSet(self._context, latest, kinds, bells, self._receiver)
             if 'event' in self._kinds and latest.events and self._threaded:
-                self._events = RefilledSet(
+                events = RefilledSet(
                     self._context, latest, frozenset({'event'}), (), self._receiver)
+                self._events = events if events.size else None  # all may be destroyed by now
                 self._events_at = 0
         if 'timer' in self._kinds:
             self._timers.update(latest.timers)
@@ -320,6 +321,7 @@ class WaitSetIntake:
             self._thread = None
 
     def _run(self) -> None:
+        self._receiver.on_thread()
         sharpen_wake_ups()
         self._timers.watch_clocks(True)
         ended = False
@@ -338,6 +340,7 @@ class WaitSetIntake:
                     self._bell.acquire(True, min(0.1, 0.001 * self._failures))
         finally:
             self._timers.watch_clocks(False)
+            self._timers.update(())
             self._drop()
         if ended and self._on_shutdown is not None:
             self._on_shutdown()

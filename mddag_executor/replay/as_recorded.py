@@ -16,13 +16,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import os
-from typing import Any, Protocol
+from typing import Any
 
+from mddag_executor.replay.batches import BatchWatcher, Watcher
 from mddag_executor.replay.drift import WatchedRecording
 from mddag_executor.replay.fast_compile import worth_it
-from mddag_executor.replay.follower import Event, Follower, Observer
+from mddag_executor.replay.follower import Follower, Observer
 from mddag_executor.replay.following import (
     AnyFollower,
     AnyMapping,
@@ -49,16 +50,6 @@ from mddag_executor.simulate.compiled import available
 from msg_graph import TaskSet
 
 Progress = Callable[[int], None]
-
-
-class Watcher(Protocol):
-    """Who wants to be told of a run while it is replayed (a report, an export)."""
-
-    def observers(self, task_set: TaskSet, judge: Judge) -> Sequence[Observer]:
-        """Return observers; they are told after the judge."""
-
-    def handlers(self) -> dict[str, Callable[[Event], None]]:
-        """Return what else the follower is to tell."""
 
 
 class Replay:
@@ -158,8 +149,8 @@ def replay(
     """
     Replay a trace as recorded.
 
-    Memory depends on the jobs that are open at one time, on the number of sinks' completions
-    (their response times are kept) and, where paths are declared, on that of their flows.
+    Memory depends on the jobs that are open at one time and on the number of sinks' completions
+    (their response times are kept).
 
     :param path: a trace of this executor, or an imported one.
     :param task_set: the declaration that judges; None: the one in the trace, if it has one.
@@ -181,12 +172,14 @@ def replay_recording(
     """
     Replay an open recording as recorded; see ``replay``.
 
-    Only a trace of this executor is replayed in compiled code, and only where nobody watches.
+    Only a trace of this executor is replayed in compiled code, and only where whoever watches can
+    be told in batches.
     """
     mapping = map_recording(recording, task_set)
-    if watcher is None and isinstance(recording, Recording) and (
+    batches = watcher if isinstance(watcher, BatchWatcher) else None
+    if watcher is batches and isinstance(recording, Recording) and (
             worth_it(recording.message_count) if compiled is None else compiled and available()):
-        found = replay_compiled(recording, mapping, progress)
+        found = replay_compiled(recording, mapping, progress, batches)
         if found is not None:
             return found
     parts = _Parts(recording, mapping, watcher)
@@ -199,18 +192,19 @@ def replay_recording(
 
 
 def replay_compiled(
-    recording: Recording, mapping: AnyMapping, progress: Progress | None = None
+    recording: Recording, mapping: AnyMapping, progress: Progress | None = None,
+    watcher: BatchWatcher | None = None,
 ) -> Replay | None:
     """Replay a recording in compiled code; None where that can only be done in Python."""
     from mddag_executor.replay.fast import FastReplay
     from mddag_executor.replay.fast_arrays import Declined
     assert isinstance(mapping, Mapping)
-    parts = _Parts(recording, mapping, None)
+    parts = _Parts(recording, mapping, watcher, in_batches=True)
     follower = parts.follower
     assert isinstance(follower, Follower)
     try:
         FastReplay(recording, mapping, parts.judge, parts.usage, follower, parts.paths,
-                   parts.groups).run(progress)
+                   parts.groups, watcher).run(progress)
     except Declined:
         if isinstance(recording, WatchedRecording):
             recording.forget()
@@ -222,7 +216,8 @@ class _Parts:
     """All that is told of a run."""
 
     def __init__(
-        self, recording: AnyRecording, mapping: AnyMapping, watcher: Watcher | None
+        self, recording: AnyRecording, mapping: AnyMapping,
+        watcher: Watcher | None, in_batches: bool = False,
     ) -> None:
         self.groups = RecordedGroups()
         waits = GroupWaits(self.groups)
@@ -235,7 +230,10 @@ class _Parts:
             observers.append(self.paths)
             handlers.append(self.paths.handlers())
         if watcher is not None:
-            observers.extend(watcher.observers(mapping.task_set, self.judge))
+            if isinstance(watcher, BatchWatcher) and in_batches:
+                watcher.begin(mapping.task_set, self.judge, self.usage)
+            else:
+                observers.extend(watcher.observers(mapping.task_set, self.judge))
             handlers.append(watcher.handlers())
         self.seen = Seen()
         self.follower = make_follower(

@@ -20,12 +20,12 @@ Theory of operation
 An execution could have started as soon as it was ready, its callback group had nothing else and a
 worker was idle; it is late by what passed from then until it did.
 
-Which workers were idle is counted: at an instant, as many executions as have started and not ended
-are on workers, and as many as are ready and have not started are about to be, or wait for one.
-When these are fewer than the workers at the instant at which an execution becomes ready, it could
-have started at once.  (It may still have waited: a worker that is about to end is left to take
-what it has started itself.)  Else it had to wait for the worker that took it, until that had ended
-what it did before.
+Whether a worker was idle is counted.  An execution is *free* from when it is ready and its group
+has nothing else; those that are free and have not ended are on workers, or about to be, or wait
+for one.  Where they are no more than the workers at the instant from which an execution is free,
+it could have started at once.  (It may still have waited: a worker that is about to end is left
+to take what it has started itself.)  Else it had to wait for the worker that took it, until that
+had ended what it did before.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Dispatches:
         self._n_workers = n_workers
         self._worker_free: dict[int, int] = {}
         self._group_free: dict[int, int] = {}
-        # when it was ready, and free to start as far as its group and as its worker goes
-        self._ready, self._group, self._worker = array('q'), array('q'), array('q')
+        # from when it was free, and from when its worker was, too
+        self._free, self._worker = array('q'), array('q')
         self._start, self._end = array('q'), array('q')
 
     def add(self, worker: int, group: int | None, ready: int, start: int, end: int) -> int:
@@ -61,22 +61,22 @@ class Dispatches:
         if group is not None:
             could = max(could, self._group_free.get(group, 0))
             self._group_free[group] = end
-        self._group.append(could)
+        self._free.append(could)
         if worker >= 0:
             could = max(could, self._worker_free.get(worker, 0))
             self._worker_free[worker] = end
         self._worker.append(could)
-        for column, time in ((self._ready, ready), (self._start, start), (self._end, end)):
-            column.append(time)
+        self._start.append(start)
+        self._end.append(end)
         return len(self._start) - 1
 
     def late(self) -> Any:
         """Return by number how late it was dispatched, ns, as an array."""
         import numpy as np
-        ready, start, end, group, worker = (
+        free, start, end, worker = (
             np.array(column, dtype=np.int64) for column in (
-                self._ready, self._start, self._end, self._group, self._worker))
-        n_ready, n_ended = (
-            np.searchsorted(np.sort(times), ready, 'right') for times in (ready, end))
-        could = np.where(n_ready - n_ended <= self._n_workers, group, worker)
+                self._free, self._start, self._end, self._worker))
+        n_free, n_ended = (
+            np.searchsorted(np.sort(times), free, 'right') for times in (free, end))
+        could = np.where(n_free - n_ended <= self._n_workers, free, worker)
         return np.maximum(0, start - could)

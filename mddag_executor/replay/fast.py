@@ -25,8 +25,8 @@ Theory of operation
 3. Whatever is not as an executor records it (times that run backwards, a DAG that is not there,
    numbers too large for 64 bits), is *declined*: the replay is begun anew, in plain Python, which
    says what is wrong.
-4. Memory depends on the open jobs, on the sinks' completions, and, where paths are declared, on
-   the length of the trace: 16 bytes for each step of a flow.
+4. Memory depends on the open jobs and on the sinks' completions: flows along paths that are over
+   are counted and forgotten when their table is full (``path_flows``).
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from mddag_executor.core import NEVER
 from mddag_executor.core.policies import POLICIES
 from mddag_executor.core.state import State
 from mddag_executor.replay import fast_work as fw
+from mddag_executor.replay.batches import Batch, BatchWatcher
 from mddag_executor.replay.chains import Breakdown, Step, Worst
 from mddag_executor.replay.drift import WatchedRecording
 from mddag_executor.replay.fast_arrays import Declined, grown, Header, make_work, Numbers
@@ -69,7 +70,9 @@ class FastReplay:
     def __init__(
         self, recording: Recording, mapping: Mapping, judge: Judge, usage: Usage,
         follower: Follower, paths: OwnPaths, groups: RecordedGroups,
+        watcher: BatchWatcher | None = None,
     ) -> None:
+        self._watcher = watcher
         self._recording = recording
         self._watched = recording if isinstance(recording, WatchedRecording) else None
         self._mapping = mapping
@@ -84,6 +87,7 @@ class FastReplay:
         self._numbers = Numbers(mapping.task_set)
         self._work, self._header = self._use(
             make_work(mapping, judge, usage, paths, self._numbers))
+        self._flows = self._numbers.flows(self._work)
         self._work.scalars[fw.WATCHED] = self._watched is not None
         self._group_numbers: dict[int, int] = {}
         self._known_callbacks: dict[int, tuple[int, int]] = {}
@@ -123,7 +127,7 @@ class FastReplay:
         if not self._started and len(rows):
             self._begin(rows)
         self._use(self._work._replace(
-            rows=rows, pieces=np.empty((len(rows), 2), dtype=np.int64)))
+            rows=rows, pieces=np.empty((len(rows), fw.N_PIECE), dtype=np.int64)))
         i = 0
         while i < len(rows):
             if rows[i, 1] == fw.OTHER:
@@ -132,9 +136,10 @@ class FastReplay:
                 continue
             if self._stale:
                 self._refresh()
+            before = i
             i = self._do['advance'](
                 self._tables.address, self._state.address, self._header.address, i)
-            self._take_away()
+            self._take_away(rows[before:i], before)
             status = self._work.scalars[fw.STATUS]
             if status == fw.DECLINED:
                 raise Declined
@@ -142,6 +147,8 @@ class FastReplay:
                 self._grow()
 
     def _grow(self) -> None:
+        if self._paths.book:
+            self._flows.make_room(self._work)
         executions = self._state.length(State._fields.index('x_slot'))
         self._use(grown(self._work, executions, self._do['copy_table']))
 
@@ -152,8 +159,12 @@ class FastReplay:
             self._work.scalars[fw.PROCESS_ID] = numbers[0, 3]
             self._started = True
 
-    def _take_away(self) -> None:
-        """Count what has been decided, and missed, and ran."""
+    def _take_away(self, rows: Any, first: int) -> None:
+        """
+        Count what has been decided, and missed, and ran.
+
+        :param rows: the events that were gone through, of which the first has that number.
+        """
         scalars = self._work.scalars
         decisions: Any = self._state.rows(State._fields.index('decisions'), 6)
         if decisions:
@@ -161,9 +172,24 @@ class FastReplay:
         for side, *miss in self._work.misses[:scalars[fw.N_MISSES]].tolist():
             self._judge.differ(Miss(*miss), side)
         n = scalars[fw.N_PIECES]
+        pieces = self._work.pieces[:n]
         if n:
-            pieces = self._work.pieces[:n]
-            self._usage.pool.add_many(pieces[:, 0], pieces[:, 1])
+            self._usage.pool.add_many(pieces[:, fw.R_START], pieces[:, fw.R_END])
+        if self._watcher is not None:
+            self._tell(self._watcher, pieces, decisions, rows, first)
+
+    def _tell(
+        self, watcher: BatchWatcher, pieces: Any, decisions: Any, rows: Any, first: int
+    ) -> None:
+        """Tell who watches."""
+        places = np.flatnonzero(rows[:, 1] == fw.RELEASE) if len(rows) else np.empty(0, np.int64)
+        releases = rows[places, 4:7] if len(rows) else np.empty((0, 3), dtype=np.int64)
+        releases[:, 0] = self._work.map_dag[releases[:, 0]]
+        known = releases[:, 0] >= 0
+        watcher.take(Batch(
+            pieces[:, :fw.R_AT], releases[known],
+            np.searchsorted(pieces[:, fw.R_AT], places[known] + first), decisions,
+            np.searchsorted(pieces[:, fw.R_DECIDED], np.arange(len(decisions)), side='right')))
 
     # --- events for Python -----------------------------------------------------------------------
 
@@ -237,7 +263,7 @@ class FastReplay:
         if not self._do['finish_run'](
                 self._tables.address, self._state.address, self._header.address, now):
             raise Declined
-        self._take_away()
+        self._take_away(np.empty((0, 1), dtype=np.int64), 0)
 
     def _end(self) -> None:
         """Put the sums where the plain replay has them."""
@@ -261,8 +287,8 @@ class FastReplay:
             self._tell_published()
             self._end_watched(self._watched)
         if self._paths.book:
-            self._paths.flows = self._numbers.flows(
-                self._work, self._header, self._do['flows_of'])
+            self._flows.finish(self._work)
+            self._paths.flows = self._flows
 
     def _end_sinks(self) -> None:
         width = len(self._work.walk)

@@ -25,7 +25,7 @@ from mddag_executor.replay.fast_work import Work
 from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.mapping import Mapping
 from mddag_executor.replay.own_paths import OwnPaths
-from mddag_executor.replay.path_flows import FlowColumns, Flows
+from mddag_executor.replay.path_flows import Flows
 from mddag_executor.replay.paths import hops
 from mddag_executor.replay.usage import Usage
 from msg_graph import TaskSet
@@ -35,6 +35,8 @@ _HOPS = {'trigger': fw.TRIGGER, 'topic': fw.TOPIC, 'variable': fw.VARIABLE}
 _TABLES = (
     'threads', 'ongoing', 'slots', 'recent', 'callbacks', 'pairs', 'path_jobs', 'publishers')
 _RUNS = 3       # of a vertex in a job that are kept at least
+FIRST_STEPS = 1 << 16
+"""Steps of flows that there is room for at first."""
 _MOST_PLACES = 2 ** 16
 _MOST_NUMBERS = 2 ** 24     # that are kept of all jobs
 
@@ -157,20 +159,21 @@ class Numbers:
              1 + self._nodes.get(node, -1))
             for address, (node, topic) in paths.publishers.items()]
 
-    def flows(self, work: Work, header: Header, flows_of: Callable[..., int]) -> Flows:
-        """Return the flows along the paths."""
-        n = int(work.scalars[fw.N_STEPS])
-        marks = np.empty(max(n, 1), dtype=np.int8)
-        none = np.empty((0, 4), dtype=np.int64)
-        flows_of(header.address, -1, -1, marks, none)
-        found = []
-        for first, last in zip(self._first_place, self._first_place[1:]):
-            n = flows_of(header.address, first, last, marks, none)
-            rows = np.empty((n, 4), dtype=np.int64)
-            if len(rows):
-                flows_of(header.address, first, last, marks, rows)
-            found.append(FlowColumns(*rows.T))
-        return Flows(list(self._task_set.paths), self._hops, found)
+    def flows(self, work: Work) -> Flows:
+        """Return what counts the flows along the paths."""
+        columns: list[list[int]] = [[] for _ in self._task_set.dags]
+        for v, vertex in enumerate(self._task_set.vertices):
+            width = int(work.v_places[v + 1] - work.v_places[v])
+            if not width:
+                continue
+            runs = int(work.v_runs[v]) + 1      # behind their number; before each its ready time
+            columns[vertex.dag] += [
+                runs + k * (1 + width) + 1 + j
+                for k in range(int(work.v_most[v])) for j in range(width)]
+            messages = work.message_at[work.v_places[v]:work.v_places[v + 1]]
+            columns[vertex.dag] += messages[messages >= 0].tolist()
+        return Flows(self._task_set.paths, self._hops, self._first_place,
+                     [array(each) for each in columns])
 
 
 def make_work(
@@ -186,7 +189,7 @@ def make_work(
     tables = judge.tables
     n = tables.n_vertices
     widest = max((len(dag.vertices) for dag in mapping.task_set.dags), default=0)
-    steps = 1 << 16 if paths.book else 1
+    steps = FIRST_STEPS if paths.book else 1
     return Work(
         scalars=scalars, counts=zeros(fw.N_TABLES),
         **{name: zeros(256, width) for name, width in zip(_TABLES, fw.WIDTHS)},
@@ -198,7 +201,7 @@ def make_work(
         sinks=zeros(n + 1, fw.N_SINK), worst=zeros((n + 1) * (widest + 1), fw.N_CHAIN),
         misses=zeros(8192 + 4 * n, 6), **numbers.columns(),
         steps=np.empty((steps, fw.N_STEP), dtype=np.int64), rows=zeros(0, 1),
-        pieces=zeros(0, 2))
+        pieces=zeros(0, fw.N_PIECE))
 
 
 class Header:
@@ -253,8 +256,4 @@ def grown(work: Work, executions: int, copy: Callable[..., None]) -> Work:
     if need > len(work.chain):
         larger['chain'] = zeros(2 * need, fw.N_CHAIN)
         larger['chain'][:len(work.chain)] = work.chain
-    room = 8 * len(work.place_done) + 8
-    if work.scalars[fw.HAS_PATHS] and work.scalars[fw.N_STEPS] + room > len(work.steps):
-        size = len(work.steps) * 3 // 2 + 2 * room
-        work.steps.resize((size, fw.N_STEP), refcheck=False)    # in place, where that can be
     return work._replace(**larger)

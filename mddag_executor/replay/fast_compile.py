@@ -39,13 +39,13 @@ _KERNELS = tuple(f'mddag_executor.{name}' for name in (
 _SOURCES = (*_KERNELS, 'mddag_executor.trace.column_layout', 'mddag_executor.replay.fast_work',
             'mddag_executor.replay.fast_types')
 _ENTRIES = ('advance', 'begin_run', 'finish_run', 'copy_table', 'set_callback', 'set_publisher',
-            'flows_of', 'scan', 'free_core')
+            'scan', 'free_core')
 _NOTHING = """\
 mddag: 1
 nodes:
   - node: /a
     callbacks:
-      - {name: a, timer: 1s, publishes: [/a], deadline: 1s, execution_time: 1ms}
+      - {name: a, timer: 1s, publishes: [/a], execution_time: 1ms}
       - {name: b, subscription: /a, deadline: 1s, execution_time: 1ms}
 paths:
   - {name: a, callbacks: ['/a:a', '/a:b']}

@@ -41,7 +41,7 @@ from mddag_executor.replay.fast_core import (
     on_job_end,
     on_release,
 )
-from mddag_executor.replay.fast_paths import count_row, mark_steps, path_flows
+from mddag_executor.replay.fast_paths import count_row
 from mddag_executor.replay.fast_tables import find, insert, rehash
 from mddag_executor.replay.fast_threads import (
     callback_row,
@@ -61,7 +61,7 @@ def advance(tables: int, state: int, work: int, i: int) -> int:
     """
     Go through the rows from number ``i`` on; return which one is the next.
 
-    ``scalars[fw.STATUS]`` says why it is, ``pieces`` has start and end of all that ran, and the
+    ``scalars[fw.STATUS]`` says why it is, ``pieces`` has all that ran, and the
     state's decisions are those since it was called.
     """
     t = as_tables(tables)
@@ -74,7 +74,11 @@ def advance(tables: int, state: int, work: int, i: int) -> int:
     while i < len(w.rows):
         status = has_room(t, s, w)
         if status == fw.ALL_DONE:
+            n = w.scalars[fw.N_PIECES]
             status = on_event(t, s, w, i)
+            if w.scalars[fw.N_PIECES] > n:
+                w.pieces[n, fw.R_AT] = i
+                w.pieces[n, fw.R_DECIDED] = len(s.decisions)
         if status != fw.ALL_DONE:
             w.scalars[fw.STATUS] = status
             return i
@@ -171,16 +175,6 @@ def set_publisher(work: int, publisher: int, topic: int, node: int) -> None:
         count_row(w, fw.PUBLISHERS, len(w.publishers))
     w.publishers[row, fw.P_TOPIC] = topic
     w.publishers[row, fw.P_NODE] = node
-
-
-def flows_of(work: int, first: int, last: int, marks: Any, flows: Any) -> int:
-    """Mark where flows end (``first`` is -1), or write those of a path (see ``path_flows``)."""
-    w = as_work(work)
-    n = w.scalars[fw.N_STEPS]
-    if first < 0:
-        mark_steps(w, n, marks)
-        return 0
-    return path_flows(w, first, last, n, marks, flows)
 
 
 def scan(

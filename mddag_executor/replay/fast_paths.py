@@ -82,21 +82,6 @@ def add_step(w: Any, place: int, parent: int, kind: int, time: int) -> int:
     return n
 
 
-def parent_of(w: Any, step: int) -> int:
-    """Return the step before a step, or -1."""
-    return (w.steps[step, fw.X_WHAT] >> fw.X_PARENT) - 1
-
-
-def place_of(w: Any, step: int) -> int:
-    """Return the place of a step."""
-    return (w.steps[step, fw.X_WHAT] >> fw.X_PLACE) & 0xFFFF
-
-
-def kind_of(w: Any, step: int) -> int:
-    """Return whether a step is an execution (1), what tells its end, or a publication (0)."""
-    return w.steps[step, fw.X_WHAT] & 0xFF
-
-
 def path_started(w: Any, dag: int, vertex: int, job: int, ready: int, start: int) -> bool:
     """Take in an execution that has begun; False where there is no room for it."""
     first, last = w.v_places[vertex], w.v_places[vertex + 1]
@@ -226,55 +211,3 @@ def path_ran(w: Any, dag: int, vertex: int, job: int, ready: int, end: int) -> N
             w.place_done[p] = step
         elif w.place_sync[p] == 0:
             w.place_done[p] = -1
-
-
-def mark_steps(w: Any, n: int, marks: Any) -> None:
-    """Mark the steps at which flows end with 1 (see ``paths``)."""
-    for step in range(n):
-        marks[step] = 0
-    for step in range(n):           # 1: another step follows
-        parent = parent_of(w, step)
-        if parent != -1:
-            marks[parent] |= 1
-    for step in range(n):           # 2: an execution that reads it went on
-        parent = parent_of(w, step)
-        if parent != -1 and kind_of(w, step) == 1 and marks[step] & 1:
-            marks[parent] |= 2
-    for step in range(n):           # 4: a flow ends here
-        if marks[step] & 1 or kind_of(w, step) == fw.RUN_END:
-            continue
-        parent = parent_of(w, step)
-        if not (parent != -1 and kind_of(w, step) == 1 and marks[parent] & 2
-                and w.place_last[place_of(w, step)] == 0):
-            marks[step] |= 4
-
-
-def path_flows(w: Any, first: int, last: int, n: int, marks: Any, flows: Any) -> int:
-    """
-    Write the flows of the path with these places: first publication, arrival, begin, end.
-
-    What there is not is -1.  Return how many there are; with no room in ``flows`` only count.
-    """
-    count = 0
-    for leaf in range(n):
-        if marks[leaf] & 4 and first <= place_of(w, leaf) < last:
-            if len(flows) > 0:
-                published = arrival = begin = end = -1
-                step = leaf
-                while step != -1:
-                    place = place_of(w, step)
-                    if kind_of(w, step) == 1:
-                        if place == last - 1:
-                            arrival = w.steps[step, fw.X_TIME]
-                            end = w.steps[step + 1, fw.X_TIME]
-                        if place == first:
-                            begin = w.steps[step, fw.X_TIME]
-                    elif place == first and w.steps[step, fw.X_TIME] != 0:
-                        published = w.steps[step, fw.X_TIME]
-                    step = parent_of(w, step)
-                flows[count, 0] = published if published != -1 else begin
-                flows[count, 1] = arrival
-                flows[count, 2] = begin
-                flows[count, 3] = end
-            count += 1
-    return count

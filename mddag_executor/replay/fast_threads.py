@@ -177,8 +177,13 @@ def on_end(w: Any, now: int, thread: int, callback: int) -> bool:
         if w.scalars[fw.N_WAITED] > fw.KEEP_WAITED:
             return False
     n = w.scalars[fw.N_PIECES]
-    w.pieces[n, 0] = start
-    w.pieces[n, 1] = now
+    w.pieces[n, fw.R_START] = start
+    w.pieces[n, fw.R_END] = now
+    w.pieces[n, fw.R_READY] = ready
+    w.pieces[n, fw.R_VERTEX] = vertex if dag >= 0 else -1
+    w.pieces[n, fw.R_JOB] = job
+    w.pieces[n, fw.R_WORKER] = w.threads[row, fw.T_WORKER]
+    w.pieces[n, fw.R_CALLBACK] = callback
     w.scalars[fw.N_PIECES] = n + 1
     if not count_use(w, vertex, w.threads[row, fw.T_WORKER], ready, start, now, first, waited):
         return False

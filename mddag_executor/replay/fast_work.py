@@ -60,6 +60,10 @@ J_PLACE = 5
 P_TOPIC, P_NODE = 5, 6
 WIDTHS = (T_STACK + DEEPEST, 9, 6, 5, 11, 5, 6, 7)
 
+# What ran: first the columns of ``batches``; then at which row it ended, and how many decisions
+# there were by then.
+(R_START, R_END, R_READY, R_VERTEX, R_JOB, R_WORKER, R_CALLBACK, R_AT, R_DECIDED,
+ N_PIECE) = range(10)
 # What callbacks used.
 U_RAN, U_BUSY, U_LONGEST, U_WAITING, U_LONGEST_WAIT, U_GROUP, N_USE = range(7)
 # A step of a chain.
@@ -159,6 +163,6 @@ class Work(NamedTuple):
     jobs: Matrix           # what is kept of each of the last jobs
     job_ring: Matrix
     steps: Matrix
-    # what is handed over: events, and start and end of what ran
+    # what is handed over: events, and what ran
     rows: Matrix
     pieces: Matrix

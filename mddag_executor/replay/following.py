@@ -21,7 +21,12 @@ import os
 from typing import Any
 
 from mddag_executor.replay.follower import Follower, Observer
-from mddag_executor.replay.imported import ImportedMapping, ImportedRecording, open_recording
+from mddag_executor.replay.imported import (
+    ImportedMapping,
+    ImportedRecording,
+    is_own,
+    open_recording,
+)
 from mddag_executor.replay.imported_jobs import ImportedFollower
 from mddag_executor.replay.mapping import Mapping
 from mddag_executor.replay.recording import Recording, ReplayError
@@ -33,8 +38,8 @@ AnyFollower = Follower | ImportedFollower
 Handlers = dict[str, Callable[[tuple[Any, ...]], None]]
 
 __all__ = [
-    'AnyFollower', 'AnyMapping', 'AnyRecording', 'Handlers', 'make_follower', 'map_recording',
-    'merged', 'open_declared', 'open_recording']
+    'AnyFollower', 'AnyMapping', 'AnyRecording', 'Handlers', 'check_declared', 'is_own',
+    'make_follower', 'map_recording', 'merged', 'open_declared', 'open_recording']
 
 
 def open_declared(
@@ -45,12 +50,22 @@ def open_declared(
 
     :raises ReplayError: when it is imported, and none is given.
     """
-    recording = open_recording(path, name)
-    if task_set is None and isinstance(recording, ImportedRecording):
+    if task_set is None:
+        check_declared(path, name)
+    return open_recording(path, name)
+
+
+def check_declared(path: str | os.PathLike[str], name: str | None) -> None:
+    """
+    Find out whether a recorded run is of this executor, so that it has a declaration.
+
+    :raises ReplayError: when it is imported.
+    :raises mddag_executor.trace.TraceError: when it is no trace.
+    """
+    if not is_own(path, name) and isinstance(open_recording(path, name), ImportedRecording):
         raise ReplayError(
-            recording.name, 'it was imported, so nothing in it says which callbacks have which '
-            'deadlines', 'give the GRAPH')
-    return recording
+            name or os.fspath(path), 'it was imported, so nothing in it says which callbacks have '
+            'which deadlines', 'give the GRAPH')
 
 
 def map_recording(recording: AnyRecording, task_set: TaskSet | None) -> AnyMapping:

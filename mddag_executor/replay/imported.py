@@ -134,9 +134,17 @@ def open_recording(
     :raises ReplayError: when no run is recorded in it.
     :raises msg_graph.GraphError: when the recorded declaration is wrong.
     """
+    return own(path, name) if is_own(path, name) else ImportedRecording(path, name)
+
+
+def is_own(path: str | os.PathLike[str], name: str | None = None) -> bool:
+    """
+    Tell whether a trace was recorded by this executor.
+
+    :raises mddag_executor.trace.TraceError: when it is no trace.
+    """
     with named_errors(os.fspath(path), name or os.fspath(path)):
-        ours = TraceReader(path).task_set_text is not None
-    return own(path, name) if ours else ImportedRecording(path, name)
+        return TraceReader(path).task_set_text is not None
 
 
 class Target(NamedTuple):

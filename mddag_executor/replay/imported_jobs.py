@@ -171,6 +171,7 @@ class ImportedFollower:
             self._active[(dag, job)] += 1
             for observer in self._observers:
                 observer.started(dag, vertex, job, run.ready, now)
+        self.paths.tidy()
         self.paths.started(
             target.callback.key, run.places, now, None if message is None else message.places,
             target.topic)

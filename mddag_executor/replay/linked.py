@@ -20,6 +20,7 @@ from collections import Counter
 from typing import Protocol
 
 from mddag_executor.replay.entities import Callback, Publisher
+from mddag_executor.replay.paths import Places
 
 Thread = tuple[int, int]        # process and thread
 
@@ -54,7 +55,7 @@ class Run:
         self.ready = start
         self.of: tuple[int, int, int] | None = None
         self.leg = 0
-        self.places: dict[tuple[int, int], int] = {}
+        self.places = Places()
 
 
 class Publication:
@@ -77,7 +78,7 @@ class Publication:
         self.stamp = 0
         self.message = message
         self.within = False     # so far only within the process
-        self.places: dict[tuple[int, int], int] = {}
+        self.places = Places()
 
     @property
     def time(self) -> int:

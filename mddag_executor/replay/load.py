@@ -134,6 +134,7 @@ class LoadBuilder(Observer):
         # completed nothing
         self._others: list[tuple[int, int, int]] = []
         self._leg: tuple[Execution, tuple[int, int, int]] | None = None
+        self._untaken: tuple[int, int, int] | None = None
         self._dispatches = Dispatches(n_workers)
         #: By global vertex: the address of the callback that ran as it.
         self.callback_of: dict[int, int] = {}
@@ -180,9 +181,11 @@ class LoadBuilder(Observer):
         jobs = self._jobs[dag]
         row = jobs.row.get(job)
         if execution is None or row is None:
+            self._untaken = dag, vertex, job    # a leg that a simulator notes before it runs
             return
-        several = self._leg is not None and self._leg[0] is execution       # a simulator's
-        if self._leg is not None and not several:
+        same = self._leg is not None and self._leg[0] is execution
+        several = same or self._untaken == (dag, vertex, job)
+        if self._leg is not None and not same:
             self._others.append(self._leg[1])
         self._leg = None
         legs = self._edges_into[vertex]

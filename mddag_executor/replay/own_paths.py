@@ -121,17 +121,18 @@ class OwnPaths(Observer):
         callback = self._vertices[vertex].callback
         if not self.book.concerns(callback.key):
             return
+        self.book.tidy()
         found = self._job(dag, job)
         if (vertex, ready) in found.runs:
             return
         topic = ''
         if self.follower is not None and callback.topics:
             topic = self.topic_of.get(self.follower.starting, '')
-        message: Places = {}
+        message = Places()
         for before in self._before[vertex]:
             for of_topic in (topic,) if topic else callback.topics:
-                message.update(found.messages.get((before, of_topic), {}))
-        places = found.runs[(vertex, ready)] = {}
+                message.update(found.messages.get((before, of_topic), ()))
+        places = found.runs[(vertex, ready)] = Places()
         self.book.started(callback.key, places, start, message, topic)
 
     def _publish(self, event: Event) -> None:
@@ -142,7 +143,7 @@ class OwnPaths(Observer):
         running = self.follower.running_in(event[3])
         times = (event[1], event[1], 0)
         if running is None or running[2] < 0:
-            self.book.published(topic, node, None, None, {}, times)
+            self.book.published(topic, node, None, None, Places(), times)
             return
         _, dag, vertex, job, ready = running
         self._published(dag, vertex, job, ready, topic, times)
@@ -153,7 +154,7 @@ class OwnPaths(Observer):
         if not self.book.concerns(callback.key):
             return
         found = self._job(dag, job)
-        message = found.messages.setdefault((vertex, topic), {})
+        message = found.messages.setdefault((vertex, topic), Places())
         self.book.published(
             topic, callback.node, callback.key, found.runs.get((vertex, ready)), message, times)
 
@@ -164,7 +165,7 @@ class OwnPaths(Observer):
         callback = self._vertices[piece.vertex].callback
         if not self.book.concerns(callback.key):
             return
-        places = self._job(piece.dag, piece.job).runs.get((piece.vertex, piece.ready), {})
+        places = self._job(piece.dag, piece.job).runs.get((piece.vertex, piece.ready)) or Places()
         if not self.any_published:
             for topic in callback.publishes:
                 self._published(piece.dag, piece.vertex, piece.job, piece.ready, topic,

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from mddag_executor.replay.path_cases import cases, Record, statistics
 from mddag_executor.replay.path_flows import Flows
 from mddag_executor.replay.paths import PathBook
 
@@ -28,43 +27,13 @@ def path_results(book: PathBook | Flows) -> dict[str, Any]:
     Return by path its figures, all times in ns.
 
     ``flows`` counts the inputs and ``arrived`` those whose flow reached the last callback.
-    ``response_time`` has CARET's cases (see ``path_cases``) from the first publication to the
+    ``response_time`` has CARET's cases (see ``path_stream``) from the first publication to the
     start of the last callback, ``whole`` those from the start of the first to the end of the last.
     ``reaction_time`` is the worst case with external latency, ``data_age`` that of every output.
+    Median and p99 are exact up to 32,768 response times; where there are more,
+    ``quantiles_within`` tells how exact they are, as a share.
     """
-    if isinstance(book, Flows):
-        return book.figures()
-    return {path.name: _result(book, number) for number, path in enumerate(book.paths)}
-
-
-def _result(book: PathBook, number: int) -> dict[str, Any]:
-    inner: list[Record] = []
-    outer: list[Record] = []
-    flows = arrived = 0
-    for first, arrival, begin, end in book.ends(number):
-        flows += 1
-        arrived += arrival is not None
-        if first is not None:
-            inner.append((first, arrival))
-        if begin is not None:
-            outer.append((begin, end))
-    response = cases(inner)
-    whole = cases(outer)
     return {
-        'callbacks': list(book.paths[number].callbacks),
-        'hops': [hop.kind for hop in book.hops(number)],
-        'flows': flows, 'arrived': arrived,
-        'response_time': _cases(response), 'reaction_time':
-            statistics(response.worst_with_external_latency),
-        'data_age': statistics(response.data_age),
-        'whole': {
-            'response_time': _cases(whole),
-            'reaction_time': statistics(whole.worst_with_external_latency),
-            'data_age': statistics(whole.data_age)}}
-
-
-def _cases(found: Any) -> dict[str, Any]:
-    return {
-        'all': statistics(found.every), 'best': statistics(found.best),
-        'worst': statistics(found.worst),
-        'worst_with_external_latency': statistics(found.worst_with_external_latency)}
+        path.name: {'callbacks': list(path.callbacks), 'hops': [hop.kind for hop in hops],
+                    **figures}
+        for path, hops, figures in zip(book.paths, book.hops, book.figures())}

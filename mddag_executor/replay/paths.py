@@ -39,21 +39,41 @@ has empty columns from there on; it is left out where another branch of the same
 By default, as in CARET, a path's time runs from the first publication to the start of the last
 callback's execution; ``whole`` figures run from the start of the first callback's execution to the
 end of the last one's.
+
+Flows that are over are counted and forgotten (see ``path_forest`` and ``path_stream``).
 """
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable, Iterator
-from typing import Literal, NamedTuple
+from collections.abc import Iterator
+import copy
+from typing import Any, Literal, NamedTuple
+import weakref
 
+from mddag_executor.replay.path_forest import Bounds, bounds, NEVER, settle, Steps
+from mddag_executor.replay.path_stream import PathFigures
+from mddag_executor.replay.spread import KEEP_EXACT
 from msg_graph import Callback, Path, TaskSet
+import numpy as np
 
 HopKind = Literal['trigger', 'topic', 'variable']
 Place = tuple[int, int]         # path, position in it
-Places = dict[Place, int]
 
+SETTLE = 65_536
+"""Steps of a path from which on flows that are over are taken out."""
+LAG_NS = 1_000_000_000
+"""Nothing is told later than this after it happened."""
 _NONE = -1
+
+
+class Places(dict[Place, int]):
+    """The steps that an execution or a message has in paths; kept for as long as they count."""
+
+    __slots__ = ('__weakref__',)
+
+
+_NOWHERE = Places()
 
 
 class Hop(NamedTuple):
@@ -78,24 +98,14 @@ class Flow(NamedTuple):
     end: int | None
 
 
-class Ends(NamedTuple):
-    """
-    The ends of a flow, ns, None for what there is not.
-
-    :ivar first: the first publication, or where it is not recorded the first start.
-    :ivar arrival: start of the last callback's execution.
-    """
-
-    first: int | None
-    arrival: int | None
-    begin: int | None
-    end: int | None
-
-
 class _Book:
     """The flows of one path: a forest of steps, each an execution or a publication."""
 
-    def __init__(self, path: Path, hops: list[Hop], legs: list[bool]) -> None:
+    def __init__(
+        self, number: int, path: Path, hops: list[Hop], legs: list[bool], settle_at: int,
+        keep: int,
+    ) -> None:
+        self.number = number
         self.path = path
         self.hops = hops
         self.sync = legs
@@ -108,28 +118,96 @@ class _Book:
         self.started = [_NONE] * n
         self.done = [_NONE] * n
         self.published = [_NONE] * n
+        #: What is known of children that are gone.
+        self.marks = bytearray()
+        self.figures = PathFigures(keep)
+        #: Who refers to steps, besides `started`, `done` and `published`.
+        self.holders: list[weakref.ref[Places]] = []
+        self.settled = False
+        self.full = self._least_full = settle_at
 
     def add(self, position: int, parent: int, is_run: bool, times: tuple[int, int, int]) -> int:
         self.parent.append(parent)
         self.position.append(position)
         self.is_run.append(is_run)
         self.times.extend(times)
+        self.marks.append(0)
         return len(self.parent) - 1
+
+    def hold(self, places: Places, position: int, step: int) -> None:
+        """Let a step be referred to by what has it."""
+        places[self.number, position] = step
+        self.holders.append(weakref.ref(places))
+
+    def steps(self) -> Steps:
+        """Return all steps as columns."""
+        n = len(self.parent)
+        position = np.array(self.position, dtype=np.int64)
+        times = np.array(self.times, dtype=np.int64).reshape(-1, 3)
+        is_run = np.frombuffer(bytes(self.is_run), dtype=np.bool_)
+        return Steps(
+            np.array(self.parent, dtype=np.int64), np.zeros(n, dtype=np.int64), position == 0,
+            position == len(self.path.callbacks) - 1, is_run, times[:, 0],
+            np.where(is_run, times[:, 1], _NONE),
+            np.frombuffer(bytes(self.marks), dtype=np.uint8))
+
+    def tidy(self) -> None:
+        """Count the flows that are over, and forget their steps."""
+        steps = self.steps()
+        self.holders = [ref for ref in self.holders if ref() is not None]
+        places = [each for each in (ref() for ref in self.holders) if each is not None]
+        every = [each for each in (
+            *self.started, *self.done, *self.published,
+            *(step for each in places for (path, _), step in each.items()
+              if path == self.number)) if each != _NONE]
+        held = np.zeros(len(self.parent), dtype=np.bool_)
+        held[every] = True
+        found = settle(steps, held)
+        now = max(0, int(max(steps.time.max(), steps.end.max())) - LAG_NS)
+        self.figures.add(found.flows, bounds(steps, found.keep, now)[0])
+        self._forget(steps, found.keep, found.marks, found.numbers(), places)
+        self.settled = True
+        self.full = max(self._least_full, 2 * len(self.parent))
+
+    def _forget(self, steps: Steps, keep: Any, marks: Any, numbers: Any,
+                places: list[Places]) -> None:
+        """Keep some of the steps only."""
+        parent = steps.parent[keep]
+        self.parent = array('q', np.where(parent == _NONE, _NONE, numbers[parent]).tobytes())
+        self.position = array('q', np.array(self.position, dtype=np.int64)[keep].tobytes())
+        self.is_run = bytearray(steps.is_run[keep].tobytes())
+        times = np.array(self.times, dtype=np.int64).reshape(-1, 3)
+        self.times = array('q', times[keep].tobytes())
+        self.marks = bytearray(marks[keep].tobytes())
+        renumbered = [*numbers.tolist(), _NONE]     # the last is of no step
+        for steps_of in (self.started, self.done, self.published):
+            steps_of[:] = [renumbered[step] for step in steps_of]
+        for each in {id(each): each for each in places}.values():
+            for place, step in each.items():
+                if place[0] == self.number:
+                    each[place] = renumbered[step]
 
 
 class PathBook:
     """
     Collects the flows along the declared paths while it is told what happened, in order of time.
 
-    Executions and publications are told by their ``places``, an empty dict for each at first,
-    which their owner keeps for as long as they may be referred to.
+    Executions and publications are told by their ``places``, empty ones for each at first, which
+    their owner keeps for as long as they may be referred to.  Before he looks at what is in them
+    he calls ``tidy``, which may renumber the steps there.
+
+    :param settle_at: how many steps of a path there are when those of flows that are over go.
+    :param keep: up to how many response times quantiles are exact.
     """
 
-    def __init__(self, task_set: TaskSet) -> None:
+    def __init__(
+        self, task_set: TaskSet, settle_at: int = SETTLE, keep: int = KEEP_EXACT
+    ) -> None:
         self._books = [
-            _Book(path, hops(task_set, path),
-                  [task_set.callback(key).kind == 'sync' for key in path.callbacks])
-            for path in task_set.paths]
+            _Book(number, path, hops(task_set, path),
+                  [task_set.callback(key).kind == 'sync' for key in path.callbacks], settle_at,
+                  keep)
+            for number, path in enumerate(task_set.paths)]
         # by callback: its places in paths
         self._at: dict[str, list[Place]] = {}
         for number, path in enumerate(task_set.paths):
@@ -143,6 +221,12 @@ class PathBook:
     def __bool__(self) -> bool:
         """Tell whether there is any path."""
         return bool(self._books)
+
+    def tidy(self) -> None:
+        """Forget flows that are over, where there are many steps; to be called now and then."""
+        for book in self._books:
+            if len(book.parent) >= book.full:
+                book.tidy()
 
     def concerns(self, key: str) -> bool:
         """Tell whether a callback is on a path."""
@@ -165,7 +249,7 @@ class PathBook:
                 if hop.kind == 'trigger':
                     if topic and topic not in hop.topics:
                         continue        # another leg of a sync callback
-                    parent = (message or {}).get((number, position - 1), _NONE)
+                    parent = (message or _NOWHERE).get((number, position - 1), _NONE)
                 elif hop.kind == 'variable':
                     parent = book.done[position - 1]
                 else:
@@ -174,7 +258,7 @@ class PathBook:
                     book.started[position] = _NONE
                     continue
             step = book.add(position, parent, True, (start, _NONE, 0))
-            places[(number, position)] = step
+            book.hold(places, position, step)
             book.started[position] = step
 
     def took(self, key: str, places: Places, message: Places) -> None:
@@ -199,7 +283,7 @@ class PathBook:
     def published(
         self, topic: str, node: str, key: str | None, run: Places | None, message: Places,
         times: tuple[int, int, int],
-    ) -> list[tuple[int, int]]:
+    ) -> None:
         """
         Take in a publication.
 
@@ -208,9 +292,7 @@ class PathBook:
         :param run: places of the execution that published it.
         :param message: its own places, to be filled.
         :param times: of rclcpp, rcl and DDS; what is not recorded is 0.
-        :return: path and step of each place, for ``correct``.
         """
-        steps = []
         candidates = [key] if key is not None else [
             k for k in self._at if self._node_of[k] == node]
         for candidate in candidates:
@@ -218,37 +300,35 @@ class PathBook:
                 book = self._books[number]
                 if position >= len(book.hops) or topic not in book.hops[position].topics:
                     continue
-                parent = (run or {}).get((number, position), _NONE)
+                parent = (run or _NOWHERE).get((number, position), _NONE)
                 if parent == _NONE and (key is None or book.sync[position]):
                     parent = book.started[position]
                 if parent == _NONE and position:
                     book.published[position] = _NONE
                     continue
                 step = book.add(position, parent, False, times)
-                message[(number, position)] = step
+                book.hold(message, position, step)
                 book.published[position] = step
-                steps.append((number, step))
-        return steps
 
     def flows(self, number: int) -> list[Flow]:
-        """Return the flows along a path, by the time of their beginning."""
+        """Return the flows along a path, by the time of their beginning; none may be forgotten."""
         book = self._books[number]
-        rows = [_flow(book, leaf) for leaf in _leaves(book)]
-        return sorted(rows, key=_order)
+        assert not book.settled
+        return sorted((_flow(book, leaf) for leaf in _leaves(book)), key=_order)
 
-    def ends(self, number: int) -> Iterator[Ends]:
-        """Yield of each flow along a path its ends, in no order."""
-        book = self._books[number]
-        return (_ends(book, leaf) for leaf in _leaves(book))
+    def figures(self) -> list[dict[str, Any]]:
+        """Return the figures of each path, as if no more flows came."""
+        return [_finished(book).result() for book in self._books]
 
     @property
     def paths(self) -> list[Path]:
         """Return the declared paths."""
         return [book.path for book in self._books]
 
-    def hops(self, number: int) -> list[Hop]:
-        """Return the hops of a path."""
-        return self._books[number].hops
+    @property
+    def hops(self) -> list[list[Hop]]:
+        """Return the hops of each path."""
+        return [book.hops for book in self._books]
 
 
 def hops(task_set: TaskSet, path: Path) -> list[Hop]:
@@ -266,28 +346,19 @@ def _hop(before: Callback, after: Callback) -> Hop:
     return Hop('topic', frozenset(before.publishes).intersection(after.reads))
 
 
-def _leaves(book: _Book) -> Iterable[int]:
-    """Return where flows end, without the dead ends beside a branch that went on."""
-    n = len(book.parent)
-    has_child = bytearray(n)
-    for parent in book.parent:
-        if parent != _NONE:
-            has_child[parent] = 1
+def _leaves(book: _Book) -> Iterator[int]:
+    """Yield where flows end, without the dead ends beside a branch that went on."""
+    steps = book.steps()
+    has_child = np.zeros(len(steps.parent), dtype=np.bool_)
+    has_child[steps.parent[steps.parent != _NONE]] = True
     # executions that another execution reads, one of which went on
-    went_on = bytearray(n)
-    for step in range(n):
-        parent = book.parent[step]
-        if parent != _NONE and book.is_run[step] and has_child[step]:
-            went_on[parent] = 1
+    went_on = {book.parent[step] for step in np.flatnonzero(has_child & steps.is_run).tolist()}
     last = len(book.path.callbacks) - 1
-    for step in range(n):
-        if has_child[step]:
-            continue
+    for step in np.flatnonzero(~has_child).tolist():
         parent = book.parent[step]
-        if (parent != _NONE and book.is_run[step] and book.position[step] < last
-                and went_on[parent]):
-            continue
-        yield step
+        if not (parent != _NONE and book.is_run[step] and book.position[step] < last
+                and parent in went_on):
+            yield step
 
 
 def _flow(book: _Book, leaf: int) -> Flow:
@@ -313,24 +384,13 @@ def _flow(book: _Book, leaf: int) -> Flow:
     return Flow(columns, begin, end)
 
 
-def _ends(book: _Book, leaf: int) -> Ends:
-    last = len(book.path.callbacks) - 1
-    first = arrival = begin = end = None
-    step = leaf
-    while step != _NONE:
-        position = book.position[step]
-        if position == 0 or position == last:
-            time, second = book.times[3 * step], book.times[3 * step + 1]
-            if not book.is_run[step]:
-                first = time or None if position == 0 else first
-            else:
-                if position == last:
-                    arrival = time
-                    end = second if second != _NONE else end
-                if position == 0:
-                    begin = time
-        step = book.parent[step]
-    return Ends(begin if first is None else first, arrival, begin, end)
+def _finished(book: _Book) -> PathFigures:
+    """Return the figures of a path when all flows are over; the book stays as it is."""
+    figures = copy.deepcopy(book.figures)
+    steps = book.steps()
+    flows = settle(steps, np.zeros(len(steps.parent), dtype=np.bool_)).flows
+    figures.add(flows, Bounds(*(NEVER,) * 3))
+    return figures
 
 
 def _order(flow: Flow) -> tuple[int, ...]:

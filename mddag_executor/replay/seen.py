@@ -21,7 +21,10 @@ from typing import Any
 
 from mddag_executor.replay.entities import Callback, Publisher
 from mddag_executor.replay.linked import Publication, Run
-from mddag_executor.replay.path_cases import statistics
+from mddag_executor.replay.spread import Spread
+import numpy as np
+
+_BATCH = 1024
 
 
 class _Executions:
@@ -38,13 +41,34 @@ class _Executions:
         self.longest = 0
 
 
+class _Latencies:
+    """From the publication to the start of a callback, ns."""
+
+    __slots__ = ('callback', 'spread', '_last')
+
+    def __init__(self, callback: Callback) -> None:
+        self.callback = callback
+        self.spread = Spread()
+        self._last = array('q')
+
+    def add(self, latency: int) -> None:
+        self._last.append(latency)
+        if len(self._last) >= _BATCH:
+            self.flush()
+
+    def flush(self) -> None:
+        """Take in what is left."""
+        self.spread.add(np.array(self._last, dtype=np.int64))
+        self._last = array('q')
+
+
 class Seen:
     """Collects while a linker tells what happened."""
 
     def __init__(self) -> None:
         self._executions: dict[int, _Executions] = {}
         self._sent: dict[int, tuple[Publisher, int]] = {}
-        self._arrived: dict[tuple[int, int], tuple[Callback, array[int]]] = {}
+        self._arrived: dict[tuple[int, int], _Latencies] = {}
 
     def started(self, run: Run, message: Publication | None) -> None:
         """Take in that an execution has begun."""
@@ -57,8 +81,8 @@ class Seen:
             key = (message.publisher.number, callback.number)
             found = self._arrived.get(key)
             if found is None:
-                found = self._arrived[key] = callback, array('q')
-            found[1].append(run.start - message.time)
+                found = self._arrived[key] = _Latencies(callback)
+            found.add(run.start - message.time)
 
     def ended(self, run: Run) -> None:
         """Take in that an execution has ended."""
@@ -87,13 +111,14 @@ class Seen:
     def communications(self) -> list[dict[str, Any]]:
         """Return for each pair of publisher and callback messages, and publication to start."""
         found = []
-        for (number, _), (callback, latencies) in self._arrived.items():
+        for (number, _), latencies in self._arrived.items():
+            latencies.flush()
             publisher, sent = self._sent.get(number, (None, 0))
             if publisher is None:
                 continue
             found.append({
                 'topic': publisher.topic,
                 'publisher': publisher.node.name if publisher.node is not None else None,
-                'callback': callback.label, 'sent': sent, 'arrived': len(latencies),
-                'latency_ns': statistics([(0, latency) for latency in latencies])})
+                'callback': latencies.callback.label, 'sent': sent,
+                'arrived': latencies.spread.count, 'latency_ns': latencies.spread.result()})
         return sorted(found, key=lambda each: (each['topic'], each['callback']))

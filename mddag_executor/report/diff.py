@@ -40,6 +40,7 @@ def compare(
     Compare the results of two replays.
 
     :param tolerance: how much a p99 response time may grow, as a share (0.1 is 10 %).
+    :param before: results as ``Replay`` and ``Reschedule`` give them; ``after``, too.
     :returns: for JSON: ``sinks`` by DAG and name with both sides (``a``, ``b``; null where a run
         lacks it), ``change_ns`` and ``change`` (share) of response times and ``worse``;
         ``callbacks`` with both sides' executions and mean times; ``worse`` of the whole.
@@ -50,10 +51,10 @@ def compare(
         dags[name] = {'sinks': {
             sink: _sink(sides[0]['sinks'].get(sink), sides[1]['sinks'].get(sink), tolerance)
             for sink in _union(sides[0]['sinks'], sides[1]['sinks'])}}
+    took: list[Mapping[str, Any]] = [side.get('callbacks', {}) for side in (before, after)]
     callbacks = {
-        key: {'a': _callback(before['callbacks'].get(key)),
-              'b': _callback(after['callbacks'].get(key))}
-        for key in _union(before['callbacks'], after['callbacks'])}
+        key: {'a': _callback(took[0].get(key)), 'b': _callback(took[1].get(key))}
+        for key in _union(*took)}
     return {
         'a': _run(before), 'b': _run(after), 'tolerance': tolerance,
         'worse': any(sink['worse'] for dag in dags.values() for sink in dag['sinks'].values()),
@@ -69,7 +70,8 @@ def _run(result: Mapping[str, Any]) -> dict[str, Any]:
     return {
         'trace': result['recording']['trace'], 'policy': result['policy'],
         'workers': result['workers'], 'duration_ns': result['duration_ns'],
-        'utilisation': result['utilisation'], **every._asdict()}
+        'utilisation': result['utilisation'], 'imported': 'recorded_callbacks' in result,
+        'rescheduled': result['rescheduled'], **every._asdict()}
 
 
 def _side(sink: Mapping[str, Any] | None) -> dict[str, Any] | None:
@@ -165,11 +167,13 @@ def summary(difference: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines below the tables: one for each run, and the verdict."""
     for mark in ('a', 'b'):
         run = difference[mark]
+        pool = f'imported, {run["workers"]} threads' if run['imported'] else (
+            f'policy {printable(run["policy"])}, {run["workers"]} workers')
         yield (f'{"first" if mark == "a" else "then"}: {printable(run["trace"])}: '
                f'{run["due"]} sink jobs due, {run["in_time"]} in time '
                f'({percent(run["in_time"], run["due"])}), {run["late"]} late, '
-               f'{run["expired"]} expired; policy {printable(run["policy"])}, '
-               f'{run["workers"]} workers, {format_ns(run["duration_ns"])}')
+               f'{run["expired"]} expired; ' + ('rescheduled, ' if run['rescheduled'] else '')
+               + f'{pool}, {format_ns(run["duration_ns"])}')
     n = sum(sink['worse'] for dag in difference['dags'].values()
             for sink in dag['sinks'].values())
     yield f'{n} sinks are worse in the second run' if n != 1 \

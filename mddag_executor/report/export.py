@@ -30,7 +30,8 @@ one sink: ``in_time``, ``late``, ``overdue`` (not completed when the run ended p
 ``expired`` or ``aborted``; the last three have no completion.
 
 Columns that end in ``_ns`` are whole nanoseconds: times on the trace's clock, or durations.
-``start_s`` and ``release_s`` are seconds since the run's first release.
+``start_s`` and ``release_s`` are seconds since the run's first release (or execution, where one
+came before).
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ from mddag_executor.errors import MddagError
 from mddag_executor.replay.follower import Event, Execution, Observer, Piece
 from mddag_executor.replay.judge import Judge
 from mddag_executor.report.text import printable
+from mddag_executor.report.timeline_log import Schedule, tell
 from msg_graph import TaskSet
 
 KEEP_ENDED = 4096
@@ -256,6 +258,14 @@ class Exporter(Observer):
             None if completed is None else deadline - completed, verdict), vertex)
 
 
+def export_schedule(schedule: Schedule, target: Target) -> None:
+    """Hand out the rows of a schedule that was computed."""
+    judge = Judge(schedule.task_set, compare=False)
+    exporter = Exporter(target)
+    tell(schedule, [judge, *exporter.observers(schedule.task_set, judge)])
+    exporter.finish()
+
+
 class _Rows:
     """A target that takes rows of one kind, in batches."""
 
@@ -363,10 +373,14 @@ def check_available(form: str) -> None:
         return
     try:
         __import__(module)
-    except ImportError:
+    except ModuleNotFoundError:
         raise MddagError(
             f'-o *.{form}: {module} is not installed: '
             "pip install 'mddag_executor[export]'") from None
+    except ImportError as error:  # such as a pyarrow that wants a newer NumPy
+        raise MddagError(
+            f'-o *.{form}: {module} does not load: {" ".join(str(error).split())}: '
+            'install versions that fit together') from None
 
 
 def target(form: str, file: BinaryIO, jobs: bool) -> Target:

@@ -31,6 +31,7 @@ from mddag_executor.core import Tally
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import Replay, Reschedule
 from mddag_executor.replay.bags_reschedule import BagReschedule
+from mddag_executor.replay.batches import Batch
 from mddag_executor.replay.follower import Event, Observer
 from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.usage import Usage
@@ -50,7 +51,7 @@ from mddag_executor.report.html_tables import (
 from mddag_executor.report.tables import percent, total
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import MOST_EXECUTIONS, Timeline
-from mddag_executor.report.timeline_log import Schedule, tell
+from mddag_executor.report.timeline_log import of_rescheduled, Schedule, tell
 from mddag_executor.simulate import Load, Run
 from msg_graph import TaskSet
 
@@ -66,14 +67,24 @@ class Watch:
     """Collects what a report shows while a run is replayed."""
 
     def __init__(self, most: int = MOST_EXECUTIONS) -> None:
-        self.timeline = Timeline(most)
+        self._most = most
+        self.timeline: Timeline
         self.judge: Judge
         self.usage: Usage
 
+    def begin(self, task_set: TaskSet, judge: Judge, usage: Usage) -> None:
+        """Take in what will have counted the run when it is over; ``take`` will be told of it."""
+        self.timeline = Timeline(self._most)
+        self.judge = judge
+        self.usage = usage
+
+    def take(self, batch: Batch) -> None:
+        """Take in what happened."""
+        self.timeline.take(batch)
+
     def observers(self, task_set: TaskSet, judge: Judge) -> Sequence[Observer]:
         """Return observers; they are told after the judge."""
-        self.judge = judge
-        self.usage = Usage(task_set)
+        self.begin(task_set, judge, Usage(task_set))
         judge.listeners.append(self.timeline.decided)
         return [self.timeline, self.usage]
 
@@ -128,21 +139,7 @@ def of_replay(outcome: Replay, watch: Watch) -> ReportData:
 
 def of_reschedule(outcome: Reschedule) -> ReportData:
     """Return the data of a report about a recorded run that was rescheduled."""
-    work = outcome.work
-    transports = work.transports
-    tables = outcome.tables
-    edges = {
-        (v, tables.successors[i]): i - tables.first_successor[tables.first_vertex[dag]]
-        for v, dag in enumerate(tables.dag_of[:len(outcome.task_set.vertices)])
-        for i in range(tables.first_successor[v], tables.first_successor[v + 1])}
-
-    def delay(dag: int, job: int, before: int, after: int) -> int:
-        return int(transports.delays[
-            transports.base[dag] + job * transports.stride[dag] + edges[before, after]])
-
-    watch = _told(Schedule(
-        outcome.task_set, work.load, outcome.log, outcome.decisions, outcome.end_ns,
-        outcome.end_ns, True, work.jobs, delay))
+    watch = _told(of_rescheduled(outcome))
     result = outcome.result()
     facts = [('recording', result['recording']['trace']), *_facts(result)]
     return watch.data('Replay, rescheduled', facts, outcome.task_set, outcome.workers,
@@ -151,8 +148,7 @@ def of_reschedule(outcome: Reschedule) -> ReportData:
 
 def of_bag(outcome: BagReschedule) -> ReportData:
     """Return the data of a report about an ordinary bag that was rescheduled."""
-    watch = _told(Schedule(
-        outcome.task_set, outcome.load, outcome.log, outcome.decisions, outcome.end, outcome.end))
+    watch = _told(of_rescheduled(outcome))
     result = outcome.result()
     facts = [('bag', result['recording']['trace']), *_facts(result),
              *(('assumed', note) for note in outcome.notes)]
@@ -181,9 +177,12 @@ def _told(schedule: Schedule) -> Watch:
 
 def _facts(result: dict[str, Any]) -> list[tuple[str, str]]:
     utilisation = result['utilisation']
+    pool = [('policy', str(result['policy']) + (', preemptive' if result['preemptive'] else '')),
+            ('workers', str(result['workers']))]
+    if 'recorded_callbacks' in result:      # another executor ran it
+        pool = [('imported', f'{result["workers"]} threads ran callbacks')]
     return [
-        ('policy', str(result['policy']) + (', preemptive' if result['preemptive'] else '')),
-        ('workers', str(result['workers'])), ('duration', format_ns(result['duration_ns'])),
+        *pool, ('duration', format_ns(result['duration_ns'])),
         ('utilisation', '-' if utilisation is None else f'{utilisation:.3f}')]
 
 
@@ -255,10 +254,11 @@ def _head(data: ReportData) -> Iterator[str]:
         f'<span><b>{escape(printable(word))}</b> {escape(printable(text))}</span>'
         for word, text in data.facts) + '</p>\n'
     missed = every.due - every.in_time
-    yield (f'<p class="verdict {"bad" if missed else "good"}">{every.due} sink jobs due, '
-           f'{every.in_time} in time ({percent(every.in_time, every.due)}), {every.late} late, '
-           f'{every.expired} expired'
-           + (f', {every.aborted} aborted' if every.aborted else '') + '</p>\n')
+    if data.task_set.dags:
+        yield (f'<p class="verdict {"bad" if missed else "good"}">{every.due} sink jobs due, '
+               f'{every.in_time} in time ({percent(every.in_time, every.due)}), {every.late} '
+               f'late, {every.expired} expired'
+               + (f', {every.aborted} aborted' if every.aborted else '') + '</p>\n')
     for warning in data.warnings:
         yield f'<p class="warning">{escape(printable(warning))}</p>\n'
     timeline = data.timeline

@@ -108,7 +108,7 @@ def _overview(data: ReportData, prepared: Prepared, time: Range1d) -> Any:
         plot.quad(left=edges[:-1][late], right=edges[1:][late], bottom=data.workers * 1.02,
                   top=data.workers * 1.08, fill_color=_RED, line_color=_RED, line_width=1.5)
     plot.yaxis.axis_label = 'busy workers'
-    _seconds(plot, 'time since the first release (s): drag the window or its edges')
+    _seconds(plot, 'time since the beginning (s): drag the window or its edges')
     tool = RangeTool(x_range=time)
     tool.overlay.fill_color = '#000000'
     tool.overlay.fill_alpha = 0.08
@@ -158,7 +158,7 @@ def _timeline(name: str, lines: list[Line], time: Range1d, gaps: list[list[int]]
                           fill_color=_RED, line_color='#ffffff')
     plot.add_tools(HoverTool(renderers=[marked], tooltips=_TOOLTIP))
     _lines(plot, lines)
-    _seconds(plot, 'time since the first release (s)')
+    _seconds(plot, 'time since the beginning (s)')
     _style(plot, grid=False)
     return plot
 
@@ -203,7 +203,7 @@ def _flow() -> Any:
     _lines(plot, [])
     plot.yaxis[0].ticker.name = 'flow_ticks'
     plot.yaxis[0].name = 'flow_axis'
-    _seconds(plot, 'time since the first release (s); the red line is the deadline')
+    _seconds(plot, 'time since the beginning (s); the red line is the deadline')
     _style(plot)
     return plot
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from mddag_executor.report.tables import counts, percent, short_names, total
+from mddag_executor.report.tables import counts, each_sink, verdicts_line
 from mddag_executor.report.text import Cell, format_ns, printable, table
 
 _TIMES_HEADER = (
@@ -36,20 +36,16 @@ _COMPARISON_HEADER = (
 
 def times_table(dags: Mapping[str, Any]) -> str:
     """Return a table of where the response times went: on average, and for the worst job."""
-    short = short_names(name for dag in dags.values() for name in dag['sinks'])
     rows: list[list[Cell]] = []
-    for dag_name, dag in dags.items():
-        shown = dag_name
-        for name, sink in dag['sinks'].items():
-            breakdown = sink['breakdown']
-            if breakdown is None:
-                rows.append([shown, short[name], *[None] * 12])
-            else:
-                mean, worst = breakdown['mean'], breakdown['worst']
-                rows.append([
-                    shown, short[name], _time(mean['release_lag_ns']), *_parts(mean),
-                    worst['job'], *_parts(worst)])
-            shown = ''
+    for sink in each_sink(dags):
+        row: list[Cell] = [sink.shown_dag, sink.shown_name]
+        breakdown = sink.result['breakdown']
+        if breakdown is None:
+            rows.append([*row, *[None] * 12])
+        else:
+            mean, worst = breakdown['mean'], breakdown['worst']
+            rows.append([*row, _time(mean['release_lag_ns']), *_parts(mean),
+                         worst['job'], *_parts(worst)])
     return table(_TIMES_HEADER, rows)
 
 
@@ -143,31 +139,25 @@ def paths_rows(paths: Mapping[str, Any]) -> Iterator[list[Cell]]:
 
 def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> str:
     """Return a table of rescheduled sinks, each figure beside the recorded one."""
-    short = short_names(name for dag in dags.values() for name in dag['sinks'])
     rows: list[list[Cell]] = []
-    for dag_name, dag in dags.items():
-        shown = dag_name
-        for name, sink in dag['sinks'].items():
-            before = recorded[dag_name]['sinks'][name]
-            row: list[Cell] = [shown, short[name], format_ns(sink['relative_deadline_ns'])]
-            for side in (sink, before):
-                verdicts = counts(side)
-                row.append(f'{verdicts.in_time} of {verdicts.due}')
-            for key in ('median', 'p99', 'max'):
-                for side in (sink, before):
-                    response = side['response_ns']
-                    row.append(None if response is None else format_ns(response[key]))
-            rows.append(row)
-            shown = ''
+    for sink in each_sink(dags):
+        sides = (sink.result, recorded[sink.dag]['sinks'][sink.name])
+        row: list[Cell] = [
+            sink.shown_dag, sink.shown_name, format_ns(sink.result['relative_deadline_ns'])]
+        for side in sides:
+            verdicts = counts(side)
+            row.append(f'{verdicts.in_time} of {verdicts.due}')
+        for key in ('median', 'p99', 'max'):
+            for side in sides:
+                response = side['response_ns']
+                row.append(None if response is None else format_ns(response[key]))
+        rows.append(row)
     return table(_COMPARISON_HEADER, rows)
 
 
 def summary(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the tables of a replay."""
-    every = total(result['dags'])
-    yield (f'{every.due} sink jobs due, {every.in_time} in time '
-           f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
-           + (f', {every.aborted} aborted' if every.aborted else ''))
+    yield verdicts_line(result['dags'])
     pool = f'policy {printable(result["policy"])}, {result["workers"]} workers'
     if 'recorded_callbacks' in result:      # another executor ran it
         pool = f'imported: {result["workers"]} threads ran callbacks'

@@ -23,7 +23,7 @@ sink job that got a verdict, and *in time* what completed by its deadline.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from mddag_executor.report.text import Cell, format_ns, table
@@ -67,21 +67,44 @@ def short_names(names: Iterable[str]) -> dict[str, str]:
     return {name: short if used[short] == 1 else name for name, short in shortened.items()}
 
 
+class Sink(NamedTuple):
+    """
+    A sink in a table.
+
+    :ivar dag: the name of its DAG, and as the table shows it: in the DAG's first row only.
+    :ivar name: its name, and as the table shows it.
+    :ivar result: what there is of it.
+    """
+
+    dag: str
+    shown_dag: str
+    name: str
+    shown_name: str
+    result: Mapping[str, Any]
+
+
+def each_sink(dags: Mapping[str, Any]) -> Iterator[Sink]:
+    """Yield the sinks of all DAGs, in the order of a table's rows."""
+    short = short_names(name for dag in dags.values() for name in dag['sinks'])
+    for dag_name, dag in dags.items():
+        shown = dag_name
+        for name, result in dag['sinks'].items():
+            yield Sink(dag_name, shown, name, short[name], result)
+            shown = ''
+
+
 def sink_table(dags: Mapping[str, Any]) -> str:
     """Return a table with a row for each sink: counts, and response times by its deadline."""
-    short = short_names(name for dag in dags.values() for name in dag['sinks'])
     some_aborted = total(dags).aborted > 0
     header = [*HEADER[:6], *(['aborted'] if some_aborted else []), *HEADER[6:]]
     rows: list[list[Cell]] = []
-    for dag_name, dag in dags.items():
-        shown = dag_name
-        for name, sink in dag['sinks'].items():
-            verdicts = counts(sink)
-            rows.append([
-                shown, short[name], verdicts.due, verdicts.in_time, verdicts.late,
-                verdicts.expired, *([verdicts.aborted] if some_aborted else []),
-                *response_cells(sink['response_ns']), format_ns(sink['relative_deadline_ns'])])
-            shown = ''
+    for sink in each_sink(dags):
+        verdicts = counts(sink.result)
+        rows.append([
+            sink.shown_dag, sink.shown_name, verdicts.due, verdicts.in_time, verdicts.late,
+            verdicts.expired, *([verdicts.aborted] if some_aborted else []),
+            *response_cells(sink.result['response_ns']),
+            format_ns(sink.result['relative_deadline_ns'])])
     return table(header, rows)
 
 
@@ -100,3 +123,11 @@ def percent(part: int, whole: int) -> str:
     if part not in (0, whole):
         share = min(99.99, max(0.01, share))
     return f'{share:.2f} %'
+
+
+def verdicts_line(dags: Mapping[str, Any]) -> str:
+    """Return the line that stands below a table of sinks: the verdicts about all of them."""
+    every = total(dags)
+    return (f'{every.due} sink jobs due, {every.in_time} in time '
+            f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
+            + (f', {every.aborted} aborted' if every.aborted else ''))

@@ -46,6 +46,8 @@ from mddag_executor.core.state import (
     SINK_EXPIRED,
     SINK_MISSED,
 )
+from mddag_executor.replay import batches
+from mddag_executor.replay.batches import Batch, CALLBACK, VERTEX
 from mddag_executor.replay.follower import Observer, Piece
 import numpy as np
 import numpy.typing as npt
@@ -61,6 +63,9 @@ DONE, OVERDUE, EXPIRED, ABORTED = range(4)
 _KINDS = {SINK_DONE: DONE, SINK_MISSED: OVERDUE, SINK_EXPIRED: EXPIRED, SINK_ABORTED: ABORTED}
 
 _FIRST_WIDTH = 1 << 16      # of a bin, ns
+_ADDRESS = 2 ** 64 - 1
+STARTED, ENDED, BECAME_READY, WORKED_BY, DONE_FOR = (
+    batches.START, batches.END, batches.READY, batches.WORKER, batches.JOB)
 
 Ints = npt.NDArray[np.int64]
 
@@ -150,6 +155,25 @@ class Bins:
             sums[i] += max(0, right - start)
             start = right
 
+    def add_many(self, lent: bool, starts: Ints, ends: Ints) -> None:
+        """Add stretches: as ``add`` does, one after the other; the origin is known."""
+        if not len(starts):
+            return
+        assert self.origin is not None
+        sums = self.lent if lent else self.busy
+        self.place(int(ends.max()))
+        starts = np.maximum(starts, self.origin)
+        starts, ends = starts[starts < ends], ends[starts < ends]
+        while len(starts):
+            places = (starts - self.origin) // self.width
+            until = np.minimum(ends, self.origin + (places + 1) * self.width)
+            first = int(places.min())
+            busy = np.zeros(int(places.max()) + 1 - first, dtype=np.int64)
+            np.add.at(busy, places - first, until - starts)
+            for i, more in enumerate(busy.tolist(), first):
+                sums[i] += more
+            starts, ends = until[until < ends], ends[until < ends]
+
 
 class Timeline(Observer):
     """
@@ -193,6 +217,10 @@ class Timeline(Observer):
 
     def decided(self, decisions: Sequence[Decision]) -> None:
         """Keep verdicts; to be told what the judge's core decides."""
+        self._decided(decisions, len(self._open.executions) // 6)
+
+    def _decided(self, decisions: Sequence[Decision], filled: int) -> None:
+        """Keep verdicts; so many executions were in the open block then."""
         block = self._open
         for kind, _, vertex, job, deadline, time in decisions:
             if kind == JOB_END or kind == DROP:
@@ -201,10 +229,68 @@ class Timeline(Observer):
             block.verdicts.extend((vertex, job, deadline, time, verdict))
             if verdict != DONE or time > deadline:
                 block.missed += 1
-                if len(block.executions) < self._block_size and len(self._blocks) > 1:
+                if 6 * filled < self._block_size and len(self._blocks) > 1:
                     self._blocks[-2].missed += 1    # where much of the job ran
                 self.n_missed += 1
                 self.bins.missed[self.bins.place(max(time, deadline))] += 1
+
+    def take(self, batch: Batch) -> None:
+        """Keep what happened in a stretch of the run."""
+        pieces = batch.pieces
+        n = len(pieces)
+        self._find_origin(batch)
+        executions = self._rows_of(pieces)
+        lent = pieces[:, WORKED_BY] < 0
+        for which in (False, True):
+            chosen = lent == which
+            self.bins.add_many(which, pieces[chosen, STARTED], pieces[chosen, ENDED])
+        self.n_executions += n
+        self.workers.update(np.unique(pieces[:, WORKED_BY]).tolist())
+        decided, released = batch.decided_after.tolist(), batch.released_after
+        at = decision = 0
+        while True:
+            filled = len(self._open.executions) // 6
+            end = min(n, at + self._block_size - filled)
+            full = filled + end - at == self._block_size
+            # what comes with the last execution of a block belongs to the next block
+            here = (released >= at) & ((released < end) | (not full))
+            self._open.releases.frombytes(batch.releases[here].tobytes())
+            while decision < len(decided) and (decided[decision] < end or not full):
+                self._decided([batch.decisions[decision]], filled + decided[decision] - at)
+                decision += 1
+            self._open.executions.frombytes(executions[at:end].tobytes())
+            if not full:
+                return
+            self._next_block()
+            at = end
+
+    def _find_origin(self, batch: Batch) -> None:
+        """Let the sums begin with what happened first."""
+        if self.bins.origin is not None:
+            return
+        for (kind, *_, deadline, time), after in zip(
+                batch.decisions, batch.decided_after.tolist()):
+            if after == 0 and kind not in (JOB_END, DROP) and (
+                    _KINDS[kind] != DONE or time > deadline):
+                self.bins.place(max(time, deadline))
+                return
+        if len(batch.pieces):
+            self.bins.place(int(batch.pieces[0, STARTED]))
+
+    def _rows_of(self, pieces: Ints) -> Ints:
+        """Return executions as they are kept: ROW, JOB, WORKER, READY, START, END."""
+        row, job = pieces[:, VERTEX].copy(), pieces[:, DONE_FOR].copy()
+        undeclared = row < 0
+        if undeclared.any():
+            callbacks = pieces[undeclared, CALLBACK]
+            different, first, which = np.unique(
+                callbacks, return_index=True, return_inverse=True)
+            rows = np.zeros(len(different), dtype=np.int64)
+            for k in np.argsort(first).tolist():    # in the order in which they came
+                rows[k] = self._undeclared_row(int(different[k]) & _ADDRESS)
+            row[undeclared], job[undeclared] = rows[which], -1
+        return np.column_stack((row, job, pieces[:, WORKED_BY], pieces[:, BECAME_READY],
+                                pieces[:, STARTED], pieces[:, ENDED]))
 
     def handlers(self) -> dict[str, Callable[[tuple[Any, ...]], None]]:
         """Return what else a follower of events is to tell: names of callbacks."""

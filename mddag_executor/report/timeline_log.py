@@ -33,6 +33,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END
+from mddag_executor.replay import Reschedule
+from mddag_executor.replay.bags_reschedule import BagReschedule
 from mddag_executor.replay.follower import Execution, Observer, Piece
 from mddag_executor.simulate import END, Load, LogEntry, START
 from msg_graph import TaskSet
@@ -63,6 +65,26 @@ class Schedule(NamedTuple):
     judged: bool = True
     numbers: list[list[int]] | None = None
     delay: Delay | None = None
+
+
+def of_rescheduled(outcome: Reschedule | BagReschedule) -> Schedule:
+    """Return the schedule of a recording or a bag that was rescheduled."""
+    if isinstance(outcome, BagReschedule):
+        return Schedule(outcome.task_set, outcome.load, outcome.log, outcome.decisions,
+                        outcome.end, outcome.end)
+    transports, tables = outcome.work.transports, outcome.tables
+    edges = {
+        (v, tables.successors[i]): i - tables.first_successor[tables.first_vertex[dag]]
+        for v, dag in enumerate(tables.dag_of[:len(outcome.task_set.vertices)])
+        for i in range(tables.first_successor[v], tables.first_successor[v + 1])}
+
+    def delay(dag: int, job: int, before: int, after: int) -> int:
+        return int(transports.delays[
+            transports.base[dag] + job * transports.stride[dag] + edges[before, after]])
+
+    return Schedule(
+        outcome.task_set, outcome.work.load, outcome.log, outcome.decisions, outcome.end_ns,
+        outcome.end_ns, True, outcome.work.jobs, delay)
 
 
 def tell(schedule: Schedule, observers: Sequence[Observer]) -> None:

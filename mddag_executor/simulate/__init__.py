@@ -15,16 +15,13 @@
 """Simulation in virtual time: the core over releases and execution times."""
 
 from mddag_executor.simulate.engine import END, Load, LogEntry, PREEMPT, START
-from mddag_executor.simulate.run import (
+from mddag_executor.simulate.errors import SimulationError
+from mddag_executor.simulate.run import JUDGES, Run, Settings, simulate
+from mddag_executor.simulate.workload import (
     draw_execution_times,
-    JUDGES,
     periodic_load,
     read_execution_times,
-    Run,
     scale_execution_times,
-    Settings,
-    simulate,
-    SimulationError,
     utilisation,
 )
 

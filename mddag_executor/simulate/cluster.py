@@ -42,9 +42,9 @@ import warnings
 
 from mddag_executor import __version__
 from mddag_executor.errors import MddagError
+from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.experiment import Chunk, Evaluator, Experiment
 from mddag_executor.simulate.pools import Pool
-from mddag_executor.simulate.run import SimulationError
 
 LOCAL = 'local'
 CONNECT_S = 3.0

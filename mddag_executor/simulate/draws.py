@@ -38,6 +38,7 @@ from mddag_executor.core import rad_offsets
 from mddag_executor.errors import InputError, UsageError
 from msg_graph import ExecutionTime, TaskSet
 from msg_graph.analysis import topological_order
+from msg_graph.duration import DAY
 import numpy as np
 import numpy.typing as npt
 
@@ -47,7 +48,6 @@ Times = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float64]
 Samples = Mapping[str, Times]
 
-_LONGEST_NS = 86_400_000_000_000
 _REMEDY = "write one array of measured ns for each 'node:callback' with numpy.savez"
 
 
@@ -87,7 +87,7 @@ def _array(archive: Any, key: str, name: str) -> npt.NDArray[Any]:
 def _whole_us(values: npt.NDArray[Any], key: str, name: str) -> Times:
     if values.ndim != 1 or values.size == 0 or values.dtype.kind not in 'iuf':
         raise InputError(name, f'the values of {key} are no list of numbers', _REMEDY)
-    if not bool(np.all((values >= 0) & (values < _LONGEST_NS))):  # false for what is no number
+    if not bool(np.all((values >= 0) & (values < DAY))):  # false for what is no number
         raise InputError(
             name, f'a value of {key} is negative or no number of ns below one day',
             'take it out of the array')

@@ -32,25 +32,16 @@ import time
 from typing import TYPE_CHECKING
 
 from mddag_executor.simulate.checkpoint import Checkpoint
+from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.evaluation import Evaluation
-from mddag_executor.simulate.experiment import (
-    Chunk,
-    DEFAULT_POLICIES,
-    Evaluator,
-    Experiment,
-    Judge,
-    PlainJudge,
-    STRIDE,
-)
+from mddag_executor.simulate.experiment import Chunk, Evaluator, Experiment, STRIDE
 from mddag_executor.simulate.pools import Pool, ProcessPool, ThreadPool
-from mddag_executor.simulate.run import SimulationError
 import numpy as np
 
 if TYPE_CHECKING:
     from mddag_executor.simulate.cluster import Cluster
 
-__all__ = [
-    'CORES', 'DEFAULT_POLICIES', 'Evaluation', 'Experiment', 'Judge', 'PlainJudge', 'evaluate']
+__all__ = ['CORES', 'Evaluation', 'Experiment', 'evaluate', 'uses_compiled']
 
 CORES = ('auto', 'compiled', 'plain')
 Progress = Callable[[int], None]

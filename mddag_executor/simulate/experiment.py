@@ -35,18 +35,18 @@ from functools import lru_cache
 import time
 from typing import NamedTuple, Protocol
 
+from mddag_executor import defaults
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Tables
 from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import new_state
 from mddag_executor.simulate.acceptance import Bools
 from mddag_executor.simulate.draws import Draws, feasible, Floats, Samples, Times, utilisations
 from mddag_executor.simulate.engine import any_missed, run
-from mddag_executor.simulate.run import check, periodic_load, Settings
+from mddag_executor.simulate.run import check, Settings
+from mddag_executor.simulate.workload import periodic_load
 from msg_graph import TaskSet
 import numpy as np
 
-DEFAULT_POLICIES = ('rad', 'rm', 'wc', 'fifo')
 STRIDE = 2 ** 40
 """So far apart are the numbers of the first runs of two task sets."""
 
@@ -65,9 +65,9 @@ class Experiment:
     """
 
     task_set: TaskSet
-    policies: tuple[str, ...] = DEFAULT_POLICIES
-    workers: int = 7
-    duration_ns: int = 3_000_000_000
+    policies: tuple[str, ...] = defaults.POLICIES
+    workers: int = defaults.WORKERS
+    duration_ns: int = defaults.DURATION_NS
     seed: int = 0
     samples: Samples | None = None
     preemptive: bool | None = None
@@ -202,18 +202,14 @@ class PlainJudge:
 
     def __call__(self, settings: Settings, times: Times) -> Bools:
         """Tell which of the runs met every deadline."""
-        tables, policy = self._tables, find_policy(settings.policy)
+        tables = self._tables
         accepted = np.zeros(len(times), dtype=np.bool_)
         for row in range(len(times)):
-            state = new_state(
-                tables, settings.workers, preemptive=policy.mode(settings.preemptive),
-                dispatch_overhead=settings.dispatch_overhead_ns,
-                switch_overhead=settings.switch_overhead_ns, polling=policy.polling)
+            state, key = settings.start(tables)
             load = self._load._replace(costs=times[row].tolist())
             ended = run(
-                tables, state, policy.key, load, settings.duration_ns,
-                settings.stop_at_first_miss)
-            if settings.judge == 'horizon':
+                tables, state, key, load, settings.duration_ns, settings.stop_at_first_miss)
+            if settings.judges_open(ended):
                 finish(tables, state, ended)
             accepted[row] = not any_missed(state, 0)
         return accepted

@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-Entry points of the compiled core: whole runs, over memory that ``compiled`` lends them.
+Entry points of the compiled core: whole runs, over memory that they are lent (``lending``).
 
 They are compiled and never called as they stand here: the names of the core that they use are then
-bound to its compiled functions (see ``compiled``).  Structures are handed over as addresses.
+bound to its compiled functions (see ``compiling``).  Structures are handed over as addresses.
 """
 
 from __future__ import annotations

@@ -23,14 +23,16 @@ from statistics import median
 import time
 from typing import Any
 
+from mddag_executor import defaults
 from mddag_executor.simulate.compiled import CompiledJudge
 from mddag_executor.simulate.draws import Draws
-from mddag_executor.simulate.evaluate import evaluate, Experiment, Judge, PlainJudge
+from mddag_executor.simulate.evaluate import evaluate
+from mddag_executor.simulate.experiment import Experiment, Judge, PlainJudge
 from mddag_executor.simulate.run import Settings
 from msg_graph import loads, TaskSet
 import numpy as np
 
-WORKERS = 7
+WORKERS = defaults.WORKERS
 _DAG = 10
 _PERIODS_MS = (10, 20, 33, 50, 100)
 _UTILISATION = 0.6

@@ -35,11 +35,11 @@ from statistics import median
 import time
 from typing import Any
 
-from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Scheduler, Tables
-from mddag_executor.core.state import IDLE, new_state
+from mddag_executor.core.state import IDLE
 from mddag_executor.simulate.engine import END, Load, LogEntry, run
-from mddag_executor.simulate.run import draw_execution_times, periodic_load
+from mddag_executor.simulate.run import Settings
+from mddag_executor.simulate.workload import draw_execution_times, periodic_load
 from msg_graph import TaskSet
 
 
@@ -56,14 +56,13 @@ def time_core(
     :raises mddag_executor.core.PolicyError: when there is no such policy.
     :raises SimulationError: when a callback declares no execution time.
     """
-    row = find_policy(policy)
+    settings = Settings(policy, workers, duration_ns, preemptive=None)
     tables = Tables.build(task_set)
     load = periodic_load(task_set, draw_execution_times(task_set, seed), duration_ns)
 
     def simulate(log: list[LogEntry] | None = None) -> None:
-        state = new_state(
-            tables, workers, preemptive=row.preemptive, polling=row.polling)
-        run(tables, state, row.key, load, duration_ns, False, log)
+        state, key = settings.start(tables)
+        run(tables, state, key, load, duration_ns, False, log)
 
     log: list[LogEntry] = []
     simulate(log)
@@ -74,7 +73,7 @@ def time_core(
     live_jobs = drive_live(legs, policy, load)
     live = _seconds(lambda: drive_live(legs, policy, load), repeat)
     return {
-        'policy': policy, 'preemptive': row.preemptive, 'vertex_jobs': vertex_jobs,
+        'policy': policy, 'preemptive': settings.preempts, 'vertex_jobs': vertex_jobs,
         'events': events, 'repeat': repeat, 'us_per_event': _us(taken, events),
         'us_per_vertex_job': _us(taken, vertex_jobs),
         'live_us_per_vertex_job': _us(live, live_jobs)}

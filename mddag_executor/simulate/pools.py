@@ -29,8 +29,8 @@ import signal
 from types import TracebackType
 
 from mddag_executor.errors import MddagError
+from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.experiment import Chunk, Evaluator, Experiment
-from mddag_executor.simulate.run import SimulationError
 
 
 class Pool:

@@ -12,33 +12,25 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""One simulated run: a task set, execution times and a policy give a verdict."""
+"""One simulated run: a task set, its workload and a policy give a verdict."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
-import json
-import math
-import random
 from typing import Any
 
+from mddag_executor import defaults
 from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import Decision, new_state
-from mddag_executor.errors import MddagError
+from mddag_executor.core.policies import KeyFunction
+from mddag_executor.core.state import Decision, new_state, State
 from mddag_executor.simulate.engine import Load, LogEntry, run
-from msg_graph import Dag, TaskSet
+from mddag_executor.simulate.errors import SimulationError
+from msg_graph import TaskSet
 
 JUDGES = ('horizon', 'completions')
-
-_FORMAT = 'write {"DAG": {"/node:callback": microseconds}}'
-_LONGEST_US = 86_400_000_000
-
-
-class SimulationError(MddagError):
-    """Input of a simulation that can not be used."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +46,40 @@ class Settings:
     """
 
     policy: str = 'rad'
-    workers: int = 7
-    duration_ns: int = 3_000_000_000
+    workers: int = defaults.WORKERS
+    duration_ns: int = defaults.DURATION_NS
     preemptive: bool | None = False
     judge: str = 'horizon'
     stop_at_first_miss: bool = False
     dispatch_overhead_ns: int = 0
     switch_overhead_ns: int = 0
+
+    @property
+    def preempts(self) -> bool:
+        """
+        Tell whether what is more urgent takes the worker of what runs.
+
+        :raises mddag_executor.core.PolicyError: there is no such policy, or it never preempts
+        """
+        return find_policy(self.policy).mode(self.preemptive)
+
+    def start(self, tables: Tables) -> tuple[State, KeyFunction]:
+        """
+        Return the core's state for such a run, and the policy's key.
+
+        :raises mddag_executor.core.PolicyError: as ``preempts``
+        """
+        row = find_policy(self.policy)
+        state = new_state(
+            tables, self.workers, preemptive=self.preempts,
+            dispatch_overhead=self.dispatch_overhead_ns,
+            switch_overhead=self.switch_overhead_ns, polling=row.polling)
+        return state, row.key
+
+    def judges_open(self, ended_ns: int) -> bool:
+        """Tell whether what is open at the end is judged: not where the run ended early."""
+        stopped = self.stop_at_first_miss and ended_ns < self.duration_ns
+        return self.judge == 'horizon' and not stopped
 
 
 @dataclass
@@ -87,119 +106,6 @@ class Run:
             'utilisation': self.utilisation, **self.tally.result()}
 
 
-def draw_execution_times(task_set: TaskSet, seed: int) -> list[list[int]]:
-    """
-    Draw one execution time (ns) for each vertex, for the whole run, as in the paper.
-
-    :return: one list for each DAG, by local vertex index; the same seed gives the same draw.
-    :raises SimulationError: when a callback declares no execution time.
-    """
-    generator = random.Random(seed)
-    times = []
-    for dag in task_set.dags:
-        row = []
-        for vertex in dag.vertices:
-            times_of_callback = vertex.callback.execution_time
-            if times_of_callback is None:
-                raise SimulationError(
-                    f'{task_set.file}:{vertex.callback.line}: {vertex.callback.key} declares no '
-                    'execution_time: add one, or give --execution-times FILE')
-            row.append(times_of_callback.draw(generator.random()))
-        times.append(row)
-    return times
-
-
-def read_execution_times(task_set: TaskSet, text: str, name: str) -> list[list[int]]:
-    """
-    Read fixed execution times: JSON ``{"DAG": {"/node:callback": microseconds, …}, …}``.
-
-    :return: ns, one list for each DAG, by local vertex index.
-    :raises SimulationError: on anything that is not that, or a vertex without a time.
-    """
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise SimulationError(
-            f'{name}:{error.lineno}: not JSON ({error.msg}): {_FORMAT}') from None
-    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
-        raise SimulationError(f'{name}: not usable JSON ({error}): {_FORMAT}') from None
-    if not isinstance(data, dict) or not all(isinstance(v, dict) for v in data.values()):
-        raise SimulationError(f'{name}: not an object of objects: {_FORMAT}')
-    known = {dag.name for dag in task_set.dags}
-    for dag_name in data:
-        if dag_name not in known:
-            raise SimulationError(
-                f"{name}: DAG '{dag_name}' is not in {task_set.file}: "
-                f"its DAGs are {', '.join(sorted(known))}")
-    return [_dag_times(dag, data.get(dag.name, {}), name) for dag in task_set.dags]
-
-
-def _dag_times(dag: Dag, times: Mapping[str, Any], name: str) -> list[int]:
-    row = []
-    names: set[str] = set()
-    for vertex in dag.vertices:
-        names.update((vertex.name, vertex.callback.key))
-        value = times.get(vertex.name, times.get(vertex.callback.key))
-        if value is None:
-            raise SimulationError(
-                f'{name}: no execution time for {vertex.callback.key} of DAG {dag.name}: add it')
-        if isinstance(value, bool) or not isinstance(value, (int, float)) \
-                or not 0 < value < _LONGEST_US:
-            raise SimulationError(
-                f'{name}: execution time of {vertex.callback.key} of DAG {dag.name} is '
-                f'{_shown(value)}: give microseconds, above 0 and below one day')
-        row.append(max(1, round(value * 1000)))
-    for key in times:
-        if key not in names:
-            raise SimulationError(
-                f"{name}: '{key}' is not a vertex of DAG {dag.name}: take it out or correct it")
-    return row
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 40 else text[:37] + '...'
-
-
-def utilisation(task_set: TaskSet, times: Sequence[Sequence[int]], workers: int) -> float:
-    """Return the normalised utilisation: sum of execution time over period, by workers."""
-    total = sum(sum(row) / dag.period_ns for dag, row in zip(task_set.dags, times))
-    return total / workers
-
-
-def scale_execution_times(
-    task_set: TaskSet, times: Sequence[Sequence[int]], workers: int, target: float
-) -> list[list[int]]:
-    """
-    Return the execution times scaled by one factor to a normalised utilisation, ns.
-
-    :raises SimulationError: when the target is no number above zero, or there is nothing to scale.
-    """
-    now = utilisation(task_set, times, workers)
-    if not (target > 0 and math.isfinite(target)):
-        raise SimulationError(f'utilisation {target}: no number above zero: give one as 0.6')
-    if now == 0:
-        raise SimulationError('utilisation: all execution times are 0: give times to scale')
-    factor = target / now
-    return [[round(time * factor) for time in row] for row in times]
-
-
-def periodic_load(task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns: int) -> Load:
-    """Return the load of releases at k*T from 0, with the same execution times in each job."""
-    releases = sorted(
-        (job * dag.period_ns, dag.index, job)
-        for dag in task_set.dags
-        for job in range(-(-duration_ns // dag.period_ns)))
-    bases = []
-    costs: list[int] = []
-    for row in times:
-        bases.append(len(costs))
-        costs.extend(row)
-    return Load(
-        [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases],
-        costs, bases, [0] * len(bases))
-
-
 def simulate(
     task_set: TaskSet,
     load: Load,
@@ -221,27 +127,22 @@ def simulate(
     :raises mddag_executor.core.PolicyError: when there is no such policy.
     """
     check(settings)
-    policy = find_policy(settings.policy)
-    preemptive = policy.mode(settings.preemptive)
     tables = Tables.build(
         task_set, max_active_jobs=NEVER if max_active_jobs is None else max_active_jobs)
-    state = new_state(
-        tables, settings.workers, preemptive=preemptive,
-        dispatch_overhead=settings.dispatch_overhead_ns,
-        switch_overhead=settings.switch_overhead_ns, polling=policy.polling)
+    state, key = settings.start(tables)
     entries: list[LogEntry] = []
     ended = run(
-        tables, state, policy.key, load, settings.duration_ns, settings.stop_at_first_miss,
+        tables, state, key, load, settings.duration_ns, settings.stop_at_first_miss,
         entries if log else None, progress)
-    stopped = settings.stop_at_first_miss and ended < settings.duration_ns
-    if settings.judge == 'horizon' and not stopped:
+    if settings.judges_open(ended):
         finish(tables, state, ended)
     tally = Tally(task_set, tables)
     for time, dag in zip(load.times, load.dags):
         if time < settings.duration_ns and time <= ended:
             tally.released(dag)
     tally.add(state.decisions)
-    return Run(settings, tally, ended, utilisation, preemptive, entries, state.decisions)
+    return Run(
+        settings, tally, ended, utilisation, settings.preempts, entries, state.decisions)
 
 
 def check(settings: Settings) -> None:

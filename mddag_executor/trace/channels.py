@@ -44,7 +44,7 @@ Event = tuple[Any, ...]
 Decoder = tuple[Event, Callable[[bytes], Event]]
 
 _TOPIC = re.compile(r'/trace/([A-Za-z][A-Za-z0-9_]*)/([A-Za-z][A-Za-z0-9_]*)')
-_DEFINITIONS_LIMIT = 64 * 1024 * 1024       # bytes of all schemas and channels
+DEFINITIONS_LIMIT = 64 * 1024 * 1024        # bytes of all schemas and channels
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class Channels:
         if kept.setdefault(number, content) != content:
             raise ValueError('a schema or channel changes its meaning')
         self._size += len(content)
-        if self._size > _DEFINITIONS_LIMIT:
+        if self._size > DEFINITIONS_LIMIT:
             raise ValueError('the schemas are too large')
         return number
 

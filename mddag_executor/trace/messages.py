@@ -27,9 +27,8 @@ from typing import NamedTuple
 
 from mddag_executor.trace import records
 from mddag_executor.trace.blocks import Block, Damage, load, open_data, read_summary, scan
+from mddag_executor.trace.channels import DEFINITIONS_LIMIT
 from mddag_executor.trace.reader import open_trace
-
-_DEFINITIONS_LIMIT = 64 * 1024 * 1024       # bytes of all schemas and channels
 
 
 class Topic(NamedTuple):
@@ -139,7 +138,7 @@ class MessageReader:
 
     def _define(self, opcode: int, content: bytes, topics: Collection[str]) -> None:
         self._size += len(content)
-        if self._size > _DEFINITIONS_LIMIT:
+        if self._size > DEFINITIONS_LIMIT:
             raise ValueError('the schemas are too large')
         cursor = records.Cursor(content)
         number = cursor.uint16()

@@ -32,7 +32,7 @@ All methods are for one thread; `TraceWriter` is what many threads may call.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 import functools
 import os
 import struct
@@ -94,16 +94,25 @@ def _encoder(event: EventType, number: int) -> Callable[..., bytes]:
 def _channels(events: Iterable[EventType]) -> dict[str, _Channel]:
     """Return the channels by full and by short event name; of equal short names the first wins."""
     channels: dict[str, _Channel] = {}
-    schema_names: set[str] = set()
+    taken: set[str] = set()
     for number, event in enumerate(events, 1):
-        name = camel_case(event.name)
-        if name in schema_names:
-            name = camel_case(event.provider) + name
-        schema_names.add(name)
-        channel = _Channel(event, number, f'mddag_trace/msg/{name}')
+        channel = _Channel(event, number, _schema_name(event, taken))
+        taken.add(channel.schema_name)
         channels[event.key] = channel
         channels.setdefault(event.name, channel)
     return channels
+
+
+def _schema_name(event: EventType, taken: Collection[str], number: int = 1) -> str:
+    """Return a name for an event's message: with its provider, then numbers, if it is taken."""
+    name = camel_case(event.name)
+    stem = found = f'mddag_trace/msg/{name}'
+    if found in taken:
+        stem = found = f'mddag_trace/msg/{camel_case(event.provider)}{name}'
+    while found in taken:
+        number += 1
+        found = f'{stem}V{number}'
+    return found
 
 
 class TraceFile:
@@ -166,15 +175,9 @@ class TraceFile:
             number += 1
             key = f'{event.key}#{number}'
         if key not in self._channels:
-            names = {channel.schema_name for channel in self._in_order}
-            stem = schema_name = f'mddag_trace/msg/{camel_case(event.name)}'
-            if schema_name in names:
-                stem = schema_name = \
-                    f'mddag_trace/msg/{camel_case(event.provider)}{camel_case(event.name)}'
-            while schema_name in names:
-                number += 1
-                schema_name = f'{stem}V{number}'
-            channel = _Channel(event, len(self._in_order) + 1, schema_name)
+            taken = {channel.schema_name for channel in self._in_order}
+            channel = _Channel(
+                event, len(self._in_order) + 1, _schema_name(event, taken, number))
             self._channels[key] = channel
             self._in_order.append(channel)
         return key

@@ -41,6 +41,7 @@ import time
 from types import TracebackType
 from typing import Any, TYPE_CHECKING
 
+from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.groups import events_of
 from mddag_executor.trace.schema import EventType
@@ -75,7 +76,7 @@ class TraceWriter:
         :raises TraceError: where the file cannot be written
         """
         if clock_offset is None:
-            clock_offset = time.time_ns() - time.monotonic_ns()
+            clock_offset = epoch_offset_ns()
         #: What to add to `time.monotonic_ns()` for a time on the trace's clock.
         self.clock_offset = clock_offset
         #: Why recording ended early, None while all is well.

@@ -19,12 +19,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from mddag_executor.cli import main as program
 from mddag_executor.core import POLICIES, Tables
 from mddag_executor.simulate import draw_execution_times, periodic_load
 from mddag_executor.simulate.measure_core import drive_live, time_core
 from msg_graph import load, loads, TaskSet
 import pytest
+
+from .helpers import caller
+
+call = caller('bench', 'core')
 
 AUTOWARE = Path(__file__).parents[2] / 'config' / 'autoware.yaml'
 GRAPH = """\
@@ -36,12 +39,6 @@ nodes:
       - {name: x, subscription: /a, publishes: [/x], execution_time: 1ms}
       - {name: join, sync: [/x, /b], deadline: 9ms, execution_time: 1ms}
 """
-
-
-def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = program.main(['bench', 'core', *map(str, arguments)])
-    output = capsys.readouterr()
-    return status, output.out, output.err
 
 
 def vertex_jobs(task_set: TaskSet, duration_ns: int) -> int:

@@ -19,23 +19,20 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from mddag_executor.cli import main as program
 from mddag_executor.cli.bench_evaluate import growth
 from mddag_executor.simulate import compiled
 from mddag_executor.simulate.draws import Draws, utilisations
 from mddag_executor.simulate.measure import random_task_set, WORKERS
 import pytest
 
+from .helpers import caller
+
+call = caller('bench', 'evaluate')
+
 GRAPH = """\
 mddag: 1
 nodes: [{node: /n, callbacks: [{name: a, timer: 50ms, deadline: 9ms, execution_time: 2ms}]}]
 """
-
-
-def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = program.main(['bench', 'evaluate', *map(str, arguments)])
-    output = capsys.readouterr()
-    return status, output.out, output.err
 
 
 @pytest.fixture

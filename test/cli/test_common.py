@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Reading and writing files, standard input, and kinds of arguments."""
+"""Reading and writing files, and standard input."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ import os
 from pathlib import Path
 import stat
 
-from mddag_executor.cli import common
+from mddag_executor.cli import common, options
 from mddag_executor.errors import InputError, UsageError
 import numpy
 import pytest
@@ -155,26 +155,7 @@ def test_a_folder_without_write_permission(tmp_path: Path) -> None:
 
 def test_tables_give_way_to_json_on_standard_output() -> None:
     parser = argparse.ArgumentParser()
-    common.add_json(parser)
+    options.add_json(parser)
     assert common.wants_tables(parser.parse_args([]))
     assert common.wants_tables(parser.parse_args(['--json', 'file']))
     assert not common.wants_tables(parser.parse_args(['--json', '-']))
-
-
-def test_durations() -> None:
-    assert common.duration('20s') == 20_000_000_000
-    assert common.duration('1.5 ms') == 1_500_000
-    for text in ('', '20', '0s', '-1s', 'nan', '20 parsecs'):
-        with pytest.raises(argparse.ArgumentTypeError):
-            common.duration(text)
-
-
-def test_numbers() -> None:
-    assert common.positive_int('7') == 7
-    assert common.positive_float('0.6') == 0.6
-    for text in ('0', '-1', '1.5', 'x', ''):
-        with pytest.raises(argparse.ArgumentTypeError):
-            common.positive_int(text)
-    for text in ('0', '-1', 'nan', 'inf', '1e999', 'x', ''):
-        with pytest.raises(argparse.ArgumentTypeError):
-            common.positive_float(text)

@@ -31,6 +31,10 @@ from msg_graph import load
 import numpy as np
 import pytest
 
+from .helpers import caller
+
+call = caller('evaluate')
+
 GRAPH = """\
 mddag: 1
 workers: 1
@@ -54,12 +58,6 @@ def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / 'graph.yaml'
     path.write_text(GRAPH)
     return path
-
-
-def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = program.main(['evaluate', *map(str, arguments)])
-    output = capsys.readouterr()
-    return status, output.out, output.err
 
 
 def test_table(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,6 +26,10 @@ from typing import Any
 from mddag_executor.cli import main as program
 import pytest
 
+from .helpers import caller
+
+call = caller()
+
 DEMO = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'
 GRAPH = """\
 mddag: 1
@@ -35,12 +39,6 @@ nodes:
       - {name: t, timer: 10ms, publishes: [/a], execution_time: 2ms}
       - {name: s, subscription: /a, deadline: 5ms, execution_time: %s}
 """
-
-
-def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = program.main([*map(str, arguments)])
-    output = capsys.readouterr()
-    return status, output.out, output.err
 
 
 @pytest.fixture

@@ -23,18 +23,16 @@ from msg_graph import load, loads
 from msg_graph.analysis import utilisation
 import pytest
 
+from .helpers import caller
+
+call = caller('generate')
+
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Give the working directory."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = program.main(['generate', *map(str, arguments)])
-    output = capsys.readouterr()
-    return status, output.out, output.err
 
 
 def test_standard_output(capsys: pytest.CaptureFixture[str]) -> None:

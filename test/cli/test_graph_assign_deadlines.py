@@ -20,9 +20,12 @@ import io
 import json
 from pathlib import Path
 
-from mddag_executor.cli import main as program
 from msg_graph import load
 import pytest
+
+from .helpers import caller
+
+call = caller('graph', 'assign-deadlines')
 
 GRAPH = """\
 # Mine.
@@ -43,12 +46,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'g.yaml').write_text(GRAPH)
     return tmp_path
-
-
-def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = program.main(['graph', 'assign-deadlines', *map(str, arguments)])
-    output = capsys.readouterr()
-    return status, output.out, output.err
 
 
 def test_by_path(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

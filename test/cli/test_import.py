@@ -19,9 +19,12 @@ from __future__ import annotations
 from pathlib import Path
 import sys
 
-from mddag_executor.cli import main as program
 from mddag_executor.trace import ctf, read_events
 import pytest
+
+from .helpers import caller
+
+call = caller('import')
 
 HELPER = """\
 import json, struct, sys
@@ -43,12 +46,6 @@ def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(ctf, '_HELPER', helper)
     monkeypatch.setattr(ctf, 'interpreters', lambda: [sys.executable])
     return folder
-
-
-def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = program.main(['import', *map(str, arguments)])
-    output = capsys.readouterr()
-    return status, output.out, output.err
 
 
 def test_it_writes_a_trace(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -41,10 +41,10 @@ def verb(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[argparse.Namesp
             parser.add_argument('--number', type=int)
 
         module = ModuleType('probe')
-        module.__dict__.update(NAME='probe', HELP='try things', EXAMPLE='mddag probe graph.yaml',
-                               add_arguments=add_arguments, main=action)
+        module.__dict__.update(EXAMPLE='mddag probe graph.yaml', add_arguments=add_arguments,
+                               main=action)
         row = program.Verb('probe', 'try things')
-        monkeypatch.setattr(program, 'available', lambda: {'probe': row})
+        monkeypatch.setattr(program, 'VERBS', {'probe': row})
         monkeypatch.setattr(program, 'load', lambda _: module)
     return install
 
@@ -163,33 +163,26 @@ def test_only_the_chosen_verb_is_imported(monkeypatch: pytest.MonkeyPatch) -> No
     def load(verb: program.Verb) -> ModuleType:
         loaded.append(verb.module)
         module = ModuleType(verb.module)
-        module.__dict__.update(HELP='x', EXAMPLE='x', add_arguments=lambda parser: None,
+        module.__dict__.update(EXAMPLE='x', add_arguments=lambda parser: None,
                                main=lambda args: 0)
         return module
 
     monkeypatch.setattr(program, 'load', load)
-    monkeypatch.setattr(program, 'available', lambda: program.VERBS)
     assert program.main(['replay']) == 0
     assert loaded == ['replay']
 
 
-def test_a_verb_without_module_is_not_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(program.VERBS, 'absent', program.Verb('no_such_module', 'nothing'))
-    assert 'absent' not in program.available()
-    assert 'absent' not in program.build_parser(None).format_help()
-
-
-@pytest.mark.parametrize('name', sorted(program.available()))
-def test_each_verb_agrees_with_the_table(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize('name', sorted(program.VERBS))
+def test_the_help_of_each_verb(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     row = program.VERBS[name]
     module = program.load(row)
-    assert module.NAME == name
-    assert module.HELP == row.summary
     assert f'mddag {name}' in module.EXAMPLE
     with pytest.raises(SystemExit) as stop:
         program.main([name, '--help'])
     assert stop.value.code == 0
-    assert module.EXAMPLE.strip().splitlines()[0] in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert row.summary[1:] in ' '.join(out.split())
+    assert module.EXAMPLE.strip().splitlines()[0] in out
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -226,9 +219,9 @@ def test_a_reader_that_goes_away_is_no_error(length: int) -> None:
             [sys.executable, '-c',
              'import sys, types\n'
              'from mddag_executor.cli import main as program\n'
-             "module = types.SimpleNamespace(HELP='x', EXAMPLE='x', add_arguments=id,\n"
+             "module = types.SimpleNamespace(EXAMPLE='x', add_arguments=id,\n"
              f'                               main=lambda args: print("x" * {length}) or 0)\n'
-             "program.available = lambda: {'probe': program.Verb('probe', 'x')}\n"
+             "program.VERBS = {'probe': program.Verb('probe', 'x')}\n"
              'program.load = lambda verb: module\n'
              "sys.exit(program.main(['probe']))"],
             stdout=gone, stderr=subprocess.PIPE, text=True, check=False,

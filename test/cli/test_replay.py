@@ -22,9 +22,12 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from mddag_executor.cli import main as program
 from mddag_executor.trace import TraceFile
 import pytest
+
+from .helpers import caller
+
+call = caller('replay')
 
 GRAPH = """\
 mddag: 1
@@ -63,12 +66,6 @@ def trace(tmp_path: Path) -> Path:
         add('deadline', 40, 0, 1, 2, START + 38 * MS, START + 40 * MS)
         add('shutdown', 50, START + 50 * MS)
     return path
-
-
-def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = program.main(['replay', *map(str, arguments)])
-    output = capsys.readouterr()
-    return status, output.out, output.err
 
 
 def test_the_tables(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:

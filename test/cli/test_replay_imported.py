@@ -19,10 +19,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from mddag_executor.cli import main as program
 import pytest
 
+from ..cli.helpers import caller
 from ..replay.recorded import MS, Recorded
+
+call = caller('replay')
 
 GRAPH = """\
 mddag: 1
@@ -52,12 +54,6 @@ def trace(tmp_path: Path) -> Path:
         r.receive(12, 2, at + 3 * MS, at + (12 if k == 4 else 5) * MS, stamp)
     (tmp_path / 'graph.yaml').write_text(GRAPH)
     return r.write()
-
-
-def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = program.main(['replay', *map(str, arguments)])
-    output = capsys.readouterr()
-    return status, output.out, output.err
 
 
 def test_with_a_graph(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,9 +22,12 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 from typing import Any
 
+from mddag_executor.cli import run
 from mddag_executor.report.tables import counts, percent, short_names, sink_table, total
+from mddag_executor.trace import read_events
 import pytest
 
 Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
@@ -141,8 +144,11 @@ def test_spinning_takes_cpu_which_is_not_overhead(graph: Path, mddag: Mddag) -> 
     measured = json.loads(process.stdout)['measured']
     assert (measured['mode'], measured['seed']) == ('spin', 0)
     # 0.4 of a core for 150 callbacks a second are 2.7 ms each: they must not be in the figure.
-    assert 0 < measured['cpu_us_per_callback'] < 1500
-    assert measured['callbacks_per_s'] == pytest.approx(150, rel=0.1)
+    assert 0 < measured['cpu_us_per_callback'] < 0.4 / 150 * 1e6
+    # A busy machine runs fewer of them: the rate is that of the run itself.
+    assert measured['callbacks'] > 0
+    assert measured['callbacks_per_s'] == pytest.approx(
+        measured['callbacks'] * 1e9 / measured['window_ns'], rel=0.01)
 
 
 def test_a_warning_when_spinning_can_not_work(graph: Path, mddag: Mddag) -> None:
@@ -182,6 +188,62 @@ def test_a_signal_during_the_warm_up_leaves_a_whole_result(graph: Path) -> None:
     out, _ = process.communicate(timeout=20)
     assert process.returncode == 0
     assert json.loads(out)['measured'] is None
+
+
+def test_a_signal_that_comes_twice_is_one(graph: Path) -> None:
+    """Who ends a process group sends one, and `ros2 launch` sends its own, too."""
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'run', str(graph), '--synthetic', 'sleep',
+         '--trace', 'out.mcap'], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    trace, sizes = Path('out.mcap'), set[int]()
+    end = time.monotonic() + 30
+    while len(sizes) < 3 and time.monotonic() < end:  # nothing, its head, the first events
+        if trace.exists():
+            sizes.add(trace.stat().st_size)
+        time.sleep(0.01)
+    time.sleep(0.2)
+    begin = time.monotonic()
+    while time.monotonic() < begin + 0.4:  # on to its very end
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.02)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 0 and 'Traceback' not in err, err
+    assert 'sink jobs due' in out and 'trace: ' in out
+    assert [event['_name'] for event in read_events('out.mcap')].count('mddag:task_set') == 1
+
+
+def test_a_later_sigint_interrupts_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Ending:
+        stops = 0
+
+        def stop(self, hurried: bool) -> None:
+            self.stops += 1
+
+    before = signal.getsignal(signal.SIGINT)
+    ending, now = Ending(), iter([10.0, 10.4, 12.0])
+    monkeypatch.setattr(run, 'time', SimpleNamespace(monotonic=lambda: next(now)))
+    try:
+        with run._Signals() as signals:
+            signals.end_of(ending)  # type: ignore[arg-type]
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+            assert ending.stops == 2
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_the_names_of_synthetic_nodes_are_those_of_the_declaration(
+    graph: Path, mddag: Mddag
+) -> None:
+    process = mddag(
+        'run', graph, '--synthetic', 'sleep', '--duration', '0.5s', '--json', 'result.json',
+        '--ros-args', '-r', '__ns:=/robot', '-r', '/data:=/other')
+    assert process.returncode == 0, process.stderr
+    assert '--ros-args: nodes made from the declaration have the names that it' in process.stderr
+    result = json.loads(Path('result.json').read_text())
+    assert (result['undeclared'], result['never_ran'], result['drift']) == (0, [], [])
 
 
 def test_two_workers_are_a_bound(graph: Path, mddag: Mddag) -> None:

@@ -19,7 +19,8 @@ from __future__ import annotations
 import io
 
 from hypothesis import given, strategies
-from mddag_executor.cli.text import format_ns, one_line, printable, Progress, table
+from mddag_executor.cli.text import format_ns, one_line, printable, Progress, table, warn
+from msg_graph import errors
 import pytest
 
 
@@ -134,3 +135,23 @@ def test_progress_of_unknown_length() -> None:
         clock.now += 3
         progress.update(1500)
     assert '\rreading: 1500' in stream.getvalue()
+
+
+def test_a_warning_is_one_harmless_line(capsys: pytest.CaptureFixture[str]) -> None:
+    warn('a\n  b\x1b[31m')
+    assert capsys.readouterr() == ('', 'warning: a b\\x1b[31m\n')
+
+
+def test_both_packages_make_names_harmless_alike() -> None:
+    every = ''.join(map(chr, range(0x11000))) + '\U000e0001\U0010ffff'
+    assert printable(every) == errors.printable(every)
+    assert printable(every).isprintable()
+
+
+def test_progress_in_events() -> None:
+    now = [0.0]
+    stream = Terminal()
+    with Progress('reading', stream=stream, clock=lambda: now[0]) as line:
+        now[0] = 3.0
+        line.events(1_234_567)
+        assert stream.getvalue().strip() == 'reading: 1.2 million events'

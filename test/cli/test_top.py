@@ -28,7 +28,7 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-from mddag_executor.cli.top import Board, GONE_AFTER_S, picture, plain
+from mddag_executor.report.board import Board, GONE_AFTER_S, picture, plain
 import pytest
 
 from .test_run import GRAPH

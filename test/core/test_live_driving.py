@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from operator import attrgetter, methodcaller
 from typing import Any
 
 from hypothesis import strategies as st
@@ -52,7 +53,6 @@ from mddag_executor.core.state import (
 from .task_sets import examples, task_sets, TICK
 
 WAITING, RUNNING, SUSPENDED, DONE, DROPPED = 'waiting', 'running', 'suspended', 'done', 'dropped'
-ALIVE = (WAITING, RUNNING, SUSPENDED)
 MAX_ACTIVE = 3
 EXPIRE_AFTER = 20 * TICK
 
@@ -81,6 +81,10 @@ class Job:
     slot: int
     release: int
     end: int | None = None
+
+
+# No lambdas: older versions of hypothesis read the source of one whenever they call it.
+MESSAGES, OPEN_JOBS = attrgetter('messages'), methodcaller('open_jobs')
 
 
 class LiveDriver(RuleBasedStateMachine):
@@ -133,7 +137,7 @@ class LiveDriver(RuleBasedStateMachine):
         self.jobs.append(job)
         self.make_ready(job, self.tables.source[dag], 0, self.groups[group])
 
-    @precondition(lambda self: self.messages)
+    @precondition(MESSAGES)
     @rule(data=st.data(), group=st.integers(0, 2))
     def message_arrives(self, data: st.DataObject, group: int) -> None:
         place = data.draw(st.integers(0, len(self.messages) - 1))
@@ -191,7 +195,7 @@ class LiveDriver(RuleBasedStateMachine):
         assert worker == min(idle) if schedule else worker in idle
         assert self.state.worker_x[worker] == x
 
-    @precondition(lambda self: self.with_fate(RUNNING))
+    @precondition(methodcaller('with_fate', RUNNING))
     @rule(data=st.data())
     def complete(self, data: st.DataObject) -> None:
         self.complete_one(data.draw(st.sampled_from(self.with_fate(RUNNING))))
@@ -220,7 +224,7 @@ class LiveDriver(RuleBasedStateMachine):
                 (job, first + after, leg) for leg in legs
                 if topics[leg] in me.callback.publishes]
 
-    @precondition(lambda self: self.with_fate(WAITING))
+    @precondition(methodcaller('with_fate', WAITING))
     @rule(data=st.data())
     def drop(self, data: st.DataObject) -> None:
         fresh = [run for run in self.with_fate(WAITING) if not run.began]
@@ -228,21 +232,21 @@ class LiveDriver(RuleBasedStateMachine):
             self.scheduler.drop(data.draw(st.sampled_from(fresh)).x, self.now)
             self.settle()
 
-    @precondition(lambda self: self.with_fate(RUNNING))
+    @precondition(methodcaller('with_fate', RUNNING))
     @rule(data=st.data())
     def lend(self, data: st.DataObject) -> None:
         run = data.draw(st.sampled_from(self.with_fate(RUNNING)))
         self.scheduler.lend(run.x)
         run.lent = True
 
-    @precondition(lambda self: self.with_fate(RUNNING))
+    @precondition(methodcaller('with_fate', RUNNING))
     @rule(data=st.data())
     def suspend(self, data: st.DataObject) -> None:
         run = data.draw(st.sampled_from(self.with_fate(RUNNING)))
         self.scheduler.suspend(run.x)
         run.fate, run.lent = SUSPENDED, False
 
-    @precondition(lambda self: self.with_fate(SUSPENDED))
+    @precondition(methodcaller('with_fate', SUSPENDED))
     @rule(data=st.data())
     def resume(self, data: st.DataObject) -> None:
         run = data.draw(st.sampled_from(self.with_fate(SUSPENDED)))
@@ -255,7 +259,7 @@ class LiveDriver(RuleBasedStateMachine):
         self.settle()
         assert self.over() == []
 
-    @precondition(lambda self: self.open_jobs())
+    @precondition(OPEN_JOBS)
     @rule(data=st.data(), abort=st.booleans())
     def end_job(self, data: st.DataObject, abort: bool) -> None:
         job = data.draw(st.sampled_from(self.open_jobs()))

@@ -157,6 +157,26 @@ def test_a_suspended_callback_keeps_its_group_and_its_key() -> None:
     assert scheduler.take(0, 8) == blocked
 
 
+def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits() -> None:
+    scheduler = live(workers=1)
+    first, second = scheduler.new_group(), scheduler.new_group()
+    running = scheduler.undeclared(0, second, 0)
+    scheduler.take(0, 0)
+    waiting = scheduler.undeclared(1, second, 1)
+    assert scheduler.take(0, 1) == -1
+    scheduler.free_group(second)
+    assert scheduler.new_group() not in (first, second), 'its owner runs'
+    scheduler.complete(running, 2)
+    assert scheduler.take(0, 2) == waiting
+    scheduler.complete(waiting, 3)
+    assert scheduler.new_group() == second
+    n_groups = len(scheduler.state.group_owner)
+    for _ in range(50):
+        scheduler.free_group(first)
+        assert scheduler.new_group() == first
+    assert len(scheduler.state.group_owner) == len(scheduler.state.group_heap) == n_groups
+
+
 def test_what_waits_for_a_group_comes_in_order_of_its_key() -> None:
     scheduler = live(workers=2)
     group = scheduler.new_group()

@@ -15,8 +15,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from fractions import Fraction
 import math
+import tracemalloc
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -34,6 +36,7 @@ from mddag_executor.core.state import (
     SINK_EXPIRED,
     SINK_MISSED,
 )
+from mddag_executor.core.tally import Latest
 import pytest
 
 from .task_sets import declaration, examples
@@ -115,6 +118,41 @@ def test_a_bounded_tally_keeps_the_extremes_and_the_last() -> None:
     assert sink['completed'] == 5
     assert sink['response_ns'] == {
         'min': 1 * US, 'median': 5 * US, 'p99': 6 * US, 'max': 9 * US}
+
+
+@examples(200)
+@given(st.lists(st.integers(-2 ** 63, 2 ** 63 - 1), max_size=40), st.none() | st.integers(0, 9))
+def test_the_latest_are_as_in_a_deque(values: list[int], keep: int | None) -> None:
+    latest, expected = Latest(keep), deque[int](maxlen=keep)
+    for value in values:
+        latest.append(value)
+        expected.append(value)
+        assert list(latest) == list(expected)
+    assert len(latest) == len(expected) and bool(latest) == bool(expected)
+    size = len(expected)
+    assert [latest[i] for i in range(-size, size)] == [expected[i] for i in range(-size, size)]
+    for beyond in (size, -size - 1):
+        with pytest.raises(IndexError):
+            latest[beyond]
+
+
+def test_what_exceeds_64_bits_is_the_nearest_within() -> None:
+    latest = Latest(2)
+    for value in (7, 2 ** 64, -2 ** 64):
+        latest.append(value)
+    assert list(latest) == [2 ** 63 - 1, -2 ** 63]
+
+
+def test_the_latest_take_eight_bytes_each() -> None:
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        latest = Latest(2_000)
+        for value in range(10 ** 6, 10 ** 6 + 5_000):
+            latest.append(value)
+        assert tracemalloc.get_traced_memory()[0] - before < 2_000 * 10
+    finally:
+        tracemalloc.stop()
 
 
 @examples(200)

@@ -137,7 +137,8 @@ def test_includes_stay_in_their_folder(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize('text', [
     '[' * 200_000, '{"d": ' * 100_000, f'{{"d": {{"/n:x": 1{"0" * 5000}}}}}', 'NaN', '1e999', '',
-    '{"control": {"/x:y": "\\u001b[2J"}}', '\ud800'.encode('utf-8', 'replace').decode()])
+    '{"control": {"/x:y": "\\u001b[2J"}}', '\ud800'.encode('utf-8', 'replace').decode()],
+    ids=range(8))  # pytest 7 would hand the whole text on in the environment
 def test_harmful_tables_of_execution_times(mddag: Mddag, tmp_path: Path, text: str) -> None:
     (tmp_path / 'times.json').write_text(text)
     done = mddag('simulate', AUTOWARE, '--execution-times', 'times.json', cwd=tmp_path)

@@ -28,8 +28,8 @@ import subprocess
 from types import SimpleNamespace
 
 from mddag_executor.cli.main import user_line
-from mddag_executor.cli.top import Board, MOST_STATUSES
 from mddag_executor.replay import replay
+from mddag_executor.report.board import Board, MOST_STATUSES
 from mddag_executor.trace import read_events, TraceFile
 from mddag_executor.trace.schema import EVENTS
 import pytest

@@ -12,11 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The launch file, on stand-ins for `launch` and `launch_ros` that keep what they are given."""
+"""
+The launch file, on stand-ins for `launch` and `launch_ros` that keep what they are given.
+
+They take what those of Jazzy (launch 3.4, launch_ros 0.26) take, by position and by name. The real
+ones run in `test_colcon.py`, where they are installed.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, KW_ONLY
 import importlib.util
 from pathlib import Path
 import sys
@@ -57,16 +62,25 @@ class Share:
 @dataclass
 class Argument:
     name: str
+    _: KW_ONLY
     default_value: Any = None
-    description: str = ''
+    description: str | None = None
+    choices: list[str] | None = None
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Node:
-    package: str
     executable: str
+    package: str | None = None
+    name: str | None = None
+    namespace: str | None = None
     arguments: list[Any] = field(default_factory=list)
     output: str = 'log'
+
+    def command(self, given: dict[str, str]) -> list[str]:
+        """Return what is executed, behind the path of the executable."""
+        named = [] if self.name is None else ['-r', f'__node:={self.name}']
+        return [*(resolved(part, given) for part in self.arguments), '--ros-args', *named]
 
 
 @dataclass
@@ -84,7 +98,7 @@ class Description:
         values = dict(given)
         for argument in self.arguments():
             values.setdefault(argument.name, resolved(argument.default_value, values))
-        return [resolved(part, values) for part in self.node().arguments]
+        return self.node().command(values)
 
 
 def resolved(part: Any, given: dict[str, str]) -> str:
@@ -122,9 +136,10 @@ def test_it_starts_the_program_where_colcon_puts_it(description: Description) ->
 
 
 def test_the_defaults_are_a_command_that_mddag_run_takes(description: Description) -> None:
-    # launch_ros puts --ros-args at the end of every node's command line.
-    args = program.build_parser('run').parse_args([*description.command(), '--ros-args'])
+    args = program.build_parser('run').parse_args(description.command())
     assert args.verb == 'run'
+    # With a name there, every node of the process would get it.
+    assert args.ros_args == []
     assert Path(args.graph) == TOP / 'config' / 'autoware.yaml'
     assert Path(args.graph).is_file()
     assert (args.synthetic, args.utilisation) == ('sleep', 0.6)

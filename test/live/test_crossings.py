@@ -351,11 +351,12 @@ class Run:
     def __init__(self, folder: Path, name: str, nodes: list[str], **environment: str) -> None:
         self.result = folder / f'{name}.json'
         self.trace = folder / f'{name}.mcap'
+        path = os.pathsep.join([str(GUESTS), *filter(None, [os.environ.get('PYTHONPATH')])])
         self._process = subprocess.Popen(
             [sys.executable, '-m', 'mddag_executor', 'run', str(folder / 'graph.yaml'),
              *(arg for node in nodes for arg in ('--node', f'relay:{node}')),
              '--json', str(self.result), '--trace', str(self.trace)],
-            cwd=folder, env={**os.environ, 'PYTHONPATH': str(GUESTS), **environment},
+            cwd=folder, env={**os.environ, 'PYTHONPATH': path, **environment},
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
     def end(self) -> dict[str, Any]:
@@ -375,8 +376,7 @@ def test_two_processes_share_a_graph_and_the_sink_judges(
         tmp_path: Path, takes: str, late: bool):
     (tmp_path / 'graph.yaml').write_text(CHAIN)
     mark = tmp_path / 'enough'
-    down = Run(
-        tmp_path, 'down', ['second', 'last'], RELAY_TAKES=takes, RELAY_MARK=str(mark))
+    down = Run(tmp_path, 'down', ['second', 'last'], RELAY_TAKES=takes, RELAY_MARK=str(mark))
     up = Run(tmp_path, 'up', ['sensor', 'first'])
     try:
         assert wait_for(mark.exists, 30.0)

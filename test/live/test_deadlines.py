@@ -20,6 +20,7 @@ import threading
 import time
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from mddag_executor import DeadlineMiss
 from mddag_executor.live import current_job
 from msg_graph import loads, TaskSet
@@ -44,23 +45,28 @@ nodes:
 
 
 class Chain:
-    """The nodes of CHAIN; each body may be replaced, and the jobs that it ran for are kept."""
+    """CHAIN's nodes; bodies may be replaced; keeps the jobs, and those not of the message."""
 
     def __init__(self, make_node: Any, bodies: dict[str, Any] | None = None) -> None:
         bodies = bodies or {}
         self.jobs: dict[str, list[Any]] = {n: [] for n in ('tick', 'relay', 'early', 'last')}
+        self.wrong: list[Any] = []
         self.group = ReentrantCallbackGroup()
         self.nodes = {n: make_node(n) for n in ('source', 'middle', 'sink')}
         self.a = self.nodes['source'].create_publisher(Header, '/a', 10)
         self.b = self.nodes['middle'].create_publisher(Header, '/b', 10)
 
         def body(name: str, publisher: Any = None) -> Any:
-            def run(*message: Any) -> None:
-                self.jobs[name].append(current_job())
-                if name in bodies:
-                    bodies[name]()
+            def run(message: Any = None) -> None:
+                job = current_job()
+                self.jobs[name].append(job)
+                if message is None:
+                    message = Header(stamp=Time(sec=job.job))
+                elif job is not None and job.job != message.stamp.sec:
+                    self.wrong.append((name, job, message))
+                bodies.get(name, lambda: None)()
                 if publisher is not None:
-                    publisher.publish(Header())
+                    publisher.publish(message)
             return run
         self.timer = self.nodes['source'].create_timer(
             0.02, body('tick', self.a), self.group, autostart=False)
@@ -98,6 +104,7 @@ def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executo
         assert wait_for(lambda: len(chain.jobs['last']) == len(chain.jobs['tick']))
     ran = [j.job for j in chain.jobs['tick']]
     count = len(ran)
+    assert chain.wrong == []
     for jobs in chain.jobs.values():
         assert sorted(j.job for j in jobs) == ran
         assert {j.dag for j in jobs} == {'chain'}
@@ -130,6 +137,7 @@ def test_jobs_that_overlap_and_overtake_are_told_apart(make_executor, make_node)
         assert wait_for(lambda: len(chain.jobs['last']) == len(chain.jobs['tick']))
     order = [j.job for j in chain.jobs['last']]
     assert order != sorted(order) and sorted(order) == [j.job for j in chain.jobs['tick']]
+    assert chain.wrong == []
     assert sinks(executor)['/sink:last']['completed'] == len(order)
 
 
@@ -147,6 +155,7 @@ def test_unequal_deadlines_are_judged_apart_and_misses_are_told(make_executor, m
     late = [miss for miss in misses if miss.kind == 'late']  # not periods that were missed
     assert found['/middle:early']['late'] == found['/middle:early']['completed'] == len(late)
     assert found['/sink:last']['late'] == 0
+    assert executor.statistics()['dags']['chain']['ends']['late'] == len(late)
     miss = late[0]
     assert (miss.dag, miss.vertex, miss.job) == ('chain', '/middle:early', 0)
     assert miss.deadline_ns == miss.release_ns + 10_000_000

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+import gc
 import json
 import os
 from pathlib import Path
@@ -26,8 +27,10 @@ import sys
 import threading
 import time
 from typing import Any
+import weakref
 
-from mddag_executor.live.hosting import Host
+from mddag_executor.live.hosting import Guest, Host
+from mddag_executor.live.loading import Program
 import pytest
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
@@ -255,6 +258,36 @@ def test_another_executors_tasks_run_on_ours(host: Host, ros_context: Any) -> No
     host.executor.spin_once(timeout_sec=1.0)
     assert task.result() == 42
     other.shutdown()
+
+
+def test_executors_of_programs_are_not_kept(host: Host, ros_context: Any) -> None:
+    def use() -> Any:
+        other = SingleThreadedExecutor(context=ros_context)
+        other.spin_once(timeout_sec=0.0)
+        other.shutdown()
+        return weakref.ref(other)
+
+    used = [use() for _ in range(5)]
+    gc.collect()
+    assert [executor() for executor in used] == [None] * 5
+
+
+def test_nodes_that_a_program_destroys_are_not_kept(host: Host, ros_context: Any) -> None:
+    guest = Guest(Program('chat:main', 'chat', lambda: None))
+
+    def use() -> Any:
+        node = Node('helper', context=ros_context, enable_rosout=False)
+        host.adopt(node, guest)
+        node.destroy_node()
+        return weakref.ref(node)
+
+    used = [use() for _ in range(5)]
+    stays = Node('stays', context=ros_context)
+    host.adopt(stays, guest)
+    gc.collect()
+    assert [node() for node in used] == [None] * 5
+    assert guest.nodes == host.executor.get_nodes() == [stays]
+    stays.destroy_node()
 
 
 def test_the_guests_know_nothing_of_us() -> None:

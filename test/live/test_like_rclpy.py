@@ -16,9 +16,11 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 import threading
 import time
 
+import pytest
 from rclpy.action import ActionClient, ActionServer
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
@@ -57,6 +59,42 @@ def test_a_coroutine_goes_on_in_the_step_after_its_future_is_done(make_executor)
     future.set_result(None)
     executor.spin_once(timeout_sec=1)
     assert task.done() and task.result() == 'done'
+
+
+@pytest.mark.parametrize('mine', [True, False], ids=['own', 'free'])
+@pytest.mark.parametrize('generates', [False, True], ids=['await', 'for'])
+def test_a_task_awaits_one_future_after_another(make_executor, mine, generates):
+    """Since rclpy 7.1.9 a coroutine must not go on before the future that it awaits is done."""
+    executor = make_executor()
+    futures = [executor.create_future() if mine else Future() for _ in range(20)]
+    got = []
+
+    async def one_by_one() -> AsyncIterator[int]:
+        for future in futures:
+            yield await future
+
+    async def inner(future: Future) -> None:
+        got.append(await future)
+
+    async def outer() -> str:
+        if generates:
+            async for value in one_by_one():
+                got.append(value)
+        else:
+            for future in futures:
+                await inner(future)
+        return 'done'
+
+    task = executor.create_task(outer)
+    with Spinning(executor) as spinning:
+        for number, future in enumerate(futures):
+            time.sleep(0.003)
+            future.set_result(number)
+        assert wait_for(task.done)
+    assert task.result() == 'done' and got == list(range(20))
+    assert spinning.error is None
+    # where rclpy's own executors keep tasks that are to go on, which nobody would take out here
+    assert not getattr(executor, '_ready_tasks', ())
 
 
 def test_feedback_is_handled_before_a_goals_future_ends_the_spin(make_executor, make_node):

@@ -156,3 +156,19 @@ nodes:
     dag = statistics['dags']['alone']
     assert dag['jobs'] == skipped + statistics['callbacks']['/source:tick']['ready']
     assert dag['ends']['expired'] >= skipped
+
+
+def test_a_timer_that_gets_its_declared_period_later_is_the_declared_one(
+    make_executor: Any, make_node: Any
+) -> None:
+    executor = make_executor(loads(
+        'mddag: 1\nnodes: [{node: /node, callbacks: '
+        '[{name: tick, timer: 20ms, dag: tick, deadline: 20ms}]}]'))
+    node = make_node('node')
+    executor.add_node(node)
+    timer = node.create_timer(0.05, lambda: None)
+    with Spinning(executor):
+        assert wait_for(lambda: executor.statistics()['callbacks'].get(
+            '/node:timer 50000000 ns', {}).get('ran', 0) >= 2)
+        timer.timer_period_ns = 20_000_000
+        assert wait_for(lambda: executor.statistics()['dags']['tick']['jobs'] >= 2)

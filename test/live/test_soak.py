@@ -14,13 +14,18 @@
 
 from __future__ import annotations
 
+from collections import deque
 import json
 from pathlib import Path
 import subprocess
 import sys
+from threading import Thread
+from types import SimpleNamespace
 from typing import Any
+import weakref
 
-from mddag_executor.live.bench.soak import FAULTS, StallWatch, usage
+from mddag_executor.live.bench.soak import FAULTS, MEMORY_RATIO, Soak, StallWatch, usage
+from mddag_executor.live.bench.soak_memory import in_use, resident
 import pytest
 
 TOP = Path(__file__).resolve().parents[2]
@@ -49,6 +54,8 @@ def test_a_short_soak_loses_nothing_and_keeps_nothing(intake: str):
     assert result['faults']['raised'] == result['faults']['raise'] + 1
     assert result['ran'] > 10_000 and result['jobs'] > 2_000
     assert result['executions'] == result['ran'] + result['dropped']
+    assert -20_000 < result['middleware_keeps'] < 50_000, 'bytes for each node made again'
+    assert -0.5 < result['memory_growth'] <= MEMORY_RATIO
 
 
 def test_what_a_process_uses():
@@ -56,6 +63,50 @@ def test_what_a_process_uses():
     with open('/dev/null'):
         assert usage()['handles'] == before['handles'] + 1
     assert before['memory'] > 1_000_000 and before['threads'] >= 1
+
+
+def test_memory_that_was_freed_is_not_in_use():
+    before = in_use()
+    blocks = [bytes(10_000) for _ in range(8_000)]
+    assert resident() - before > 60_000_000
+    kept = blocks[::100]  # so that the C library can't give it all back by itself
+    del blocks
+    cycle: list[Any] = [Thread()]
+    cycle.append(cycle)
+    gone = weakref.ref(cycle[0])
+    del cycle
+    assert in_use() - before < 20_000_000
+    assert gone() is None and len(kept) == 80
+
+
+def test_of_the_misses_those_in_clean_windows_are_kept():
+    soak = Soak.__new__(Soak)
+    soak._missed, soak._clean_missed, soak._clean = deque(), [], []
+    soak._missed.extend([(5, 'early'), (15, 'before any window')])
+    assert soak._sort_out() == 0 and not soak._missed
+    soak._clean = [(20, 30), (50, 60)]
+    soak._missed.extend([(19, 'a'), (20, 'b'), (29, 'c'), (30, 'd'), (49, 'e'), (55, 'f')])
+    assert soak._sort_out() == 3
+    soak._missed.append((25, 'told late'))
+    assert soak._sort_out() == 1 and not soak._missed
+    assert soak._clean_missed == [(20, 'b'), (29, 'c'), (55, 'f'), (25, 'told late')]
+
+
+def test_what_the_middleware_keeps_is_left_out_of_the_growth():
+    def failures(after: int, keeps: float) -> list[str]:
+        soak = Soak.__new__(Soak)
+        soak.nodes = SimpleNamespace(started=0)  # type: ignore[assignment]
+        usual = {'threads': 1, 'handles': 1}
+        result = {'before': {'memory': 100_000_000, **usual},
+                  'after': {'memory': after, **usual},
+                  'middleware_keeps': keeps, 'faults': {'destroy': 10}, 'clean_misses': 0}
+        return soak._failures(result, {'callbacks': {}, 'dags': {}}, [])
+
+    assert failures(104_900_000, 0.0) == []
+    assert failures(105_500_000, 0.0) == [
+        'memory grew by 5.5% (besides 0 kB that the middleware keeps of nodes made again)']
+    assert failures(105_500_000, 60_000.0) == []
+    assert len(failures(105_500_000, -60_000.0)) == 1  # noise, and nobody gives back for others
 
 
 def test_the_watch_for_stalls_ends_with_its_process():

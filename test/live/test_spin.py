@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import gc
 import threading
 import time
@@ -30,19 +31,25 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from .conftest import Spinning, wait_for
+from .intake.helpers import Pulse
 
 
-@pytest.mark.parametrize('kind', ['timer', 'subscription', 'task', 'coroutine', 'service'])
+@pytest.mark.parametrize(
+    'kind', ['timer', 'subscription', 'service', 'guard', 'waitable', 'task', 'coroutine'])
 def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
+    """The only worker ends the spin right after it: who swallows it is found out at once."""
     node = make_node()
-    executor = make_executor()
+    executor = make_executor(num_workers=1)
     executor.add_node(node)
+    after: Future = Future(executor=executor)
 
     def fail(*args: Any) -> None:
+        if not after.done():
+            executor.create_task(after.set_result, None)
         raise ZeroDivisionError(kind)
 
-    async def fail_later() -> None:
-        raise ZeroDivisionError(kind)
+    async def fail_later(*args: Any) -> None:
+        fail()
 
     if kind == 'timer':
         node.create_timer(0.01, fail)
@@ -54,10 +61,33 @@ def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
         node.create_service(Trigger, '/ask', fail)
         client = node.create_client(Trigger, '/ask')
         node.create_timer(0.05, lambda: client.call_async(Trigger.Request()))
+    elif kind == 'guard':
+        node.create_guard_condition(fail).trigger()
+    elif kind == 'waitable':
+        pulse = Pulse(node, node.default_callback_group)
+        pulse.execute = fail_later  # type: ignore[method-assign]
+        node.add_waitable(pulse)
+        pulse.guard.trigger()
     else:
         executor.create_task(fail if kind == 'task' else fail_later)
     with pytest.raises(ZeroDivisionError, match=kind):
-        executor.spin_until_future_complete(Future(), 5.0)
+        executor.spin_until_future_complete(after, 5.0)
+
+
+def test_what_fails_when_it_is_taken_comes_out_of_spin(make_executor, make_node):
+    class Broken(Pulse):
+
+        def take_data(self) -> int:
+            raise ZeroDivisionError('taken')
+
+    node = make_node()
+    broken = Broken(node, node.default_callback_group)
+    node.add_waitable(broken)
+    executor = make_executor()
+    executor.add_node(node)
+    broken.guard.trigger()
+    with pytest.raises(ZeroDivisionError, match='taken'):
+        executor.spin_until_future_complete(Future(), 2.0)
 
 
 def test_it_spins_on_after_an_exception(make_executor):
@@ -90,6 +120,33 @@ def test_an_exception_that_somebody_awaits_does_not_end_spin(make_executor):
     task.add_done_callback(lambda t: inner.set_exception(t.exception()))
     executor.spin_until_future_complete(outer, 5.0)
     assert outer.result() == 'handled'
+
+
+class Turn:
+    """What a coroutine may await as well: nothing that says when it is ready."""
+
+    def __await__(self) -> Iterator[None]:
+        yield
+
+
+@pytest.mark.parametrize('stepwise', [False, True])
+def test_a_coroutine_that_awaits_something_unknown_is_asked_again(make_executor, stepwise):
+    executor, turns = make_executor(), []
+
+    async def work() -> str:
+        for turn in range(5):
+            await Turn()
+            turns.append(turn)
+        return 'done'
+
+    task = executor.create_task(work)
+    if stepwise:
+        for _ in range(6):
+            executor.spin_once(0.1)
+    else:
+        executor.spin_until_future_complete(task, 3.0)
+    assert task.done() and task.result() == 'done' and turns == [0, 1, 2, 3, 4]
+    assert not getattr(executor, '_ready_tasks', ())  # rclpy's own, which nobody looks at here
 
 
 def test_spin_once_runs_one_callback_and_has_finished_it(make_executor, make_node):
@@ -128,12 +185,35 @@ def test_spin_until_future_complete_times_out(make_executor):
     assert 0.1 <= time.monotonic() - begin < 3
 
 
+@pytest.mark.parametrize('what', ['task', 'node', 'entity'])
+def test_what_is_new_wakes_a_spin_once_that_waits(make_executor, make_node, what):
+    executor, ran = make_executor(), threading.Event()
+    node = make_node()
+    if what == 'entity':
+        executor.add_node(node)
+    waiting = threading.Thread(target=executor.spin_once, args=(4.0,))
+    waiting.start()
+    time.sleep(0.2)
+    if what == 'task':
+        executor.create_task(ran.set)
+    else:
+        node.create_timer(0.001, ran.set)
+        executor.add_node(node)
+    try:
+        assert ran.wait(3.0)
+    finally:
+        waiting.join()
+
+
 def test_spinning_twice_is_an_error(make_executor):
     executor = make_executor()
+    assert not executor.is_spinning
     with Spinning(executor):
         time.sleep(0.05)
+        assert executor.is_spinning
         with pytest.raises(RuntimeError, match='already spinning'):
             executor.spin_once(0)
+    assert not executor.is_spinning
 
 
 def test_external_shutdown_raises_as_with_rclpy(make_executor, ros_context):
@@ -166,6 +246,38 @@ def test_shutdown_waits_for_a_running_callback(make_executor):
         assert not executor.shutdown(0.01)
         assert executor.shutdown(5.0)
         assert done
+
+
+@pytest.mark.parametrize('end', ['shutdown', 'future'])
+def test_no_thread_goes_on_though_the_context_does(make_executor, make_node, ros_context, end):
+    before = set(threading.enumerate())
+    node, calls = make_node(), []
+    done: Future = Future()
+
+    def tick() -> None:
+        calls.append(1)
+        if len(calls) > 10 and not done.done():
+            done.set_result(None)
+
+    node.create_timer(0.001, tick)
+    node.create_subscription(Header, '/topic', calls.append, 10)
+    node.create_guard_condition(lambda: calls.append(2)).trigger()
+    publisher = node.create_publisher(Header, '/topic', 10)
+    executor = make_executor()
+    executor.add_node(node)
+    if end == 'shutdown':
+        with Spinning(executor):
+            assert wait_for(lambda: publisher.get_subscription_count() and done.done())
+            publisher.publish(Header())
+    else:
+        executor.spin_until_future_complete(done, 5.0)
+    assert done.done() and ros_context.ok()
+
+    def left() -> set[str]:
+        names = {thread.name for thread in set(threading.enumerate()) - before}
+        # between two spins the workers wait for the next one
+        return names if end == 'shutdown' else {n for n in names if 'worker' not in n}
+    assert wait_for(lambda: not left(), 1.0), left()
 
 
 def test_freeze_gc_leaves_what_there_is_alone(make_executor):

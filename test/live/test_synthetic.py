@@ -26,7 +26,7 @@ from mddag_executor.live.execution import ExecutionPlan, PlanError, sleeper, spi
 from mddag_executor.live.executor import MultiDeadlineExecutor
 from mddag_executor.live.session import run_synthetic, Session
 from mddag_executor.live.synthetic import build_nodes
-from mddag_executor.simulate.run import draw_execution_times
+from mddag_executor.simulate import draw_execution_times
 from msg_graph import load, loads, TaskSet
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 import sys
 
@@ -58,8 +59,9 @@ def make_workspace(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (site / 'half.py').write_text('import not_installed_anywhere\n')
     (site / 'wrong.py').write_text('x = 1\nraise RuntimeError("no licence\\nhere")\n')
     (folder / 'graph.yaml').write_text(GRAPH)
-    monkeypatch.setenv('AMENT_PREFIX_PATH', str(prefix))
-    monkeypatch.setenv('PYTHONPATH', str(site))
+    # Before what is there: rclpy and this package may come from a sourced ROS or workspace.
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(prefix), prepend=os.pathsep)
+    monkeypatch.setenv('PYTHONPATH', str(site), prepend=os.pathsep)
     monkeypatch.syspath_prepend(str(site))
     monkeypatch.chdir(folder)
     for name in ('chat', 'half', 'wrong'):

@@ -43,14 +43,7 @@ def test_diamond() -> None:
     assert means == [1_000_000, 5_000_000, 2_000_000, 4_000_000, 7_000_000]
     assert analysis.path_lengths(DIAMOND, means) == [
         8_000_000, 7_000_000, 2_000_000, 6_000_000, 9_000_000]
-    assert analysis.longest_path(DIAMOND, means) == (2, 4)
-    assert analysis.longest_path(DIAMOND, means, end=0) == (2, 1, 0)
     assert analysis.utilisation(DIAMOND) == 1.9
-
-
-def test_ties_go_to_the_smallest_index() -> None:
-    assert analysis.longest_path(DIAMOND, [1, 1, 1, 1, 1]) == (2, 1, 0)
-    assert analysis.longest_path(DIAMOND, [1, 1, 1, 1, 2]) == (2, 1, 0)
 
 
 def test_unknown_where_an_execution_time_is_missing() -> None:
@@ -85,15 +78,11 @@ def weighted(draw: st.DrawFn) -> tuple[Dag, list[int]]:
 
 
 @given(weighted())
-def test_longest_path_is_that_of_all_paths(case: tuple[Dag, list[int]]) -> None:
+def test_path_lengths_are_those_of_all_paths(case: tuple[Dag, list[int]]) -> None:
     dag, weights = case
     best = 0
     for length in range(len(dag.vertices)):
         for rest in permutations(range(len(dag.vertices)), length + 1):
             if all(step in dag.edges for step in zip(rest, rest[1:])):
                 best = max(best, sum(weights[i] for i in rest))
-    path = analysis.longest_path(dag, weights)
-    assert path[0] == dag.source
-    assert path[-1] in dag.sinks
-    assert all(step in dag.edges for step in zip(path, path[1:]))
-    assert sum(weights[i] for i in path) == max(analysis.path_lengths(dag, weights)) == best
+    assert max(analysis.path_lengths(dag, weights)) == best

@@ -19,7 +19,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 from msg_graph import DurationError, format_duration, parse_duration
-from msg_graph.duration import DAY, exact_duration
+from msg_graph.duration import DAY, exact_duration, short_duration, whole_us
 import pytest
 
 
@@ -128,3 +128,17 @@ def test_an_exact_text_reads_back(ns: int) -> None:
 def test_what_no_declaration_can_say_has_an_exact_text_too(ns: int) -> None:
     """Traces say such things; the reader of the text then says what is wrong."""
     assert exact_duration(ns) == f'{ns}ns'
+
+
+@pytest.mark.parametrize(('ns', 'text'), [
+    (1, '1ns'), (999, '999ns'), (1_000, '1us'), (1_001, '1.001us'), (1_234_567, '1234.567us'),
+    (1_234_000, '1.234ms'), (1_500_000_000, '1500ms'), (DAY, '86400000ms')])
+def test_short_ones_are_exact(ns: int, text: str) -> None:
+    assert short_duration(ns) == text
+    assert parse_duration(text, minimum_ns=1) == ns
+
+
+def test_deadlines_are_whole_us() -> None:
+    assert [whole_us(ns) for ns in (0, 1, 1_000, 1_000.5, 1_001)] == [
+        1_000, 1_000, 1_000, 2_000, 2_000]
+    assert whole_us(float('inf')) == whole_us(DAY + 1) == DAY

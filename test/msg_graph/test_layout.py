@@ -36,7 +36,7 @@ nodes:
 - node:   /n    # a node
   callbacks:
   # first
-  - {name: t,   timer: 10ms,publishes: [ /a ]}   # why
+  - {name: t,   timer: 10ms,publishes: [ /a ]}       # why
   -   name:  "x"
       # on the topic
       subscription: /a
@@ -58,7 +58,7 @@ nodes:
   - node: /n    # a node
     callbacks:
   # first
-      - {name: t, timer: 10ms, publishes: [/a]}  # why
+      - {name: t, timer: 10ms, publishes: [/a]}      # why
       - name: "x"
       # on the topic
         subscription: /a
@@ -92,9 +92,43 @@ def test_what_ships_keeps_its_meaning_and_its_comments(name: str) -> None:
     result = format_text(text, name)
     assert meaning(result) == meaning(text)
     assert re.findall('#.*', result) == re.findall('#.*', text)
-    # Only what cannot be broken, a long name, is longer than a line may be.
-    assert [line for line in result.splitlines() if len(line) > 99 and len(line.split()) > 2] == []
+    # Only what cannot be broken, a key with a long name, is longer than a line may be.
+    assert [line for line in result.splitlines() if len(line) > 99 and ', ' in line] == []
     assert format_text(result, name) == result
+
+
+def test_long_lists_break_ahead_of_what_would_not_fit() -> None:
+    items = [f'/a/topic/with/the/number/n{number}' for number in range(9)]
+    text = (f'mddag: 1\nnodes:\n  - node: /{"n" * 90}\n    callbacks:\n'
+            f'      - {{name: t, timer: 10ms, publishes: [{", ".join(items)}]}}  # all\n'
+            f'      - name: x\n        subscription: /a/topic/with/the/number/n1\n'
+            '        deadline: 5ms\n'
+            f'        publishes: [{", ".join(f"{item}b" for item in items)}]\n')
+    result = format_text(text)
+    assert meaning(result) == meaning(text)
+    assert ' '.join(result.split()) == ' '.join(text.split())
+    lines = result.splitlines()
+    assert lines[2] == text.splitlines()[2], 'a name stays with its key'
+    assert all(len(line) <= 87 for line in lines[3:])
+    assert [line for line in lines if line.startswith(' ' * 10 + '/')] != []
+    assert format_text(result) == result
+
+
+@pytest.mark.parametrize('column', ['', '  '])
+def test_no_comment_is_lost(column: str) -> None:
+    text = f"""\
+mddag: 1
+nodes:
+# 'one'
+{column}- node: /n
+{column}  callbacks:
+{column}  # two
+{column}  - {{name: "a", timer: 10ms, deadline: 5ms}}  #three #
+"""
+    result = format_text(text)
+    assert re.findall('#.*', result) == ["# 'one'", '# two', '#three #']
+    with pytest.raises(msg_graph.GraphError, match='without the loss of a comment: write'):
+        format_text(text.replace('timer:', 'publishes: [/a,  # four\n        /b], timer:'))
 
 
 def test_a_wrong_declaration_is_an_error() -> None:

@@ -22,10 +22,11 @@ import os
 from pathlib import Path
 from typing import Any
 
-from mddag_executor.replay import replay, reschedule
+from mddag_executor.replay import imported_jobs, links, replay, reschedule
 from mddag_executor.replay.following import make_follower, map_recording, open_recording
 from mddag_executor.replay.imported_jobs import ImportedFollower
 from mddag_executor.replay.linked import Publication, Run
+from mddag_executor.replay.paths import PathBook
 from mddag_executor.trace import import_ctf, TraceError
 from msg_graph import loads, TaskSet
 import pytest
@@ -153,8 +154,8 @@ def test_path(told: tuple[Told, ImportedFollower]) -> None:
     assert sorted(found, key=order) == sorted(expected, key=order)
     assert len(found) == 56
     response = slow_cases([(row[0] or 0, row[-1]) for row in expected])
-    records = [(ends.first, ends.arrival) for ends in told[1].paths.ends(0)
-               if ends.first is not None]
+    records = [(first, flow.columns[-1][3]) for flow in told[1].paths.flows(0)
+               if (first := flow.columns[0][0]) is not None]
     assert slow_cases(records) == response
 
 
@@ -174,6 +175,26 @@ def test_the_replay_says_the_same(trace: Path, graph: TaskSet) -> None:
     assert result['callbacks']['/filter_node:callback_0']['executions'] == 49
     assert {name: dag['jobs'] for name, dag in result['dags'].items()} == {
         '/drive_node': 49, '/sensor_dummy_node': 49, '/timer_driven_node': 49}
+
+
+def test_the_same_when_what_is_over_is_forgotten(
+    trace: Path, graph: TaskSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = replay(trace, graph).result()['paths']
+    left: list[int] = []
+    tidy = PathBook.tidy
+
+    def note(book: PathBook) -> None:
+        before = len(book._books[0].parent)
+        tidy(book)
+        if len(book._books[0].parent) < before:
+            left.append(len(book._books[0].parent))
+
+    monkeypatch.setattr(PathBook, 'tidy', note)
+    monkeypatch.setattr(links, 'KEEP', 4)
+    monkeypatch.setattr(imported_jobs, 'PathBook', lambda declared: PathBook(declared, 100))
+    assert replay(trace, graph).result()['paths'] == expected
+    assert len(left) > 3 and max(left) < 200, left
 
 
 def test_without_a_graph(trace: Path) -> None:

@@ -48,6 +48,12 @@ def test_it_waits_for_its_group_beside_idle_workers() -> None:
     assert late(7, (0, 5, 0, 0, 400), (1, 5, 100, 410, 500)) == [0, 10]
 
 
+def test_others_may_have_taken_the_workers_while_its_group_was_busy() -> None:
+    executions = ((0, 5, 0, 0, 400), (0, None, 390, 400, 500), (0, 5, 100, 510, 600),
+                  (1, None, 0, 0, 600))
+    assert late(2, *executions) == [0, 0, 10, 0]
+
+
 def test_an_unknown_worker_is_not_waited_for() -> None:
     assert late(1, (-1, None, 0, 0, 400), (-1, None, 100, 430, 500)) == [0, 330]
 

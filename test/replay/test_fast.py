@@ -26,15 +26,12 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mddag_executor.errors import MddagError
-from mddag_executor.replay import replay
+from mddag_executor.replay import fast_compile, replay
 from mddag_executor.replay.as_recorded import replay_compiled, replay_recording
 from mddag_executor.replay.drift import WatchedRecording
 from mddag_executor.replay.following import map_recording
 from mddag_executor.replay.mapping import Mapping
 from mddag_executor.replay.measure import write_long_trace
-from mddag_executor.replay.path_cases import cases
-from mddag_executor.replay.path_cases import statistics as plain_statistics
-from mddag_executor.replay.path_flows import statistics, times
 from mddag_executor.replay.recording import Recording
 from mddag_executor.replay.usage import PoolUse
 from mddag_executor.simulate import Settings, simulate
@@ -155,6 +152,12 @@ def simulate_to(
     write_trace(path, task_set, arrivals, run)
 
 
+def test_what_is_compiled_beforehand_can_be_replayed() -> None:
+    """Its declaration is one that is accepted: else nothing would ever be compiled, silently."""
+    assert loads(fast_compile._NOTHING, 'nothing.yaml').paths
+    fast_compile.compile_here()
+
+
 def test_a_live_run() -> None:
     assert compare(TOP / 'bags' / 'demo_short.mcap')
 
@@ -269,17 +272,6 @@ def test_what_is_wrong_is_left_to_the_plain_replay(tmp_path: Path) -> None:
 
 
 # --- parts ---------------------------------------------------------------------------------------
-
-RECORDS = st.lists(st.tuples(st.integers(0, 30), st.none() | st.integers(0, 40)), max_size=40)
-
-
-@given(RECORDS)
-def test_response_times_of_columns(records: list[tuple[int, int | None]]) -> None:
-    start = np.array([start for start, _ in records], dtype=np.int64)
-    end = np.array([-1 if end is None else end for _, end in records], dtype=np.int64)
-    for found, expected in zip(times(start, end), cases(records)):
-        assert statistics(found) == plain_statistics(expected)
-
 
 @given(st.lists(st.tuples(st.integers(0, 10**13), st.integers(0, 10**11)), max_size=30),
        st.integers(1, 10))

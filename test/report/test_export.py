@@ -36,6 +36,8 @@ DEMO = runs.CONFIG.parent / 'bags' / 'demo_short.mcap'
 
 
 def exported(path: Path, form: str, jobs: bool = False) -> bytes:
+    if form == 'pftrace':
+        pytest.importorskip('perfetto', reason='perfetto is not installed')
     file = io.BytesIO()
     rows = target(form, file, jobs)
     exporter = Exporter(rows)

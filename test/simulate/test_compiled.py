@@ -29,9 +29,9 @@ import sys
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import POLICIES, Tables
-from mddag_executor.simulate import compiled
+from mddag_executor.simulate import compiled, compiling
 from mddag_executor.simulate.draws import Draws
-from mddag_executor.simulate.evaluate import PlainJudge
+from mddag_executor.simulate.experiment import PlainJudge
 from mddag_executor.simulate.run import Settings, simulate
 from msg_graph import load, loads
 import numpy as np
@@ -190,7 +190,7 @@ def test_a_second_process_does_not_compile(tmp_path: Path) -> None:
         'from mddag_executor.simulate import compiled', 'print(compiled.cached())',
         XDG_CACHE_HOME=str(tmp_path)) == 'True'
     assert [path.name for path in (tmp_path / 'mddag_executor').iterdir()] == [
-        compiled._fingerprint()]
+        compiling._fingerprint()]
 
 
 @pytest.mark.slow
@@ -206,7 +206,7 @@ def test_an_interrupted_compilation_is_not_begun_anew(
 ) -> None:
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     interrupted = subprocess.CompletedProcess([], -signal.SIGINT)
-    monkeypatch.setattr(compiled.subprocess, 'run', lambda *_, **__: interrupted)
+    monkeypatch.setattr(compiling.subprocess, 'run', lambda *_, **__: interrupted)
     judge = compiled.CompiledJudge(load(CONFIG / 'autoware.yaml'), 10 ** 9)
     with pytest.raises(KeyboardInterrupt):
         judge.warm_up()
@@ -217,9 +217,9 @@ def test_without_a_place_for_the_cache(
 ) -> None:
     for place in ('relative', '/proc/nowhere'):
         monkeypatch.setenv('XDG_CACHE_HOME', place)
-        assert compiled._stamp() is None
+        assert compiling._stamp() is None
         assert not compiled.cached()
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
-    stamp = compiled._stamp()
+    stamp = compiling._stamp()
     assert stamp is not None and stamp.is_file()
     assert stamp.parent.stat().st_mode & 0o077 == 0

@@ -27,12 +27,17 @@ import math
 from pathlib import Path
 
 from mddag_executor.core import POLICIES, PolicyError
-from mddag_executor.simulate import compiled
+from mddag_executor.simulate import (
+    compiled,
+    periodic_load,
+    Settings,
+    simulate,
+    SimulationError,
+)
 from mddag_executor.simulate import evaluate as module
 from mddag_executor.simulate.acceptance import BINS, WIDE_BINS
 from mddag_executor.simulate.draws import Draws
 from mddag_executor.simulate.evaluate import evaluate, Evaluation, Experiment
-from mddag_executor.simulate.run import periodic_load, Settings, simulate, SimulationError
 from msg_graph import load, loads, TaskSet
 import numpy as np
 import pytest

@@ -65,6 +65,9 @@ class Recorder:
         if reaction is not None:
             reaction(*what)
 
+    def on_thread(self) -> None:
+        """Nothing is to be done."""
+
     def hold(self) -> None:
         self.held += 1
 

@@ -21,6 +21,7 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.live.entities import snapshot
 from mddag_executor.live.events import EventsIntake
 from mddag_executor.live.waitset import WaitSetIntake
 import pytest
@@ -106,6 +107,28 @@ def test_nothing_is_handed_over_for_what_was_removed(
     finally:
         stop.set()
         flooding.join()
+    assert not recorder.errors
+
+
+def test_all_is_destroyed_before_it_is_looked_at(
+    intake: Any, node: Node, other: Node, recorder: Recorder
+) -> None:
+    name = topic()
+    for _ in range(3):
+        node.create_subscription(String, name, nothing, 10)
+    entities = snapshot([node])
+    assert entities.events
+    node.destroy_node()
+    start(intake)
+    intake.update(entities)
+    time.sleep(0.2)
+    assert not recorder.errors
+    other.create_subscription(String, name, nothing, 10)
+    publisher = other.create_publisher(String, name, 10)
+    intake.update([other])
+    assert matched(publisher)
+    publisher.publish(text('goes on'))
+    assert wait_for(lambda: recorder.messages)
     assert not recorder.errors
 
 

@@ -83,14 +83,18 @@ sys.exit(3)
 """
 
 
+def _environment() -> dict[str, str]:
+    root = Path(__file__).resolve().parents[3]
+    path = os.pathsep.join([str(root), *filter(None, [os.environ.get('PYTHONPATH')])])
+    return {**os.environ, 'PYTHONPATH': path}
+
+
 def _signalled(tmp_path: Path, kind: str, number: signal.Signals) -> tuple[int, str, str]:
     program = tmp_path / 'program.py'
     program.write_text(PROGRAM)
-    root = Path(__file__).resolve().parents[3]
-    path = os.pathsep.join([str(root), *filter(None, [os.environ.get('PYTHONPATH')])])
     with subprocess.Popen(
         [sys.executable, str(program), kind], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        text=True, env={**os.environ, 'PYTHONPATH': path},
+        text=True, env=_environment(),
     ) as process:
         assert process.stdout is not None
         try:
@@ -121,8 +125,7 @@ def test_signals_do_what_they_do_with_rclpys_executors(
 def test_a_process_that_forgets_to_stop_ends_all_the_same(tmp_path: Path, kind: str) -> None:
     program = tmp_path / 'program.py'
     program.write_text(PROGRAM.split('done.wait()')[0] + 'sys.exit(4)\nfinally:\n    pass\n')
-    root = Path(__file__).resolve().parents[3]
     ended = subprocess.run(
         [sys.executable, str(program), kind], capture_output=True, text=True, timeout=20.0,
-        env={**os.environ, 'PYTHONPATH': str(root)}, check=False)
+        env=_environment(), check=False)
     assert (ended.returncode, ended.stdout, ended.stderr) == (4, 'ready\n', '')

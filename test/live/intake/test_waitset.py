@@ -41,12 +41,6 @@ def intake(timer_intake: WaitSetIntake) -> WaitSetIntake:
     return timer_intake
 
 
-def on_grid(dues: list[int], period: int) -> bool:
-    """Return whether due times are points of one exact phase grid, and never go back."""
-    steps = [b - a for a, b in zip(dues, dues[1:])]
-    return all(step > 0 and step % period == 0 for step in steps)
-
-
 # --- snapshots -----------------------------------------------------------------------------------
 
 

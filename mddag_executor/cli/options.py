@@ -1,0 +1,203 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Arguments of the verbs: their kinds, and the options that several verbs have.
+
+An option that means the same in two verbs is declared here, so that its name, its default and its
+help are the same, too. Like the verbs' modules this one imports nothing heavy.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+import math
+from types import ModuleType
+from typing import Any, TypeVar
+
+from mddag_executor import defaults
+from mddag_executor.errors import UsageError
+
+T = TypeVar('T')
+
+
+# --- kinds of arguments --------------------------------------------------------------------------
+
+def duration(text: str) -> int:
+    """Return the nanoseconds of an argument such as `20s` or `100ms`."""
+    import msg_graph
+    try:
+        return msg_graph.parse_duration(text)
+    except (ValueError, msg_graph.GraphError) as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def positive_int(text: str) -> int:
+    """Return a whole number from 1 up."""
+    return _parsed(text, int, lambda value: value >= 1, 'whole number from 1 up')
+
+
+def seed(text: str) -> int:
+    """Return a whole number from 0 to 2**64 - 1."""
+    return _parsed(
+        text, int, lambda value: 0 <= value < 2 ** 64, 'whole number from 0 to 2**64 - 1')
+
+
+def number(text: str) -> float:
+    """Return a finite number."""
+    return _parsed(text, float, math.isfinite, 'number')
+
+
+def positive_float(text: str) -> float:
+    """Return a finite number above zero."""
+    return _parsed(
+        text, float, lambda value: value > 0 and math.isfinite(value), 'number above zero')
+
+
+def ratio(text: str) -> float:
+    """Return a number from 0 to 1."""
+    return _parsed(text, float, lambda value: 0 <= value <= 1, 'number from 0 to 1')
+
+
+def _parsed(text: str, kind: Callable[[str], T], fits: Callable[[T], bool], what: str) -> T:
+    try:
+        value = kind(text)
+        if fits(value):
+            return value
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f'{text!r} is no {what}')
+
+
+def or_zero(kind: Callable[[str], int]) -> Callable[[str], int]:
+    """Return a kind of argument that may be `0` as well."""
+    return lambda text: 0 if text == '0' else kind(text)
+
+
+def list_of(kind: Callable[[str], T]) -> Callable[[str], list[T]]:
+    """Return the kind of argument that is several of a kind, with commas between them."""
+    return lambda text: [kind(part.strip()) for part in text.split(',')]
+
+
+def policies(text: str) -> tuple[str, ...]:
+    """
+    Return the policies that `--policies` names.
+
+    :raises mddag_executor.errors.MddagError: there is no such policy, or it stands there twice
+    """
+    from mddag_executor.core import policy
+    names = [name.strip() for name in text.split(',')]
+    for i, name in enumerate(names):
+        policy(name)
+        if name in names[:i]:
+            raise UsageError(f"--policies: '{name}' stands there twice: name each once")
+    return tuple(names)
+
+
+# --- options that several verbs have -------------------------------------------------------------
+
+def add_graph(parser: argparse.ArgumentParser) -> None:
+    """Declare the argument `GRAPH`."""
+    parser.add_argument(
+        'graph', metavar='GRAPH', help="the declaration, a YAML file ('-': standard input)")
+
+
+def add_workload(parser: argparse.ArgumentParser) -> None:
+    """Declare `--graph` of a benchmark; see `common.load_workload`."""
+    parser.add_argument(
+        '--graph', metavar='FILE',
+        help="a declaration to take instead of the paper's workload ('-': standard input)")
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Declare `--json`."""
+    parser.add_argument('--json', metavar='FILE',
+                        help="write the whole result as JSON ('-': to standard output, "
+                             'instead of the tables)')
+
+
+def add_report(parser: argparse.ArgumentParser) -> None:
+    """Declare `--report`."""
+    parser.add_argument('--report', metavar='OUT.html',
+                        help='write tables and pictures of the run as one HTML file that needs no '
+                             "network (needs mddag_executor[report]; '-': to standard output)")
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Declare `--workers`, whose default is that of `defaults.workers`."""
+    parser.add_argument(
+        '--workers', type=positive_int, metavar='M',
+        help=f"threads that run callbacks (default: the declaration's, else {defaults.WORKERS})")
+
+
+def add_virtual_time(parser: argparse.ArgumentParser) -> None:
+    """Declare `--duration` of simulated runs."""
+    parser.add_argument(
+        '--duration', type=duration, default=defaults.DURATION_NS, metavar='TIME',
+        help=f'virtual time of each run (default: {defaults.DURATION_NS // 10 ** 9}s)')
+
+
+def add_overhead(parser: argparse.ArgumentParser) -> None:
+    """Declare `--overhead` of simulated runs."""
+    parser.add_argument(
+        '--overhead', type=or_zero(duration), default=0, metavar='TIME',
+        help='what each dispatch of a callback takes more (default: 0)')
+
+
+def add_seed(
+    parser: argparse.ArgumentParser, what: str, kind: Callable[[str], int] = seed, default: int = 0
+) -> None:
+    """
+    Declare `--seed`.
+
+    :param what: is drawn with it; the help begins with it.
+    """
+    parser.add_argument('--seed', type=kind, default=default, metavar='N',
+                        help=f'{what} (default: %(default)s)')
+
+
+def add_jobs(parser: argparse.ArgumentParser) -> None:
+    """Declare `--jobs`, whose default is `common.processors()`."""
+    parser.add_argument(
+        '--jobs', type=positive_int, metavar='N',
+        help='runs to simulate at a time (default: the number of processors)')
+
+
+def add_repeat(
+    parser: argparse.ArgumentParser, default: int,
+    what: str = 'measure everything R times, and take the medians',
+) -> None:
+    """Declare `--repeat` of a benchmark."""
+    parser.add_argument('--repeat', type=positive_int, default=default, metavar='R',
+                        help=f'{what} (default: %(default)s)')
+
+
+# --- verbs ---------------------------------------------------------------------------------------
+
+def add_verb(parsers: Any, name: str, module: ModuleType, summary: str, description: str) -> None:
+    """
+    Add a verb, or a verb of a verb, to the parsers that `add_subparsers` returned.
+
+    :param module: has `EXAMPLE`, `add_arguments` and, unless it has verbs itself, `main`, which
+        becomes `args.main`.
+    :param summary: for the list of verbs
+    """
+    examples = ''.join(f'\n  {line}' for line in module.EXAMPLE.strip().splitlines())
+    parser = parsers.add_parser(
+        name, help=summary, allow_abbrev=False, description=description,
+        epilog=f'example:{examples}', formatter_class=argparse.RawDescriptionHelpFormatter)
+    module.add_arguments(parser)
+    if hasattr(module, 'main'):
+        parser.set_defaults(main=module.main)

@@ -1,0 +1,133 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What `replay`, `export` and `diff` share: how recordings of every kind become runs.
+
+A trace of this executor and an imported recording are replayed as they were recorded, or, with
+`--reschedule`, as the scheduler core would have run them; an ordinary bag has no jobs, so it can
+only be rescheduled.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from mddag_executor.cli import bags, options
+from mddag_executor.cli.text import Progress
+from mddag_executor.core import POLICIES
+from mddag_executor.core import policy as find_policy
+from mddag_executor.errors import UsageError
+
+if TYPE_CHECKING:
+    from mddag_executor.replay import Replay, Reschedule
+    from mddag_executor.replay.bags_reschedule import BagReschedule
+    from mddag_executor.replay.batches import Watcher
+    from mddag_executor.replay.recording import Recording
+    from msg_graph import TaskSet
+
+_ONLY_RESCHEDULED = ('workers', 'policy', 'preemptive', 'overheads', 'execution_times')
+
+
+def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
+    """Declare `--reschedule` and what goes with it; ``what`` is its help."""
+    add = parser.add_argument
+    add('--reschedule', action='store_true', help=what)
+    add('--workers', type=options.positive_int, metavar='M',
+        help='with --reschedule: threads that run callbacks (default: as recorded)')
+    add('--policy', metavar='P',
+        help=f'with --reschedule: one of {", ".join(POLICIES)} (default: as recorded)')
+    add('--preemptive', action='store_true',
+        help='with --reschedule: what is more urgent takes the worker of what runs')
+    bags.add_arguments(parser)
+
+
+def check(args: argparse.Namespace, *files: str | None) -> None:
+    """
+    Check the arguments.
+
+    :param files: what else may be standard input.
+    :raises mddag_executor.errors.UsageError: where they do not go together
+    """
+    if args.policy is not None:
+        find_policy(args.policy)
+    bags.check(args, *files)
+    if args.reschedule:
+        return
+    for option in _ONLY_RESCHEDULED:
+        if getattr(args, option) not in (None, False):
+            raise UsageError(
+                f'--{option.replace("_", "-")}: a run is replayed as it was recorded: add '
+                '--reschedule')
+
+
+def is_bag(path: str) -> bool:
+    """Tell whether a recording is an ordinary bag, which can only be rescheduled."""
+    from mddag_executor.replay.bags import is_ordinary
+    return is_ordinary(path)
+
+
+def check_declared(path: str, name: str) -> None:
+    """
+    Find out whether a recording says which deadlines there are, where no graph is given.
+
+    :raises mddag_executor.errors.MddagError: where it does not
+    """
+    if is_bag(path):
+        raise bags.no_graph(name)
+    from mddag_executor.replay.following import check_declared as check_it
+    check_it(path, name)
+
+
+def as_recorded(
+    path: str, name: str, task_set: TaskSet | None, watcher: Watcher | None = None,
+    own: type[Recording] | None = None, doing: str = 'replaying',
+) -> tuple[Replay, Recording | None]:
+    """
+    Replay a recorded run; return what came of it, and the recording where it is of this executor.
+
+    :param own: what to make of a recording of this executor.
+    :raises mddag_executor.errors.MddagError: where that can not be
+    """
+    from mddag_executor.replay.as_recorded import replay_recording
+    from mddag_executor.replay.following import open_recording
+    from mddag_executor.replay.recording import Recording
+    with Progress(doing) as line:
+        recording = open_recording(path, name, own or Recording)
+        outcome = replay_recording(
+            recording, task_set,
+            lambda events: line.update(round(events / 1e6, 1), 'million events'), watcher)
+    return outcome, recording if isinstance(recording, Recording) else None
+
+
+def rescheduled(
+    args: argparse.Namespace, path: str, name: str, task_set: TaskSet | None
+) -> Reschedule | BagReschedule:
+    """
+    Run the scheduler over a recording of any kind.
+
+    :raises mddag_executor.errors.MddagError: where that can not be
+    """
+    if is_bag(path):
+        return bags.reschedule_bag(args, path, name, task_set)
+    if args.execution_times is not None:
+        raise UsageError('--execution-times: a trace has its own: leave the option out')
+    from mddag_executor.replay import reschedule
+    recorded = args.overheads in (None, bags.RECORDED)
+    with Progress('replaying') as line:
+        return reschedule(
+            path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
+            overheads=recorded, dispatch_overhead=0 if recorded else args.overheads, name=name,
+            progress=lambda events: line.update(round(events / 1e6, 1), 'million events'))

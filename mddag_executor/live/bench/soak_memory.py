@@ -1,0 +1,116 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How much memory a process has in use, and how much the middleware keeps of nodes made again.
+
+Theory of operation
+-------------------
+glibc keeps what was freed, for each thread apart: a spin that an exception ends and that begins
+anew has new threads, and leaves a megabyte or two behind that nobody uses.  So ``in_use`` collects
+garbage and gives free memory back to the system (``malloc_trim``) before it looks.
+
+rclpy and the middleware keep something of each node that is destroyed and made again.  A process
+of its own (this module, run) tells how much: the same nodes, made again without any executor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import gc
+import os
+from pathlib import Path
+import random
+import subprocess
+import sys
+import time
+
+from mddag_executor.live.bench.soak_nodes import SoakNodes
+from mddag_executor.live.execution import ExecutionPlan
+from msg_graph import load
+import rclpy
+from rclpy.utilities import try_shutdown
+
+WARM_UP_REMADE = 100
+TIMEOUT_S = 120.0
+
+
+def resident() -> int:
+    """Return the memory that the process occupies, bytes."""
+    pages = int(Path('/proc/self/statm').read_text().split()[1])
+    return pages * os.sysconf('SC_PAGE_SIZE')
+
+
+def in_use() -> int:
+    """Collect garbage, give free memory back, and return what the process still occupies."""
+    gc.collect()
+    try:
+        ctypes.CDLL(None).malloc_trim(0)
+    except AttributeError:
+        pass  # another C library
+    return resident()
+
+
+def kept_by_middleware(graph: str, remade: int) -> float:
+    """
+    Return how many bytes remain of each node made again, without an executor.
+
+    :param graph: the declaration.
+    :param remade: how many nodes to make again.
+    """
+    done = subprocess.run(
+        [sys.executable, '-m', 'mddag_executor.live.bench.soak_memory', graph, str(remade)],
+        capture_output=True, text=True, timeout=TIMEOUT_S + remade, check=True)
+    return float(done.stdout)
+
+
+def measure(graph: str, remade: int, seed: int = 0) -> float:
+    """Make nodes again, in this process; return the bytes that remain of each."""
+    task_set = load(graph)
+    nodes = SoakNodes(task_set, ExecutionPlan(task_set))
+    names = list(nodes.nodes)
+    chosen = random.Random(seed)
+
+    def make_again(times: int) -> int:
+        for _ in range(times):
+            name = chosen.choice(names)
+            nodes.nodes[name].destroy_node()
+            nodes.make(name)
+        time.sleep(1.0)  # for the middleware's threads
+        return in_use()
+
+    before = make_again(WARM_UP_REMADE)
+    after = make_again(remade)
+    for node in nodes.nodes.values():
+        node.destroy_node()
+    return (after - before) / remade
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, and print the bytes that remain of each node."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument('graph', help='the declaration')
+    parser.add_argument('remade', type=int, help='how many nodes to make again')
+    args = parser.parse_args(arguments)
+    rclpy.init(args=[])
+    try:
+        print(measure(args.graph, args.remade))
+    finally:
+        try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,72 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What happened in a run, many at once: how the compiled replay tells of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from mddag_executor.core.state import Decision
+from mddag_executor.replay.follower import Event, Observer
+from mddag_executor.replay.judge import Judge
+from mddag_executor.replay.usage import Usage
+from msg_graph import TaskSet
+import numpy as np
+import numpy.typing as npt
+
+Ints = npt.NDArray[np.int64]
+
+
+class Batch(NamedTuple):
+    """
+    A stretch of a run.
+
+    :ivar pieces: what ran, a row each in the order of their ends, with the columns START to
+        CALLBACK below; DAG-less callbacks have vertex -1.  ``follower.Piece`` has what they mean.
+    :ivar releases: DAG, job and release of each.
+    :ivar released_after: how many of ``pieces`` had ended when each release was recorded.
+    :ivar decisions: what the core decided; ``decided_after`` as for releases.
+    """
+
+    pieces: Ints
+    releases: Ints
+    released_after: Ints
+    decisions: Sequence[Decision]
+    decided_after: Ints
+
+
+START, END, READY, VERTEX, JOB, WORKER, CALLBACK = range(7)
+
+
+class Watcher(Protocol):
+    """Who wants to be told of a run while it is replayed (a report, an export)."""
+
+    def observers(self, task_set: TaskSet, judge: Judge) -> Sequence[Observer]:
+        """Return observers; they are told after the judge.  What was told before is forgotten."""
+
+    def handlers(self) -> dict[str, Callable[[Event], None]]:
+        """Return what else the follower is to tell."""
+
+
+@runtime_checkable
+class BatchWatcher(Watcher, Protocol):
+    """Who can be told of a run in batches, too, instead of one thing after the other."""
+
+    def begin(self, task_set: TaskSet, judge: Judge, usage: Usage) -> None:
+        """Take in what will have counted the run when it is over, and forget what was told."""
+
+    def take(self, batch: Batch) -> None:
+        """Take in what happened."""

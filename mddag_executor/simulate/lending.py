@@ -1,0 +1,89 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Memory that compiled code works on: what it is lent, and what it leaves (see ``vectors``).
+
+A structure has three words for each field, those of a vector (address, length, capacity), or an
+integer in the first of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+import ctypes
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+
+class Lent:
+    """A named tuple of integers and lists, as a structure in numpy's memory."""
+
+    def __init__(self, row: NamedTuple, *more: int) -> None:
+        self._columns: list[npt.NDArray[np.int64]] = []  # keeps the memory
+        words = []
+        for value in (*row, *more):
+            if isinstance(value, int):
+                words += [value, 0, 0]
+                continue
+            column = np.array(value, dtype=np.int64)
+            self._columns.append(column)
+            words += [column.ctypes.data, len(column), len(column)]
+        self._words = np.array(words, dtype=np.int64)
+
+    @property
+    def address(self) -> int:
+        """Return where the structure is, as long as this object lives."""
+        return int(self._words.ctypes.data)
+
+    def copy(self) -> Lent:
+        """Return a structure of its own over the same columns."""
+        copied = copy(self)
+        copied._words = self._words.copy()
+        return copied
+
+
+class Empty:
+    """Memory for a structure or a vector that is all empty."""
+
+    def __init__(self, fields: int = 1) -> None:
+        self._words = np.zeros(3 * fields, dtype=np.int64)
+
+    @property
+    def address(self) -> int:
+        """Return where it is, as long as this object lives."""
+        return int(self._words.ctypes.data)
+
+    def length(self, field: int) -> int:
+        """Return how many elements a field has, which is a vector."""
+        return int(self._words[3 * field + 1])
+
+    def write(self, field: int, values: Sequence[int]) -> None:
+        """Write a field, which is a vector of so many numbers."""
+        address, length = self._words[3 * field:3 * field + 2].tolist()
+        assert length == len(values)
+        data = (ctypes.c_int64 * length).from_address(address)
+        data[:] = list(values)
+
+    def rows(self, field: int, width: int) -> list[tuple[int, ...]]:
+        """Return a copy of a field, which is a vector of tuples."""
+        address, length = self._words[3 * field:3 * field + 2].tolist()
+        if length == 0:
+            return []
+        data = (ctypes.c_int64 * (length * width)).from_address(address)
+        rows = np.ctypeslib.as_array(data).reshape(length, width).tolist()
+        return [tuple(row) for row in rows]

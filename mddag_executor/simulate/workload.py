@@ -1,0 +1,157 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What one simulated run is given: an execution time for each vertex, and the releases.
+
+Execution times are a list for each DAG, by local vertex index, in ns: each vertex has one for the
+whole run, as in the paper's experiment. (``draws`` has those of many runs, as arrays.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import json
+import math
+import random
+from typing import Any
+
+from mddag_executor.simulate.engine import Load
+from mddag_executor.simulate.errors import SimulationError
+from msg_graph import Dag, TaskSet
+from msg_graph.duration import DAY, MICROSECOND
+
+_FORMAT = 'write {"DAG": {"/node:callback": microseconds}}'
+_LONGEST_US = DAY // MICROSECOND
+
+
+def draw_execution_times(
+    task_set: TaskSet, seed: int, undeclared: int | None = None
+) -> list[list[int]]:
+    """
+    Draw one execution time (ns) for each vertex, for the whole run, as in the paper.
+
+    :param undeclared: that of callbacks which declare none, ns; None: each must declare one.
+    :return: one list for each DAG, by local vertex index; the same seed gives the same draw.
+    :raises SimulationError: when a callback declares no execution time.
+    """
+    generator = random.Random(seed)
+    times = []
+    for dag in task_set.dags:
+        row = []
+        for vertex in dag.vertices:
+            # Draws even where nothing is declared: declaring one more time changes no other.
+            share = generator.random()
+            times_of_callback = vertex.callback.execution_time
+            if times_of_callback is None and undeclared is not None:
+                row.append(undeclared)
+                continue
+            if times_of_callback is None:
+                raise SimulationError(
+                    f'{task_set.file}:{vertex.callback.line}: {vertex.callback.key} declares no '
+                    'execution_time: add one, or give --execution-times FILE')
+            row.append(times_of_callback.draw(share))
+        times.append(row)
+    return times
+
+
+def read_execution_times(task_set: TaskSet, text: str, name: str) -> list[list[int]]:
+    """
+    Read fixed execution times: JSON ``{"DAG": {"/node:callback": microseconds, …}, …}``.
+
+    :return: ns, one list for each DAG, by local vertex index.
+    :raises SimulationError: on anything that is not that, or a vertex without a time.
+    """
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise SimulationError(
+            f'{name}:{error.lineno}: not JSON ({error.msg}): {_FORMAT}') from None
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
+        raise SimulationError(f'{name}: not usable JSON ({error}): {_FORMAT}') from None
+    if not isinstance(data, dict) or not all(isinstance(v, dict) for v in data.values()):
+        raise SimulationError(f'{name}: not an object of objects: {_FORMAT}')
+    known = {dag.name for dag in task_set.dags}
+    for dag_name in data:
+        if dag_name not in known:
+            raise SimulationError(
+                f"{name}: DAG '{dag_name}' is not in {task_set.file}: "
+                f"its DAGs are {', '.join(sorted(known))}")
+    return [_dag_times(dag, data.get(dag.name, {}), name) for dag in task_set.dags]
+
+
+def _dag_times(dag: Dag, times: Mapping[str, Any], name: str) -> list[int]:
+    row = []
+    names: set[str] = set()
+    for vertex in dag.vertices:
+        names.update((vertex.name, vertex.callback.key))
+        value = times.get(vertex.name, times.get(vertex.callback.key))
+        if value is None:
+            raise SimulationError(
+                f'{name}: no execution time for {vertex.callback.key} of DAG {dag.name}: add it')
+        if isinstance(value, bool) or not isinstance(value, (int, float)) \
+                or not 0 < value < _LONGEST_US:
+            raise SimulationError(
+                f'{name}: execution time of {vertex.callback.key} of DAG {dag.name} is '
+                f'{_shown(value)}: give microseconds, above 0 and below one day')
+        row.append(max(1, round(value * 1000)))
+    for key in times:
+        if key not in names:
+            raise SimulationError(
+                f"{name}: '{key}' is not a vertex of DAG {dag.name}: take it out or correct it")
+    return row
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + '...'
+
+
+def utilisation(task_set: TaskSet, times: Sequence[Sequence[int]], workers: int) -> float:
+    """Return the normalised utilisation: sum of execution time over period, by workers."""
+    total = sum(sum(row) / dag.period_ns for dag, row in zip(task_set.dags, times))
+    return total / workers
+
+
+def scale_execution_times(
+    task_set: TaskSet, times: Sequence[Sequence[int]], workers: int, target: float
+) -> list[list[int]]:
+    """
+    Return the execution times scaled by one factor to a normalised utilisation, ns.
+
+    :raises SimulationError: when the target is no number above zero, or there is nothing to scale.
+    """
+    now = utilisation(task_set, times, workers)
+    if not (target > 0 and math.isfinite(target)):
+        raise SimulationError(f'utilisation {target}: no number above zero: give one as 0.6')
+    if now == 0:
+        raise SimulationError('utilisation: all execution times are 0: give times to scale')
+    factor = target / now
+    return [[round(time * factor) for time in row] for row in times]
+
+
+def periodic_load(task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns: int) -> Load:
+    """Return the load of releases at k*T from 0, with the same execution times in each job."""
+    releases = sorted(
+        (job * dag.period_ns, dag.index, job)
+        for dag in task_set.dags
+        for job in range(-(-duration_ns // dag.period_ns)))
+    bases = []
+    costs: list[int] = []
+    for row in times:
+        bases.append(len(costs))
+        costs.extend(row)
+    return Load(
+        [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases],
+        costs, bases, [0] * len(bases))

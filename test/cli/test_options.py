@@ -1,0 +1,111 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Kinds of arguments, and options that several verbs have."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+import importlib
+
+from mddag_executor import defaults
+from mddag_executor.analysis import BUDGETS
+from mddag_executor.cli import main as program
+from mddag_executor.cli import options
+from mddag_executor.core import POLICIES, PolicyError
+from mddag_executor.errors import UsageError
+from mddag_executor.simulate import JUDGES
+from mddag_executor.simulate.evaluate import CORES
+from msg_graph import loads
+import pytest
+
+
+@pytest.mark.parametrize(('kind', 'text', 'value'), [
+    (options.duration, '20s', 20_000_000_000),
+    (options.duration, '1.5 ms', 1_500_000),
+    (options.positive_int, '7', 7),
+    (options.positive_float, '0.6', 0.6),
+    (options.number, '-1e3', -1000.0),
+    (options.ratio, '1', 1.0),
+    (options.seed, str(2 ** 64 - 1), 2 ** 64 - 1),
+    (options.or_zero(options.duration), '0', 0),
+    (options.or_zero(options.duration), '3ms', 3_000_000),
+    (options.list_of(options.positive_int), '1, 2,4', [1, 2, 4]),
+])
+def test_what_an_argument_is(kind: Callable[[str], object], text: str, value: object) -> None:
+    assert kind(text) == value
+
+
+@pytest.mark.parametrize(('kind', 'texts'), [
+    (options.duration, ('', '20', '0s', '-1s', 'nan', '20 parsecs')),
+    (options.positive_int, ('0', '-1', '1.5', 'x', '')),
+    (options.positive_float, ('0', '-1', 'nan', 'inf', '1e999', 'x', '')),
+    (options.number, ('nan', 'inf', 'x', '')),
+    (options.ratio, ('-0.1', '1.1', 'nan', 'x')),
+    (options.seed, ('-1', str(2 ** 64), 'x')),
+    (options.or_zero(options.positive_int), ('-1', 'x', '')),
+    (options.list_of(options.positive_int), ('1,,2', '1,x', '')),
+])
+def test_what_no_argument_is(kind: Callable[[str], object], texts: tuple[str, ...]) -> None:
+    for text in texts:
+        with pytest.raises(argparse.ArgumentTypeError):
+            kind(text)
+
+
+def test_policies() -> None:
+    assert options.policies('rad, fifo') == ('rad', 'fifo')
+    assert options.policies(','.join(POLICIES)) == tuple(POLICIES)
+    with pytest.raises(PolicyError, match="policy 'edf': there is no such policy"):
+        options.policies('rad,edf')
+    with pytest.raises(UsageError, match="--policies: 'rad' stands there twice"):
+        options.policies('rad,fifo,rad')
+
+
+def test_the_number_of_workers() -> None:
+    text = 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, timer: 1s, deadline: 1s}]}]\n'
+    assert defaults.workers(None, loads(text)) == 7
+    assert defaults.workers(None, loads(text + 'workers: 3\n')) == 3
+    assert defaults.workers(2, loads(text + 'workers: 3\n')) == 2
+
+
+@pytest.mark.parametrize(('verb', 'option', 'known'), [
+    ('simulate', '--judge', JUDGES), ('evaluate', '--judge', JUDGES),
+    ('graph_analyse', '--budget', BUDGETS), ('graph_assign_deadlines', '--budget', BUDGETS),
+    ('evaluate', '--core', CORES),
+])
+def test_choices_are_those_of_the_program(verb: str, option: str, known: tuple[str, ...]) -> None:
+    """Verbs name them again, as to import them would make every help slow."""
+    parser = argparse.ArgumentParser()
+    importlib.import_module(f'mddag_executor.cli.{verb}').add_arguments(parser)
+    action, = (each for each in parser._actions if option in each.option_strings)
+    assert action.choices is not None
+    assert sorted(action.choices) == sorted(known)
+
+
+@pytest.mark.parametrize(('words', 'says'), [
+    (['graph', 'check', '--help'], 'Validate a declaration and show the DAG tasks'),
+    (['bench', 'core', '--help'], 'CPU time for each event'),
+    (['graph', '--help'], 'lay a declaration out evenly'),
+    (['bench', '--help'], 'measure the batch evaluation'),
+])
+def test_the_help_of_verbs_of_verbs(
+    words: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        program.main(words)
+    assert stop.value.code == 0
+    out = capsys.readouterr().out
+    assert says in ' '.join(out.split())
+    assert 'example:\n  mddag ' in out

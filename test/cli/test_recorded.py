@@ -1,0 +1,176 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verbs `export` and `diff` take every kind of recording that `replay` takes."""
+
+from __future__ import annotations
+
+from contextlib import redirect_stdout
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.cli import main as program
+import pytest
+
+from ..replay.recorded import MS, Recorded
+from ..replay.test_ordinary_bags import write_bag
+
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /camera
+    callbacks: [{name: grab, timer: 100ms, publishes: [/image], execution_time: 2ms}]
+  - node: /detect
+    callbacks: [{name: detect, subscription: /image, deadline: 8ms, execution_time: 4ms}]
+"""
+OTHER = GRAPH.replace('/camera', '/radar').replace('/detect', '/track')
+
+
+@pytest.fixture(scope='module')
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Give two graphs and a recording of each kind: ten jobs each, but imported four."""
+    folder = tmp_path_factory.mktemp('recordings')
+    found = {name: folder / name for name in ('graph.yaml', 'other.yaml', 'own.mcap', 'bag')}
+    found['graph.yaml'].write_text(GRAPH)
+    found['other.yaml'].write_text(OTHER)
+    with redirect_stdout(io.StringIO()):
+        assert program.main([
+            'simulate', str(found['graph.yaml']), '--duration', '1s', '--workers', '2',
+            '--trace', str(found['own.mcap'])]) == 0
+    write_bag(found['bag'])
+    r = Recorded(folder / 'imported.mcap')
+    r.node(1, '/camera')
+    r.node(2, '/detect')
+    r.timer(11, 1, 100 * MS)
+    r.publisher(100, 1, '/image')
+    r.subscription(12, 2, '/image')
+    for k in range(1, 5):
+        at = k * 100 * MS
+        r.run(11, 1, at, at + 2 * MS)
+        stamp = r.publish(100, 1, at + 1 * MS)
+        r.receive(12, 2, at + 3 * MS, at + (12 if k == 4 else 5) * MS, stamp)
+    found['imported.mcap'] = r.write()
+    return {name: str(path) for name, path in found.items()}
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    status = program.main([*arguments])
+    output = capsys.readouterr()
+    return status, output.out, output.err
+
+
+def sink(result: Any) -> Any:
+    return result['dags']['/camera']['sinks']['/detect:detect']
+
+
+@pytest.mark.parametrize(('arguments', 'verdicts'), [
+    (['own.mcap'], ['in_time'] * 10),
+    (['imported.mcap', 'graph.yaml'], ['in_time'] * 3 + ['late']),
+    (['imported.mcap', 'graph.yaml', '--reschedule', '--policy', 'rad'],
+     ['in_time'] * 3 + ['late']),
+    (['own.mcap', '--reschedule', '--overheads', '3ms'], ['late'] * 10),
+    (['bag', 'graph.yaml', '--reschedule'], ['in_time'] * 9),     # the tenth was not due
+    (['bag', 'graph.yaml', '--reschedule', '--overheads', '2ms'], ['late'] * 9)])
+@pytest.mark.parametrize('form', ['csv', 'parquet', 'pftrace'])
+def test_export(
+    files: dict[str, str], arguments: list[str], verdicts: list[str], form: str, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    if form != 'csv':
+        pytest.importorskip('perfetto' if form == 'pftrace' else 'pyarrow')
+    out = tmp_path / f'out.{form}'
+    rows = [] if form == 'pftrace' else ['--rows', 'jobs']
+    status, text, errors = call(
+        capsys, 'export', *(files.get(word, word) for word in arguments), '-o', str(out), *rows)
+    assert (status, text, errors) == (0, f'exported: {out}\n', '')
+    if form == 'csv':
+        with out.open(newline='') as stream:
+            assert [row['verdict'] for row in csv.DictReader(stream)] == verdicts
+    elif form == 'parquet':
+        from pyarrow import parquet
+        assert parquet.read_table(out).column('verdict').to_pylist() == verdicts
+    else:
+        from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace
+        trace = Trace()
+        trace.ParseFromString(out.read_bytes())
+        names = [name.name for packet in trace.packet
+                 for name in packet.interned_data.event_names]
+        assert '/detect:detect' in names
+
+
+def test_executions_of_an_imported_recording_need_no_graph(
+    files: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / 'out.csv'
+    assert call(capsys, 'export', files['imported.mcap'], '-o', str(out))[0] == 0
+    with out.open(newline='') as stream:
+        names = [row['vertex'] for row in csv.DictReader(stream)]
+    assert names == ['/camera timer 100ms', '/detect subscription /image'] * 4
+
+
+@pytest.mark.parametrize(('arguments', 'medians', 'due'), [
+    (['own.mcap', 'imported.mcap'], (6, 5), (10, 4)),       # judged by the own one's declaration
+    (['imported.mcap', 'own.mcap'], (5, 6), (4, 10)),
+    (['imported.mcap', 'imported.mcap', 'graph.yaml'], (5, 5), (4, 4)),
+    (['own.mcap', 'own.mcap', '--reschedule', '--overheads', '1ms'], (6, 8), (10, 10)),
+    (['own.mcap', 'bag', 'graph.yaml', '--reschedule'], (6, 6), (10, 9)),
+    (['own.mcap', 'bag', '--reschedule', '--overheads', '1ms'], (6, 8), (10, 9)),
+    (['bag', 'own.mcap', '--reschedule', '--overheads', '1ms'], (8, 8), (9, 10)),
+    (['imported.mcap', 'bag', 'graph.yaml', '--reschedule'], (5, 6), (4, 9))])
+def test_diff(
+    files: dict[str, str], arguments: list[str], medians: tuple[int, int], due: tuple[int, int],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = [files.get(word, word) for word in arguments]
+    status, text, errors = call(capsys, 'diff', *words, '--json', '-')
+    assert (status, errors) == (0, '')
+    found = json.loads(text)
+    sides = sink(found)['a'], sink(found)['b']
+    assert tuple(round(side['response_ns']['median'] / MS) for side in sides) == medians
+    assert tuple(side['due'] for side in sides) == due
+    assert [found[mark]['imported'] for mark in 'ab'] == [
+        word == 'imported.mcap' for word in arguments[:2]]
+    lines = call(capsys, 'diff', *words)[1].splitlines()
+    assert all(('imported, 2 threads' in line) == found[mark]['imported']
+               and ('rescheduled' in line) == found[mark]['rescheduled']
+               for mark, line in zip('ab', lines[-3:-1]))
+
+
+@pytest.mark.parametrize(('arguments', 'problem'), [
+    (['export', 'imported.mcap', '--rows', 'jobs', '-o', 'out.csv'], 'it was imported'),
+    (['export', 'imported.mcap', 'other.yaml', '-o', 'out.csv'], 'none of the callbacks'),
+    (['export', 'bag', '-o', 'out.csv'], 'give a GRAPH and --reschedule'),
+    (['export', 'bag', 'graph.yaml', '-o', 'out.csv'], 'give a GRAPH and --reschedule'),
+    (['export', 'own.mcap', '--workers', '2', '-o', 'out.csv'], 'add --reschedule'),
+    (['export', 'own.mcap', '--reschedule', '--policy', 'x', '-o', 'out.csv'], "'x'"),
+    (['diff', 'imported.mcap', 'imported.mcap'], 'it was imported'),
+    (['diff', 'imported.mcap', 'bag', '--reschedule'], 'it was imported'),
+    (['diff', 'bag', 'imported.mcap', '--reschedule'], 'give a GRAPH and --reschedule'),
+    (['diff', 'bag', 'own.mcap'], 'give a GRAPH and --reschedule'),
+    (['diff', 'own.mcap', 'bag', 'graph.yaml'], 'give a GRAPH and --reschedule'),
+    (['diff', 'own.mcap', 'imported.mcap', 'other.yaml'], 'none of the callbacks'),
+    (['diff', 'own.mcap', 'own.mcap', '--policy', 'rad'], 'add --reschedule'),
+    (['diff', 'own.mcap', 'own.mcap', '--reschedule', '--callbacks'], '--callbacks: ')])
+def test_what_can_not_be(
+    files: dict[str, str], arguments: list[str], problem: str, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, out, errors = call(capsys, *(files.get(word, word) for word in arguments))
+    assert (status, out, errors.count('\n')) == (2, '', 1), errors
+    assert errors.startswith('error: ') and problem in errors
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,53 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a run that does not come to its end tells."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = """
+import threading, time
+from mddag_executor.cli.stuck import told_when_stuck
+from mddag_executor.live.session import Session
+
+class Executor:
+    def spin(self):
+        time.sleep(0.05)
+    def shutdown(self, timeout_sec):
+        time.sleep({takes})
+
+with told_when_stuck(0.5) as ends:
+    with Session(Executor(), on_end=ends) as session:
+        session.wait(None)
+print('end')
+time.sleep(0.7)  # it is over: nothing more is told
+"""
+
+
+@pytest.mark.parametrize(('takes', 'times'), [(0.0, 0), (1.5, 1)])
+def test_an_end_that_takes_too_long_tells_where_each_thread_stands(
+    takes: float, times: int
+) -> None:
+    process = subprocess.run(
+        [sys.executable, '-c', PROGRAM.format(takes=takes)], capture_output=True, text=True,
+        timeout=30, check=True)
+    assert process.stdout == 'end\n'
+    assert process.stderr.count('Timeout') == times
+    assert process.stderr.count('in shutdown') == times
+    assert process.stderr.count(' in end') == times

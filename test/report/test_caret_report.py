@@ -1,0 +1,142 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A real CARET recording through the program: whatever it writes says what CARET says."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+import re
+from typing import Any
+from xml.etree import ElementTree
+
+from mddag_executor.cli import main as program
+from mddag_executor.trace import import_ctf, TraceError
+import pytest
+
+from ..replay.cases_by_hand import slow_cases
+from ..replay.test_caret_sample import GRAPH, rows, SESSION
+from ..report import test_html_browser as pages
+
+pytest.importorskip('bokeh', reason='Bokeh is not installed')
+pytestmark = pytest.mark.skipif(not SESSION.is_dir(), reason='the recording is not there')
+browser = pages.browser
+FILTER = '/filter_node:callback_0'
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give a folder with all that the program makes of the recording."""
+    path = tmp_path_factory.mktemp('caret')
+    trace, graph = path / 'sample.mcap', path / 'graph.yaml'
+    graph.write_text(GRAPH)
+    try:
+        import_ctf(SESSION, trace)
+    except TraceError as error:
+        if 'not installed' in str(error):
+            pytest.skip('python3-bt2 is not installed')
+        raise
+    assert program.main([
+        'replay', str(trace), str(graph), '--report', str(path / 'report.html'), '--json',
+        str(path / 'result.json'), '--junit', str(path / 'junit.xml')]) == 0
+    for name in ('executions.csv', 'run.pftrace', 'executions.parquet'):
+        assert program.main(['export', str(trace), str(graph), '-o', str(path / name)]) == 0
+    return path
+
+
+def filter_times() -> list[tuple[int, int]]:
+    return [(start or 0, end or 0) for start, end in rows('cb_filter_node_callback_0.csv')]
+
+
+def test_the_result_says_what_caret_says(folder: Path) -> None:
+    result = json.loads((folder / 'result.json').read_text())
+    assert (result['warnings'], result['drift']) == ([], [])
+    use = result['callbacks'][FILTER]
+    took = [end - start for start, end in filter_times()]
+    assert (use['executions'], use['busy_ns'], use['longest_ns']) == (
+        len(took), sum(took), max(took))
+    cases = slow_cases([(row[0] or 0, row[-1]) for row in rows('demo_target_path.csv')])
+    for case, found in result['paths']['target']['response_time'].items():
+        times = sorted(time for _, time in cases[case])
+        assert (found['count'], found['min'], found['max'], found['mean']) == (
+            len(times), times[0], times[-1], round(sum(times) / len(times))), case
+
+
+def test_junit(folder: Path) -> None:
+    suites = ElementTree.parse(folder / 'junit.xml').getroot()
+    result = json.loads((folder / 'result.json').read_text())
+    sinks = {name: sink for dag in result['dags'].values() for name, sink in dag['sinks'].items()}
+    tests = {test.get('name'): test for test in suites.iter('testcase')}
+    assert set(tests) == set(sinks)
+    for name, sink in sinks.items():
+        missed = sink['late'] + sink['expired']
+        failure = tests[name].find('failure')
+        assert (failure is not None) == (missed > 0)
+        if failure is not None:
+            assert (failure.get('message') or '').startswith(f'{missed} of ')
+
+
+def test_exports_have_carets_callback_times(folder: Path) -> None:
+    with (folder / 'executions.csv').open(newline='') as stream:
+        table = [(int(row['start_ns']), int(row['end_ns'])) for row in csv.DictReader(stream)
+                 if row['vertex'] == FILTER]
+    assert sorted(table) == filter_times()
+    parquet = pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
+    columns = parquet.read_table(folder / 'executions.parquet').to_pydict()
+    assert sorted(
+        (start, end) for name, start, end in
+        zip(columns['vertex'], columns['start_ns'], columns['end_ns']) if name == FILTER
+    ) == filter_times()
+
+
+def test_perfetto_has_carets_callback_times(folder: Path) -> None:
+    module = pytest.importorskip(
+        'perfetto.protos.perfetto.trace.perfetto_trace_pb2', reason='perfetto is not installed')
+    trace: Any = module.Trace()
+    trace.ParseFromString((folder / 'run.pftrace').read_bytes())
+    # the track of a callback is called like it; its slices like the job
+    tracks = {packet.track_descriptor.uuid for packet in trace.packet
+              if packet.HasField('track_descriptor')
+              and packet.track_descriptor.name.endswith('filter_node:callback_0')}
+    assert tracks
+    times: dict[int, list[int]] = {1: [], 2: []}     # slices begin and end
+    for packet in trace.packet:
+        if packet.HasField('track_event') and packet.track_event.track_uuid in tracks:
+            times[packet.track_event.type].append(packet.timestamp)
+    assert list(zip(sorted(times[1]), sorted(times[2]))) == filter_times()
+
+
+def test_the_report_opens_and_shows_it(browser: Any, folder: Path) -> None:
+    pages.opened(browser, folder / 'report.html')
+    assert pages.complaints(browser) == []
+    text = browser.execute_script('return document.body.innerText')
+    assert 'imported 12 threads ran callbacks' in ' '.join(text.split())
+    assert re.search(r'target\s+47 of 56\s+all\s+46', text)
+    assert re.search(r'/filter_node:callback_0\s+49\s', text)
+    names = pages.bars(browser, 1, 'a')
+    assert len(names) == 480 and names.count(FILTER) == 49
+    starts = [left for left, name in zip(pages.bars(browser, 1, 'left'), names) if name == FILTER]
+    expected = [start for start, _ in filter_times()]
+    for left, start in zip(sorted(starts), expected):   # the page counts in 100 ns
+        assert abs((left - min(starts)) * 1e9 - (start - expected[0])) <= 101
+    assert browser.execute_script(
+        'return document.documentElement.scrollWidth <= window.innerWidth')
+    # the declared path can be chosen, and is drawn
+    browser.execute_script("""
+        const choice = document.getElementById('mddag-path');
+        choice.selectedIndex = [...choice.options].findIndex(o => o.text === 'path target');
+        choice.dispatchEvent(new Event('change'));""")
+    assert pages.complaints(browser) == []
