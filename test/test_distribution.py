@@ -174,7 +174,7 @@ def test_the_executor_loads_little_besides_rclpy() -> None:
     # It takes declarations, and calls into rcl; traces, plots and compilers come when asked for.
     assert foreign & (HEAVY | {'json', 'asyncio', 'multiprocessing', 'http'}) <= {'ctypes', 'yaml'}
     parts = {name.split('.')[1] for name in more if name.startswith(f'{NAME}.')}
-    assert parts == {'core', 'errors', 'live', 'trace'}
+    assert parts == {'clocks', 'core', 'defaults', 'errors', 'live', 'trace'}
     assert {f'{NAME}.trace.writer', f'{NAME}.trace.reader', f'{NAME}.trace.ctf'} & more == set()
 
 

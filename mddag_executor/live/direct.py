@@ -47,7 +47,8 @@ lock), and publishers come and go just when nodes are destroyed.  In a wait set 
 for every message.
 
 Subscriptions with durability other than volatile get messages from the past at some later time,
-so they are not direct.
+so they are not direct; nor are those on which time depends: whoever tells the time is not to run
+what waits for it.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ import threading
 from typing import Any
 
 from mddag_executor.live.attribution import PublisherState
-from mddag_executor.live.entities import EntitySet, Receiver
+from mddag_executor.live.entities import EntitySet, keeps_time, Receiver
 from mddag_executor.live.hooks import install, publisher_state
 from rclpy.exceptions import InvalidHandle
 from rclpy.qos import DurabilityPolicy, qos_check_compatible, QoSCompatibility
@@ -271,6 +272,8 @@ class DirectTakes:
             return None
         if direct is None:
             if subscription.qos_profile.durability != DurabilityPolicy.VOLATILE:
+                return None
+            if keeps_time(subscription):
                 return None
             direct = self._known[key] = Direct(
                 self, subscription, self._receiver, self._on_change)

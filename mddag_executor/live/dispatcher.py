@@ -184,6 +184,10 @@ class Dispatcher:
                 return
             now = self.tick()
             if entry.depth and len(entry.waiting) >= entry.depth:
+                if entry.callback is None:
+                    self._replace_oldest(entry, work, now)
+                    self.dispatch(now)
+                    return
                 self._drop_oldest(entry, now)
             if entry.source >= 0 and release is not None:
                 self._start_job(entry, work, min(release, now), now)
@@ -295,6 +299,30 @@ class Dispatcher:
         """Keep QoS: the oldest waiting message of a full queue goes."""
         self._drop(entry, next(iter(entry.waiting)), 'qos_depth', now)
         self.decided(now)
+
+    def _replace_oldest(self, entry: Entry, work: Work, now: int) -> None:
+        """
+        Keep QoS for a callback that no DAG declares: whose turn it is stays as it was.
+
+        The next message takes the place of the one that goes.  With a place of its own, a callback
+        whose queue overflows all the time would never be one that has waited long: it would starve
+        beside others that have.
+        """
+        places = iter(entry.waiting)
+        first, second = next(places), next(places, -1)
+        gone = self._work[first]
+        if second < 0:
+            gone.x = -1
+            self.undeclared += 1
+            self.verdicts.note_drop(entry, NO_ORIGIN, 'qos_depth', now)
+            self._note_ready(entry, work, first, now)
+            return
+        heir = self._work[second]
+        self._work[first], self._work[second] = heir, gone
+        heir.x, gone.x = first, second
+        self._drop(entry, second, 'qos_depth', now)
+        self.decided(now)
+        self._start_undeclared(entry, work, now)
 
     def _drop(self, entry: Entry, x: int, reason: str, now: int) -> None:
         del entry.waiting[x]

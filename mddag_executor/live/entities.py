@@ -33,6 +33,7 @@ from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
 from rclpy.service import Service
 from rclpy.subscription import Subscription
+from rclpy.time_source import TimeSource
 from rclpy.timer import Timer
 from rclpy.waitable import Waitable
 
@@ -178,6 +179,12 @@ def _flatten(nodes: dict[Node, _Lists], accept: Callable[[Any], bool] | None) ->
         [w for w in waitables if not is_qos_event(w)],
         [w for w in waitables if is_qos_event(w)],
         nodes)
+
+
+def keeps_time(subscription: Subscription) -> bool:
+    """Return whether it is the one through which rclpy gets a node's simulated time."""
+    callback = subscription.callback
+    return getattr(callback, '__func__', None) is TimeSource.clock_callback
 
 
 def is_qos_event(waitable: Waitable) -> bool:

@@ -69,7 +69,7 @@ class Entry:
         'kind', 'entity', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'dropped', 'skipped', 'busy_ns',
         'unattributed', 'removed', 'address', 'handle', 'enters', 'soon', 'soon_from',
-        'publishes', 'light')
+        'publishes', 'light', 'at_once')
 
     def __init__(
         self, kind: str, entity: Any, node: str, callback: Callback | None, group: int,
@@ -105,6 +105,8 @@ class Entry:
         # the topics that its callback has published on
         self.publishes: set[str] = set()
         self.removed = False
+        # whether it runs where it is taken (see ``receiver``)
+        self.at_once = False
         self.address = id(self)
         # taken from before a callback runs: it raises once the entity is destroyed
         self.handle = entity.handle if kind in _HANDLED else None
@@ -200,6 +202,10 @@ class Work:
             self.coroutine.close()
 
 
+def _nothing() -> None:
+    pass
+
+
 class TaskWork(Work):
     """An execution of an rclpy ``Task``; exceptions are the task's."""
 
@@ -211,8 +217,10 @@ class TaskWork(Work):
         task.waits_for = None
         task()
         if task.done() or task.cancelled():
+            self.function = _nothing  # whoever else holds on to the task does so: see ``tasks``
             if self.then is not None:
                 self.then(task)
+            del task
             return None
         return awaited(self.coroutine) if task.waits_for is None else task.waits_for
 

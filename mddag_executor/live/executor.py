@@ -65,7 +65,7 @@ from mddag_executor.live.settings import (
 )
 from mddag_executor.live.statistics import statistics
 from mddag_executor.live.stepping import deadline_of, Stepping
-from mddag_executor.live.tasks import make_task
+from mddag_executor.live.tasks import make_task, Unclaimed
 from mddag_executor.live.verdicts import DeadlineMiss
 from mddag_executor.live.waitset import WaitSetIntake
 from msg_graph import TaskSet
@@ -160,6 +160,7 @@ class MultiDeadlineExecutor(Stepping):
                 trace, task_set, policy, num_workers, deadline_ns, max_active_jobs,
                 clock_offset)
         self._errors: deque[BaseException] = deque()
+        self._unclaimed = Unclaimed(self._fail)
         self._attention = threading.Event()
         self._changed = True
         self._refresh_at = 0.0
@@ -179,7 +180,7 @@ class MultiDeadlineExecutor(Stepping):
             task_set, self._dispatcher.tables, self._dispatcher.scheduler)
         self._receiver = Receiver(
             self._dispatcher, self._registry, task_set, self, self._fail, self._recorder,
-            self._gathering)
+            self._pool, self._gathering)
         self._new_tasks: deque[Work] = deque()
         self._task_entry = Entry(TASK, None, '', None, -1, 0, 'task')
         self._rates = RateWatch(self._registry)
@@ -203,7 +204,8 @@ class MultiDeadlineExecutor(Stepping):
             task()
             return task
         task, work = make_task(
-            self._task_entry, self, self._dispatcher.resume, callback, args, kwargs)
+            self._task_entry, self, self._dispatcher.resume, self._unclaimed, callback, args,
+            kwargs)
         if self._spinning.locked():
             self._dispatcher.undeclared_ready(self._task_entry, work)
         else:
@@ -353,6 +355,7 @@ class MultiDeadlineExecutor(Stepping):
         self._ring()
 
     def _raise_error(self) -> None:
+        self._unclaimed.look()
         if self._errors:
             raise self._errors.popleft()
 

@@ -17,7 +17,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import threading
 import time
+from types import MethodType
 from typing import Any
 
 from mddag_executor.live.attribution import Origin
@@ -25,12 +27,14 @@ from mddag_executor.live.crossings import header_stamp
 from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.entries import Entry, Work
 from mddag_executor.live.gathering import Gathering
+from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
 from rclpy.subscription import Subscription
 
+_END_OF_SLEEP = threading.Event.set
 WITH_INFO = Subscription.CallbackType.WithMessageInfo
 
 
@@ -38,14 +42,16 @@ class Receiver:
     """
     The intake's receiver: runs in its threads, and never blocks for long.
 
-    A client's response is passed on at once, here: it only completes a future, and a callback
-    that waits for it may hold the last worker.
+    What callbacks may wait for comes through though they hold all workers.  So some of rclpy's
+    own parts, which only take note of something, run at once, here: a client's response, which
+    completes a future; while workers run, what sets a node's simulated time, and the timer of a
+    ``Rate``, which ends a sleep.
     """
 
     def __init__(
         self, dispatcher: Dispatcher, registry: Registry, task_set: TaskSet | None,
         executor: Any, fail: Callable[[BaseException], None], recorder: Recorder | None,
-        gathering: Gathering | None = None,
+        pool: Pool, gathering: Gathering | None = None,
     ) -> None:
         self._dispatcher = dispatcher
         self._registry = registry
@@ -53,6 +59,7 @@ class Receiver:
         self._executor = executor
         self._fail = fail
         self._recorder = recorder
+        self._pool = pool
         self._gathering = gathering
 
     def on_thread(self) -> None:
@@ -71,9 +78,21 @@ class Receiver:
     def on_timer(self, timer: Any, due_ns: int) -> None:
         """Take in a timer; ``due_ns`` is its nominal due time on the monotonic clock."""
         entry = self._registry[timer]
-        if entry is not None:
-            self._dispatcher.timer_due(
-                entry, Work(entry, timer.callback, ()), due_ns + self._dispatcher.clock_offset)
+        if entry is None:
+            return
+        callback = timer.callback
+        if type(callback) is MethodType and callback.__func__ is _END_OF_SLEEP:
+            if entry.callback is None and self._pool.running:
+                self._run(entry, callback)
+                return
+        self._dispatcher.timer_due(
+            entry, Work(entry, callback, ()), due_ns + self._dispatcher.clock_offset)
+
+    def _run(self, entry: Entry, callback: Callable[..., Any], *args: Any) -> None:
+        entry.ready += 1
+        self._dispatcher.undeclared += 1
+        callback(*args)
+        entry.ran += 1
 
     def on_missed(self, timer: Any, due_ns: int, count: int) -> None:
         """Take in that periods were skipped since nobody was there to look at the timer."""
@@ -91,6 +110,9 @@ class Receiver:
         """Take in a message with its info."""
         entry = self._registry[subscription]
         if entry is None:
+            return
+        if entry.at_once and self._pool.running:
+            self._run(entry, subscription.callback, message)
             return
         args = (message, info) if subscription._callback_type is WITH_INFO else (message,)
         work = Work(entry, subscription.callback, args)

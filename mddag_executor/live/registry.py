@@ -21,6 +21,7 @@ from typing import Any
 import weakref
 
 from mddag_executor.core import Scheduler, Tables
+from mddag_executor.live.entities import keeps_time
 from mddag_executor.live.entries import (
     CLIENT,
     COUNTS,
@@ -224,6 +225,7 @@ class Registry:
                 return None  # destroyed between being listed and looked at
             raise
         entry = Entry(kind, entity, node, callback, self._group(entity), depth, label)
+        entry.at_once = callback is None and kind == SUBSCRIPTION and keeps_time(entity)
         if callback is not None:
             assert self._task_set is not None
             link(entry, self._task_set, self._tables, topic)

@@ -12,30 +12,71 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Tasks of the executor: futures that know whether somebody takes care of their exception."""
+"""
+Tasks of the executor: futures that know whether somebody takes care of their exception.
+
+Theory of operation
+-------------------
+What a task raises comes out of spin, as with rclpy's executors, unless somebody else takes care of
+it: who awaits the task, or has asked to be told of its end, before it fails (it is *observed*).
+
+With several workers a task that a callback creates may have failed before that callback gets to
+its ``await``, or to ``result()``.  So such an exception is put by for as long as that callback is
+under way and somebody holds on to the task; who fetches it meanwhile takes care of it.
+"""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 import inspect
 from typing import Any
+import weakref
 
-from mddag_executor.live.entries import AtOnce, Entry, TaskWork
+from mddag_executor.live.entries import AtOnce, Entry, TaskWork, Work
+from mddag_executor.live.hooks import current
 from rclpy.task import Future, Task
 
+_RCLPY = Task.__call__.__code__.co_filename
 
 class ObservedTask(Task):
     """
     A task that knows whether somebody waits for it, and so takes care of its exception.
 
     :ivar waits_for: the future that its coroutine waits for, where rclpy says so (7.1.9).
+    :ivar maker: the execution whose callback has created it, or None.
+    :ivar put_by: told its exception where nobody took care of that, once it was put by.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.observed = False
         self.waits_for: Future | None = None
+        running: Any = current.running
+        self.maker: Work | None = None if running is None else running.work
+        self.put_by: Callable[[BaseException], None] | None = None
         super().__init__(*args, **kwargs)  # type: ignore[no-untyped-call]
+
+    def __del__(self) -> None:
+        """Tell an exception that was put by: nobody can take care of it any more."""
+        if self.put_by is not None:
+            self.give_out()
+        super().__del__()  # type: ignore[no-untyped-call]
+
+    def unclaimed(self) -> BaseException | None:
+        """Return its exception if nobody takes care of that."""
+        if self.observed or self._exception_fetched:
+            return None
+        error: BaseException | None = self._exception
+        return error
+
+    def give_out(self) -> None:
+        """Tell an exception that was put by, unless somebody has taken care of it."""
+        tell, self.put_by = self.put_by, None
+        error = self.unclaimed()
+        if error is not None and tell is not None:
+            self._exception_fetched = True
+            tell(error)
 
     def add_done_callback(self, callback: Callable[[Future], None]) -> None:
         """Add a callback for when the task is done."""
@@ -47,14 +88,62 @@ class ObservedTask(Task):
         self.waits_for = future
 
 
+class Unclaimed:
+    """
+    The exceptions of tasks that nobody takes care of so far.
+
+    :param fail: told those that nobody will take care of.
+    """
+
+    def __init__(self, fail: Callable[[BaseException], None]) -> None:
+        self._fail = fail
+        # weakly, so that a task can go that nobody holds on to: it tells its exception then
+        self._tasks: deque[weakref.ref[ObservedTask]] = deque()
+
+    def ended(self, task: ObservedTask) -> None:
+        """
+        Take in that a task has ended.
+
+        :raises BaseException: what it has raised, if nobody can take care of that.
+        """
+        error = task.unclaimed()
+        if error is None:
+            task.maker = None
+            return
+        if task.maker is None or task.maker.x < 0:
+            task._exception_fetched = True
+            raise error
+        # The task must not hold on to itself by the frames in which it caught the exception.
+        trace = error.__traceback__
+        while trace is not None and trace.tb_frame.f_code.co_filename == _RCLPY:
+            trace.tb_frame.clear()
+            trace = trace.tb_next
+        error.__traceback__ = trace
+        task.put_by = self._fail
+        self._tasks.append(weakref.ref(task))
+
+    def look(self) -> None:
+        """Tell the exceptions of tasks whose makers have ended."""
+        for _ in range(len(self._tasks)):
+            reference = self._tasks.popleft()
+            task = reference()
+            if task is None or task.unclaimed() is None:
+                continue
+            if task.maker is None or task.maker.x < 0:
+                task.give_out()
+            else:
+                self._tasks.append(reference)
+
+
 def make_task(
-    entry: Entry, executor: Any, resume: Callable[[TaskWork], None],
+    entry: Entry, executor: Any, resume: Callable[[TaskWork], None], unclaimed: Unclaimed,
     callback: Any, args: tuple[Any, ...], kwargs: dict[str, Any],
 ) -> tuple[ObservedTask, TaskWork]:
     """
     Make a task of a function, a coroutine function or a coroutine, and the work that runs it.
 
     :param resume: makes the work ready again; called when the task is cancelled.
+    :param unclaimed: where its exception goes if nobody takes care of that.
     """
     coroutine = None
     if inspect.iscoroutinefunction(callback):
@@ -64,15 +153,7 @@ def make_task(
     task = ObservedTask(callback, args, kwargs, executor=executor)
     work = TaskWork(entry, task, ())
     work.coroutine = coroutine
-    work.then = _raise_unobserved
+    work.then = unclaimed.ended
     if coroutine is not None:
         Future.add_done_callback(task, AtOnce(partial(resume, work)))  # not an observer
     return task, work
-
-
-def _raise_unobserved(task: Any) -> None:
-    """Raise a finished task's exception, unless somebody has asked to be told of its end."""
-    if not task.observed:
-        error: BaseException | None = task.exception()
-        if error is not None:
-            raise error

@@ -71,7 +71,8 @@ def make_executor(request: Any, ros_context: Any) -> Iterator[Callable[..., Any]
     with contextlib.ExitStack() as stack:
         def make(*args: Any, **kwargs: Any) -> MultiDeadlineExecutor:
             kwargs.setdefault('intake', request.param)
-            executor = MultiDeadlineExecutor(*args, context=ros_context, **kwargs)
+            kwargs.setdefault('context', ros_context)
+            executor = MultiDeadlineExecutor(*args, **kwargs)
             stack.callback(executor.shutdown, 5.0)
             return executor
         yield make

@@ -50,7 +50,7 @@ def test_a_short_soak_loses_nothing_and_keeps_nothing(intake: str):
         '--intake', intake)
     failed = [line for line in result['failed'] if 'deadlines missed' not in line]
     assert failed == []
-    assert sum(result['faults'][fault] for fault in FAULTS) == result['clean_windows'] >= 3
+    assert sum(result['faults'][fault] for fault in FAULTS) == result['clean_windows'] >= 2
     assert result['faults']['raised'] == result['faults']['raise'] + 1
     assert result['ran'] > 10_000 and result['jobs'] > 2_000
     assert result['executions'] == result['ran'] + result['dropped']

@@ -1,0 +1,519 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What users have asked rclpy and rclcpp for, by issue, as far as no other test here has it.
+
+Elsewhere: bounded queues (rclcpp#3213) and synchronous calls (rclpy#1211, #1398) in
+``test_executor``, callback groups (rclpy#850) in ``test_groups``, rates (rclpy#1126) in
+``test_rates``, further signals (rclpy#1279) in ``test_signals``.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+from builtin_interfaces.msg import Time as TimeMessage
+from mddag_executor.live import current_job
+from msg_graph import loads
+import pytest
+import rclpy
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Header
+
+from .conftest import Spinning, wait_for
+
+MS = 1_000_000
+
+
+# --- starvation ----------------------------------------------------------------------------------
+
+
+def test_those_that_are_always_ready_do_not_starve_others(make_executor, make_node):
+    """
+    One worker, far more to do than it can, and still everybody gets his turn (rclcpp#2645).
+
+    The declared timer's key is 5 ms after its release and so smaller than that of what becomes
+    ready at the same time, 100 ms after that; but after 100 ms those are the older ones.
+    """
+    graph = loads("""
+mddag: 1
+nodes:
+  - node: /greedy
+    callbacks: [{name: tick, timer: 1ms, dag: greedy, deadline: 5ms}]
+""")
+    greedy, modest = make_node('greedy'), make_node('modest')
+    runs: Counter[str] = Counter()
+
+    def note(name: str, seconds: float = 0.0) -> Any:
+        def run(*_: Any) -> None:
+            runs[name] += 1
+            time.sleep(seconds)
+        return run
+
+    greedy.create_timer(0.001, note('greedy', 0.003))
+    group = ReentrantCallbackGroup()
+    publisher = modest.create_publisher(Header, '/topic', 10)
+    modest.create_subscription(Header, '/topic', note('message'), 10, callback_group=group)
+    modest.create_timer(0.005, lambda: publisher.publish(Header()), group)
+    modest.create_timer(0.01, note('timer'), group)
+    executor = make_executor(graph, num_workers=1)
+    executor.add_node(greedy)
+    executor.add_node(modest)
+
+    def again() -> None:  # and one that makes itself ready again and again
+        runs['task'] += 1
+        executor.create_task(again)
+
+    with Spinning(executor):
+        executor.create_task(again)
+        assert wait_for(lambda: min(runs[n] for n in (
+            'greedy', 'message', 'timer', 'task')) >= 10, 10.0), runs
+
+
+def test_all_of_one_group_get_their_turn(make_executor, make_node):
+    """Also where their callbacks exclude each other, on several workers (rclcpp#2702)."""
+    node = make_node()
+    group = MutuallyExclusiveCallbackGroup()
+    runs: Counter[int] = Counter()
+
+    def note(number: int) -> Any:
+        def run(_: Header) -> None:
+            runs[number] += 1
+            time.sleep(0.002)
+        return run
+
+    publishers = []
+    for number in range(5):
+        node.create_subscription(Header, f'/t{number}', note(number), 10, callback_group=group)
+        publishers.append(node.create_publisher(Header, f'/t{number}', 10))
+    others = ReentrantCallbackGroup()
+
+    def publish() -> None:
+        for publisher in publishers:
+            publisher.publish(Header())
+
+    node.create_timer(0.002, publish, others)
+    executor = make_executor(num_workers=3)
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: min(runs[n] for n in range(5)) >= 20, 10.0), runs
+        counts = [runs[number] for number in range(5)]
+    # In the order of becoming ready: a queue that is full has its ten, like the others.
+    assert max(counts) - min(counts) <= 12
+
+
+def slow_and_quick(node: Any) -> Counter[str]:
+    """Give a node a timer that takes longer than its period, and quick callbacks."""
+    runs: Counter[str] = Counter()
+
+    def slow() -> None:
+        runs['slow'] += 1
+        time.sleep(0.01)
+
+    def quick(_: Header) -> None:
+        runs['quick'] += 1
+
+    publisher = node.create_publisher(Header, '/topic', 10)
+    node.create_subscription(Header, '/topic', quick, 10)
+    node.create_timer(0.002, slow)
+    node.create_timer(0.005, lambda: publisher.publish(Header()))
+    return runs
+
+
+def test_a_slow_timer_does_not_monopolise(make_executor, make_node):
+    """Its subscriptions run as well, though it is always due (rclcpp#2402)."""
+    node = make_node()
+    runs = slow_and_quick(node)
+    executor = make_executor(num_workers=2)
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: min(runs['slow'], runs['quick']) >= 10), runs
+
+
+def test_a_slow_timer_does_not_monopolise_a_loop_of_spin_once(make_executor, make_node):
+    """One callback at a time, and none for ever the same (rclcpp#2402)."""
+    node = make_node()
+    runs = slow_and_quick(node)
+    executor = make_executor()
+    executor.add_node(node)
+
+    def ran() -> bool:
+        executor.spin_once(0.1)
+        return min(runs['slow'], runs['quick']) >= 10
+    assert wait_for(ran), runs
+
+
+# --- timers --------------------------------------------------------------------------------------
+
+
+def test_an_overrun_gives_no_burst_and_the_phase_is_kept(make_executor, make_node):
+    """Missed periods are skipped and counted, and releases stay on the grid (rclcpp#2771)."""
+    graph = loads("""
+mddag: 1
+nodes:
+  - node: /source
+    callbacks: [{name: tick, timer: 20ms, dag: alone, deadline: 20ms}]
+""")
+    node = make_node('source')
+    starts: list[float] = []
+    releases: list[int] = []
+
+    def tick() -> None:
+        job = current_job()
+        assert job is not None
+        starts.append(time.monotonic())
+        releases.append(job.release_ns)
+        if len(starts) == 3:
+            time.sleep(0.13)
+
+    node.create_timer(0.02, tick)
+    executor = make_executor(graph, num_workers=2)
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(starts) >= 10)
+    # of what it missed one release may have waited, and nothing more
+    after = [b - a for a, b in zip(starts[3:], starts[4:])]
+    assert sum(gap < 0.002 for gap in after) <= 1, after
+    for release in releases:
+        assert abs((release - releases[0] + 10 * MS) % (20 * MS) - 10 * MS) < 2 * MS, releases
+    counts = executor.statistics()['callbacks']['/source:tick']
+    assert counts['skipped'] >= 4
+    jobs = round((releases[-1] - releases[0]) / (20 * MS)) + 1
+    assert executor.statistics()['dags']['alone']['jobs'] >= jobs
+
+
+# --- simulated time ------------------------------------------------------------------------------
+
+
+class Simulation:
+    """A node with simulated time and somebody who tells it the time."""
+
+    def __init__(self, make_node: Any) -> None:
+        self.node = make_node(
+            'simulated', parameter_overrides=[Parameter('use_sim_time', value=True)])
+        self._publisher = make_node('clock').create_publisher(
+            Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+
+    def matched(self) -> bool:
+        return wait_for(lambda: self._publisher.get_subscription_count() == 1)
+
+    def set_clock(self, now: int) -> bool:
+        """Tell the time until the node has it."""
+        message = Clock(clock=TimeMessage(sec=now // 10**9, nanosec=now % 10**9))
+        clock = self.node.get_clock()
+        return any(
+            self._publisher.publish(message)
+            or wait_for(lambda: clock.now().nanoseconds == now, 0.1) for _ in range(20))
+
+
+def test_the_clock_goes_on_while_all_workers_are_busy(make_executor, make_node):
+    """As it does without simulated time (rclpy#792)."""
+    simulation = Simulation(make_node)
+    executor = make_executor()
+    executor.add_node(simulation.node)
+    gate, together = threading.Event(), threading.Barrier(8)
+
+    def busy() -> None:
+        together.wait(5.0)
+        gate.wait(10.0)
+
+    with Spinning(executor):
+        assert simulation.matched()
+        for _ in range(7):
+            executor.create_task(busy)
+        together.wait(5.0)
+        try:
+            assert simulation.set_clock(5 * 10**9)
+            assert simulation.set_clock(6 * 10**9)
+        finally:
+            gate.set()
+
+
+def test_every_worker_may_sleep_on_the_simulated_clock(make_executor, make_node, ros_context):
+    """They would wait for a clock that waits for them (rclpy#792)."""
+    simulation = Simulation(make_node)
+    node = simulation.node
+    executor = make_executor()
+    executor.add_node(node)
+    clock = node.get_clock()
+    ends: list[bool] = []
+
+    def sleep() -> None:
+        ends.append(clock.sleep_for(Duration(seconds=1), context=ros_context))
+
+    slept: list[bool] = []
+
+    def sleep_in_the_group_of_the_clock() -> None:
+        timer.cancel()
+        slept.append(clock.sleep_for(Duration(seconds=1), context=ros_context))
+
+    with Spinning(executor):
+        assert simulation.matched() and simulation.set_clock(10**9)
+        timer = node.create_timer(1e-3, sleep_in_the_group_of_the_clock)
+        for _ in range(6):
+            executor.create_task(sleep)
+        assert wait_for(lambda: len(ends) == 6 and slept or simulation.set_clock(
+            clock.now().nanoseconds + 200 * MS) and False)
+    assert ends == [True] * 6 and slept == [True]
+
+
+def test_every_worker_may_sleep_with_a_rate(make_executor, make_node):
+    """The timer that ends their sleep needs no worker (the same for ``create_rate``)."""
+    node = make_node()
+    executor = make_executor()
+    executor.add_node(node)
+    together = threading.Barrier(7)
+    rates = [node.create_rate(100) for _ in range(7)]
+
+    def sleep(rate: Any) -> int:
+        together.wait(5.0)
+        for _ in range(3):
+            rate.sleep()
+        return 1
+
+    tasks = [executor.create_task(sleep, rate) for rate in rates]
+    with Spinning(executor):
+        done = wait_for(lambda: all(task.done() for task in tasks))
+        for rate in rates:
+            rate.destroy()
+    assert done and [task.result() for task in tasks] == [1] * 7
+
+
+def test_a_clock_that_jumps_back_does_not_stall_timers(make_executor, make_node):
+    """They go on with the clock as it is then (rclpy#1490, rclcpp#2535)."""
+    simulation = Simulation(make_node)
+    calls: list[int] = []
+    clock = simulation.node.get_clock()
+    executor = make_executor()
+    executor.add_node(simulation.node)
+
+    def run(start: int, steps: int) -> None:
+        for step in range(1, steps + 1):
+            assert simulation.set_clock(start + step * 10 * MS)
+            time.sleep(0.002)
+
+    with Spinning(executor):
+        assert simulation.matched() and simulation.set_clock(100 * 10**9)
+        simulation.node.create_timer(0.05, lambda: calls.append(clock.now().nanoseconds))
+        time.sleep(0.1)
+        run(100 * 10**9, 20)
+        assert wait_for(lambda: len(calls) >= 3)
+        for back in (50 * 10**9, 10**9):
+            before = len(calls)
+            run(back, 20)
+            assert wait_for(lambda n=before: len(calls) >= n + 3)
+            assert calls[-1] < back + 10**9
+
+
+# --- tasks ---------------------------------------------------------------------------------------
+
+
+def fails() -> None:
+    raise KeyError('handled')
+
+
+async def fails_later() -> None:
+    fails()
+
+
+@pytest.mark.parametrize('kind', [fails, fails_later])
+@pytest.mark.parametrize('late', [False, True])
+def test_an_exception_that_is_handled_does_not_end_the_executor(make_executor, kind, late):
+    """Whether the task fails before its maker awaits it or after (rclpy#1215, #1098)."""
+    executor = make_executor()
+
+    async def handle() -> int:
+        handled = 0
+        for _ in range(10):
+            task = executor.create_task(kind)
+            if late:
+                assert wait_for(task.done)
+            try:
+                await task
+            except KeyError:
+                handled += 1
+        return handled
+
+    def look() -> str:  # with rclpy's example, in a function
+        task = executor.create_task(kind)
+        assert wait_for(task.done)
+        try:
+            task.result()
+        except KeyError as error:
+            return str(error)
+        return ''
+
+    tasks = [executor.create_task(work) for work in (handle, look)]
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: all(task.done() for task in tasks))
+        time.sleep(0.15)  # somebody looks for exceptions every 100 ms
+    assert spinning.error is None
+    assert [task.result() for task in tasks] == [10, "'handled'"]
+
+
+@pytest.mark.parametrize('kept', [False, True])
+def test_an_exception_that_nobody_handles_ends_the_spin(make_executor, kept):
+    """One that was put by since its maker could have handled it comes out as well."""
+    executor = make_executor()
+    tasks: list[Any] = []
+    gate: Future = Future()
+
+    async def make() -> None:
+        task = executor.create_task(fails)
+        assert wait_for(task.done)
+        if kept:
+            tasks.append(task)
+        else:
+            del task
+            await gate  # it is under way for as long as this test lasts
+
+    maker = executor.create_task(make)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: spinning.error is not None)
+        spinning.join()
+    assert isinstance(spinning.error, KeyError)
+    assert maker.done() == kept
+
+
+# --- ends ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('what', ['context', 'executor', 'executor, waiting'])
+def test_shutdown_from_inside_a_callback(make_executor, make_node, ros_context, what):
+    """It hangs in rclpy: rclpy#944, and #1646 of an executor's own shutdown."""
+    node = make_node()
+    executor = make_executor()
+    executor.add_node(node)
+    calls: list[int] = []
+
+    def end() -> None:
+        calls.append(1)
+        if what == 'context':
+            rclpy.shutdown(context=ros_context)
+        else:
+            executor.shutdown(None if 'waiting' in what else 0)
+
+    node.create_timer(0.01, end, MutuallyExclusiveCallbackGroup())
+    node.create_timer(0.001, lambda: time.sleep(0.002))
+    spinning = Spinning(executor)
+    with spinning:
+        spinning.join()
+    assert calls == [1]
+    if what == 'context':
+        assert isinstance(spinning.error, ExternalShutdownException)
+    else:
+        assert spinning.error is None
+
+
+def test_shutdown_while_spin_dispatches(make_executor, make_node):
+    """Nothing is handed to a pool that has been closed meanwhile (rclpy#1724)."""
+    node = make_node()
+    timers = [node.create_timer(0.001, lambda: None, ReentrantCallbackGroup()) for _ in range(5)]
+    assert timers
+    for turn in range(15):
+        executor = make_executor(num_workers=3)
+        executor.add_node(node)
+        stop = threading.Event()
+
+        def feed(executor: Any = executor, stop: threading.Event = stop) -> None:
+            while not stop.is_set():
+                executor.create_task(lambda: None)
+                time.sleep(0.0001)
+
+        feeder = threading.Thread(target=feed)
+        try:
+            with Spinning(executor) as spinning:
+                feeder.start()
+                time.sleep(0.002 * turn)
+        finally:
+            stop.set()
+            feeder.join()
+        assert spinning.error is None
+        executor.remove_node(node)
+
+
+PROGRAM = """
+import sys, threading, time
+import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import ExternalShutdownException
+from std_srvs.srv import Trigger
+from mddag_executor import MultiDeadlineExecutor
+
+def busy():
+    running.add(threading.get_ident())
+    if len(running) >= 5:
+        ready.set()
+    end = time.monotonic() + 0.02
+    while time.monotonic() < end:
+        node.get_logger().debug('busy')
+
+def ask():
+    client.call(Trigger.Request())
+    asked.set()
+
+running, ready, asked = set(), threading.Event(), threading.Event()
+rclpy.init()
+node = rclpy.create_node('node')
+group = ReentrantCallbackGroup()
+node.create_service(Trigger, '/ask', lambda request, response: response, callback_group=group)
+client = node.create_client(Trigger, '/ask', callback_group=group)
+for period in range(40, 47):
+    node.create_timer(period / 1000, busy, group)
+node.create_timer(0.05, ask, group)
+executor = MultiDeadlineExecutor(intake=sys.argv[1])
+threading.Thread(target=lambda: ready.wait() and asked.wait() and print('ready', flush=True),
+                 daemon=True).start()
+try:
+    rclpy.spin(node, executor)
+except (KeyboardInterrupt, ExternalShutdownException):
+    pass
+finally:
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown()
+"""
+
+
+@pytest.mark.parametrize('intake', ['events', 'waitset'])
+def test_ctrl_c_is_quiet(intake):
+    """While all workers are busy, with the idiom of rclpy's own examples (rclpy#1279)."""
+    process = subprocess.Popen(
+        [sys.executable, '-c', PROGRAM, intake], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == 'ready\n', process.communicate()[1]
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=10)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == 0, err
+    assert out == ''
+    # On a busy machine the timers skip periods, and that is said.
+    assert [line for line in err.splitlines() if 'can not keep its rate' not in line] == []
