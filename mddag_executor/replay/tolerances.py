@@ -31,7 +31,8 @@ is tolerated.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from array import array
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,38 +40,59 @@ from mddag_executor.core import Tables, Tally
 from mddag_executor.core.state import SINK_DONE
 from msg_graph import TaskSet
 
+FOLD = 65_536
+
+
+class Runs:
+    """A set of numbers, told in any order, as runs of consecutive ones: memory is that of runs."""
+
+    def __init__(self) -> None:
+        self._new = array('q')
+        self._runs: list[tuple[int, int]] = []
+
+    def add(self, number: int) -> None:
+        """Take in a number; one that is there already changes nothing."""
+        self._new.append(number)
+        if len(self._new) >= max(FOLD, len(self._runs)):
+            self._fold()
+
+    def longest(self) -> int:
+        """Return the length of the longest run."""
+        self._fold()
+        return max((last - first + 1 for first, last in self._runs), default=0)
+
+    def _fold(self) -> None:
+        """Make runs of what is new, and join those that touch."""
+        told = sorted([*self._runs, *((number, number) for number in set(self._new))])
+        del self._new[:]
+        self._runs = []
+        for first, last in told:
+            if self._runs and first <= self._runs[-1][1] + 1:
+                first, before = self._runs.pop()
+                last = max(last, before)
+            self._runs.append((first, last))
+
 
 class MissTally(Tally):
     """A tally that keeps which jobs missed at each sink."""
 
     def __init__(self, task_set: TaskSet, tables: Tables, keep: int | None = None) -> None:
         super().__init__(task_set, tables, keep)
-        #: By global vertex of each sink: the jobs that missed, as they became known.
-        self.missed_jobs: dict[int, list[int]] = {vertex: [] for vertex in self.sinks}
+        #: By global vertex of each sink: the jobs that missed.
+        self.missed_jobs = {vertex: Runs() for vertex in self.sinks}
 
     def _add_sink(
         self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
     ) -> None:
         super()._add_sink(kind, dag, vertex, job, deadline, time)
         if kind != SINK_DONE or time > deadline:
-            self.missed_jobs[vertex].append(job)
+            self.missed_jobs[vertex].add(job)
 
     def add_bursts(self, dags: Mapping[str, Any]) -> None:
         """Add to each sink of a result its longest burst of misses, as `longest_burst`."""
         for v, jobs in self.missed_jobs.items():
             dag = self._dags[self._tables.dag_of[v]].name
-            dags[dag]['sinks'][self.vertex_name(v)]['longest_burst'] = longest_burst(jobs)
-
-
-def longest_burst(jobs: Iterable[int]) -> int:
-    """Return the length of the longest run of consecutive numbers."""
-    longest = length = 0
-    before: int | None = None
-    for job in sorted(set(jobs)):
-        length = length + 1 if before is not None and job == before + 1 else 1
-        longest = max(longest, length)
-        before = job
-    return longest
+            dags[dag]['sinks'][self.vertex_name(v)]['longest_burst'] = jobs.longest()
 
 
 @dataclass(frozen=True)
