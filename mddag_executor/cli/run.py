@@ -44,8 +44,8 @@ from mddag_executor.cli.text import printable, Progress
 from mddag_executor.core import POLICIES
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import MddagError, UsageError
-from mddag_executor.report.drift import drift_lines
-from mddag_executor.report.tables import percent, sink_table, total
+from mddag_executor.report.live_runs import listed, summary
+from mddag_executor.report.tables import sink_table
 
 if TYPE_CHECKING:
     from mddag_executor.live.execution import ExecutionPlan
@@ -58,7 +58,6 @@ EXAMPLE = """\
 mddag run graph.yaml --node my_package/driver --node my_package.filter:main --trace run.mcap
 mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20s"""
 
-_LONGEST_LIST = 10
 # SIGINTs within this time are one: who ends a process group sends it to all processes of it, and
 # `ros2 launch`, where it reads from no terminal, then once more to those that it started.
 _SAME_INTERRUPT_S = 1.0
@@ -155,7 +154,7 @@ def _leave_threads_behind(error: BaseException | None) -> None:
             if not t.daemon and t is not threading.main_thread()]
     if not left or error is not None:
         return
-    print(f'warning: threads that nodes started still run and are left behind: {_listed(left)}',
+    print(f'warning: threads that nodes started still run and are left behind: {listed(left)}',
           file=sys.stderr)
     sys.stdout.flush()
     sys.stderr.flush()
@@ -340,70 +339,7 @@ class _Signals:
 
 
 def _report(args: argparse.Namespace, result: dict[str, Any]) -> None:
-    if args.json is not None:
-        common.write_json(args.json, result)
-    if common.wants_tables(args):
+    if common.write_result(args, result):
         print(sink_table(result['dags']))
         for line in summary(result):
             print(line)
-
-
-def summary(result: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines that stand below the table of a run."""
-    every = total(result['dags'])
-    yield (f'{every.due} sink jobs due, {every.in_time} in time '
-           f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
-           + (f', {every.aborted} aborted' if every.aborted else ''))
-    measured = result['measured']
-    if measured is not None:
-        yield from measured_lines(measured)
-    dropped = result['dropped']
-    yield f'{sum(dropped.values())} dropped' + _details(dropped)
-    skipped = {name: counts['skipped'] for name, counts in result['callbacks'].items()
-               if counts['skipped']}
-    if skipped:
-        yield f'{sum(skipped.values())} timer releases skipped' + _details(skipped)
-    undeclared = {
-        name: counts['unattributed' if counts['declared'] else 'ran']
-        for name, counts in result['callbacks'].items()}
-    yield (f'{result["undeclared"]} runs of undeclared callbacks'
-           + _details({name: count for name, count in undeclared.items() if count}))
-    never = [*result['never_ran'], *(
-        name for name, counts in result['callbacks'].items()
-        if counts['declared'] and not counts['ran'])]
-    drift = result.get('drift', ())
-    yield from drift_lines(drift)
-    if never and not any(each['kind'] == 'never ran' for each in drift):
-        yield f'declared callbacks that never ran: {len(never)}: ' + _listed(never)
-    if result['trace'] is not None:
-        lost = result['trace']['lost']
-        yield (f'trace: {printable(str(Path(result["trace"]["path"]).absolute()))}'
-               + (f' ({lost} events lost: the disk was too slow)' if lost else ''))
-
-
-def measured_lines(measured: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines about what the synthetic nodes themselves measured."""
-    yield (
-        f'measured by the nodes, {measured["window_ns"] / 1e9:.1f} s after a warm-up of '
-        f'{measured["warm_up_ns"] / 1e9:g} s: {measured["sink_jobs_due"]} due, '
-        f'{measured["on_time"]} on time ({percent(measured["on_time"], measured["sink_jobs_due"])}'
-        f'), {measured["late"]} late, {measured["missing"]} missing')
-    cpu = measured['cpu_us_per_callback']
-    yield (
-        f'utilisation {measured["utilisation"]:.3f} planned (seed {measured["seed"]}), '
-        f'{measured["utilisation_taken"]:.3f} taken; {measured["callbacks_per_s"]:.0f} callbacks '
-        f'a second, {"-" if cpu is None else f"{cpu:.0f}"} us of CPU each')
-    attribution = measured['attribution']
-    if attribution['wrong'] or attribution['none']:
-        yield (f'{attribution["wrong"]} callbacks ran as the wrong job, {attribution["none"]} as '
-               'none')
-
-
-def _details(numbers: dict[str, int]) -> str:
-    return ': ' + _listed([f'{name} {n}' for name, n in numbers.items()]) if numbers else ''
-
-
-def _listed(names: Sequence[str]) -> str:
-    shown = ', '.join(printable(name) for name in names[:_LONGEST_LIST])
-    return shown + (f', … ({len(names) - _LONGEST_LIST} more)'
-                    if len(names) > _LONGEST_LIST else '')

@@ -1,0 +1,86 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What came of a live run, as lines of text below the table of its sinks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.report.drift import drift_lines
+from mddag_executor.report.tables import percent, verdicts_line
+from mddag_executor.report.text import printable
+
+_LONGEST_LIST = 10
+
+
+def summary(result: dict[str, Any]) -> Iterator[str]:
+    """Yield the lines that stand below the table of a run."""
+    yield verdicts_line(result['dags'])
+    measured = result['measured']
+    if measured is not None:
+        yield from measured_lines(measured)
+    dropped = result['dropped']
+    yield f'{sum(dropped.values())} dropped' + _details(dropped)
+    skipped = {name: counts['skipped'] for name, counts in result['callbacks'].items()
+               if counts['skipped']}
+    if skipped:
+        yield f'{sum(skipped.values())} timer releases skipped' + _details(skipped)
+    undeclared = {
+        name: counts['unattributed' if counts['declared'] else 'ran']
+        for name, counts in result['callbacks'].items()}
+    yield (f'{result["undeclared"]} runs of undeclared callbacks'
+           + _details({name: count for name, count in undeclared.items() if count}))
+    never = [*result['never_ran'], *(
+        name for name, counts in result['callbacks'].items()
+        if counts['declared'] and not counts['ran'])]
+    drift = result.get('drift', ())
+    yield from drift_lines(drift)
+    if never and not any(each['kind'] == 'never ran' for each in drift):
+        yield f'declared callbacks that never ran: {len(never)}: ' + listed(never)
+    if result['trace'] is not None:
+        lost = result['trace']['lost']
+        yield (f'trace: {printable(str(Path(result["trace"]["path"]).absolute()))}'
+               + (f' ({lost} events lost: the disk was too slow)' if lost else ''))
+
+
+def measured_lines(measured: dict[str, Any]) -> Iterator[str]:
+    """Yield the lines about what the synthetic nodes themselves measured."""
+    yield (
+        f'measured by the nodes, {measured["window_ns"] / 1e9:.1f} s after a warm-up of '
+        f'{measured["warm_up_ns"] / 1e9:g} s: {measured["sink_jobs_due"]} due, '
+        f'{measured["on_time"]} on time ({percent(measured["on_time"], measured["sink_jobs_due"])}'
+        f'), {measured["late"]} late, {measured["missing"]} missing')
+    cpu = measured['cpu_us_per_callback']
+    yield (
+        f'utilisation {measured["utilisation"]:.3f} planned (seed {measured["seed"]}), '
+        f'{measured["utilisation_taken"]:.3f} taken; {measured["callbacks_per_s"]:.0f} callbacks '
+        f'a second, {"-" if cpu is None else f"{cpu:.0f}"} us of CPU each')
+    attribution = measured['attribution']
+    if attribution['wrong'] or attribution['none']:
+        yield (f'{attribution["wrong"]} callbacks ran as the wrong job, {attribution["none"]} as '
+               'none')
+
+
+def _details(numbers: dict[str, int]) -> str:
+    return ': ' + listed([f'{name} {n}' for name, n in numbers.items()]) if numbers else ''
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names for a line of text: the first ones, and how many more there are."""
+    shown = ', '.join(printable(name) for name in names[:_LONGEST_LIST])
+    return shown + (f', … ({len(names) - _LONGEST_LIST} more)'
+                    if len(names) > _LONGEST_LIST else '')
