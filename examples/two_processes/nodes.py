@@ -14,6 +14,9 @@
 
 """Sensor, filter and control; every message passes the stamp of the sensor's reading on."""
 
+import time
+
+import rclpy
 from rclpy.node import Node
 from std_msgs.msg import Header
 
@@ -47,7 +50,12 @@ class Control(Node):
 
     def __init__(self) -> None:
         super().__init__('control')
-        self.create_subscription(Header, '/clean', self.step, 10)
+        subscription = self.create_subscription(Header, '/clean', self.step, 10)
+        # The run begins when its nodes are there: this one waits for the other process.
+        for _ in range(600):
+            if subscription.get_publisher_count() or not rclpy.ok():
+                break
+            time.sleep(0.05)
 
     def step(self, reading: Header) -> None:
         pass

@@ -37,6 +37,7 @@ from mddag_executor.core.rules import complete, make_ready
 from mddag_executor.core.state import IDLE, OPEN, SUSPENDED
 from mddag_executor.live.attribution import Attribution, Origin
 from mddag_executor.live.crossings import Crossings
+from mddag_executor.live.dropping import Dropping
 from mddag_executor.live.entries import Entry, Work
 from mddag_executor.live.hooks import current
 from mddag_executor.live.verdicts import DeadlineMiss, NO_ORIGIN, Record, Verdicts
@@ -54,7 +55,7 @@ class Seat(Protocol):
     vtid: int
 
 
-class Dispatcher:
+class Dispatcher(Dropping):
     """
     Turns what became ready into executions of the core, and its decisions into actions.
 
@@ -292,53 +293,6 @@ class Dispatcher:
             if work.x >= 0 and self.scheduler.state.x_state[work.x] == SUSPENDED:
                 self.scheduler.resume(work.x)
                 self.dispatch(self.tick())
-
-    # --- what does not run -----------------------------------------------------------------------
-
-    def _drop_oldest(self, entry: Entry, now: int) -> None:
-        """Keep QoS: the oldest waiting message of a full queue goes."""
-        self._drop(entry, next(iter(entry.waiting)), 'qos_depth', now)
-        self.decided(now)
-
-    def _replace_oldest(self, entry: Entry, work: Work, now: int) -> None:
-        """
-        Keep QoS for a callback that no DAG declares: whose turn it is stays as it was.
-
-        The next message takes the place of the one that goes.  With a place of its own, a callback
-        whose queue overflows all the time would never be one that has waited long: it would starve
-        beside others that have.
-        """
-        places = iter(entry.waiting)
-        first, second = next(places), next(places, -1)
-        gone = self._work[first]
-        if second < 0:
-            gone.x = -1
-            self.undeclared += 1
-            self.verdicts.note_drop(entry, NO_ORIGIN, 'qos_depth', now)
-            self._note_ready(entry, work, first, now)
-            return
-        heir = self._work[second]
-        self._work[first], self._work[second] = heir, gone
-        heir.x, gone.x = first, second
-        self._drop(entry, second, 'qos_depth', now)
-        self.decided(now)
-        self._start_undeclared(entry, work, now)
-
-    def _drop(self, entry: Entry, x: int, reason: str, now: int) -> None:
-        del entry.waiting[x]
-        work = self._work.pop(x)
-        work.x = -1
-        self.scheduler.drop(x, now)
-        self.verdicts.note_drop(entry, work.origin or NO_ORIGIN, reason, now)
-
-    def remove(self, entry: Entry) -> None:
-        """Forget a destroyed entity: what waits of it never runs."""
-        with self.lock:
-            entry.removed = True
-            now = self.tick()
-            for x in list(entry.waiting):
-                self._drop(entry, x, 'destroyed', now)
-            self.decided(now)
 
     def release_of(self, work: Work) -> int:
         """Return the release of the job that a declared execution belongs to; it is not over."""

@@ -53,7 +53,11 @@ class AtOnce:
 
 
 class Destroyed(Exception):
-    """The entity was destroyed after its execution had become ready: it must not run."""
+    """
+    The entity was destroyed after its execution had become ready: it must not run.
+
+    Or it is a timer that was cancelled.
+    """
 
 
 class Entry:
@@ -176,10 +180,13 @@ class Work:
         :raises BaseException: whatever the callback raises.
         """
         if self.coroutine is None:
-            if self.entry.handle is not None:
+            handle = self.entry.handle
+            if handle is not None:
                 try:
-                    with self.entry.handle:
-                        pass
+                    with handle:
+                        # One more may have become due before it was cancelled in its callback.
+                        if self.entry.kind is TIMER and handle.is_timer_canceled():
+                            raise Destroyed
                 except InvalidHandle:
                     raise Destroyed from None
             result = self.function(*self.args)

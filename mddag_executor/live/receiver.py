@@ -31,10 +31,13 @@ from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 from msg_graph import TaskSet
+from rclpy.action.client import ActionClient
 from rclpy.exceptions import InvalidHandle
 from rclpy.subscription import Subscription
 
 _END_OF_SLEEP = threading.Event.set
+MOST_FEEDBACK = 64
+"""More of it is taken in its turn."""
 WITH_INFO = Subscription.CallbackType.WithMessageInfo
 
 
@@ -186,7 +189,32 @@ class Receiver:
             return
         for future in waitable._futures:
             future._set_executor(self._executor)
-        self._dispatcher.undeclared_ready(entry, Work(entry, waitable.execute, (data,)))
+        if isinstance(waitable, ActionClient):
+            self._feedback(entry, waitable, data)
+        if data:
+            self._dispatcher.undeclared_ready(entry, Work(entry, waitable.execute, (data,)))
+
+    def _feedback(self, entry: Entry, client: Any, data: dict[str, Any]) -> None:
+        """
+        Hand over the feedback that an action client has taken, each with the callback it is for.
+
+        A client forgets the callback when the goal's result has come.  It takes one feedback at a
+        time, so with a result all that is there is taken, too; and another worker may have the
+        result in its hands soon, so the callback is looked up now.
+        """
+        callbacks = getattr(client, '_feedback_callbacks', {})
+        messages = [data['feedback']] if 'feedback' in data else []
+        if 'result' in data and callbacks:
+            kind = client._action_type.Impl.FeedbackMessage
+            for message in iter(lambda: client._client_handle.take_feedback(kind), None):
+                messages.append(message)
+                if len(messages) >= MOST_FEEDBACK:
+                    break
+        for message in messages:
+            callback = callbacks.get(bytes(message.goal_id.uuid))
+            if callback is not None:
+                data.pop('feedback', None)  # the first one
+                self._dispatcher.undeclared_ready(entry, Work(entry, callback, (message,)))
 
     def on_intake_error(self, error: BaseException) -> None:
         """Take an error of the intake: it comes out of spin."""

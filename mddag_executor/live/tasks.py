@@ -40,6 +40,7 @@ from rclpy.task import Future, Task
 
 _RCLPY = Task.__call__.__code__.co_filename
 
+
 class ObservedTask(Task):
     """
     A task that knows whether somebody waits for it, and so takes care of its exception.

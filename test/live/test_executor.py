@@ -125,6 +125,7 @@ def test_synchronous_calls_from_all_workers_at_once(make_executor, make_node):
 
 
 def test_synchronous_call_inside_spin_once(make_executor, make_node):
+    """The same one callback at a time (rclpy#1211)."""
     node, answers = make_node(), []
     node.create_service(Trigger, '/ask', lambda request, response: response)
     client = node.create_client(Trigger, '/ask', callback_group=ReentrantCallbackGroup())
@@ -169,18 +170,25 @@ def test_action_with_feedback_result_and_cancel(make_executor, make_node):
     executor.add_node(node)
     with Spinning(executor) as spinning:
         assert client.wait_for_server(5.0)
-        time.sleep(0.3)  # the server may see the client later than the client the server
+        # The server may see the client later than the client the server: what it publishes until
+        # then is gone.
+        assert wait_for(lambda: wait_for(lambda: feedback, 0.1) or client.send_goal_async(
+            Fibonacci.Goal(order=1), feedback_callback=feedback.append) is None)
+        assert wait_for(lambda: len(feedback) % 3 == 0)
+        feedback.clear()
         handles = [
             client.send_goal_async(Fibonacci.Goal(order=n), feedback_callback=feedback.append)
             for n in (3, 4, 99)]
         assert wait_for(lambda: all(h.done() for h in handles))
         assert all(h.result().accepted for h in handles)
+        # Before the results: rclpy's client ignores feedback of a goal whose result has come.
+        assert wait_for(lambda: len(feedback) == 9)
         results = [h.result().get_result_async() for h in handles]
         assert wait_for(lambda: results[0].done() and results[1].done())
         assert [list(r.result().result.sequence) for r in results[:2]] == [[3], [4]]
         handles[2].result().cancel_goal_async()
         assert wait_for(results[2].done)
-        assert wait_for(lambda: len(feedback) == 9)
+    assert len(feedback) == 9
     assert spinning.error is None
     server.destroy()
     client.destroy()
@@ -248,6 +256,7 @@ def stays(calls: list[Any]) -> bool:
 
 
 def test_entities_created_and_destroyed_while_it_spins(make_executor, make_node):
+    """What is destroyed meanwhile neither runs nor fails (rclpy#1206)."""
     node, calls = make_node(), []
     executor = make_executor()
     executor.add_node(node)
@@ -335,6 +344,7 @@ def test_never_more_than_the_workers(make_executor):
 
 
 def test_queue_depth_is_kept_and_drops_are_counted(make_executor, make_node):
+    """A bounded queue, the policy is that of its QoS: the oldest goes (rclcpp#3213)."""
     node, got, gate = make_node(), [], threading.Event()
     group = MutuallyExclusiveCallbackGroup()
 

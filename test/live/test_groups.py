@@ -12,6 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
+"""Callback groups that are given to an executor by themselves (rclpy#850)."""
+
 from __future__ import annotations
 
 import threading

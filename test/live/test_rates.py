@@ -12,6 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
+"""Warnings about timers that can not keep their rate (rclpy#1126)."""
+
 from __future__ import annotations
 
 import time

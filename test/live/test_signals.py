@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a signal does to a process that spins: it ends soon, quietly, and leaves no thread."""
+"""What a signal does to a process that spins: it ends soon and quietly (rclpy#1279)."""
 
 from __future__ import annotations
 

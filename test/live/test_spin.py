@@ -101,6 +101,7 @@ def test_it_spins_on_after_an_exception(make_executor):
 
 
 def test_an_exception_that_somebody_awaits_does_not_end_spin(make_executor):
+    """See also ``test_asked_for`` (rclpy#1215)."""
     executor = make_executor()
 
     async def fails() -> None:
@@ -224,6 +225,7 @@ def test_external_shutdown_raises_as_with_rclpy(make_executor, ros_context):
 
 
 def test_shutdown_from_a_callback(make_executor, make_node):
+    """See also ``test_asked_for`` (rclpy#944)."""
     node = make_node()
     executor = make_executor()
     executor.add_node(node)

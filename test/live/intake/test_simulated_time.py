@@ -103,6 +103,7 @@ def test_simulated_time_drives_timers(simulation: Simulation) -> None:
 
 
 def test_simulated_time_that_jumps_back_does_not_stall_timers(simulation: Simulation) -> None:
+    """It is asked for in rclpy#1490 and rclcpp#2535."""
     simulation.node.create_timer(0.050, nothing)
     simulation.intake.update([simulation.node])
     simulation.run(1000 * MS, 20)

@@ -1,0 +1,370 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What rclpy's executors promise: lifecycle nodes, QoS events, parameters, what callbacks make."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import pytest
+from rclpy.action import ActionClient, ActionServer
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidHandle
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
+
+from .conftest import Spinning, wait_for
+
+# --- kinds of nodes and events -------------------------------------------------------------------
+
+
+def test_a_lifecycle_node_goes_through_its_transitions(make_executor, make_node, ros_context):
+    """By its services, called by a callback of another node of the same executor."""
+    lifecycle = pytest.importorskip('rclpy.lifecycle', reason='lifecycle_msgs is not installed')
+    from lifecycle_msgs.msg import Transition
+    from lifecycle_msgs.srv import ChangeState, GetState
+    seen: list[str] = []
+
+    class Managed(lifecycle.LifecycleNode):
+
+        def on_configure(self, state: Any) -> Any:
+            self.publisher = self.create_lifecycle_publisher(Header, '/managed', 10)
+            self.timer = self.create_timer(0.005, lambda: self.publisher.publish(Header()))
+            seen.append('configure')
+            return super().on_configure(state)
+
+        def on_activate(self, state: Any) -> Any:
+            seen.append('activate')
+            return super().on_activate(state)
+
+        def on_deactivate(self, state: Any) -> Any:
+            seen.append('deactivate')
+            return super().on_deactivate(state)
+
+        def on_cleanup(self, state: Any) -> Any:
+            self.destroy_timer(self.timer)
+            self.destroy_publisher(self.publisher)
+            seen.append('cleanup')
+            return lifecycle.TransitionCallbackReturn.SUCCESS
+
+    managed = Managed('managed', context=ros_context, enable_rosout=False)
+    other = make_node('manager')
+    change = other.create_client(ChangeState, '/managed/change_state')
+    state = other.create_client(GetState, '/managed/get_state')
+    heard: list[Header] = []
+    other.create_subscription(Header, '/managed', heard.append, 10)
+    executor = make_executor()
+    executor.add_node(managed)
+    executor.add_node(other)
+
+    async def go(transition: int) -> str:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert (await change.call_async(request)).success
+        label: str = (await state.call_async(GetState.Request())).current_state.label
+        return label
+
+    def now_in(transition: int) -> str:
+        task = executor.create_task(go(transition))
+        assert wait_for(task.done)
+        label: str = task.result()
+        return label
+
+    with Spinning(executor) as spinning:
+        assert change.wait_for_service(5.0) and state.wait_for_service(5.0)
+        assert now_in(Transition.TRANSITION_CONFIGURE) == 'inactive'
+        time.sleep(0.05)
+        assert heard == []
+        assert now_in(Transition.TRANSITION_ACTIVATE) == 'active'
+        assert wait_for(lambda: len(heard) >= 3)
+        assert now_in(Transition.TRANSITION_DEACTIVATE) == 'inactive'
+        assert now_in(Transition.TRANSITION_CLEANUP) == 'unconfigured'
+    assert spinning.error is None
+    assert seen == ['configure', 'activate', 'deactivate', 'cleanup']
+    managed.destroy_node()
+
+
+def test_qos_events_reach_their_callbacks(make_executor, make_node):
+    """Deadline missed and liveliness lost, on both sides, in a worker."""
+    node = make_node()
+    got: dict[str, list[Any]] = {
+        'requested': [], 'offered': [], 'changed': [], 'lost': []}
+    qos = QoSProfile(
+        depth=10, deadline=Duration(seconds=0.1), liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
+        liveliness_lease_duration=Duration(seconds=0.2))
+    node.create_subscription(
+        Header, '/topic', lambda m: None, qos, event_callbacks=SubscriptionEventCallbacks(
+            deadline=got['requested'].append, liveliness=got['changed'].append))
+    publisher = node.create_publisher(
+        Header, '/topic', qos, event_callbacks=PublisherEventCallbacks(
+            deadline=got['offered'].append, liveliness=got['lost'].append))
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: publisher.get_subscription_count() == 1)
+        publisher.publish(Header())
+        assert wait_for(lambda: all(got.values())), got
+        assert wait_for(lambda: got['changed'][-1].not_alive_count == 1)
+        publisher.assert_liveliness()
+        assert wait_for(lambda: got['changed'][-1].alive_count == 1)
+    assert spinning.error is None
+    assert got['lost'][0].total_count >= 1 and got['requested'][0].total_count >= 1
+
+
+def test_incompatible_qos_is_told_on_both_sides(make_executor, make_node):
+    node = make_node()
+    requested: list[Any] = []
+    offered: list[Any] = []
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        node.create_subscription(
+            Header, '/topic', lambda m: None,
+            QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE),
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=requested.append))
+        node.create_publisher(
+            Header, '/topic', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT),
+            event_callbacks=PublisherEventCallbacks(incompatible_qos=offered.append))
+        assert wait_for(lambda: requested and offered)
+    assert spinning.error is None
+    assert requested[0].total_count == offered[0].total_count == 1
+
+
+def test_parameters_through_another_node_of_the_same_executor(make_executor, make_node):
+    node, other = make_node('server', start_parameter_services=True), make_node('asker')
+    node.declare_parameter('speed', 3)
+    node.declare_parameter('name', 'first')
+    told: list[str] = []
+    node.add_post_set_parameters_callback(lambda given: told.extend(p.name for p in given))
+    client = AsyncParameterClient(other, 'server', callback_group=ReentrantCallbackGroup())
+    executor = make_executor()
+    executor.add_node(node)
+    executor.add_node(other)
+
+    async def ask() -> tuple[Any, ...]:
+        given = await client.set_parameters([Parameter('speed', value=5)])
+        names = await client.list_parameters([], 10)
+        values = await client.get_parameters(['speed', 'name'])
+        types = await client.describe_parameters(['name'])
+        return given.results, names.result.names, values.values, types.descriptors
+
+    with Spinning(executor) as spinning:
+        assert client.wait_for_services(5.0)
+        task = executor.create_task(ask)
+        assert wait_for(task.done)
+    assert spinning.error is None
+    results, names, values, descriptors = task.result()
+    assert results[0].successful and told == ['speed']
+    assert {'speed', 'name'} <= set(names)
+    assert values[0].integer_value == 5 and values[1].string_value == 'first'
+    assert descriptors[0].name == 'name'
+    assert node.get_parameter('speed').value == 5
+
+
+# --- what callbacks make and destroy -------------------------------------------------------------
+
+
+def test_entities_that_a_callback_makes_run(make_executor, make_node):
+    """Entities of each kind, made in a worker, and a node."""
+    node = make_node()
+    ran: dict[str, list[Any]] = {name: [] for name in (
+        'timer', 'message', 'request', 'response', 'guard', 'result', 'node')}
+    executor = make_executor()
+    executor.add_node(node)
+    kept: list[Any] = []
+    group = ReentrantCallbackGroup()
+
+    def answer(request: Any, response: Any) -> Any:
+        ran['request'].append(1)
+        return response
+
+    def execute(goal: Any) -> Any:
+        goal.succeed()
+        return Fibonacci.Result()
+
+    async def use(publisher: Any, client: Any, actions: Any) -> None:
+        while not (publisher.get_subscription_count() and client.service_is_ready()
+                   and actions.server_is_ready()):
+            await pause()
+        publisher.publish(Header())
+        ran['response'].append(await client.call_async(Trigger.Request()))
+        goal = await actions.send_goal_async(Fibonacci.Goal())
+        ran['result'].append(await goal.get_result_async())
+
+    async def pause() -> None:
+        future: Future = Future(executor=executor)
+        timer = node.create_timer(0.005, lambda: future.set_result(None), group)
+        await future
+        node.destroy_timer(timer)
+
+    def make() -> None:
+        first.cancel()
+        node.create_timer(0.005, lambda: ran['timer'].append(1), group)
+        node.create_subscription(Header, '/made', ran['message'].append, 10)
+        node.create_service(Trigger, '/made', answer)
+        guard = node.create_guard_condition(lambda: ran['guard'].append(1))
+        kept.extend([
+            ActionServer(node, Fibonacci, '/made_action', execute, callback_group=group),
+            ActionClient(node, Fibonacci, '/made_action', callback_group=group)])
+        executor.create_task(use(
+            node.create_publisher(Header, '/made', 10), node.create_client(Trigger, '/made'),
+            kept[-1]))
+        guard.trigger()
+        new = make_node('made')
+        new.create_timer(0.005, lambda: ran['node'].append(1))
+        executor.add_node(new)
+
+    first = node.create_timer(0.005, make)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: all(ran.values()), 10.0), ran
+    assert spinning.error is None
+    for made in kept:
+        made.destroy()
+
+
+@pytest.mark.parametrize('stepwise', [False, True])
+def test_a_timer_that_its_callback_cancels_runs_once(make_executor, make_node, stepwise):
+    """Even where the next period begins before it gets to that."""
+    node, calls = make_node(), []
+    executor = make_executor()
+    executor.add_node(node)
+
+    def once() -> None:
+        calls.append(1)
+        time.sleep(0.03)
+        timer.cancel()
+
+    timer = node.create_timer(0.005, once)
+    if stepwise:
+        for _ in range(5):
+            executor.spin_once(0.05)
+    else:
+        with Spinning(executor):
+            assert wait_for(lambda: calls)
+            time.sleep(0.1)
+            assert calls == [1]
+            timer.reset()
+            assert wait_for(lambda: len(calls) == 2)
+            time.sleep(0.05)
+    assert len(calls) == (1 if stepwise else 2)
+
+
+def test_a_callback_may_destroy_what_it_belongs_to(make_executor, make_node):
+    """A timer itself, a subscription itself, and in the end the node they are of (rclpy#1206)."""
+    executor = make_executor()
+    with Spinning(executor) as spinning:
+        for _ in range(10):
+            node = make_node()
+            calls: list[str] = []
+
+            def heard(_: Header, node: Node = node, calls: list[str] = calls) -> None:
+                calls.append('message')
+                node.destroy_subscription(next(iter(node.subscriptions)))
+                node.create_timer(0.001, lambda: calls.append('node') or node.destroy_node())
+
+            publisher = node.create_publisher(Header, '/topic', 10)
+            node.create_subscription(Header, '/topic', heard, 10)
+
+            def tick(
+                node: Node = node, calls: list[str] = calls, publisher: Any = publisher,
+            ) -> None:
+                calls.append('timer')
+                if publisher.get_subscription_count():
+                    node.destroy_timer(next(iter(node.timers)))
+                    publisher.publish(Header())
+
+            node.create_timer(0.001, tick)
+            executor.add_node(node)
+            assert wait_for(lambda some=calls: 'node' in some), calls
+            assert calls.count('message') == calls.count('node') == 1
+    assert spinning.error is None
+
+
+def test_publishers_are_destroyed_while_another_thread_publishes(make_executor, make_node):
+    """The publishing thread is told, the executor goes on (rclpy#1206 for subscriptions)."""
+    node, got = make_node(), []
+    executor = make_executor()
+    executor.add_node(node)
+    node.create_subscription(Header, '/topic', got.append, 10)
+    current: list[Any] = []
+    stop = threading.Event()
+    errors: list[BaseException] = []
+
+    def publish() -> None:
+        while not stop.is_set():
+            try:
+                current[-1].publish(Header())
+            except InvalidHandle:
+                time.sleep(0.0005)
+            except BaseException as error:
+                errors.append(error)
+                return
+
+    current.append(node.create_publisher(Header, '/topic', 10))
+    thread = threading.Thread(target=publish)
+    with Spinning(executor) as spinning:
+        thread.start()
+        try:
+            for _ in range(20):
+                before = len(got)
+                assert wait_for(lambda n=before: len(got) > n)
+                old = current[-1]
+                current.append(node.create_publisher(Header, '/topic', 10))
+                node.destroy_publisher(old)
+        finally:
+            stop.set()
+            thread.join()
+    assert spinning.error is None and errors == []
+
+
+def test_a_result_does_not_overtake_the_feedback_before_it(make_executor, make_node):
+    """All that was published before the result, though its client forgets whom to tell then."""
+    node, feedback = make_node(), []
+    group = ReentrantCallbackGroup()
+
+    def execute(goal: Any) -> Any:
+        for number in range(8):
+            goal.publish_feedback(Fibonacci.Feedback(sequence=[number]))
+        goal.succeed()
+        return Fibonacci.Result()
+
+    server = ActionServer(node, Fibonacci, '/counted', execute, callback_group=group)
+    client = ActionClient(node, Fibonacci, '/counted', callback_group=group)
+    executor = make_executor()
+    executor.add_node(node)
+
+    async def run() -> None:
+        goal = await client.send_goal_async(Fibonacci.Goal(), feedback_callback=feedback.append)
+        await goal.get_result_async()
+
+    with Spinning(executor) as spinning:
+        assert client.wait_for_server(5.0)
+        assert wait_for(lambda: node.count_subscribers('/counted/_action/feedback') == 1)
+        for turn in range(1, 11):
+            task = executor.create_task(run)
+            assert wait_for(task.done)
+            assert wait_for(lambda n=turn: len(feedback) == 8 * n, 1.0), (turn, len(feedback))
+    assert spinning.error is None
+    server.destroy()
+    client.destroy()
