@@ -31,7 +31,6 @@ from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 from msg_graph import TaskSet
-from rclpy.action.client import ActionClient
 from rclpy.exceptions import InvalidHandle
 from rclpy.subscription import Subscription
 
@@ -189,7 +188,7 @@ class Receiver:
             return
         for future in waitable._futures:
             future._set_executor(self._executor)
-        if isinstance(waitable, ActionClient):
+        if hasattr(waitable, '_feedback_callbacks'):  # an action client; rclpy.action loads much
             self._feedback(entry, waitable, data)
         if data:
             self._dispatcher.undeclared_ready(entry, Work(entry, waitable.execute, (data,)))
@@ -202,7 +201,7 @@ class Receiver:
         time, so with a result all that is there is taken, too; and another worker may have the
         result in its hands soon, so the callback is looked up now.
         """
-        callbacks = getattr(client, '_feedback_callbacks', {})
+        callbacks = client._feedback_callbacks
         messages = [data['feedback']] if 'feedback' in data else []
         if 'result' in data and callbacks:
             kind = client._action_type.Impl.FeedbackMessage

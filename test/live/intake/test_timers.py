@@ -152,7 +152,7 @@ def test_many_timers_wake_their_thread_for_those_due_only(
     time.sleep(0.2)
     many = _cpu_for(intake_threads(), 0.5)
     assert len(recorder.dues(timer)) > 80
-    assert many < 4 * few + 10 * MS
+    assert many < 4 * few + 45 * MS  # all of them at each wake-up: 150 ms at least
 
 
 def _cpu_for(threads: list[threading.Thread], seconds: float) -> int:
