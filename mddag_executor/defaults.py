@@ -28,6 +28,7 @@ DURATION_NS = 3_000_000_000
 """Virtual time of a simulated run."""
 
 
-def workers(asked: int | None, task_set: TaskSet) -> int:
+def workers(asked: int | None, task_set: TaskSet | None) -> int:
     """Return the number of workers: what was asked for, else what is declared, else seven."""
-    return asked or task_set.workers or WORKERS
+    declared = None if task_set is None else task_set.workers
+    return asked or declared or WORKERS

@@ -29,11 +29,10 @@ from __future__ import annotations
 import argparse
 from contextlib import ExitStack
 import math
-import sys
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded
-from mddag_executor.cli.text import one_line
+from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -106,8 +105,6 @@ def _check_arguments(args: argparse.Namespace) -> None:
         raise UsageError('-: standard input can be only one of A, B and GRAPH: name the others')
     common.check_output(args.json)
     recorded.check(args, args.first, args.second, args.graph)
-    if args.reschedule and args.callbacks:
-        raise UsageError('--callbacks: it shows what was recorded: leave it or --reschedule out')
 
 
 def _results(
@@ -143,7 +140,7 @@ def _result(
     else:
         outcome, _ = recorded.as_recorded(path, name, task_set, doing=f'replaying {name}')
     for warning in outcome.warnings:
-        print(f'warning: {one_line(warning)}', file=sys.stderr)
+        warn(warning)
     return outcome.result(), outcome.task_set
 
 

@@ -24,11 +24,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import PurePath
-import sys
 from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common, recorded
-from mddag_executor.cli.text import one_line, printable
+from mddag_executor.cli.text import printable, warn
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -81,7 +80,7 @@ def main(args: argparse.Namespace) -> int:
             common.output_file(args.output) as file:
         warnings = _export(args, path, name, task_set, target(form, file, args.rows == 'jobs'))
     for warning in warnings:
-        print(f'warning: {one_line(warning)}', file=sys.stderr)
+        warn(warning)
     if args.output != '-':
         print(f'exported: {printable(args.output)}')
     return 0

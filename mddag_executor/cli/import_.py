@@ -17,11 +17,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common
-from mddag_executor.cli.text import one_line, printable, Progress
+from mddag_executor.cli.text import printable, Progress, warn
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
     common.check_output(args.output)
     imported = _import(args.session, args.output)
     for warning in imported.warnings:
-        print(f'warning: {one_line(warning)}', file=sys.stderr)
+        warn(warning)
     print(f'{_count(imported.events, "event")} of {_count(imported.kinds, "kind")} from '
           f'{_count(len(imported.processes), "process", "processes")}: {printable(args.output)}')
     return 0

@@ -65,6 +65,9 @@ def check(args: argparse.Namespace, *files: str | None) -> None:
         find_policy(args.policy)
     bags.check(args, *files)
     if args.reschedule:
+        if getattr(args, 'callbacks', False):
+            raise UsageError(
+                '--callbacks: it shows what was recorded: leave it or --reschedule out')
         return
     for option in _ONLY_RESCHEDULED:
         if getattr(args, option) not in (None, False):
@@ -107,8 +110,7 @@ def as_recorded(
     with Progress(doing) as line:
         recording = open_recording(path, name, own or Recording)
         outcome = replay_recording(
-            recording, task_set,
-            lambda events: line.update(round(events / 1e6, 1), 'million events'), watcher)
+            recording, task_set, line.events, watcher)
     return outcome, recording if isinstance(recording, Recording) else None
 
 
@@ -130,4 +132,4 @@ def rescheduled(
         return reschedule(
             path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
             overheads=recorded, dispatch_overhead=0 if recorded else args.overheads, name=name,
-            progress=lambda events: line.update(round(events / 1e6, 1), 'million events'))
+            progress=line.events)

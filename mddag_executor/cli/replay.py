@@ -25,11 +25,10 @@ An ordinary bag (a folder with metadata.yaml, or one of its files) has no jobs; 
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded, verdicts
-from mddag_executor.cli.text import one_line, printable
+from mddag_executor.cli.text import printable, warn
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -86,7 +85,7 @@ def main(args: argparse.Namespace) -> int:
         else:
             outcome = _replay(path, name, task_set, watch, drift)
     for warning in outcome.warnings:
-        print(f'warning: {one_line(warning)}', file=sys.stderr)
+        warn(warning)
     result = outcome.result()
     if not args.reschedule:
         result['drift'] = [each.result() for each in drift]
@@ -106,8 +105,6 @@ def _check_arguments(args: argparse.Namespace) -> None:
     if args.trace == '-' and args.graph == '-':
         raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
     recorded.check(args, args.trace, args.graph)
-    if args.reschedule and args.callbacks:
-        raise UsageError('--callbacks: it shows what was recorded: leave it or --reschedule out')
 
 
 def _replay(

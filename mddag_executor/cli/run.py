@@ -40,7 +40,7 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.stuck import told_when_stuck
-from mddag_executor.cli.text import printable, Progress
+from mddag_executor.cli.text import Progress, warn
 from mddag_executor.core import POLICIES
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import MddagError, UsageError
@@ -154,8 +154,7 @@ def _leave_threads_behind(error: BaseException | None) -> None:
             if not t.daemon and t is not threading.main_thread()]
     if not left or error is not None:
         return
-    print(f'warning: threads that nodes started still run and are left behind: {listed(left)}',
-          file=sys.stderr)
+    warn(f'threads that nodes started still run and are left behind: {listed(left)}')
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)
@@ -176,18 +175,15 @@ def _check_arguments(args: argparse.Namespace) -> None:
 def _warn(plan: ExecutionPlan, remapped: bool) -> None:
     """Tell what the draw makes impossible, whatever the executor does, and what is in vain."""
     for sink in plan.infeasible():
-        print(
-            f'warning: {printable(sink.vertex)}: with seed {plan.seed} its critical path takes '
-            f'{sink.critical_path_ns / 1e6:.1f} ms, and its deadline is '
-            f'{sink.deadline_ns / 1e6:.1f} ms: no scheduler can keep it', file=sys.stderr)
+        warn(f'{sink.vertex}: with seed {plan.seed} its critical path takes '
+             f'{sink.critical_path_ns / 1e6:.1f} ms, and its deadline is '
+             f'{sink.deadline_ns / 1e6:.1f} ms: no scheduler can keep it')
     if remapped:
-        print('warning: --ros-args: nodes made from the declaration have the names that it gives '
-              'them: remappings do not reach them', file=sys.stderr)
+        warn('--ros-args: nodes made from the declaration have the names that it gives them: '
+             'remappings do not reach them')
     if plan.mode == 'spin' and plan.utilisation * plan.workers > 0.9:
-        print(
-            f'warning: spinning callbacks share the interpreter lock, so one core; these need '
-            f'{plan.utilisation * plan.workers:.2f}: lower --utilisation, or sleep',
-            file=sys.stderr)
+        warn('spinning callbacks share the interpreter lock, so one core; these need '
+             f'{plan.utilisation * plan.workers:.2f}: lower --utilisation, or sleep')
 
 
 @contextmanager
@@ -253,7 +249,7 @@ def _run(
         **executor.statistics(), 'measured': measured}
     result['drift'] = [each.result() for each in watch.drift(result)]
     if not session.clean:
-        print('warning: a callback has not ended in time; it is left behind', file=sys.stderr)
+        warn('a callback has not ended in time; it is left behind')
     return result, session.error
 
 
@@ -295,8 +291,8 @@ def _run_programs(
             if guest.error is not None and session.error is None:
                 session.error = guest.error
         for guest in left:
-            print(f'warning: --node {printable(guest.program.spec)}: its main() has not '
-                  'ended in time; it is left behind', file=sys.stderr)
+            warn(f'--node {guest.program.spec}: its main() has not ended in time; it is left '
+                 'behind')
 
 
 class _Signals:

@@ -215,6 +215,13 @@ class Dispatcher(Dropping):
             self._start_undeclared(entry, work, now)
             self.dispatch(now)
 
+    def ran_at_once(self, entry: Entry) -> None:
+        """Count an undeclared callback that ran where it was taken."""
+        with self.lock:
+            entry.ready += 1
+            entry.ran += 1
+            self.undeclared += 1
+
     def _start_job(self, entry: Entry, work: Work, release: int, now: int) -> None:
         dag = self.tables.dag_of[entry.source]
         slot = self._release(dag, release, now)

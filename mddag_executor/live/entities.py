@@ -29,6 +29,7 @@ from typing import Any, Protocol
 
 from rclpy.client import Client
 from rclpy.event_handler import EventHandler
+from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
 from rclpy.service import Service
@@ -179,6 +180,15 @@ def _flatten(nodes: dict[Node, _Lists], accept: Callable[[Any], bool] | None) ->
         [w for w in waitables if not is_qos_event(w)],
         [w for w in waitables if is_qos_event(w)],
         nodes)
+
+
+def alive(entity: Any) -> bool:
+    """Return whether a node, or what belongs to one, has not been destroyed."""
+    try:
+        with entity.handle:
+            return True
+    except InvalidHandle:
+        return False
 
 
 def keeps_time(subscription: Subscription) -> bool:

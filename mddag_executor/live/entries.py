@@ -185,7 +185,7 @@ class Work:
                 try:
                     with handle:
                         # One more may have become due before it was cancelled in its callback.
-                        if self.entry.kind is TIMER and handle.is_timer_canceled():
+                        if self.entry.kind == TIMER and handle.is_timer_canceled():
                             raise Destroyed
                 except InvalidHandle:
                     raise Destroyed from None

@@ -225,8 +225,7 @@ def _message_type(kind: str) -> Any:
 
 def sketch_of(found: Probe) -> Sketch:
     """Return what is known of the system, and what is supposed."""
-    intervals = {topic: seen.interval_ns
-                 for topic, seen in found.seen.items()}
+    intervals = {topic: seen.interval_ns for topic, seen in found.seen.items()}
     nodes = []
     for name, endpoints in found.nodes.items():
         node = SketchNode(name)

@@ -39,9 +39,9 @@ import time
 from types import TracebackType
 from typing import Any
 
+from mddag_executor.live.entities import alive
 from mddag_executor.live.interception import Interception
 from mddag_executor.live.loading import describe, LoadingError, Program
-from rclpy.exceptions import InvalidHandle
 from rclpy.executors import Executor
 from rclpy.node import Node
 
@@ -225,7 +225,7 @@ class Host:
         if guest is None:
             return
         with self._lock:
-            gone = [node for node in guest.nodes if _is_destroyed(node)]
+            gone = [node for node in guest.nodes if not alive(node)]
             for node in gone:
                 guest.nodes.remove(node)
         for node in gone:
@@ -242,14 +242,6 @@ class Host:
             left = 0.05 if end is None else min(0.05, end - time.monotonic())
             if left <= 0 or guest is not None and guest.ended.is_set() or waits_for.wait(left):
                 return
-
-
-def _is_destroyed(node: Node) -> bool:
-    try:
-        with node.handle:
-            return False
-    except InvalidHandle:
-        return True
 
 
 def _nodes_in(program: Program, value: Any) -> list[Node]:

@@ -52,7 +52,7 @@ from itertools import chain
 from operator import length_hint, methodcaller
 from typing import Any
 
-from mddag_executor.live.entities import EMPTY, EntitySet, Receiver
+from mddag_executor.live.entities import alive, EMPTY, EntitySet, Receiver
 from mddag_executor.live.standins import STAND_INS, StandIn
 from rclpy.exceptions import InvalidHandle
 
@@ -168,14 +168,12 @@ class NodeStandIn:
 
     def _took_back(self, stand_in: StandIn) -> bool:
         """Take back a stand-in that was never added, if its entity has been destroyed."""
-        try:
-            with stand_in.handle:
-                return False
-        except InvalidHandle:
-            for known in self._by_kind.values():
-                known.pop(stand_in.key, None)
-            stand_in.let_go()
-            return True
+        if alive(stand_in):
+            return False
+        for known in self._by_kind.values():
+            known.pop(stand_in.key, None)
+        stand_in.let_go()
+        return True
 
     def _change(self) -> None:
         wanted = self._applied = self.wanted

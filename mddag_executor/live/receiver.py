@@ -91,10 +91,8 @@ class Receiver:
             entry, Work(entry, callback, ()), due_ns + self._dispatcher.clock_offset)
 
     def _run(self, entry: Entry, callback: Callable[..., Any], *args: Any) -> None:
-        entry.ready += 1
-        self._dispatcher.undeclared += 1
         callback(*args)
-        entry.ran += 1
+        self._dispatcher.ran_at_once(entry)
 
     def on_missed(self, timer: Any, due_ns: int, count: int) -> None:
         """Take in that periods were skipped since nobody was there to look at the timer."""

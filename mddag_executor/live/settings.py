@@ -22,7 +22,7 @@ import operator
 import os
 from typing import Any
 
-from mddag_executor.defaults import WORKERS, workers
+from mddag_executor.defaults import workers
 from mddag_executor.errors import UsageError
 from msg_graph import load, parse_duration, TaskSet
 from msg_graph.duration import DAY
@@ -157,7 +157,7 @@ def resolve(
         raise UsageError(f'graph: {graph!r} is no declaration: give the path of one, a TaskSet, '
                          'or None')
     if num_workers is None:
-        num_workers = WORKERS if task_set is None else workers(None, task_set)
+        num_workers = workers(None, task_set)
     num_workers = whole('num_workers', num_workers, MOST_WORKERS)
     if isinstance(default_deadline, str):
         default_deadline = parse_duration(default_deadline)

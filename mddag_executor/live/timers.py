@@ -56,7 +56,7 @@ from heapq import heapify, heappop, heappush
 import time
 from typing import Any
 
-from mddag_executor.live.entities import Receiver
+from mddag_executor.live.entities import alive, Receiver
 from mddag_executor.live.slots import Slot, TOLERANCE_NS, WIDE_NS
 from rclpy.clock import Clock, JumpHandle, JumpThreshold
 from rclpy.duration import Duration
@@ -127,7 +127,7 @@ class TimerQueue:
                 try:
                     slot = Slot(timer)
                 except Exception as error:
-                    if not isinstance(error, InvalidHandle) and _alive(timer):
+                    if not isinstance(error, InvalidHandle) and alive(timer):
                         self._on_error(error)
                     continue
             slots[id(timer)] = slot
@@ -346,19 +346,10 @@ class TimerQueue:
     def _failed(self, slot: Slot, error: Exception) -> None:
         """Sort out an exception of rcl: the timer was destroyed, cancelled, or it is an error."""
         slot.entry = 0
-        if isinstance(error, InvalidHandle) or not _alive(slot.timer):
+        if isinstance(error, InvalidHandle) or not alive(slot.timer):
             self._slots.pop(id(slot.timer), None)
             return
         if slot.until() is None:
             self._park(slot)
         else:
             self._on_error(error)
-
-
-def _alive(timer: Timer) -> bool:
-    """Return whether a timer has not been destroyed."""
-    try:
-        with timer.handle:
-            return True
-    except InvalidHandle:
-        return False

@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from mddag_executor.core.state import Decision
+from mddag_executor.replay import fast_work as fw
 from mddag_executor.replay.follower import Event, Observer
 from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.usage import Usage
@@ -48,7 +49,8 @@ class Batch(NamedTuple):
     decided_after: Ints
 
 
-START, END, READY, VERTEX, JOB, WORKER, CALLBACK = range(7)
+START, END, READY, VERTEX, JOB, WORKER, CALLBACK = (
+    fw.R_START, fw.R_END, fw.R_READY, fw.R_VERTEX, fw.R_JOB, fw.R_WORKER, fw.R_CALLBACK)
 
 
 class Watcher(Protocol):

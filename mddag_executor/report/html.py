@@ -48,7 +48,7 @@ from mddag_executor.report.html_tables import (
     sinks_html,
     worst_html,
 )
-from mddag_executor.report.tables import percent, total
+from mddag_executor.report.tables import total, verdicts_line
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import MOST_EXECUTIONS, Timeline
 from mddag_executor.report.timeline_log import of_rescheduled, Schedule, tell
@@ -249,16 +249,14 @@ def _page(
 
 
 def _head(data: ReportData) -> Iterator[str]:
-    every = total(data.tally.result()['dags'])
+    dags = data.tally.result()['dags']
+    every = total(dags)
     yield '<p class="facts">' + ' '.join(
         f'<span><b>{escape(printable(word))}</b> {escape(printable(text))}</span>'
         for word, text in data.facts) + '</p>\n'
     missed = every.due - every.in_time
     if data.task_set.dags:
-        yield (f'<p class="verdict {"bad" if missed else "good"}">{every.due} sink jobs due, '
-               f'{every.in_time} in time ({percent(every.in_time, every.due)}), {every.late} '
-               f'late, {every.expired} expired'
-               + (f', {every.aborted} aborted' if every.aborted else '') + '</p>\n')
+        yield (f'<p class="verdict {"bad" if missed else "good"}">{verdicts_line(dags)}</p>\n')
     for warning in data.warnings:
         yield f'<p class="warning">{escape(printable(warning))}</p>\n'
     timeline = data.timeline

@@ -26,7 +26,7 @@ from typing import Any
 from mddag_executor.cli import main as program
 import pytest
 
-from ..replay.recorded import MS, Recorded
+from ..replay.recorded import four_jobs, MS
 from ..replay.test_ordinary_bags import write_bag
 
 GRAPH = """\
@@ -52,18 +52,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
             'simulate', str(found['graph.yaml']), '--duration', '1s', '--workers', '2',
             '--trace', str(found['own.mcap'])]) == 0
     write_bag(found['bag'])
-    r = Recorded(folder / 'imported.mcap')
-    r.node(1, '/camera')
-    r.node(2, '/detect')
-    r.timer(11, 1, 100 * MS)
-    r.publisher(100, 1, '/image')
-    r.subscription(12, 2, '/image')
-    for k in range(1, 5):
-        at = k * 100 * MS
-        r.run(11, 1, at, at + 2 * MS)
-        stamp = r.publish(100, 1, at + 1 * MS)
-        r.receive(12, 2, at + 3 * MS, at + (12 if k == 4 else 5) * MS, stamp)
-    found['imported.mcap'] = r.write()
+    found['imported.mcap'] = four_jobs(folder / 'imported.mcap')
     return {name: str(path) for name, path in found.items()}
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 import pytest
 
 from ..cli.helpers import caller
-from ..replay.recorded import MS, Recorded
+from ..replay.recorded import four_jobs, MS
 
 call = caller('replay')
 
@@ -41,19 +41,8 @@ paths:
 @pytest.fixture
 def trace(tmp_path: Path) -> Path:
     """Give a recording of four jobs; the last one is late."""
-    r = Recorded(tmp_path / 'drive.mcap')
-    r.node(1, '/camera')
-    r.node(2, '/detect')
-    r.timer(11, 1, 100 * MS)
-    r.publisher(100, 1, '/image')
-    r.subscription(12, 2, '/image')
-    for k in range(1, 5):
-        at = k * 100 * MS
-        r.run(11, 1, at, at + 2 * MS)
-        stamp = r.publish(100, 1, at + 1 * MS)
-        r.receive(12, 2, at + 3 * MS, at + (12 if k == 4 else 5) * MS, stamp)
     (tmp_path / 'graph.yaml').write_text(GRAPH)
-    return r.write()
+    return four_jobs(tmp_path / 'drive.mcap')
 
 
 def test_with_a_graph(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,6 +18,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import contextlib
+import signal
+import subprocess
+import sys
 import threading
 import time
 from typing import Any
@@ -63,6 +66,22 @@ def wait_for(condition: Callable[[], Any], seconds: float = 5.0) -> bool:
             return False
         time.sleep(0.002)
     return True
+
+
+def interrupted(program: str, *arguments: str) -> tuple[int, str, str]:
+    """Run a program that prints ``ready``, then SIGINT it; return exit status, output, errors."""
+    process = subprocess.Popen(
+        [sys.executable, '-c', program, *arguments], stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == 'ready\n', process.communicate()[1]
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=10)
+    finally:
+        process.kill()
+        process.wait()
+    return process.returncode, out, err
 
 
 @pytest.fixture(params=['events', 'waitset'])

@@ -16,9 +16,6 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
 import threading
 import time
 from typing import Any
@@ -29,7 +26,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from rclpy.executors import ExternalShutdownException
 from rclpy.task import Future
 
-from .conftest import Spinning, wait_for
+from .conftest import interrupted, Spinning, wait_for
 
 # --- tasks ---------------------------------------------------------------------------------------
 
@@ -204,18 +201,8 @@ finally:
 @pytest.mark.parametrize('intake', ['events', 'waitset'])
 def test_ctrl_c_is_quiet(intake):
     """While all workers are busy, with the idiom of rclpy's own examples (rclpy#1279)."""
-    process = subprocess.Popen(
-        [sys.executable, '-c', PROGRAM, intake], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        text=True)
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == 'ready\n', process.communicate()[1]
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=10)
-    finally:
-        process.kill()
-        process.wait()
-    assert process.returncode == 0, err
+    status, out, err = interrupted(PROGRAM, intake)
+    assert status == 0, err
     assert out == ''
     # On a busy machine the timers skip periods, and that is said.
     assert [line for line in err.splitlines() if 'can not keep its rate' not in line] == []

@@ -22,8 +22,6 @@ The rest of their contract: nodes and entities in ``test_contract_nodes``, kinds
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 import threading
 import time
 
@@ -38,7 +36,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import Spinning, wait_for
+from .conftest import interrupted, Spinning, wait_for
 
 
 def counting(node: Node, period: float = 0.005) -> list[int]:
@@ -216,18 +214,8 @@ print(sorted(ends))
 
 @pytest.mark.parametrize('intake', ['events', 'waitset'])
 def test_a_signal_ends_the_executors_of_all_contexts(intake):
-    process = subprocess.Popen(
-        [sys.executable, '-c', CONTEXTS, intake], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        text=True)
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == 'ready\n', process.communicate()[1]
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=10)
-    finally:
-        process.kill()
-        process.wait()
-    assert process.returncode == 0, err
+    status, out, err = interrupted(CONTEXTS, intake)
+    assert status == 0, err
     assert out in (
         "[('other', 'ExternalShutdownException'), ('own', 'KeyboardInterrupt')]\n",
         "[('other', 'ExternalShutdownException'), ('own', 'ExternalShutdownException')]\n")

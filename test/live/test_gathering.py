@@ -107,7 +107,12 @@ class Machine:
         self.mine = 1
 
     def gathering(self) -> Gathering:
-        return Gathering(cpu_times=lambda: dict(self.busy), thread_cpu_time=lambda _: self.mine)
+        """Return one that this thread has joined, and that has looked once."""
+        gathering = Gathering(
+            cpu_times=lambda: dict(self.busy), thread_cpu_time=lambda _: self.mine)
+        gathering.join()
+        self.pass_second(gathering)
+        return gathering
 
     def pass_second(self, gathering: Gathering) -> None:
         gathering._looked -= LOOK_S
@@ -118,8 +123,6 @@ class Machine:
 def test_the_home_moves_from_where_others_are() -> None:
     machine = Machine()
     gathering = machine.gathering()
-    gathering.join()
-    machine.pass_second(gathering)
     first = gathering.home
     machine.busy[first] += 900_000_000
     machine.pass_second(gathering)
@@ -131,8 +134,6 @@ def test_the_home_moves_from_where_others_are() -> None:
 def test_it_does_not_move_from_its_own_work_nor_to_a_cpu_as_busy() -> None:
     machine = Machine()
     gathering = machine.gathering()
-    gathering.join()
-    machine.pass_second(gathering)
     first = gathering.home
     machine.busy[first] += 900_000_000
     machine.mine += 900_000_000

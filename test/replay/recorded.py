@@ -151,3 +151,19 @@ class Recorded:
             self.add('ros2:rmw_take', start - 4 * US, tid, callback + 30_000, 0x99, BEGIN + stamp,
                      True, pid=pid)
         self.run(callback, tid, start, end, pid=pid)
+
+
+def four_jobs(path: Path) -> Path:
+    """Write a recording of /camera and /detect, which a message each 100 ms starts."""
+    r = Recorded(path)
+    r.node(1, '/camera')
+    r.node(2, '/detect')
+    r.timer(11, 1, 100 * MS)
+    r.publisher(100, 1, '/image')
+    r.subscription(12, 2, '/image')
+    for k in range(1, 5):
+        at = k * 100 * MS
+        r.run(11, 1, at, at + 2 * MS)
+        stamp = r.publish(100, 1, at + 1 * MS)
+        r.receive(12, 2, at + 3 * MS, at + (12 if k == 4 else 5) * MS, stamp)
+    return r.write()

@@ -130,17 +130,22 @@ def nonsense(draw: st.DrawFn) -> tuple[Any, ...]:
             *(draw(ANY[kind]) for _, kind in event.fields))
 
 
+def write_events(path: Path, events: list[tuple[Any, ...]], in_order: bool) -> None:
+    """Write events (name, ms, thread, fields…) behind a declaration, by their times or not."""
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME, 1, 1, SMALL, 'g.yaml', 'rad', 2, MS, 3, False)
+        for name, ms, thread, *fields in sorted(
+                events, key=lambda event: event[1] if in_order else 0):
+            file.add(name, START_TIME + ms * MS, 1, thread, *fields)
+
+
 @given(st.lists(nonsense(), max_size=60), st.booleans())
 @settings(max_examples=200)
 def test_events_with_any_values(events: list[tuple[Any, ...]], in_order: bool) -> None:
     """Whoever wrote it, there are counts and warnings, or one line; never a traceback."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'a.mcap')
-        with TraceFile(path) as file:
-            file.add('task_set', START_TIME, 1, 1, SMALL, 'g.yaml', 'rad', 2, MS, 3, False)
-            for name, ms, thread, *fields in sorted(
-                    events, key=lambda event: event[1] if in_order else 0):
-                file.add(name, START_TIME + ms * MS, 1, thread, *fields)
+        write_events(path, events, in_order)
         outcome = replay(path)
         jobs = sum(outcome.tally.jobs)
         assert jobs <= sum(event[0] == 'mddag:job_release' for event in events)

@@ -41,7 +41,7 @@ import numpy as np
 import pytest
 
 from .helpers import Chances, declarations, MS, SMALL, small, START_TIME, VirtualRun
-from .test_damage import nonsense
+from .test_damage import nonsense, write_events
 
 pytest.importorskip('numba')
 
@@ -214,11 +214,7 @@ def test_flipped_bits(sound: bytes, tmp_path: Path) -> None:
 def test_events_with_any_values(events: list[tuple[Any, ...]], in_order: bool) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'a.mcap')
-        with TraceFile(path) as file:
-            file.add('task_set', START_TIME, 1, 1, SMALL, 'g.yaml', 'rad', 2, MS, 3, False)
-            for name, ms, thread, *fields in sorted(
-                    events, key=lambda event: event[1] if in_order else 0):
-                file.add(name, START_TIME + ms * MS, 1, thread, *fields)
+        write_events(path, events, in_order)
         compare(path)
 
 
