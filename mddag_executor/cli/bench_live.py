@@ -38,7 +38,9 @@ from mddag_executor.live.bench.spec import (
     EXECUTORS,
     GROUPS,
     LOADS,
+    NONE,
     parse_executors,
+    PHASES,
     Spec,
 )
 from mddag_executor.report.tables import percent
@@ -61,7 +63,8 @@ ENTITIES_RATE_HZ = 100.0
 _LOADS_OF_OPTIONS = {
     'graph': ('autoware', 'reference-system'), 'utilisation': ('autoware', 'reference-system'),
     'bodies': ('autoware', 'reference-system'), 'topics': ('topics',),
-    'rate': ('topics', 'entities'), 'idle': ('entities',), 'groups': ('topics', 'entities')}
+    'rate': ('topics', 'entities'), 'idle': ('entities',), 'groups': ('topics', 'entities'),
+    'phases': ('topics',)}
 _SEED = 2
 
 
@@ -73,7 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'empty callbacks of many topics; entities: one active topic beside idle subscriptions')
     add('--executors', default=','.join(EXECUTORS), metavar='E[,E…]',
         help=f'some of {", ".join(EXECUTORS)}; the first two are this one, by intake, also with a '
-        'policy as rad-events:fifo (default: all)')
+        'policy as rad-events:fifo (default: all); and none: what the nodes of a declaration cost '
+        'without an executor')
     add('--policies', metavar='P[,P…]',
         help=f'run this executor with each of these: {", ".join(POLICIES)} (default: rad)')
     add('--utilisation', type=options.list_of(options.positive_float), metavar='U[,U…]',
@@ -92,6 +96,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--groups', choices=GROUPS,
         help="with topics and entities: the node's default callback group, one for each "
         'subscription, or a reentrant one (default: shared)')
+    add('--phases', choices=PHASES,
+        help='with --load topics: each topic at a phase of its own, or all published in a row, '
+        'as one timer does (default: drawn)')
     add('--workers', type=options.positive_int, default=defaults.WORKERS, metavar='M',
         help='threads of this executor and of MultiThreadedExecutor (default: %(default)s)')
     add('--seconds', type=options.positive_float, default=10.0, metavar='S',
@@ -113,6 +120,10 @@ def main(args: argparse.Namespace) -> int:
     """
     _check(args)
     executors = parse_executors(args.executors, args.policies)
+    if args.load not in DECLARED and any(name == NONE for name, _ in executors):
+        raise UsageError(
+            f'--executors: none: not with --load {args.load}, whose publishers are in another '
+            f'process: leave it out, or take --load {" or ".join(DECLARED)}')
     with _graph(args) as graph:
         specs = make_specs(args, executors, graph)
         results = _measure(specs, args.repeat)
@@ -194,7 +205,8 @@ def make_specs(
     elif args.load == 'topics':
         pairs = TOPICS if args.topics is None and args.rate is None else [
             (args.topics or TOPICS[0][0], args.rate or TOPICS[0][1])]
-        variants = [{'topics': topics, 'rate_hz': rate, 'groups': groups}
+        variants = [{'topics': topics, 'rate_hz': rate, 'groups': groups,
+                     'phases': args.phases or 'drawn'}
                     for topics, rate in pairs]
     else:
         rate = args.rate or ENTITIES_RATE_HZ
@@ -267,7 +279,8 @@ def notes(results: Sequence[dict[str, Any]]) -> Iterator[str]:
     first = results[0]
     how = f', medians of {first["repeat"]}' if first['repeat'] > 1 else ''
     yield (f'{first["seconds"]:g} s each{how}, seed {first["seed"]}, {first["workers"]} '
-           'workers' + (f', {first["groups"]} callback groups' if 'groups' in first else ''))
+           'workers' + (f', {first["groups"]} callback groups' if 'groups' in first else '')
+           + (', published together' if first.get('phases') == 'together' else ''))
     if first['load'] in DECLARED:
         yield ('in time: of the sink jobs that were due, noticed by the executor or not; CPU: of '
                'the whole process')

@@ -23,6 +23,7 @@ aborts after its work was done.  (rclpy's own executors do so when a daemon thre
 from __future__ import annotations
 
 import atexit
+from collections.abc import Callable
 from functools import partial
 import os
 import time
@@ -40,8 +41,6 @@ _now = time.monotonic_ns
 
 class _Intake(Protocol):
 
-    def wake(self) -> None: ...
-
     def stop(self) -> None: ...
 
 
@@ -54,8 +53,8 @@ class _Executor(Protocol):
 
 _started: weakref.WeakSet[_Intake] = weakref.WeakSet()
 _executors: weakref.WeakSet[_Executor] = weakref.WeakSet()
-_by_context: weakref.WeakKeyDictionary[Context, weakref.WeakSet[_Intake]] = (
-    weakref.WeakKeyDictionary())
+_Methods = set[weakref.WeakMethod[Callable[[], None]]]
+_by_context: weakref.WeakKeyDictionary[Context, _Methods] = weakref.WeakKeyDictionary()
 
 
 def stop_at_exit(intake: _Intake) -> None:
@@ -93,24 +92,27 @@ def _forget() -> None:
 os.register_at_fork(after_in_child=_forget)
 
 
-def wake_at_shutdown(context: Context, intake: _Intake) -> None:
+def call_at_shutdown(context: Context, method: Callable[[], None]) -> None:
     """
-    Have an intake woken when its context is shut down.
+    Have a method called when a context is shut down, as long as its object is alive.
 
     A context never forgets a callback of somebody who is alive, and executors can make an intake
-    for each spin; so it gets only one for all intakes.
+    for each spin; so it gets only one for all.
+
+    :param method: must not wait for a lock: whoever ends the context may hold it.
     """
-    intakes = _by_context.get(context)
-    if intakes is not None:
-        intakes.add(intake)
-        return
-    intakes = _by_context[context] = weakref.WeakSet([intake])
-    context.on_shutdown(partial(_wake_all, intakes))
+    methods = _by_context.get(context)
+    if methods is None:
+        methods = _by_context[context] = set()
+        context.on_shutdown(partial(_call_all, methods))
+    methods.add(weakref.WeakMethod(method, methods.discard))
 
 
-def _wake_all(intakes: weakref.WeakSet[_Intake]) -> None:
-    for intake in list(intakes):
-        intake.wake()
+def _call_all(methods: _Methods) -> None:
+    for reference in list(methods):
+        method = reference()
+        if method is not None:
+            method()
 
 
 class SecondLooks:

@@ -32,7 +32,7 @@ import time
 from typing import Any
 
 from mddag_executor.live.direct import DirectTakes
-from mddag_executor.live.endings import SecondLooks, stop_at_exit, wake_at_shutdown
+from mddag_executor.live.endings import call_at_shutdown, SecondLooks, stop_at_exit
 from mddag_executor.live.entities import EMPTY, EntitySet, Receiver, snapshot
 from mddag_executor.live.native import NodeStandIn
 from mddag_executor.live.waitset import PATIENCE, WaitSetIntake
@@ -221,7 +221,7 @@ class EventsIntake:
         self._parts: dict[str, Any] = {}
         self._ending: list[Any] = []
         self._refused: set[str] = set()
-        wake_at_shutdown(context, self)
+        call_at_shutdown(context, self.wake)
 
     @classmethod
     def available(cls) -> bool:

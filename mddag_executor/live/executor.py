@@ -42,7 +42,7 @@ from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.live import hooks
 from mddag_executor.live.diagnostics import Diagnostics
 from mddag_executor.live.dispatcher import Dispatcher
-from mddag_executor.live.endings import halt_at_exit
+from mddag_executor.live.endings import call_at_shutdown, halt_at_exit
 from mddag_executor.live.entities import EMPTY
 from mddag_executor.live.entries import AtOnce, Entry, TASK, Work
 from mddag_executor.live.events import EventsIntake
@@ -193,6 +193,8 @@ class MultiDeadlineExecutor(Stepping):
                 self._context, task_set, self._dispatcher, self._pool, self._registry,
                 self._recorder, every_ns, thresholds)
         self._intake_kind = intake
+        # What is ready still would run before the spin notices.
+        call_at_shutdown(self._context, self._pool.start_no_more)
         halt_at_exit(self)
 
     # --- tasks -----------------------------------------------------------------------------------

@@ -175,6 +175,10 @@ class Pool:
         with self._lock:
             self.running = False
 
+    def start_no_more(self) -> None:
+        """Start nothing more, from now on; for those who must not wait for the lock."""
+        self.running = False
+
     def close(self, timeout: float | None) -> bool:
         """
         End the threads; return False when a callback still ran after ``timeout`` seconds.

@@ -47,7 +47,7 @@ from collections.abc import Callable, Iterable
 import threading
 import time
 
-from mddag_executor.live.endings import SecondLooks, stop_at_exit, wake_at_shutdown
+from mddag_executor.live.endings import call_at_shutdown, SecondLooks, stop_at_exit
 from mddag_executor.live.entities import EMPTY, EntitySet, Receiver, snapshot
 from mddag_executor.live.refilled import RefilledSet
 from mddag_executor.live.timers import sharpen_wake_ups, TimerQueue
@@ -135,7 +135,7 @@ class WaitSetIntake:
         self._polling = False
         self._events: RefilledSet | None = None  # apart from the others in a thread only
         self._events_at = 0
-        wake_at_shutdown(context, self)
+        call_at_shutdown(context, self.wake)
 
     # --- what to wait for ------------------------------------------------------------------------
 

@@ -101,6 +101,17 @@ def test_every_executor_is_offered_the_same(tmp_path: Path, mddag: Mddag) -> Non
     assert plot.read_bytes().startswith(b'\x89PNG')
 
 
+def test_topics_that_are_published_together(mddag: Mddag) -> None:
+    process = mddag(
+        'bench', 'live', '--load', 'topics', '--topics', '5', '--rate', '20', '--seconds', '0.5',
+        '--executors', 'single', '--phases', 'together', '--json', '-', timeout=120.0)
+    assert process.returncode == 0, process.stderr
+    result, = json.loads(process.stdout)
+    assert result['phases'] == 'together'
+    check_messages(result)
+    assert result['published'] % 5 == 0  # in rows, of all topics each
+
+
 def test_entities_have_idle_neighbours(mddag: Mddag) -> None:
     process = mddag(
         'bench', 'live', '--load', 'entities', '--idle', '0,20', '--seconds', '0.5',
@@ -136,6 +147,15 @@ def test_autoware_is_judged_by_its_nodes(tmp_path: Path, mddag: Mddag) -> None:
             assert verdicts == run['sink_jobs_due'] > 200
             assert run['attribution'] == {'wrong': 0, 'none': 0}
     assert '<svg' in plot.read_text()
+
+
+def test_nodes_run_without_an_executor() -> None:
+    graph = str(find('config/autoware.yaml'))
+    result = measure(Spec(
+        'autoware', 'none', graph=graph, utilisation=0.1, seconds=1.0, warm_up_s=0.5))
+    assert result['on_time'] > 0.5 * result['sink_jobs_due'] > 100
+    assert 0 < result['cpu_us_per_callback']
+    check_latency(result['dispatch_latency_us'])
 
 
 @pytest.mark.parametrize('executor', ['rad-waitset', 'multi'])
@@ -247,6 +267,9 @@ def test_nothing_outlives_a_killed_bench() -> None:
     (['--load', 'autoware', '--topics', '3'], '--topics: it means nothing to --load autoware'),
     (['--load', 'topics', '--utilisation', '0.3'], '--utilisation: it means nothing'),
     (['--load', 'topics', '--executors', 'foo'], "--executors: 'foo' is unknown"),
+    (['--load', 'topics', '--executors', 'none'], '--executors: none: not with --load topics'),
+    (['--load', 'autoware', '--executors', 'none:rad'], 'only this executor knows policies'),
+    (['--load', 'autoware', '--phases', 'drawn'], '--phases: it means nothing to --load autoware'),
     (['--load', 'entities', '--idle', '1,-1'], "argument --idle: '-1' is no whole number"),
     (['--load', 'autoware', '--graph', '/none.yaml'], '/none.yaml: '),
     (['--load', 'topics', '--plot', 'x.gif'], 'x.gif: the ending tells no kind of picture'),

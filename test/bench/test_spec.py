@@ -38,7 +38,7 @@ def test_executors_and_policies_by_name() -> None:
 @pytest.mark.parametrize(('executors', 'policies', 'text'), [
     ('rad', None, "--executors: 'rad' is unknown"),
     ('', None, "--executors: '' is unknown"),
-    ('multi:fifo', None, 'know no policies'),
+    ('multi:fifo', None, 'only this executor knows policies'),
     ('rad-events:fast', None, 'fast'),
     ('rad-events', 'fast', 'fast'),
     ('multi,multi', None, 'stands there twice'),

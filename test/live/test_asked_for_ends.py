@@ -128,6 +128,26 @@ def test_shutdown_from_inside_a_callback(make_executor, make_node, ros_context, 
         assert spinning.error is None
 
 
+def test_nothing_starts_after_the_context_has_ended(make_executor, make_node, ros_context):
+    """What was ready by then neither: a worker is quicker than the thread that spins."""
+    node = make_node()
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    calls: list[int] = []
+
+    def end() -> None:
+        calls.append(1)
+        time.sleep(0.05)  # the others become ready
+        rclpy.shutdown(context=ros_context)
+
+    for _ in range(5):
+        node.create_timer(0.02, end, ReentrantCallbackGroup())
+    with Spinning(executor) as spinning:
+        spinning.join()
+    assert calls == [1]
+    assert isinstance(spinning.error, ExternalShutdownException)
+
+
 def test_shutdown_while_spin_dispatches(make_executor, make_node):
     """Nothing is handed to a pool that has been closed meanwhile (rclpy#1724)."""
     node = make_node()

@@ -18,7 +18,8 @@ from __future__ import annotations
 
 import time
 
-from mddag_executor.live.bench.spec import OURS, Spec
+from mddag_executor.live.bench.spec import NONE, OURS, Spec
+from mddag_executor.live.bench.unmanaged import NoExecutor
 from mddag_executor.live.session import Session
 from msg_graph import TaskSet
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
@@ -44,6 +45,8 @@ def make_executor(spec: Spec, task_set: TaskSet | None) -> Executor:
         from mddag_executor.live.executor import MultiDeadlineExecutor
         return MultiDeadlineExecutor(
             task_set, num_workers=spec.workers, policy=spec.policy, intake=OURS[spec.executor])
+    if spec.executor == NONE:
+        return NoExecutor()
     if spec.executor == 'multi':
         return MultiThreadedExecutor(spec.workers)
     return SingleThreadedExecutor() if spec.executor == 'single' else EventsExecutor()

@@ -69,7 +69,8 @@ def run_messages(spec: Spec) -> dict[str, Any]:
         _subscribe(node, f'{prefix}/idle_{i}', starts, group())
     executor.add_node(node)
     session = UnfinishedSession(executor, spec)
-    with session, PublisherProcess(topics, spec.rate_hz, spec.seed) as publisher:
+    seed = None if spec.phases == 'together' else spec.seed
+    with session, PublisherProcess(topics, spec.rate_hz, seed) as publisher:
         publisher.wait_until_ready()
         _wait_until_matched(session, active)
         publisher.begin()

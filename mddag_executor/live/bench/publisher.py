@@ -22,9 +22,10 @@ to publish on the line ``go``, and stops on the line ``stop``.  Its last line is
 messages that it published on each topic.  It ends when its standard input does: so it can not
 outlive the process that reads from it.
 
-All topics have the same period; their phases are drawn, so that messages come neither all at once
-nor evenly spaced.  What falls behind by more than a period leaves releases out: messages in a
-burst would be lost for want of queue depth, which is no fault of the executor that is measured.
+All topics have the same period.  With a seed their phases are drawn, so that messages come neither
+all at once nor evenly spaced; without one all are published in a row, each period.  What falls
+behind by more than a period leaves releases out: messages in a burst would be lost for want of
+queue depth, which is no fault of the executor that is measured.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class PublisherProcess:
     :param topics: what it publishes.
     """
 
-    def __init__(self, topics: Sequence[str], rate_hz: float, seed: int) -> None:
+    def __init__(self, topics: Sequence[str], rate_hz: float, seed: int | None) -> None:
         what = json.dumps({'topics': list(topics), 'rate_hz': rate_hz, 'seed': seed})
         self._process = subprocess.Popen(
             [sys.executable, '-m', 'mddag_executor.live.bench.publisher', what],
@@ -137,13 +138,14 @@ class _Orders:
 
 
 def publish(
-    publishers: Sequence[Publisher], rate_hz: float, seed: int, stop: threading.Event
+    publishers: Sequence[Publisher], rate_hz: float, seed: int | None, stop: threading.Event
 ) -> list[int]:
     """Publish on all topics until told to stop; return how often on each."""
     period = round(1e9 / rate_hz)
     generator = random.Random(seed)
     begin = time.monotonic_ns() + 1_000_000
-    due = [(begin + generator.randrange(period), index) for index in range(len(publishers))]
+    due = [(begin + (0 if seed is None else generator.randrange(period)), index)
+           for index in range(len(publishers))]
     heapq.heapify(due)
     counts = [0] * len(publishers)
     message = Header()

@@ -29,6 +29,9 @@ OURS = {'rad-events': 'events', 'rad-waitset': 'waitset'}
 PEERS = ('single', 'multi', 'events')
 """rclpy's SingleThreadedExecutor, MultiThreadedExecutor and EventsExecutor."""
 
+NONE = 'none'
+"""No executor: what the nodes of a declared load cost by themselves (see ``unmanaged``)."""
+
 EXECUTORS = (*OURS, *PEERS)
 LOADS = ('autoware', 'topics', 'entities', 'reference-system')
 DECLARED = {
@@ -39,6 +42,8 @@ GROUPS = ('shared', 'own', 'reentrant')
 The callback groups of message loads: the node's default one, in which one callback runs at a time;
 a mutually exclusive one for each subscription; one for all in which callbacks overlap freely.
 """
+PHASES = ('drawn', 'together')
+"""When the topics of a message load are published: each at a phase of its own, or all in a row."""
 
 
 class BenchError(MddagError):
@@ -61,6 +66,7 @@ class Spec:
     :ivar rate_hz: how often each is.
     :ivar idle: how many subscriptions there are besides, whose topics nobody publishes.
     :ivar groups: the callback groups of the subscriptions, one of ``GROUPS``.
+    :ivar phases: when the topics are published, one of ``PHASES``.
     """
 
     load: str
@@ -77,6 +83,7 @@ class Spec:
     rate_hz: float = 100.0
     idle: int = 0
     groups: str = 'shared'
+    phases: str = 'drawn'
 
     @property
     def name(self) -> str:
@@ -108,12 +115,12 @@ def parse_executors(text: str, policies: str | None = None) -> list[tuple[str, s
     found: list[tuple[str, str]] = []
     for item in text.split(','):
         name, colon, policy = item.strip().partition(':')
-        if name not in EXECUTORS:
+        if name not in (*EXECUTORS, NONE):
             raise UsageError(
-                f"--executors: '{name}' is unknown: give some of {', '.join(EXECUTORS)}")
-        if colon and name in PEERS:
+                f"--executors: '{name}' is unknown: give some of {', '.join((*EXECUTORS, NONE))}")
+        if colon and name not in OURS:
             raise UsageError(
-                f"--executors: '{item.strip()}': rclpy's executors know no policies: leave it out")
+                f"--executors: '{item.strip()}': only this executor knows policies: leave it out")
         if colon:
             find_policy(policy)
         for each in [policy] if colon else default if name in OURS else ['rad']:

@@ -1,0 +1,84 @@
+# Copyright 2026 The mddag_executor developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+No executor at all: what the nodes of a declaration cost by themselves.
+
+Theory of operation: a thread for each timer waits until that is due and calls it.  Whoever
+publishes takes the message from each subscription of the topic, and runs its callback, in its own
+thread.  There is no intake, queue, order, pool, callback group or attribution; nothing is handed
+from one thread to another.  What is left is what every executor pays for: waiting for timers,
+emulated execution, publishing, the middleware, taking messages, and the bodies themselves.  So the
+difference to an executor's CPU time is what that executor takes.
+
+Callbacks that one message starts run one after the other, and so do all jobs of a DAG, so less is
+done in time; the cost of each callback hardly depends on that.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+from rclpy.executors import Executor
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+
+
+class NoExecutor(Executor):
+    """Stands where an executor does; for a process that ends when it has been measured."""
+
+    def spin(self) -> None:
+        """Run the timers and subscriptions of the nodes that were added."""
+        nodes = self.get_nodes()
+        take_where_published([s for node in nodes for s in node.subscriptions])
+        for timer in [timer for node in nodes for timer in node.timers]:
+            threading.Thread(target=self._run, args=(timer,), daemon=True).start()
+        while self._context.ok():
+            time.sleep(0.1)
+
+    def _run(self, timer: Timer) -> None:
+        while self._context.ok():
+            left = timer.time_until_next_call()
+            if left > 0:
+                time.sleep(left / 1e9)
+                continue
+            with timer.handle:
+                timer.handle.call_timer()
+            timer.callback()
+
+
+def take_where_published(subscriptions: list[Subscription]) -> None:
+    """Let every publisher of this process take from these, and run their callbacks."""
+    by_topic: dict[str, list[Subscription]] = {}
+    for subscription in subscriptions:
+        by_topic.setdefault(subscription.topic_name, []).append(subscription)
+    send = Publisher.publish
+    takers: dict[int, list[Subscription]] = {}
+
+    def publish(self: Any, msg: Any) -> None:
+        send(self, msg)
+        found = takers.get(id(self))
+        if found is None:
+            found = takers[id(self)] = by_topic.get(self.topic_name, [])
+        for subscription in found:
+            with subscription.handle:
+                taken = subscription.handle.take_message(
+                    subscription.msg_type, subscription.raw)
+            if taken is not None:
+                subscription.callback(*taken)
+
+    Publisher.publish = publish  # type: ignore[method-assign]
