@@ -16,7 +16,8 @@
 Draw what was measured: a curve for each executor, the load from left to right.
 
 Above is what the load asks for: for declared loads with deadlines the share in time, as in the
-paper's figure, for message loads the dispatch latency.  Below is the CPU time for each callback.
+paper's figure, for message loads the dispatch latency.  Below is the CPU time for each callback;
+there the nodes without an executor are a dashed line, the least that any of them can take.
 matplotlib (the extra ``batch``) is imported when a figure is drawn.
 """
 
@@ -25,6 +26,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 import os
 from typing import Any, BinaryIO, TYPE_CHECKING
+
+from mddag_executor.live.bench.spec import NONE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,8 +82,10 @@ def _curves(axes: Axes, results: Sequence[dict[str, Any]], value: Any) -> None:
         points = [(_x(result), value(result)) for result in results
                   if result['executor'] == name]
         points = [(x, y) for x, y in points if x is not None and y is not None]
-        axes.plot([x for x, _ in points], [y for _, y in points], label=name,
-                  marker=_MARKERS[i % len(_MARKERS)], markersize=4.5, linewidth=1.2)
+        look = {'color': '0.4', 'linestyle': '--'} if name == NONE else {
+            'marker': _MARKERS[i % len(_MARKERS)], 'markersize': 4.5}
+        axes.plot([x for x, _ in points], [y for _, y in points], label=name, linewidth=1.2,
+                  **look)
     axes.grid(color='0.9', linewidth=0.6)
     axes.set_axisbelow(True)
 
@@ -93,7 +98,7 @@ def _x(result: dict[str, Any]) -> Any:
 
 def _in_time(result: dict[str, Any]) -> float | None:
     ratio = result['on_time_ratio']
-    return None if ratio is None else 100 * float(ratio)
+    return None if ratio is None or result['executor'] == NONE else 100 * float(ratio)
 
 
 def _latency(result: dict[str, Any]) -> float | None:
