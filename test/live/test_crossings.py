@@ -396,8 +396,10 @@ def test_two_processes_share_a_graph_and_the_sink_judges(
     sink = chain['sinks']['/last:sink']
     # of the first ones, messages or the node of the sink may not have been there in time
     ran = counts['/last:sink']
-    assert 0.8 * chain['jobs'] <= sink['completed'] == ran['ran'] - ran['unattributed']
-    assert ran['ran'] <= chain['jobs']
+    judged = ran['ran'] - ran['unattributed']
+    # what expires while its sink waits, on a machine that is busy with more, runs and isn't judged
+    assert judged - chain['ends']['expired'] <= sink['completed'] <= judged <= chain['jobs']
+    assert 0.8 * chain['jobs'] <= sink['completed']
     if late:
         assert sink['late'] == sink['completed'] and lower['deadline_missed']
         assert sink['response_ns']['min'] >= 120 * MS
