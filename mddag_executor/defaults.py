@@ -26,6 +26,8 @@ POLICIES = ('rad', 'rm', 'wc', 'fifo')
 """Those that an evaluation compares."""
 DURATION_NS = 3_000_000_000
 """Virtual time of a simulated run."""
+LIVE_SEED = 2
+"""Of the execution times of live runs: each deadline of the Autoware workload leaves room."""
 
 
 def workers(asked: int | None, task_set: TaskSet | None) -> int:

@@ -65,7 +65,6 @@ _LOADS_OF_OPTIONS = {
     'bodies': ('autoware', 'reference-system'), 'topics': ('topics',),
     'rate': ('topics', 'entities'), 'idle': ('entities',), 'groups': ('topics', 'entities'),
     'phases': ('topics',)}
-_SEED = 2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -105,7 +104,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='how long each measurement is, after a warm-up of 1 s (default: 10)')
     options.add_seed(
         parser, 'of the execution times and phases, the same for all; the default is one with '
-        'which every deadline of the Autoware workload can be kept', int, default=_SEED)
+        'which every deadline of the Autoware workload can be kept', int,
+        default=defaults.LIVE_SEED)
     options.add_repeat(parser, 1, 'measure everything R times in turn, and take the medians')
     add('--plot', metavar='OUT', help='draw a figure (.png, .svg or .pdf)')
     options.add_json(parser)

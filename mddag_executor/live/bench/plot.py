@@ -64,7 +64,11 @@ def draw(results: Sequence[dict[str, Any]], file: BinaryIO, path: str) -> None:
             above.set_ylabel('hot path p99, ms' if hot else 'dispatch latency p99, us')
             above.set_yscale('log')
         below.set_ylabel('CPU for each callback, us')
-        below.set_yscale('log')
+        taken = [cpu for result in results if (cpu := _cpu(result))]
+        if taken and max(taken) > 5 * min(taken):
+            below.set_yscale('log')
+        else:  # the differences are small, and shall look so
+            below.set_ylim(bottom=0)
         below.set_xlabel(_X_LABELS[load])
         if load == 'entities':
             below.set_xscale('symlog', linthresh=1)
@@ -72,7 +76,7 @@ def draw(results: Sequence[dict[str, Any]], file: BinaryIO, path: str) -> None:
         above.legend(fontsize=8, frameon=False)
         first = results[0]
         above.set_title(
-            f'{load}: {first["seconds"]:g} s each, median of {first["repeat"]}, '
+            f'{_load(first)}: {first["seconds"]:g} s each, median of {first["repeat"]}, '
             f'{first["workers"]} workers', fontsize=9)
         figure.savefig(file, format=kind, dpi=150, metadata=metadata[kind])
 
@@ -88,6 +92,13 @@ def _curves(axes: Axes, results: Sequence[dict[str, Any]], value: Any) -> None:
                   **look)
     axes.grid(color='0.9', linewidth=0.6)
     axes.set_axisbelow(True)
+
+
+def _load(result: dict[str, Any]) -> str:
+    """Return the load's name, or that of the declaration's file."""
+    graph = result.get('graph')
+    name: str = os.path.splitext(os.path.basename(graph))[0] if graph else result['load']
+    return name
 
 
 def _x(result: dict[str, Any]) -> Any:

@@ -54,6 +54,7 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.defaults import LIVE_SEED
 from mddag_executor.live import DeadlineMiss
 from mddag_executor.live.bench.soak_memory import in_use, kept_by_middleware, resident
 from mddag_executor.live.bench.soak_nodes import SimulatedTime, SoakFault, SoakNodes
@@ -349,7 +350,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--seconds', type=float, default=600.0)
     parser.add_argument('--utilisation', type=float, default=0.8)
     parser.add_argument('--workers', type=int, default=7)
-    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--seed', type=int, default=LIVE_SEED)
     parser.add_argument('--intake', choices=('auto', 'events', 'waitset'), default='auto')
     args = parser.parse_args(arguments)
     rclpy.init(args=[])
