@@ -45,6 +45,7 @@ import argparse
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable
+from dataclasses import asdict
 import json
 import os
 import random
@@ -73,6 +74,7 @@ MEMORY_RATIO = 0.05
 REMADE = 200
 """So many nodes a process beside this one makes again, to see what the middleware keeps."""
 MATCH_S = 30.0
+MOST_TOLD = 50
 STALL_S = 0.01
 
 _SLEEPER = f"""
@@ -135,8 +137,8 @@ class Soak:
         self._random = random.Random(seed)
         plan = ExecutionPlan(task_set, seed, utilisation, workers, 'sleep')
         self._infeasible = {sink.vertex for sink in plan.infeasible()}
-        self._missed: deque[tuple[int, str]] = deque()
-        self._clean_missed: list[tuple[int, str]] = []
+        self._missed: deque[DeadlineMiss] = deque()
+        self._clean_missed: list[tuple[str, DeadlineMiss]] = []
         deadlines = [v.deadline_ns or 0 for v in task_set.vertices]
         self._settle_s = min(2.0, max(deadlines) / 1e9)
         self.executor = MultiDeadlineExecutor(
@@ -147,22 +149,23 @@ class Soak:
         self.counts = dict.fromkeys((*FAULTS, 'raised'), 0)
         self._errors: list[str] = []
         self._clean: list[tuple[int, int]] = []
+        self._before: list[str] = []
         self._ending = False
         self._thread = threading.Thread(target=self._spin, name='soak-spin', daemon=True)
 
     def _on_miss(self, miss: DeadlineMiss) -> None:
         if miss.vertex not in self._infeasible:
-            self._missed.append((miss.release_ns, miss.vertex))
+            self._missed.append(miss)
 
     def _sort_out(self) -> int:
         """Keep of the misses only those in clean windows; return how many have come to these."""
         starts = [start for start, _ in self._clean]
         before = len(self._clean_missed)
         while self._missed:  # others append meanwhile
-            release, vertex = self._missed.popleft()
-            place = bisect_right(starts, release) - 1
-            if place >= 0 and release < self._clean[place][1]:
-                self._clean_missed.append((release, vertex))
+            miss = self._missed.popleft()
+            place = bisect_right(starts, miss.release_ns) - 1
+            if place >= 0 and miss.release_ns < self._clean[place][1]:
+                self._clean_missed.append((self._before[place], miss))
         return len(self._clean_missed) - before
 
     def _spin(self) -> None:
@@ -218,6 +221,7 @@ class Soak:
         time.sleep(RECOVERY_S)
         start = time.time_ns()
         time.sleep(CLEAN_S)
+        self._before.append(fault)
         self._clean.append((start, time.time_ns()))
         time.sleep(self._settle_s)  # for what was released last, before the next fault hits it
         self._say(f'{fault}: {self._sort_out()} misses in the clean window, '
@@ -285,8 +289,8 @@ class Soak:
             start - 500_000_000, stop + 200_000_000)]
         self._sort_out()
         clean_misses = [
-            vertex for release, vertex in self._clean_missed
-            if any(start <= release < stop for start, stop in judged)]
+            (fault, miss) for fault, miss in self._clean_missed
+            if any(start <= miss.release_ns < stop for start, stop in judged)]
         result = {
             'seconds': elapsed, 'faults': self.counts, 'before': before, 'after': after,
             'middleware_keeps': kept_by_middleware(self._graph, REMADE),
@@ -297,7 +301,9 @@ class Soak:
             'cut_off': self.nodes.cut_off, 'clean_windows': len(self._clean),
             'disturbed_windows': len(self._clean) - len(judged),
             'stalls': len(self._stalls.stalls), 'clean_misses': len(clean_misses),
-            'clean_missed_sinks': sorted(set(clean_misses)),
+            'clean_missed_sinks': sorted({miss.vertex for _, miss in clean_misses}),
+            'clean_missed': [
+                {'after': fault, **asdict(miss)} for fault, miss in clean_misses[:MOST_TOLD]],
             'infeasible_sinks': sorted(self._infeasible), 'simulated_ticks': ticks}
         result['failed'] = [*self._failures(result, statistics, n_open)]
         if not simulated_goes_on:
