@@ -24,6 +24,7 @@ from types import SimpleNamespace
 from typing import Any
 import weakref
 
+from mddag_executor.live import DeadlineMiss
 from mddag_executor.live.bench.soak import FAULTS, MEMORY_RATIO, Soak, StallWatch, usage
 from mddag_executor.live.bench.soak_memory import in_use, resident
 import pytest
@@ -81,16 +82,23 @@ def test_memory_that_was_freed_is_not_in_use():
 
 
 def test_of_the_misses_those_in_clean_windows_are_kept():
+    def miss(release: int, vertex: str) -> DeadlineMiss:
+        return DeadlineMiss('dag', vertex, 0, release, release + 1, None, 'expired')
+
     soak = Soak.__new__(Soak)
-    soak._missed, soak._clean_missed, soak._clean = deque(), [], []
-    soak._missed.extend([(5, 'early'), (15, 'before any window')])
+    soak._missed, soak._clean_missed, soak._clean, soak._before = deque(), [], [], []
+    soak._missed.extend([miss(5, 'early'), miss(15, 'before any window')])
     assert soak._sort_out() == 0 and not soak._missed
-    soak._clean = [(20, 30), (50, 60)]
-    soak._missed.extend([(19, 'a'), (20, 'b'), (29, 'c'), (30, 'd'), (49, 'e'), (55, 'f')])
+    soak._clean, soak._before = [(20, 30), (50, 60)], ['burst', 'destroy']
+    soak._missed.extend([miss(19, 'a'), miss(20, 'b'), miss(29, 'c'), miss(30, 'd'),
+                         miss(49, 'e'), miss(55, 'f')])
     assert soak._sort_out() == 3
-    soak._missed.append((25, 'told late'))
+    soak._missed.append(miss(25, 'told late'))
     assert soak._sort_out() == 1 and not soak._missed
-    assert soak._clean_missed == [(20, 'b'), (29, 'c'), (55, 'f'), (25, 'told late')]
+    assert soak._clean_missed == [
+        ('burst', miss(20, 'b')), ('burst', miss(29, 'c')), ('destroy', miss(55, 'f')),
+        ('burst', miss(25, 'told late'))]
+
 
 
 def test_what_the_middleware_keeps_is_left_out_of_the_growth():
