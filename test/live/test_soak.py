@@ -100,7 +100,6 @@ def test_of_the_misses_those_in_clean_windows_are_kept():
         ('burst', miss(25, 'told late'))]
 
 
-
 def test_what_the_middleware_keeps_is_left_out_of_the_growth():
     def failures(after: int, keeps: float) -> list[str]:
         soak = Soak.__new__(Soak)
