@@ -86,10 +86,10 @@ def test_of_the_misses_those_in_clean_windows_are_kept():
         return DeadlineMiss('dag', vertex, 0, release, release + 1, None, 'expired')
 
     soak = Soak.__new__(Soak)
-    soak._missed, soak._clean_missed, soak._clean, soak._before = deque(), [], [], []
+    soak._missed, soak._clean_missed, soak._clean = deque(), [], []
     soak._missed.extend([miss(5, 'early'), miss(15, 'before any window')])
     assert soak._sort_out() == 0 and not soak._missed
-    soak._clean, soak._before = [(20, 30), (50, 60)], ['burst', 'destroy']
+    soak._clean = [(20, 30, 'burst'), (50, 60, 'destroy')]
     soak._missed.extend([miss(19, 'a'), miss(20, 'b'), miss(29, 'c'), miss(30, 'd'),
                          miss(49, 'e'), miss(55, 'f')])
     assert soak._sort_out() == 3

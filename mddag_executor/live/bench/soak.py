@@ -148,8 +148,8 @@ class Soak:
         self._stalls = StallWatch()
         self.counts = dict.fromkeys((*FAULTS, 'raised'), 0)
         self._errors: list[str] = []
-        self._clean: list[tuple[int, int]] = []
-        self._before: list[str] = []
+        # start, end, and the fault before
+        self._clean: list[tuple[int, int, str]] = []
         self._ending = False
         self._thread = threading.Thread(target=self._spin, name='soak-spin', daemon=True)
 
@@ -159,13 +159,13 @@ class Soak:
 
     def _sort_out(self) -> int:
         """Keep of the misses only those in clean windows; return how many have come to these."""
-        starts = [start for start, _ in self._clean]
+        starts = [start for start, _, _ in self._clean]
         before = len(self._clean_missed)
         while self._missed:  # others append meanwhile
             miss = self._missed.popleft()
             place = bisect_right(starts, miss.release_ns) - 1
             if place >= 0 and miss.release_ns < self._clean[place][1]:
-                self._clean_missed.append((self._before[place], miss))
+                self._clean_missed.append((self._clean[place][2], miss))
         return len(self._clean_missed) - before
 
     def _spin(self) -> None:
@@ -221,8 +221,7 @@ class Soak:
         time.sleep(RECOVERY_S)
         start = time.time_ns()
         time.sleep(CLEAN_S)
-        self._before.append(fault)
-        self._clean.append((start, time.time_ns()))
+        self._clean.append((start, time.time_ns(), fault))
         time.sleep(self._settle_s)  # for what was released last, before the next fault hits it
         self._say(f'{fault}: {self._sort_out()} misses in the clean window, '
                   f'{resident() / 1e6:.1f} MB')
@@ -285,7 +284,7 @@ class Soak:
             node.destroy_node()
         self._stalls.stop()
         # what is released last in a window runs on beyond it, and may wait for what was before
-        judged = [(start, stop) for start, stop in self._clean if not self._stalls.within(
+        judged = [(start, stop) for start, stop, _ in self._clean if not self._stalls.within(
             start - 500_000_000, stop + 200_000_000)]
         self._sort_out()
         clean_misses = [
