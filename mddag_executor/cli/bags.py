@@ -64,7 +64,7 @@ def reschedule_bag(
     """
     Run the scheduler over a bag.
 
-    :raises mddag_executor.errors.MddagError: where that can not be
+    :raises mddag_executor.errors.MddagError: where that cannot be
     """
     from mddag_executor.replay.bags_reschedule import reschedule_bag as run
     from mddag_executor.simulate import read_execution_times

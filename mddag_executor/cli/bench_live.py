@@ -104,7 +104,7 @@ def main(args: argparse.Namespace) -> int:
     Make all measurements and print them.
 
     :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     _check(args)
     executors = parse_executors(args.executors, args.policies)

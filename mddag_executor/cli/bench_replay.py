@@ -71,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
     Measure and print.
 
     :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     common.check_output(args.json)
     if args.accuracy and args.trace:

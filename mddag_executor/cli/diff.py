@@ -65,9 +65,9 @@ def main(args: argparse.Namespace) -> int:
     """
     Compare two runs.
 
-    :raises mddag_executor.trace.TraceError: when a trace can not be used
+    :raises mddag_executor.trace.TraceError: when a trace cannot be used
     :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     from mddag_executor.report import diff
     _check_arguments(args)

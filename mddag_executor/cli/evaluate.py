@@ -84,7 +84,7 @@ def main(args: argparse.Namespace) -> int:
     Evaluate a declaration and print the acceptance ratios.
 
     :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     policies = options.policies(args.policies)
     _check_outputs(args)

@@ -55,9 +55,9 @@ def main(args: argparse.Namespace) -> int:
     """
     Export a trace.
 
-    :raises mddag_executor.trace.TraceError: when the trace can not be used
+    :raises mddag_executor.trace.TraceError: when the trace cannot be used
     :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     from mddag_executor.report.export import check_available, target
     form = _form(args)

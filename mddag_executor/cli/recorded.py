@@ -90,7 +90,7 @@ def as_recorded(
     Replay a recorded run; return what came of it, and the recording where it is of this executor.
 
     :param own: what to make of a recording of this executor.
-    :raises mddag_executor.errors.MddagError: where that can not be
+    :raises mddag_executor.errors.MddagError: where that cannot be
     """
     from mddag_executor.replay.as_recorded import replay_recording
     from mddag_executor.replay.following import open_recording
@@ -108,7 +108,7 @@ def rescheduled(
     """
     Run the scheduler over a recording of any kind.
 
-    :raises mddag_executor.errors.MddagError: where that can not be
+    :raises mddag_executor.errors.MddagError: where that cannot be
     """
     if is_bag(path):
         return bags.reschedule_bag(args, path, name, task_set)

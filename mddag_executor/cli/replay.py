@@ -55,9 +55,9 @@ def main(args: argparse.Namespace) -> int:
     """
     Replay a trace and print what came of its deadlines.
 
-    :raises mddag_executor.trace.TraceError: when the trace can not be used
+    :raises mddag_executor.trace.TraceError: when the trace cannot be used
     :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     common.check_output(args.json)
     common.check_report(args.report)

@@ -100,7 +100,7 @@ def main(args: argparse.Namespace) -> int:
     Run nodes until the run ends, and print what came of the deadlines.
 
     :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     common.check_output(args.json)
     _check_arguments(args)

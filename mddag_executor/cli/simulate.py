@@ -61,7 +61,7 @@ def main(args: argparse.Namespace) -> int:
     Simulate and print what came of the deadlines.
 
     :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else can not be used
+    :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     from mddag_executor.simulate import periodic_load, Settings, utilisation
     _check_arguments(args)

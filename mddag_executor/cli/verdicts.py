@@ -31,7 +31,7 @@ def check(args: argparse.Namespace) -> None:
     """
     Check the arguments.
 
-    :raises mddag_executor.errors.MddagError: where they do not go together or can not be written
+    :raises mddag_executor.errors.MddagError: where they do not go together or cannot be written
     """
     common.check_output(args.junit)
     if args.json == args.junit == '-':

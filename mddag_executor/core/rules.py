@@ -148,7 +148,7 @@ def peek(t: Tables, s: State, now: int) -> int:
     """
     Return the execution that goes next, or -1 when none may run.
 
-    On the way, what can not go next leaves the queue: dropped and aborted executions for good,
+    On the way, what cannot go next leaves the queue: dropped and aborted executions for good,
     those whose group is busy into their group's heap (rule 4) or to the next poll (rule 9).
     """
     again = True

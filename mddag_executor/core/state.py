@@ -6,7 +6,7 @@ The state that the scheduling rules change, as columns.
 A *slot* holds one open job of one DAG and owns a region of *executions* ``x``: one for each vertex
 (or leg) of that DAG.  Slots of a DAG are recycled through a free list; open jobs of a DAG form a
 list in order of release.  Columns are plain lists for live use; a compiled driver makes them
-arrays.  ``scalars`` holds what would be plain integers, because a named tuple's can not change.
+arrays.  ``scalars`` holds what would be plain integers, because a named tuple's cannot change.
 """
 
 from __future__ import annotations

@@ -219,7 +219,7 @@ class PoolWatch:
         ) if step[key]]
         failed = self._recorder is not None and self._recorder.writer.error is not None
         if failed:
-            lost.append('the trace can not be written')
+            lost.append('the trace cannot be written')
         scheduler = self._dispatcher.scheduler
         values = {
             'policy': scheduler.policy.name, 'workers': str(workers),

@@ -351,7 +351,7 @@ class Dispatcher(Dropping):
         record('callback_end', end, seat.vtid, address)
 
     def give_up(self, work: Work, now: int) -> None:
-        """End a dispatched execution that must not run: its job can not complete any more."""
+        """End a dispatched execution that must not run: its job cannot complete any more."""
         x = work.x
         work.x = -1
         origin = work.origin

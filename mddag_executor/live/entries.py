@@ -221,7 +221,7 @@ class TaskWork(Work):
 
 
 UNKNOWN = object()
-"""Stands for something awaited that can not be found out: it is asked again now and then."""
+"""Stands for something awaited that cannot be found out: it is asked again now and then."""
 
 
 def awaited(coroutine: Any) -> Any:

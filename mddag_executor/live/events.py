@@ -4,10 +4,10 @@
 Intake by events: the middleware calls, and nothing is asked again for each wake-up.
 
 Subscriptions, services and clients go through one native EventsExecutor of rclpy, QoS events
-through another (see ``native``). What can not, or crashes it, gets threads of its own: timers;
+through another (see ``native``). What cannot, or crashes it, gets threads of its own: timers;
 guard conditions, actions and other waitables. A thread is started when there is something for it.
 
-A native executor can not be repaired, and not even be disposed of, when the middleware refuses an
+A native executor cannot be repaired, and not even be disposed of, when the middleware refuses an
 entity half way. Should that happen, it is left lying, and a wait set takes over.
 """
 

@@ -42,7 +42,7 @@ A sleeper's attribute ``busy_below_ns`` tells up to which execution time it take
 
 
 class PlanError(MddagError):
-    """An execution plan that can not be made from this declaration."""
+    """An execution plan that cannot be made from this declaration."""
 
 
 @dataclass(frozen=True)

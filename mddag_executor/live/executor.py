@@ -6,7 +6,7 @@ The executor: rclpy's contract on top of intake, core and workers.
 Theory of operation
 -------------------
 ``spin`` starts the intake threads and lets the workers run; the calling thread then only looks
-after the executor: it takes note of entities that come and go, resumes what can not say when it
+after the executor: it takes note of entities that come and go, resumes what cannot say when it
 is ready, and ends the spin on an exception, a shutdown, a done future or a time-out.
 
 ``spin_once`` (see ``stepping``) runs one callback in the calling thread.
@@ -103,7 +103,7 @@ class MultiDeadlineExecutor(Stepping):
     :param thresholds: what makes a status of the diagnostics worse than OK.
     :raises msg_graph.GraphError: when the declaration is not right.
     :raises mddag_executor.errors.MddagError: on an unknown policy, intake or thread setting, a
-        value of the wrong kind, and when the trace can not be written.
+        value of the wrong kind, and when the trace cannot be written.
     :raises rclpy.exceptions.NotInitializedException: when ``rclpy.init`` was not called before.
     """
 

@@ -82,7 +82,7 @@ class Gathering:
     The threads that share a CPU.
 
     :param cpus: those that they may use; None: all that the process may.
-    :raises UsageError: where this system can not do it.
+    :raises UsageError: where this system cannot do it.
     """
 
     def __init__(

@@ -45,7 +45,7 @@ _FORMS = 'write package/executable, module:function or module:NodeClass'
 
 
 class LoadingError(MddagError):
-    """A ``--node`` that can not be run; one line that says why and what to do."""
+    """A ``--node`` that cannot be run; one line that says why and what to do."""
 
     def __init__(self, spec: str, problem: str, remedy: str) -> None:
         super().__init__(f'--node {spec}: {problem}: {remedy}')

@@ -6,7 +6,7 @@ Measure any executor by what its callbacks did.
 Theory of operation
 -------------------
 The nodes themselves write the ledger, so any executor can be measured with the same yardstick,
-and an executor can not embellish its figures: each body appends how long it took, each sink
+and an executor cannot embellish its figures: each body appends how long it took, each sink
 appends (release, completion).  Appending to a list is one indivisible step in CPython, so no lock
 is taken in a callback.
 

@@ -18,7 +18,7 @@ rules keep it from using what is gone, or what has come in its place:
 2. What it borrows (``handle``, ``callback``, ``msg_type``, ``srv_type``) are attributes set once,
    or replaced by something while the old value lives on.
 3. A stand-in holds the handle (``with handle``) of its entity from before it is shown to after
-   it was withdrawn, so an address can not be used again while events for it may be queued. It is
+   it was withdrawn, so an address cannot be used again while events for it may be queued. It is
    withdrawn in one update of the native executor; the events queued by then are through before
    an update begins that was asked for after that one: two updates later it lets go.
 4. Adding an entity that is destroyed fails half way, which the native executor does not survive.

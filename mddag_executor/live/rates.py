@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Warnings about timers that can not keep their rate (rclpy#1126).
+Warnings about timers that cannot keep their rate (rclpy#1126).
 
 Theory of operation
 -------------------
@@ -50,7 +50,7 @@ class _Known:
 
 class RateWatch:
     """
-    Warns of timers that can not keep their rate.
+    Warns of timers that cannot keep their rate.
 
     :param warn: takes a warning; None: it goes to the log.
     """
@@ -92,7 +92,7 @@ class RateWatch:
         except InvalidHandle:
             return  # destroyed meanwhile
         text = (
-            f'the timer of {entry.node} with a period of {period / 1e6:g} ms can not keep its '
+            f'the timer of {entry.node} with a period of {period / 1e6:g} ms cannot keep its '
             f'rate: {skipped} of {skipped + ran} periods were skipped within '
             f'{max(0.0, now - known.at):.1f} s')
         if ran > 0:

@@ -31,7 +31,7 @@ class Recorder:
 
     Addresses are those of Python objects: the node, the entity, and, for callbacks, the entry.
 
-    :raises mddag_executor.trace.TraceError: when the file can not be written.
+    :raises mddag_executor.trace.TraceError: when the file cannot be written.
     """
 
     def __init__(

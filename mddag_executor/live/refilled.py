@@ -115,7 +115,7 @@ class RefilledSet:
         """
         Wait until something is ready, or for a time (negative: for ever).
 
-        :raises RCLError: when rcl can not.
+        :raises RCLError: when rcl cannot.
         """
         wait_set = self._set
         wait_set.clear_entities()

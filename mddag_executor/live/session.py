@@ -40,7 +40,7 @@ Tick = Callable[[float], None]
 
 
 class SessionError(MddagError):
-    """A run that can not begin."""
+    """A run that cannot begin."""
 
 
 class Session:

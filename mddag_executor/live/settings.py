@@ -52,7 +52,7 @@ def call_back(name: str, value: Any) -> None:
     :raises UsageError: when that is impossible.
     """
     if value is not None and not callable(value):
-        raise UsageError(f'{name}: {value!r} can not be called: give a function or None')
+        raise UsageError(f'{name}: {value!r} cannot be called: give a function or None')
 
 
 def check_thresholds(value: Any) -> Thresholds:
@@ -162,7 +162,7 @@ def thread_setting(
     """
     Return what each worker thread calls first, None where nothing is to be set.
 
-    :raises UsageError: on a setting that this machine or process can not have.
+    :raises UsageError: on a setting that this machine or process cannot have.
     """
     if policy is None and cpus is None:
         if priority is not None:

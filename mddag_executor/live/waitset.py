@@ -225,7 +225,7 @@ class WaitSetIntake:
         :return: how many things were handed over: 0 after the time, and when a guard condition
             or ``wake`` ended the wait, or the context has been shut down.
         :raises RuntimeError: when the intake's thread runs.
-        :raises RCLError: when rcl can not wait for another reason.
+        :raises RCLError: when rcl cannot wait for another reason.
         """
         if self.running:
             raise RuntimeError('the intake runs in a thread of its own')

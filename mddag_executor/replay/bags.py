@@ -51,7 +51,7 @@ UNKNOWN = -1
 
 
 class BagError(InputError):
-    """A bag that can not be used; its text is `FILE: what is wrong: what to do`."""
+    """A bag that cannot be used; its text is `FILE: what is wrong: what to do`."""
 
 
 class Stamps:
@@ -73,7 +73,7 @@ class Bag:
     :ivar start: the first and ``end`` the last arrival of any message, ns; None without any.
     :ivar warnings: what is missing or doubtful, one line each.
     :raises BagError: where there is no bag, or nothing of it can be used.
-    :raises mddag_executor.trace.TraceError: where a file of it can not be read.
+    :raises mddag_executor.trace.TraceError: where a file of it cannot be read.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class Bag:
             finally:
                 reader.close()
         except Exception as error:      # of SQLite, of rosbags, or of what a damaged file gave
-            what = f'its SQLite storage can not be read ({" ".join(str(error).split())})'
+            what = f'its SQLite storage cannot be read ({" ".join(str(error).split())})'
             if not used:
                 raise BagError(str(file), what, _REMEDY) from None
             self.warnings.append(
@@ -279,10 +279,10 @@ def _unpacked(file: Path) -> Iterator[tuple[Path, bytes]]:
                             'free space, or name another folder in TMPDIR')
                     out.write(piece)
         except zstandard.ZstdError as error:
-            raise BagError(str(file), f'can not be unpacked ({error})', _REMEDY) from None
+            raise BagError(str(file), f'cannot be unpacked ({error})', _REMEDY) from None
         except OSError as error:
             raise BagError(
-                str(file), f'can not be unpacked ({error.strerror})', 'free space') from None
+                str(file), f'cannot be unpacked ({error.strerror})', 'free space') from None
         yield target, _kind(target)
 
 
@@ -336,5 +336,5 @@ def _is_stamped(topic: Topic) -> bool:
         else:
             fields = get_typestore(Stores.ROS2_JAZZY).fielddefs[topic.message_type][1]
         return bool(fields) and fields[0][1][1] in _STAMPED
-    except Exception:   # a type that rosbags does not know, or a definition that it can not read
+    except Exception:   # a type that rosbags does not know, or a definition that it cannot read
         return False

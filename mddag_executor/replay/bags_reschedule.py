@@ -230,7 +230,7 @@ def reschedule_bag(
     :param name: what messages call the bag, where that is not its path.
     :raises BagError: where there is no bag, or none of the sources is in it.
     :raises mddag_executor.simulate.SimulationError: where an execution time is not known.
-    :raises mddag_executor.errors.MddagError: on a policy that can not be.
+    :raises mddag_executor.errors.MddagError: on a policy that cannot be.
     """
     policy = policy or 'rad'
     find_policy(policy).mode(preemptive)

@@ -187,7 +187,7 @@ class Follower:
                 self._strange[f'{event[0]} without some of its fields'] += 1
                 continue
             if not 0 <= event[1] < NEVER:
-                self._strange[f'{event[0]} at a time that can not be'] += 1
+                self._strange[f'{event[0]} at a time that cannot be'] += 1
                 continue
             handlers[event[0]](event)
             count += 1
@@ -396,7 +396,7 @@ class Follower:
         if self.shut_down:
             return
         if not self.end <= event[4] < NEVER:
-            self._strange[f'{event[0]} at a time that can not be'] += 1
+            self._strange[f'{event[0]} at a time that cannot be'] += 1
             return
         self.end = event[4]
         self.shut_down = True

@@ -286,7 +286,7 @@ class ImportedFollower:
         lines = [f'{name}: {text}' for text in self.linker.losses.lines()]
         if self._strange:
             lines.append(
-                f'{name}: {self._strange} events are at a time that can not be, and are left out')
+                f'{name}: {self._strange} events are at a time that cannot be, and are left out')
         lines.extend(f'{name}: {text}' for text in self._timers.lines())
         if self._fallbacks:
             lines.append(

@@ -259,7 +259,7 @@ def measure(name: str, path: str, limit: int) -> Speed:
     Run one of ``READERS`` over a file in a process of its own.
 
     :param limit: events after which another's reader stops.
-    :raises mddag_executor.errors.MddagError: when it can not
+    :raises mddag_executor.errors.MddagError: when it cannot
     """
     context = multiprocessing.get_context('spawn')
     ours, theirs = context.Pipe(duplex=False)

@@ -164,12 +164,12 @@ def reschedule(
     :raises mddag_executor.trace.TraceError: when it is no trace.
     :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, none of the
         declaration's callbacks, or an execution time that is neither recorded nor declared.
-    :raises mddag_executor.errors.MddagError: on a policy or number of workers that can not be.
+    :raises mddag_executor.errors.MddagError: on a policy or number of workers that cannot be.
     """
     if policy is not None:
         find_policy(policy).mode(preemptive)
     if workers is not None and not 1 <= workers <= MAX_WORKERS:
-        raise UsageError(f'workers: {workers} can not be: give 1 to {MAX_WORKERS}')
+        raise UsageError(f'workers: {workers} cannot be: give 1 to {MAX_WORKERS}')
     recording = open_declared(path, name, task_set)
     policy, workers = _settings(recording.head, recording.name, policy, workers)
     mapping = map_recording(recording, task_set)

@@ -17,7 +17,7 @@ them *entry points*: ``kernel`` for evaluations, ``replay.fast_kernel`` for trac
 
 What numba makes of an entry point (with everything that it calls inside) is kept on disk, in
 ``$XDG_CACHE_HOME/mddag_executor`` (``~/.cache``), under a hash of all sources and versions that it
-was made from; numba itself adds the processor.  Where that folder can not be written, each process
+was made from; numba itself adds the processor.  Where that folder cannot be written, each process
 compiles anew.  Nothing is compiled, and numba is not imported, before the first use.
 
 Compiling leaves some 130 MB behind: LLVM keeps a module for each of about 90 functions, with a

@@ -8,4 +8,4 @@ from mddag_executor.errors import MddagError
 
 
 class SimulationError(MddagError):
-    """Input of a simulation that can not be used."""
+    """Input of a simulation that cannot be used."""

@@ -56,7 +56,7 @@ def write_trace(
     """
     Write the trace of a run that was simulated with its log.
 
-    :raises mddag_executor.trace.TraceError: when the file can not be written.
+    :raises mddag_executor.trace.TraceError: when the file cannot be written.
     """
     with TraceFile(path) as file:
         file.extend(_Merger(task_set, load, run).events(), PROCESS)

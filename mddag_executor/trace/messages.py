@@ -64,7 +64,7 @@ class MessageReader:
         """
         Yield the messages of some topics, in the order of the file.
 
-        :raises TraceError: where the file can not be read or is no MCAP file
+        :raises TraceError: where the file cannot be read or is no MCAP file
         """
         with open_trace(self.path) as (stream, size):
             try:

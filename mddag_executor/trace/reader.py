@@ -34,7 +34,7 @@ def open_trace(path: str) -> Iterator[tuple[BinaryIO, int]]:
     """
     Open a file and give it with its size.
 
-    :raises TraceError: where that can not be, and for errors of the system inside of the block
+    :raises TraceError: where that cannot be, and for errors of the system inside of the block
     """
     if '\0' in path:
         raise TraceError(path, 'is no file name', 'give the .mcap file')

@@ -178,7 +178,7 @@ class Reading:
         yield events
 
     def _add_any(self, events: list[Event], channel: int, message: bytes) -> None:
-        """Add the event in a message record; count it where it can not be decoded."""
+        """Add the event in a message record; count it where it cannot be decoded."""
         try:
             if message[_FIELDS - 4:_FIELDS - 2] != ENCAPSULATION[:2]:
                 raise ValueError('it is not plain little endian CDR')

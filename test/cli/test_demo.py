@@ -81,7 +81,7 @@ def test_the_main_job_end_to_end(
 def test_a_step_that_fails_is_one_line(
     tmp_path: Path, mddag: Callable[..., subprocess.CompletedProcess[str]]
 ) -> None:
-    (tmp_path / 'demo.mcap').mkdir()  # the trace can not be written
+    (tmp_path / 'demo.mcap').mkdir()  # the trace cannot be written
     process = mddag('demo', '--seconds', '1', '--output', tmp_path)
     assert process.returncode == 2
     assert process.stderr == (

@@ -255,7 +255,7 @@ def test_other_bad_input_is_one_line(
         ([trace, '--reschedule', '--callbacks'], '--callbacks: '),
         ([trace, '--reschedule', '--policy', 'best'], "policy 'best': there is no such policy: "),
         ([trace, '--reschedule', '--workers', '0'], 'mddag replay: argument --workers: '),
-        ([trace, '--reschedule', '--workers', '99999'], 'workers: 99999 can not be: give 1 to '),
+        ([trace, '--reschedule', '--workers', '99999'], 'workers: 99999 cannot be: give 1 to '),
         (['-', '-'], '-: standard input can be only one of TRACE and GRAPH: name the other'),
         ([], 'mddag replay: the following arguments are required: TRACE'),
     ):

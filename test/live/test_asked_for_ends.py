@@ -213,4 +213,4 @@ def test_ctrl_c_is_quiet(intake):
     assert status == 0, err
     assert out == ''
     # On a busy machine the timers skip periods, and that is said.
-    assert [line for line in err.splitlines() if 'can not keep its rate' not in line] == []
+    assert [line for line in err.splitlines() if 'cannot keep its rate' not in line] == []

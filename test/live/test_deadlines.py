@@ -341,7 +341,7 @@ def test_abort_drops_what_is_left_of_a_late_job(make_executor, make_node):
 
 
 def test_a_lost_message_expires_its_job(make_executor, make_node):
-    """Nobody runs the relay: its jobs can not complete, expire, and free their places."""
+    """Nobody runs the relay: its jobs cannot complete, expire, and free their places."""
     chain = Chain(make_node)
     chain.nodes['middle'].destroy_subscription(next(iter(chain.nodes['middle'].subscriptions)))
     executor = make_executor(with_source('max_active_jobs: 3'))

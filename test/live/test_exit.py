@@ -52,7 +52,7 @@ def run(**parts: str) -> None:
         [sys.executable, '-c', program], capture_output=True, text=True, timeout=30, check=False)
     assert process.returncode == 0, process.stderr
     assert process.stdout.splitlines()[-1] == 'end'
-    expected = 'can not keep its rate', 'use of fork() may lead to deadlocks'
+    expected = 'cannot keep its rate', 'use of fork() may lead to deadlocks'
     noise = [line for line in process.stderr.splitlines()
              if not any(text in line for text in expected)]
     assert noise == []

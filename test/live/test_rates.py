@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Warnings about timers that can not keep their rate (rclpy#1126)."""
+"""Warnings about timers that cannot keep their rate (rclpy#1126)."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_the_first_warning_comes_at_once_and_has_the_figures():
     now[0] += LOOK_S
     watch.look()
     assert warnings == [
-        'the timer of /node with a period of 10 ms can not keep its rate: 15 of 25 periods were '
+        'the timer of /node with a period of 10 ms cannot keep its rate: 15 of 25 periods were '
         'skipped within 0.5 s, its callback takes 25 ms']
 
 
@@ -111,7 +111,7 @@ def test_an_executor_warns_once_of_a_slow_timer_and_counts_what_it_skips(
     with Spinning(executor):
         assert wait_for(lambda: len(starts) >= 40)
     text = capfd.readouterr().err
-    assert text.count('can not keep its rate') == 1
+    assert text.count('cannot keep its rate') == 1
     assert 'the timer of /slow with a period of 10 ms' in text
     counts = executor.statistics()['callbacks']['/slow:timer 10000000 ns']
     # one runs, one waits: of each 35 ms there are one or two periods that nothing comes of

@@ -259,7 +259,7 @@ def test_hostile_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for content in (b'SQLite format 3\0' * 100, None):
         if content is not None:
             empty.write_bytes(content)
-        with pytest.raises(BagError, match='its SQLite storage can not be read'):
+        with pytest.raises(BagError, match='its SQLite storage cannot be read'):
             Bag(empty, {'/points'})
     with pytest.raises(BagError, match='is no file'):
         Bag(tmp_path / 'gone', {'/points'})

@@ -7,7 +7,7 @@ Make one measurement in this process and print it as JSON.
 
 The process ends without destroying anything: rclpy's executors can't be stopped in an orderly way
 while callbacks wait for their pool.  With ``--tied`` it also ends when its standard input does, so
-that it can not outlive the process that started it, even when that was killed.
+that it cannot outlive the process that started it, even when that was killed.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ def measure(
     Make one measurement in a new process; return its figures.
 
     :raises CrashError: when the process crashed, did not end and was killed, or gave no result.
-    :raises BenchError: when the measurement can not be made.
+    :raises BenchError: when the measurement cannot be made.
     """
     # Of this machine only: it must not find another one's nodes, nor be found by them.
     environment = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ}
@@ -105,7 +105,7 @@ def run_all(
 
     :param tick: told now and then which one goes on, how many were made, and for how many s.
     :param warn: told of each that crashed; its figures are None when it never succeeded.
-    :raises BenchError: when a measurement can not be made, or when all of them crashed.
+    :raises BenchError: when a measurement cannot be made, or when all of them crashed.
     """
     runs: list[list[dict[str, Any]]] = [[] for _ in specs]
     made = 0

@@ -7,7 +7,7 @@ Publish topics at fixed rates from a process of its own, and count.
 
 Theory of operation: the process says ``ready`` when each of its topics has a subscription, begins
 to publish on the line ``go``, and stops on the line ``stop``.  Its last line is the number of
-messages that it published on each topic.  It ends when its standard input does: so it can not
+messages that it published on each topic.  It ends when its standard input does: so it cannot
 outlive the process that reads from it.
 
 All topics have the same period.  With a seed their phases are drawn, so that messages come neither

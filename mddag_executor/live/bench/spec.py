@@ -35,7 +35,7 @@ PHASES = ('drawn', 'together')
 
 
 class BenchError(MddagError):
-    """A measurement that can not be made."""
+    """A measurement that cannot be made."""
 
 
 @dataclass(frozen=True)
