@@ -90,8 +90,9 @@ class Policy(NamedTuple):
     """
     A row of the policy table.
 
-    ``preemptive`` tells how the paper's experiment runs the policy; an executor of callbacks cannot
-    preempt and ignores it.  ``polling`` tells that it works in rounds (rule 9 of ``rules``).
+    ``preemptive`` tells how the paper's experiment runs the policy; an executor of callbacks
+    cannot preempt and ignores it.  ``polling`` tells that it works in rounds (rule 9 of
+    ``rules``).
     """
 
     name: str
