@@ -27,6 +27,7 @@ import argparse
 from collections.abc import Sequence
 from importlib import import_module
 import io
+from itertools import takewhile
 import os
 import sys
 from types import ModuleType
@@ -71,9 +72,27 @@ _ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_p
 class Parser(argparse.ArgumentParser):
     """An argument parser that reports a wrong command line as a `UsageError`."""
 
+    _given: Sequence[str] = ()
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse; what is left over is an error here, where the options of the verb are known."""
+        self._given = args or ()
+        parsed, left = super().parse_known_args(args, namespace)
+        if left:
+            self.error(f'unrecognized arguments: {" ".join(left)}')
+        return parsed, left
+
     def error(self, message: str) -> NoReturn:
         """Raise instead of printing the usage over several lines and exiting."""
-        raise UsageError(f"{self.prog}: {message}: see '{self.prog} --help'")
+        remedy = f"see '{self.prog} --help'"
+        for option in takewhile(lambda each: each not in ('--', '--ros-args'), self._given):
+            name = option.partition('=')[0]
+            if name.startswith('--') and name not in self._option_string_actions:
+                from msg_graph.errors import did_you_mean
+                message = f"there is no option '{name}'"
+                remedy = did_you_mean(name, self._option_string_actions, remedy)
+                break
+        raise UsageError(f'{self.prog}: {message}: {remedy}')
 
 
 def load(verb: Verb) -> ModuleType:

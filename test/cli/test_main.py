@@ -120,9 +120,9 @@ def test_an_interrupt_is_quiet(verb, capsys: pytest.CaptureFixture[str]) -> None
     ([], 'required: VERB'),
     (['nonsense'], "'nonsense'"),
     (['probe', '--number', 'x'], "argument --number: invalid int value: 'x'"),
-    (['probe', '--num', '3'], 'unrecognized arguments: --num'),
-    (['probe', '--\x1b[2J\n'], 'unrecognized arguments: --\\x1b[2J'),
-    (['--nonsense'], 'required: VERB'),
+    (['probe', '-x'], 'unrecognized arguments: -x'),
+    (['probe', '--\x1b[2J\n'], "there is no option '--\\x1b[2J"),
+    (['--nonsense'], "there is no option '--nonsense'"),
 ])
 def test_wrong_usage_is_one_line(verb, capsys: pytest.CaptureFixture[str],
                                  argv: list[str], says: str) -> None:
@@ -133,6 +133,20 @@ def test_wrong_usage_is_one_line(verb, capsys: pytest.CaptureFixture[str],
     assert err.startswith('error: mddag') and err.count('\n') == 1 and '\x1b' not in err
     assert says in err
     assert "--help'" in err
+
+
+@pytest.mark.parametrize(('argv', 'says'), [
+    (['replay', 't', '--reshedule'], "'--reshedule': did you mean '--reschedule'?"),
+    (['replay', '--reshedule'], "'--reshedule': did you mean '--reschedule'?"),
+    (['graph', 'check', 'g', '--jsn=-'], "'--jsn': did you mean '--json'?"),
+    (['--versio'], "'--versio': did you mean '--version'?"),
+])
+def test_a_misspelt_option_gets_a_suggestion(
+        capsys: pytest.CaptureFixture[str], argv: list[str], says: str) -> None:
+    assert program.main(argv) == 2
+    out, err = capsys.readouterr()
+    assert out == '' and err.count('\n') == 1 and err.startswith('error: mddag')
+    assert says in err
 
 
 def test_help_has_an_example(verb, capsys: pytest.CaptureFixture[str]) -> None:

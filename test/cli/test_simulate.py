@@ -223,7 +223,7 @@ def changed(**times: Any) -> str:
     (['--trace', '-'], None, '--trace -'),
     (['--trace', '/nowhere/x.mcap'], None, '/nowhere'),
     (['--json', '/nowhere/x.json'], None, '/nowhere'),
-    (['--speed', '3'], None, 'unrecognized arguments'),
+    (['--speed', '3'], None, "there is no option '--speed'"),
     ([], '{', 'times.json:1: not JSON'),
     ([], '[]', 'times.json: not an object of objects'),
     ([], json.dumps({'lidra': TIMES['lidar']}),
