@@ -49,6 +49,10 @@ def main(args: argparse.Namespace) -> int:
         warn(warning)
     print(f'{_count(imported.events, "event")} of {_count(imported.kinds, "kind")} from '
           f'{_count(len(imported.processes), "process", "processes")}: {printable(args.output)}')
+    if imported.unread:
+        named = ', '.join(f'{printable(provider)} ({count})'
+                          for provider, count in imported.unread.most_common())
+        print(f'replay does not use the events of these providers: {named}')
     return 0
 
 

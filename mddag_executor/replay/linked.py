@@ -51,11 +51,12 @@ class Publication:
     A message that was published; times in ns, 0 where they are not recorded.
 
     :ivar run: the execution that published it, None: none did.
+    :ivar message: its address, and `written` that of what the middleware made of it.
     :ivar places: for those who use it: its places in paths.
     """
 
-    __slots__ = ('publisher', 'run', 'rclcpp', 'rcl', 'dds', 'stamp', 'message', 'within',
-                 'places')
+    __slots__ = ('publisher', 'run', 'rclcpp', 'rcl', 'dds', 'stamp', 'message', 'written',
+                 'within', 'places')
 
     def __init__(self, publisher: Publisher | None, run: Run | None, message: int) -> None:
         self.publisher = publisher
@@ -65,6 +66,7 @@ class Publication:
         self.dds = 0
         self.stamp = 0
         self.message = message
+        self.written = 0
         self.within = False     # so far only within the process
         self.places = Places()
 

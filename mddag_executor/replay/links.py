@@ -14,10 +14,20 @@ may run before the tracer has recorded the stamp of the message that it runs for
    threads at once).  A callback may run inside another (one that spins); what ends before what
    began inside it shows that an end was lost.
 2. *Publications*, within a thread: `rclcpp_publish`, then `rcl_publish` of the same publisher (in
-   rclpy the only one; from Iron on the only one with the publisher's handle), then `dds_write`,
-   then `dds_bind_addr_to_stamp` (CARET) or `rmw_publish` (ros2_tracing from Jazzy on) with the
-   source timestamp.  `rclcpp_intra_publish` before `rclcpp_publish` of the same publisher is the
-   same publication, as of then.
+   rclpy the only one; from Iron on the only one with the publisher's handle), then what writes it
+   and what has the source timestamp.  `rclcpp_intra_publish` before `rclcpp_publish` of the same
+   publisher is the same publication, as of then.  The source timestamp comes with
+
+   * CARET and Cyclone DDS: `dds_write`, then `dds_bind_addr_to_stamp`, of the message's address,
+   * CARET and Fast DDS, up to Galactic: `dds_write`, `dds_bind_addr_to_addr` from the message to
+     what it became, then `dds_bind_addr_to_stamp` of that,
+   * CARET and Fast DDS, from Humble on: `dds_bind_addr_to_stamp` of address 0, which stands for
+     what the thread has published last,
+   * CARET from Jazzy on: in `dds_write` already,
+   * ros2_tracing from Jazzy on: `rmw_publish`; before, with an instrumented Cyclone DDS:
+     `dds:write_pre` of the message's address, then `dds:write`.
+
+   Until September 2021 CARET's events were called `ros2_hook`, some of their fields otherwise.
 3. *Messages between processes*: `dispatch_subscription_callback` (Galactic, Humble) names the
    callback and the source timestamp; later formats have `rmw_take` in the same thread before the
    `callback_start`.  The publication is the one on the same topic with that source timestamp.
@@ -81,15 +91,22 @@ class Linker:
         # by the identity of a layout, which is kept so that no other gets it
         self._known: dict[int, tuple[Layout, Handler, dict[str, int]]] = {}
         self._fields: dict[str, int] = {}       # of the event that is being taken in
+        caret: dict[str, Handler] = {
+            'dds_write': self._dds_write,
+            'dds_bind_addr_to_addr': self._became,
+            'dds_bind_addr_to_stamp': self._bind,
+        }
         self._handlers: dict[str, Handler] = {
+            **{f'{provider}:{name}': handler for name, handler in caret.items()
+               for provider in ('ros2_caret', 'ros2_hook')},
             'ros2:callback_start': self._start,
             'ros2:callback_end': self._end,
             'ros2:rclcpp_publish': self._rclcpp_publish,
             'ros2:rclcpp_intra_publish': self._intra_publish,
             'ros2:rcl_publish': self._rcl_publish,
-            'ros2_caret:dds_write': self._dds_write,
-            'ros2_caret:dds_bind_addr_to_stamp': self._bind,
             'ros2:rmw_publish': self._rmw_publish,
+            'dds:write_pre': self._write_begins,
+            'dds:write': self._written,
             'ros2:dispatch_subscription_callback': self._dispatch,
             'ros2:rmw_take': self._take,
             'ros2:dispatch_intra_process_subscription_callback': self._dispatch_within,
@@ -247,21 +264,40 @@ class Linker:
 
     def _dds_write(self, event: Event, thread: Thread, state: _Thread) -> None:
         last = state.last
+        message = self._get(event, 'message') or self._get(event, 'message_addr')
         if last is not None and not last.dds and not last.within and (
-                not last.rcl or self._get(event, 'message') == last.message):
+                not last.rcl or message == last.message):
             last.dds = event[1]
+        self._stamp(state, message, self._get(event, 'timestamp_'))
+
+    def _became(self, event: Event, thread: Thread, state: _Thread) -> None:
+        last = state.last
+        if last is not None and self._get(event, 'addr_from') == last.message:
+            last.written = self._get(event, 'addr_to')
 
     def _bind(self, event: Event, thread: Thread, state: _Thread) -> None:
-        self._stamp(state, self._get(event, 'addr'), self._get(event, 'source_stamp'))
+        address = self._get(event, 'addr') or self._get(event, 'addr_from')
+        stamp = self._get(event, 'source_stamp') or self._get(event, 'stamp_to')
+        self._stamp(state, address, stamp)
 
     def _rmw_publish(self, event: Event, thread: Thread, state: _Thread) -> None:
         stamp = self._get(event, 'timestamp_') or self._get(event, 'source_timestamp')
         self._stamp(state, self._get(event, 'message'), stamp)
 
+    def _write_begins(self, event: Event, thread: Thread, state: _Thread) -> None:
+        last = state.last
+        if last is not None and self._get(event, 'data') == last.message:
+            last.dds = event[1]
+        else:
+            state.last = None       # the stamp that follows is of something else
+
+    def _written(self, event: Event, thread: Thread, state: _Thread) -> None:
+        self._stamp(state, 0, self._get(event, 'timestamp_'))
+
     def _stamp(self, state: _Thread, address: int, stamp: int) -> None:
         last = state.last
         if last is None or last.stamp or last.within or not stamp or (
-                last.rcl and address != last.message):
+                last.rcl and address not in (0, last.message, last.written)):
             return
         last.stamp = stamp
         known = self._by_stamp.setdefault(last.topic, {})

@@ -24,6 +24,7 @@ Theory of operation:
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 import json
@@ -40,7 +41,7 @@ from typing import Any, IO
 from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.ctf_helper import PATIENCE_S
 from mddag_executor.trace.errors import TraceError
-from mddag_executor.trace.schema import EVENTS, EventType, PREAMBLE
+from mddag_executor.trace.schema import EVENTS, EventType, PREAMBLE, PROVIDERS
 from mddag_executor.trace.trace_file import TraceFile
 
 INSTALL = 'apt install python3-bt2'
@@ -61,6 +62,8 @@ class Imported:
     processes: set[int] = field(default_factory=set)
     #: Events that the tracer discarded, as far as it counted them.
     discarded: int = 0
+    #: How many events there are of providers that replay does not know.
+    unread: Counter[str] = field(default_factory=Counter)
     #: What is missing or was changed, one line each.
     warnings: list[str] = field(default_factory=list)
 
@@ -234,10 +237,12 @@ def _end_of(process: subprocess.Popen[bytes]) -> str:
 class _Kind:
     """How the events of one class are written."""
 
-    __slots__ = ('converts', 'key')
+    __slots__ = ('converts', 'key', 'unread')
 
     def __init__(self, key: str, converts: Sequence[Callable[[Any], Any] | None]) -> None:
         self.key = key
+        provider = key.partition(':')[0]
+        self.unread = None if provider in PROVIDERS else provider
         # None where no value changes
         self.converts = converts if any(converts) else None
 
@@ -280,6 +285,8 @@ class _Importer:
                       for convert, value in zip(kind.converts, values)]
         self._file.extend(((kind.key, time, vtid, *values),), vpid)
         self.result.events += 1
+        if kind.unread is not None:
+            self.result.unread[kind.unread] += 1
         self.result.processes.add(vpid)
         self._time = time
 
@@ -292,7 +299,7 @@ class _Importer:
     def _class(self, number: int, original: str, fields: list[tuple[str, str]]) -> None:
         event, converts = event_type(self._name(original), fields)
         for (given, _), (name, _) in zip(fields, event.fields):
-            if given != name:
+            if given != name and given not in dict(PREAMBLE):
                 self._changed[f'{original}.{given}'] = name
         self._kinds[number] = _Kind(self._file.define(event), converts)
 

@@ -140,3 +140,6 @@ _ALL = (
 
 #: Every event of the table by its full name.
 EVENTS = {event.key: event for event in _ALL}
+
+#: The providers whose events replay goes by, also of other recorders.
+PROVIDERS = frozenset({event.provider for event in _ALL} | {'dds', 'ros2_hook'})

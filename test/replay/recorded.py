@@ -24,7 +24,19 @@ _MORE = {
     'ros2:rclcpp_ring_buffer_enqueue': ('buffer', 'index', 'size', 'overwritten'),
     'ros2:rclcpp_ring_buffer_dequeue': ('buffer', 'index', 'size'),
     'ros2_caret:rcl_timer_init': ('timer_handle', 'period', 'init_timestamp'),
+    'ros2_caret:dds_bind_addr_to_addr': ('addr_from', 'addr_to'),
+    'ros2_hook:dds_write': ('message_addr',),
+    'ros2_hook:dds_bind_addr_to_addr': ('addr_from', 'addr_to'),
+    'ros2_hook:dds_bind_addr_to_stamp': ('addr_from', 'stamp_to'),
+    'dds:write_pre': ('writer', 'data'),
+    'dds:write': ('writer', 'timestamp_'),
 }
+_JAZZY = EventType('ros2_caret', 'dds_write', (
+    ('rmw_publisher_handle', 'uint64'), ('message', 'uint64'), ('timestamp_', 'int64')))
+STYLES = ('caret', 'fastdds', 'humble_fastdds', 'jazzy', 'hook', 'tracing', 'cyclone', 'rclpy')
+"""How a publication is recorded: by CARET with Cyclone DDS, with Fast DDS up to Galactic and from
+Humble on, from Jazzy on, and with Fast DDS in its first months; by ros2_tracing from Jazzy on, and
+before it with an instrumented Cyclone DDS; by CARET in rclpy."""
 
 
 class Recorded:
@@ -51,6 +63,7 @@ class Recorded:
             extra.append(EventType(provider, short, tuple(
                 (field, 'int64' if field.endswith('stamp') else 'uint64') for field in fields)))
         with TraceFile(self.path, extra_events=extra) as file:
+            file.define(_JAZZY)
             ordered = sorted(self._events, key=lambda event: event[0])
             for place, (time, pid, tid, name, fields) in enumerate(ordered[:stop]):
                 if place not in but:
@@ -111,22 +124,38 @@ class Recorded:
         """
         Add a publication and return its source timestamp (ns since `BEGIN`).
 
-        :param style: caret, tracing (ros2_tracing only, from Jazzy on) or rclpy
+        :param style: one of `STYLES`
         """
         self._next_message += 8
         message = self._next_message
         stamp = time + 10 * US if stamp is None else stamp
-        if style == 'caret':
-            self.add('ros2:rclcpp_publish', time, tid, handle, message, 0, pid=pid)
-        elif style == 'tracing':
-            self.add('ros2:rclcpp_publish', time, tid, 0, message, 0, pid=pid)
-        self.add('ros2:rcl_publish', time + 5 * US, tid, handle, message, pid=pid)
+
+        def add(name: str, after: int, *fields: int) -> None:
+            self.add(name, time + after * US, tid, *fields, pid=pid)
+
+        if style in ('tracing', 'cyclone'):
+            add('ros2:rclcpp_publish', 0, 0, message, 0)
+        elif style != 'rclpy':
+            add('ros2:rclcpp_publish', 0, handle, message, 0)
+        add('ros2:rcl_publish', 5, handle, message)
         if style == 'tracing':
-            self.add('ros2:rmw_publish', time + 6 * US, tid, message, BEGIN + stamp, pid=pid)
+            add('ros2:rmw_publish', 6, message, BEGIN + stamp)
+        elif style == 'cyclone':
+            add('ros2:rmw_publish', 6, message, 0)
+            add('dds:write_pre', 8, 0x77, message)
+            add('dds:write', 20, 0x77, BEGIN + stamp)
+        elif style == 'jazzy':
+            add('ros2_caret:dds_write#2', 8, handle, message, BEGIN + stamp)
         else:
-            self.add('ros2_caret:dds_write', time + 8 * US, tid, message, pid=pid)
-            self.add('ros2_caret:dds_bind_addr_to_stamp', time + 20 * US, tid, message,
-                     BEGIN + stamp, pid=pid)
+            provider = 'ros2_hook' if style == 'hook' else 'ros2_caret'
+            add(f'{provider}:dds_write', 8, message)
+            address = message
+            if style in ('fastdds', 'hook'):
+                address = 0x5550        # of one buffer, again and again
+                add(f'{provider}:dds_bind_addr_to_addr', 10, message, address)
+            elif style == 'humble_fastdds':
+                address = 0
+            add(f'{provider}:dds_bind_addr_to_stamp', 20, address, BEGIN + stamp)
         return stamp
 
     def receive(self, callback: int, tid: int, start: int, end: int, stamp: int,

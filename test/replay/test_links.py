@@ -11,7 +11,7 @@ from mddag_executor.replay.imported_jobs import ImportedFollower
 from mddag_executor.replay.linked import Publication, Run
 import pytest
 
-from .recorded import BEGIN, MS, Recorded, US
+from .recorded import BEGIN, MS, Recorded, STYLES, US
 
 CAMERA, DETECT = 11, 12         # callbacks
 IMAGE = 100                     # publisher
@@ -63,7 +63,7 @@ def recorded(tmp_path: Path) -> Recorded:
 
 
 @pytest.mark.parametrize('publish, receive', [
-    ('caret', 'caret'), ('caret', 'take'), ('tracing', 'take'), ('rclpy', 'take')])
+    ('caret', 'caret'), *((style, 'take') for style in STYLES)])
 def test_messages_between_threads(recorded: Recorded, publish: str, receive: str) -> None:
     for k in range(3):
         at = (k + 1) * 100 * MS
@@ -80,7 +80,7 @@ def test_messages_between_threads(recorded: Recorded, publish: str, receive: str
         ('/camera timer 100ms', 100 * MS, 103 * MS),
         ('/detector subscription /image', 102 * MS, 109 * MS)]
     assert len(told.runs) == 6
-    if publish == 'caret':
+    if publish not in ('tracing', 'rclpy'):
         assert told.published_at[0] == ('/image', 101 * MS, 101 * MS + 5 * US, 101 * MS + 8 * US)
 
 

@@ -11,6 +11,7 @@ import struct
 import sys
 from typing import NoReturn
 
+from mddag_executor.cli.main import main
 from mddag_executor.trace import ctf, import_ctf, read_events, TraceError, TraceReader
 import pytest
 
@@ -73,6 +74,25 @@ def test_unknown_events_keep_all_fields(tmp_path: Path) -> None:
         ('my_app:frame', CLOCK_OFFSET + 2, 1, 1, 6, -0.0, '', 0, (0, 0, 0, 0), 0, ())]
     assert reader.fields['my_app:frame'] == (
         'timestamp_', 'ratio', 'label', 'small', 'box', 'points_length', 'points')
+
+
+@bt2
+def test_providers_that_replay_does_not_know_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written = ('dds:write', [('writer', 'u64'), ('timestamp', 'i64')])
+    hook = ('ros2_hook:dds_write', [('message_addr', 'u64')])
+    app = ('my_app:frame', [('number', 'u64')])
+    folder = session(tmp_path / 's', [written, hook, app], [
+        (0, 1, 1, 1, 'p', 5, 77), (1, 2, 1, 1, 'p', 6), (2, 3, 1, 1, 'p', 7),
+        (2, 4, 1, 1, 'p', 8)])
+    assert main(['import', 'ctf', str(folder), '-o', str(tmp_path / 'out.mcap')]) == 0
+    said = capsys.readouterr()
+    # the field `timestamp` is called otherwise in every trace: no warning about that
+    assert said.err == ''
+    assert said.out.splitlines() == [
+        f'4 events of 3 kinds from 1 process: {tmp_path / "out.mcap"}',
+        'replay does not use the events of these providers: my_app (2)']
 
 
 @bt2
