@@ -26,11 +26,11 @@ from typing import Any
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, format_ns, printable, Progress, table
+from mddag_executor.core.tally import counts
 from mddag_executor.errors import MddagError
 from mddag_executor.live.bench.spec import Spec
 from mddag_executor.report.live_runs import summary
 from mddag_executor.report.tables import (
-    counts,
     each_sink,
     percent,
     response_cells,

@@ -8,8 +8,8 @@ with `--reschedule`, which is for the second run, ordinary bags.  Without a grap
 the declaration that it was recorded with, and an imported one by the other run's.
 
 Exit status: 0 when compared, whatever came of it; with `--fail-on-worse` 1 if a sink missed a
-larger share of its deadlines in the second run, or (with `--tolerance`) if its p99 response time
-grew by more than that; 2 on bad input.
+larger share of its deadlines in the second run or was never due there, or (with `--tolerance`) if
+its p99 response time grew by more than that, or if no sink was due in both; 2 on bad input.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from contextlib import ExitStack
 import math
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.cli import common, options, recorded
+from mddag_executor.cli import common, options, recorded, verdicts
 from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
 
@@ -85,7 +85,12 @@ def main(args: argparse.Namespace) -> int:
             print(diff.callbacks_table(difference))
         for line in diff.summary(difference):
             print(line)
-    return 1 if args.fail_on_worse and difference['worse'] else 0
+    if not args.fail_on_worse:
+        return 0
+    if not difference['worse'] and not difference['compared']:
+        return verdicts.unproven(
+            f'{first[1]} and {second[1]}', 'no sink was due in both, so nothing was compared')
+    return int(difference['worse'])
 
 
 def _check_arguments(args: argparse.Namespace) -> None:

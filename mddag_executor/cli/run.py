@@ -32,8 +32,9 @@ from mddag_executor.cli.text import Progress, warn
 from mddag_executor.core import POLICIES
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import MddagError, UsageError
-from mddag_executor.report.live_runs import listed, summary
+from mddag_executor.report.live_runs import summary
 from mddag_executor.report.tables import sink_table
+from mddag_executor.report.text import listed
 
 if TYPE_CHECKING:
     from mddag_executor.live.execution import ExecutionPlan

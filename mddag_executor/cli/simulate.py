@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor import defaults
-from mddag_executor.cli import common, options
+from mddag_executor.cli import common, options, verdicts
 from mddag_executor.cli.text import format_ns, printable, Progress
 from mddag_executor.core import POLICIES
 from mddag_executor.core import policy as find_policy
@@ -51,7 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--stop-at-first-miss', action='store_true',
         help='end the run with the first missed deadline')
     add('--trace', metavar='OUT.mcap', help='record the run to this file')
-    add('--fail-on-miss', action='store_true', help='exit with status 1 if a deadline was missed')
+    add('--fail-on-miss', action='store_true',
+        help='exit with status 1 if a deadline was missed, or no job was due')
     options.add_report(parser)
     options.add_json(parser)
 
@@ -88,7 +89,10 @@ def main(args: argparse.Namespace) -> int:
         print(sink_table(result['dags']))
         for line in summary(result):
             print(line)
-    return 1 if args.fail_on_miss and run.tally.missed else 0
+    if not args.fail_on_miss:
+        return 0
+    return verdicts.exit_status(
+        result['dags'], run.tally.missed, task_set.file, 'simulate for longer')
 
 
 def _check_arguments(args: argparse.Namespace) -> None:
@@ -140,12 +144,13 @@ def _result(args: argparse.Namespace, task_set: TaskSet, run: Run) -> dict[str, 
 
 def summary(result: dict[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the table of a run."""
-    from mddag_executor.report.tables import verdicts_line
+    from mddag_executor.report.tables import never_due_lines, verdicts_line
     jobs = sum(dag['jobs'] for dag in result['dags'].values())
     yield (f'{result["policy"]}, {result["workers"]} workers, '
            f'{"preemptive" if result["preemptive"] else "not preemptive"}, '
            f'{format_ns(result["duration_ns"])}, utilisation {result["utilisation"]:.3f}')
     yield f'{jobs} jobs, {verdicts_line(result["dags"])}'
+    yield from never_due_lines(result['dags'])
     if result['ended_ns'] < result['duration_ns']:
         yield f'stopped at {format_ns(result["ended_ns"], 9)}, with the first miss'
     miss = result['first_miss']

@@ -5,19 +5,26 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
+import sys
 from typing import Any
 
 from mddag_executor.cli import common, options
-from mddag_executor.cli.text import printable
+from mddag_executor.cli.text import one_line, printable
+from mddag_executor.core.tally import total
 from mddag_executor.errors import UsageError
-from mddag_executor.replay.tolerances import MissTally, Tolerance
+from mddag_executor.replay.tolerances import MissTally, NOTHING_DUE, Tolerance
+
+_NEVER_DUE = ('give a declaration whose nodes, topics and namespaces are those that ran, and a '
+              'run that is longer than its deadlines')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare `--fail-on-miss` and what goes with it."""
     add = parser.add_argument
     add('--fail-on-miss', action='store_true',
-        help='exit with status 1 if a deadline was missed, beyond what is tolerated')
+        help='exit with status 1 if a deadline was missed, beyond what is tolerated, or no job '
+        'was due')
     add('--tolerate-ratio', type=options.ratio, metavar='R',
         help='with --fail-on-miss or --junit: the share of the jobs of a sink that may miss, '
         '0 to 1')
@@ -62,7 +69,28 @@ def judge(args: argparse.Namespace, tally: MissTally, result: dict[str, Any]) ->
         from mddag_executor.report.junit import junit
         with common.output_file(args.junit) as file:
             file.write(junit(result, broken, args.trace))
-    return 1 if args.fail_on_miss and broken else 0
+    if not args.fail_on_miss:
+        return 0
+    return exit_status(result['dags'], bool(broken), args.trace)
+
+
+def exit_status(
+    dags: Mapping[str, Any], missed: bool, place: str, remedy: str = _NEVER_DUE
+) -> int:
+    """
+    Return the exit status of `--fail-on-miss`.
+
+    Where no job was due nothing has shown that deadlines hold: that is a failure, and is said.
+    """
+    if total(dags).due:
+        return int(missed)
+    return unproven(place, NOTHING_DUE, remedy)
+
+
+def unproven(place: str, what: str, remedy: str = _NEVER_DUE) -> int:
+    """Say that a run proves nothing about deadlines; return the exit status."""
+    print(f'error: {one_line(f"{place}: {what}: {remedy}")}', file=sys.stderr)
+    return 1
 
 
 def show(args: argparse.Namespace, result: dict[str, Any]) -> None:

@@ -10,8 +10,8 @@ mean the same.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from mddag_executor.core.state import (
     ABORTED,
@@ -45,6 +45,42 @@ def quantiles_us(values: list[int]) -> dict[str, float] | None:
     return {
         'p50': quantile(ordered, 0.5) / 1000, 'p99': quantile(ordered, 0.99) / 1000,
         'max': ordered[-1] / 1000}
+
+
+class Counts(NamedTuple):
+    """Verdicts about the jobs of a sink, or of several; ``late`` with the overdue at the end."""
+
+    due: int
+    in_time: int
+    late: int
+    expired: int
+    aborted: int
+
+    @property
+    def missed(self) -> int:
+        """Return how many were not in time."""
+        return self.due - self.in_time
+
+
+def counts(sink: Mapping[str, Any]) -> Counts:
+    """Return the verdicts that a sink's result holds."""
+    overdue = sink.get('overdue', 0)
+    aborted = sink.get('aborted', 0)
+    in_time = sink['completed'] - (sink['late'] - overdue)
+    due = sink['completed'] + overdue + sink['expired'] + aborted
+    return Counts(due, in_time, sink['late'], sink['expired'], aborted)
+
+
+def total(dags: Mapping[str, Any]) -> Counts:
+    """Return the verdicts about all sinks of a result."""
+    every = [counts(sink) for dag in dags.values() for sink in dag['sinks'].values()]
+    return Counts(*(sum(column) for column in zip(*every))) if every else Counts(0, 0, 0, 0, 0)
+
+
+def never_due(dags: Mapping[str, Any]) -> list[str]:
+    """Return the sinks of a result of which no job was due: nothing is known of them."""
+    return [name for dag in dags.values() for name, sink in dag['sinks'].items()
+            if not counts(sink).due]
 
 
 class Latest:
@@ -194,7 +230,7 @@ class Tally:
         return self.first_miss is not None
 
     def result(self) -> dict[str, Any]:
-        """Return ``deadline_missed``, ``first_miss`` and ``dags`` of the result format."""
+        """Return the result format's verdicts: ``deadline_missed`` to ``dags``."""
         tables = self._tables
         dags: dict[str, Any] = {}
         for dag in self._dags:
@@ -203,4 +239,5 @@ class Tally:
                 'jobs': self.jobs[dag.index],
                 'ends': {_OUTCOMES[e]: n for e, n in self.ends[dag.index].items()},
                 'sinks': {self.vertex_name(v): self.sinks[v].result() for v in vertices}}
-        return {'deadline_missed': self.missed, 'first_miss': self.first_miss, 'dags': dags}
+        return {'deadline_missed': self.missed, 'first_miss': self.first_miss,
+                'never_due': never_due(dags), 'dags': dags}

@@ -6,14 +6,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from mddag_executor.core.tally import counts, never_due
 from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
-
-
-def _judged(sink: dict[str, Any]) -> bool:
-    return any(sink[key] for key in ('completed', 'late', 'expired', 'aborted'))
 
 
 def statistics(
@@ -39,7 +36,8 @@ def statistics(
                  and (c.key not in callbacks or not callbacks[c.key]['ran'])]
     for dag in result['dags'].values():  # their sinks are judged where they are
         dag['sinks'] = {name: sink for name, sink in dag['sinks'].items()
-                        if name.partition('@')[0] not in elsewhere or _judged(sink)}
+                        if name.partition('@')[0] not in elsewhere or counts(sink).due}
+    result['never_due'] = never_due(result['dags'])
     return {
         'policy': dispatcher.scheduler.policy.name, 'workers': dispatcher.n_workers,
         **result, 'callbacks': callbacks, 'undeclared': undeclared,

@@ -14,7 +14,8 @@ to hold:
 A job was due at a sink when it completed there, expired, was aborted, or was past its deadline at
 the end of the run.  Jobs are consecutive by their number; a job that is not in the trace ends a
 burst.  Where only one of the two is given, only that one is asked for; where neither is, no miss
-is tolerated.
+is tolerated.  A sink of which no job was due is within every tolerance, unless none was due at any
+sink: then nothing has shown that deadlines hold, and all sinks fail.
 """
 
 from __future__ import annotations
@@ -26,9 +27,11 @@ from typing import Any
 
 from mddag_executor.core import Tables, Tally
 from mddag_executor.core.state import SINK_DONE
+from mddag_executor.core.tally import counts, total
 from msg_graph import TaskSet
 
 FOLD = 65_536
+NOTHING_DUE = 'no job was due at any sink, so no deadline was judged'
 
 
 class Runs:
@@ -96,7 +99,8 @@ class Tolerance:
 
         :param sink: its part of a result, with its `longest_burst`.
         """
-        due, missed = due_and_missed(sink)
+        verdicts = counts(sink)
+        due, missed = verdicts.due, verdicts.missed
         if not missed:
             return None
         if self.ratio is None and self.burst is None:
@@ -113,16 +117,10 @@ class Tolerance:
     def verdicts(self, dags: Mapping[str, Any]) -> dict[tuple[str, str], str]:
         """Return by DAG and sink why it is not within the tolerance; empty: all are."""
         found = {}
+        nothing_due = not total(dags).due
         for dag_name, dag in dags.items():
             for name, sink in dag['sinks'].items():
-                why = self.broken_by(sink)
+                why = NOTHING_DUE if nothing_due else self.broken_by(sink)
                 if why is not None:
                     found[dag_name, name] = why
         return found
-
-
-def due_and_missed(sink: Mapping[str, Any]) -> tuple[int, int]:
-    """Return how many jobs were due at a sink, and how many of them missed its deadline."""
-    never = sink['overdue'] + sink['expired'] + sink['aborted']
-    missed = sink['late'] + sink['expired'] + sink['aborted']     # late: with the overdue
-    return sink['completed'] + never, missed

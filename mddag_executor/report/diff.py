@@ -5,7 +5,8 @@ Two runs side by side, sink by sink and callback by callback.
 
 Sinks and callbacks are the same where their names are.  What only one run has is told with the
 other side empty.  A sink is *worse* in the second run if a larger share of its deadlines was
-missed there or, with a tolerance, if its p99 response time grew by more than that.
+missed there, if no job of it was due there but was in the first or, with a tolerance, if its p99
+response time grew by more than that.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from mddag_executor.report.tables import counts, percent, short_names, total
+from mddag_executor.core.tally import counts, total
+from mddag_executor.report.tables import percent, short_names
 from mddag_executor.report.text import Cell, format_ns, printable, table
 
 _KEYS = ('min', 'median', 'p99', 'max')
@@ -31,7 +33,8 @@ def compare(
     :param before: results as ``Replay`` and ``Reschedule`` give them; ``after``, too.
     :returns: for JSON: ``sinks`` by DAG and name with both sides (``a``, ``b``; null where a run
         lacks it), ``change_ns`` and ``change`` (share) of response times and ``worse``;
-        ``callbacks`` with both sides' executions and mean times; ``worse`` of the whole.
+        ``callbacks`` with both sides' executions and mean times; ``worse`` of the whole;
+        ``compared``, how many sinks were due in both.
     """
     dags: dict[str, Any] = {}
     for name in _union(before['dags'], after['dags']):
@@ -46,6 +49,9 @@ def compare(
     return {
         'a': _run(before), 'b': _run(after), 'tolerance': tolerance,
         'worse': any(sink['worse'] for dag in dags.values() for sink in dag['sinks'].values()),
+        'compared': sum(sink['a'] is not None and sink['b'] is not None
+                        and min(sink['a']['due'], sink['b']['due']) > 0
+                        for dag in dags.values() for sink in dag['sinks'].values()),
         'dags': dags, 'callbacks': callbacks}
 
 
@@ -78,7 +84,7 @@ def _sink(
     worse = False
     if a is not None and b is not None:
         worse = (b['due'] - b['in_time']) * a['due'] > (a['due'] - a['in_time']) * b['due'] \
-            or (a['due'] == 0 and b['in_time'] < b['due'])
+            or (a['due'] == 0 and b['in_time'] < b['due']) or (b['due'] == 0 and a['due'] > 0)
         if a['response_ns'] is not None and b['response_ns'] is not None:
             change_ns = {key: b['response_ns'][key] - a['response_ns'][key] for key in _KEYS}
             change = {key: grown / a['response_ns'][key] if a['response_ns'][key] else None
@@ -131,10 +137,13 @@ def _remark(sink: Mapping[str, Any]) -> str:
         return 'only in the second'
     if sink['b'] is None:
         return 'only in the first'
+    due = [bool(sink[side]['due']) for side in 'ab']
+    remarks = ['worse'] if sink['worse'] else []
+    if not all(due):
+        remarks.append('never due' + ('' if not any(due) else ' then' if due[0] else ' before'))
     if sink['a']['relative_deadline_ns'] != sink['b']['relative_deadline_ns']:
-        other = format_ns(sink['b']['relative_deadline_ns'])
-        return ('worse, ' if sink['worse'] else '') + f'deadline then {other}'
-    return 'worse' if sink['worse'] else ''
+        remarks.append(f'deadline then {format_ns(sink["b"]["relative_deadline_ns"])}')
+    return ', '.join(remarks)
 
 
 def callbacks_table(difference: Mapping[str, Any]) -> str:

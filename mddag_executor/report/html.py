@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 
 from mddag_executor import __version__
 from mddag_executor.core import Tally
+from mddag_executor.core.tally import total
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import Replay, Reschedule
 from mddag_executor.replay.bags_reschedule import BagReschedule
@@ -36,7 +37,7 @@ from mddag_executor.report.html_tables import (
     sinks_html,
     worst_html,
 )
-from mddag_executor.report.tables import total, verdicts_line
+from mddag_executor.report.tables import never_due_lines, verdicts_line
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import MOST_EXECUTIONS, Timeline
 from mddag_executor.report.timeline_log import of_rescheduled, Schedule, tell
@@ -242,10 +243,10 @@ def _head(data: ReportData) -> Iterator[str]:
     yield '<p class="facts">' + ' '.join(
         f'<span><b>{escape(printable(word))}</b> {escape(printable(text))}</span>'
         for word, text in data.facts) + '</p>\n'
-    missed = every.due - every.in_time
     if data.task_set.dags:
-        yield (f'<p class="verdict {"bad" if missed else "good"}">{verdicts_line(dags)}</p>\n')
-    for warning in data.warnings:
+        good = every.due and not every.missed
+        yield f'<p class="verdict {"good" if good else "bad"}">{verdicts_line(dags)}</p>\n'
+    for warning in [*never_due_lines(dags), *data.warnings]:
         yield f'<p class="warning">{escape(printable(warning))}</p>\n'
     timeline = data.timeline
     if timeline.kept < timeline.n_executions:

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
+from mddag_executor.core.tally import counts
 from mddag_executor.replay.chains import Breakdown
 from mddag_executor.report.html_data import Prepared, ReportData
 from mddag_executor.report.replays import (
@@ -17,7 +18,7 @@ from mddag_executor.report.replays import (
     RECORDED_HEADER,
     recorded_rows,
 )
-from mddag_executor.report.tables import counts, response_cells, short_names
+from mddag_executor.report.tables import response_cells, short_names
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import ABORTED, DONE, EXPIRED, OVERDUE
 
@@ -78,7 +79,7 @@ def sinks_html(data: ReportData) -> str:
             verdicts = counts(sink)
             rows.append((
                 dag_name, short[name], verdicts.due, verdicts.in_time,
-                verdicts.due - verdicts.in_time, verdicts.late, verdicts.expired,
+                verdicts.missed, verdicts.late, verdicts.expired,
                 verdicts.aborted, *response_cells(sink['response_ns']),
                 format_ns(sink['relative_deadline_ns'])))
     return f'<div class="wide">{html_table(header, rows, 2, bad=4)}</div>'

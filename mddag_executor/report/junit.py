@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import Any
 from xml.etree import ElementTree
 
-from mddag_executor.report.tables import counts
+from mddag_executor.core.tally import counts
 from mddag_executor.report.text import format_ns, printable
 
 

@@ -4,20 +4,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from mddag_executor.report.drift import drift_lines
-from mddag_executor.report.tables import percent, verdicts_line
-from mddag_executor.report.text import printable
-
-_LONGEST_LIST = 10
+from mddag_executor.report.tables import never_due_lines, percent, verdicts_line
+from mddag_executor.report.text import listed, printable
 
 
 def summary(result: dict[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the table of a run."""
     yield verdicts_line(result['dags'])
+    yield from never_due_lines(result['dags'])
     measured = result['measured']
     if measured is not None:
         yield from measured_lines(measured)
@@ -65,10 +64,3 @@ def measured_lines(measured: dict[str, Any]) -> Iterator[str]:
 
 def _details(numbers: dict[str, int]) -> str:
     return ': ' + listed([f'{name} {n}' for name, n in numbers.items()]) if numbers else ''
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return names for a line of text: the first ones, and how many more there are."""
-    shown = ', '.join(printable(name) for name in names[:_LONGEST_LIST])
-    return shown + (f', … ({len(names) - _LONGEST_LIST} more)'
-                    if len(names) > _LONGEST_LIST else '')

@@ -7,7 +7,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from mddag_executor.report.tables import counts, each_sink, verdicts_line
+from mddag_executor.core.tally import counts
+from mddag_executor.report.tables import each_sink, never_due_lines, verdicts_line
 from mddag_executor.report.text import Cell, format_ns, printable, table
 
 _TIMES_HEADER = (
@@ -146,6 +147,7 @@ def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> st
 def summary(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the tables of a replay."""
     yield verdicts_line(result['dags'])
+    yield from never_due_lines(result['dags'])
     pool = f'policy {printable(result["policy"])}, {result["workers"]} workers'
     if 'recorded_callbacks' in result:      # another executor ran it
         pool = f'imported: {result["workers"]} threads ran callbacks'

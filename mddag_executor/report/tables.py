@@ -14,34 +14,10 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from mddag_executor.report.text import Cell, format_ns, table
+from mddag_executor.core.tally import counts, never_due, total
+from mddag_executor.report.text import Cell, format_ns, listed, table
 
 HEADER = ('DAG', 'sink', 'due', 'in time', 'late', 'expired', 'median', 'p99', 'max', 'deadline')
-
-
-class Counts(NamedTuple):
-    """Verdicts about the jobs of a sink, or of several."""
-
-    due: int
-    in_time: int
-    late: int
-    expired: int
-    aborted: int
-
-
-def counts(sink: Mapping[str, Any]) -> Counts:
-    """Return the verdicts that a sink's result holds."""
-    overdue = sink.get('overdue', 0)
-    aborted = sink.get('aborted', 0)
-    in_time = sink['completed'] - (sink['late'] - overdue)
-    due = sink['completed'] + overdue + sink['expired'] + aborted
-    return Counts(due, in_time, sink['late'], sink['expired'], aborted)
-
-
-def total(dags: Mapping[str, Any]) -> Counts:
-    """Return the verdicts about all sinks."""
-    every = [counts(sink) for dag in dags.values() for sink in dag['sinks'].values()]
-    return Counts(*(sum(column) for column in zip(*every))) if every else Counts(0, 0, 0, 0, 0)
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
@@ -119,3 +95,10 @@ def verdicts_line(dags: Mapping[str, Any]) -> str:
     return (f'{every.due} sink jobs due, {every.in_time} in time '
             f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
             + (f', {every.aborted} aborted' if every.aborted else ''))
+
+
+def never_due_lines(dags: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line about the sinks of which no job was due, where there are any."""
+    never = never_due(dags)
+    if never:
+        yield f'never due, so not judged: {len(never)} of the sinks: {listed(never)}'

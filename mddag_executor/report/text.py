@@ -9,6 +9,7 @@ import re
 
 Cell = str | int | float | None
 
+_LONGEST_LIST = 10
 _NUMBER = re.compile(r'[-+]?[\d,]+(\.\d+)?( ?(%|ns|us|ms|s|min|h|MB|KB))?|-|')
 _UNITS = ((1, 'ns'), (1_000, 'us'), (1_000_000, 'ms'), (1_000_000_000, 's'))
 
@@ -24,6 +25,13 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return ''.join(c if c.isprintable() else c.encode('unicode_escape').decode() for c in text)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names for a line of text: the first ones, and how many more there are."""
+    shown = ', '.join(printable(name) for name in names[:_LONGEST_LIST])
+    return shown + (f', … ({len(names) - _LONGEST_LIST} more)'
+                    if len(names) > _LONGEST_LIST else '')
 
 
 def format_ns(nanoseconds: int, digits: int = 4) -> str:

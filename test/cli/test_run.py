@@ -15,7 +15,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from mddag_executor.cli import run
-from mddag_executor.report.tables import counts, percent, short_names, sink_table, total
+from mddag_executor.core.tally import counts, total
+from mddag_executor.report.tables import percent, short_names, sink_table
 from mddag_executor.trace import read_events
 import pytest
 

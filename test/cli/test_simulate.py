@@ -59,7 +59,7 @@ def test_the_result_for_machines(capsys: pytest.CaptureFixture[str], graph: Path
     result = result_of(capsys, graph, '--policy', 'rad', '--duration', '30ms')
     assert result == {
         'policy': 'rad', 'workers': 2, 'preemptive': False, 'duration_ns': 30_000_000,
-        'utilisation': 0.55, 'deadline_missed': False, 'first_miss': None,
+        'utilisation': 0.55, 'deadline_missed': False, 'first_miss': None, 'never_due': [],
         'dags': {'lidar': {
             'jobs': 3, 'ends': {'completed': 3, 'late': 0, 'aborted': 0, 'expired': 0},
             'sinks': {

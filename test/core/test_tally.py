@@ -62,7 +62,7 @@ def test_a_tally_of_everything() -> None:
     counts.add([(SINK_MISSED, 0, 1, 4, 410 * US, -1)])
     assert counts.dropped == 1
     assert counts.result() == {
-        'deadline_missed': True,
+        'deadline_missed': True, 'never_due': [],
         'first_miss': {'dag': 'd', 'vertex': '/n:x', 'job': 1, 'deadline_ns': 110 * US,
                        'completed_ns': 110 * US + 1},
         'dags': {'d': {

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from itertools import groupby
+import json
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -20,8 +21,9 @@ from mddag_executor.core.state import (
     SINK_EXPIRED,
     SINK_MISSED,
 )
+from mddag_executor.core.tally import counts
 from mddag_executor.replay import tolerances
-from mddag_executor.replay.tolerances import due_and_missed, MissTally, Runs, Tolerance
+from mddag_executor.replay.tolerances import MissTally, Runs, Tolerance
 from mddag_executor.report.junit import junit
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
@@ -62,7 +64,7 @@ def test_the_verdict_is_that_of_caret(
     sink = sink_of(missed)
     runs = [len(list(run)) for miss, run in groupby(missed) if miss]
     assert sink['longest_burst'] == max(runs, default=0)
-    assert due_and_missed(sink) == (len(missed), sum(missed))
+    assert (counts(sink).due, counts(sink).missed) == (len(missed), sum(missed))
     fails = any(missed) if ratio is None and burst is None else bool(
         ratio is not None and missed and sum(missed) / len(missed) > ratio
         or burst is not None and max(runs, default=0) > burst)
@@ -169,6 +171,66 @@ def test_junit_on_the_command_line(
     capsys.readouterr()
     assert program.main(['replay', str(trace), '--junit', '-']) == 0
     ElementTree.fromstring(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize('mode', [[], ['--reschedule']])
+def test_where_nothing_was_due_nothing_is_proven(
+    trace: Path, tmp_path: Path, mode: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A run of the declaration's nodes in which no job came is no run that held its deadlines."""
+    empty, out = tmp_path / 'empty.mcap', tmp_path / 'out.xml'
+    with TraceFile(empty) as file:
+        file.add('task_set', 0, 1, 1, GRAPH, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
+        file.add('dispatch', 10, 1, 5, 7, -1, -1, -1, 0, 10, 0)
+        file.add('callback_start', 10, 1, 5, 7, False)
+        file.add('callback_end', 20, 1, 5, 7)
+        file.add('shutdown', 200 * MS, 1, 1, 200 * MS)
+    graph = tmp_path / 'g.yaml'
+    graph.write_text(GRAPH.replace('8ms}', '8ms, execution_time: 1ms}'))
+    arguments = ['replay', str(empty), str(graph), *mode]
+    assert program.main([*arguments, '--fail-on-miss', '--junit', str(out)]) == 1
+    output = capsys.readouterr()
+    assert output.err.count(f'error: {empty}: no job was due at any sink') == 1
+    assert 'never due, so not judged: 1 of the sinks: /n:a' in output.out
+    failure = ElementTree.parse(out).getroot().find('testsuite/testcase/failure')
+    assert failure is not None and 'no job was due' in failure.attrib['message']
+    assert program.main([*arguments, '--json', '-']) == 0
+    assert json.loads(capsys.readouterr().out)['never_due'] == ['/n:a']
+
+
+def test_a_sink_that_was_never_due_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph = tmp_path / 'g.yaml'
+    graph.write_text(GRAPH.replace('8ms}', '8ms, execution_time: 1ms}') + """\
+  - node: /slow
+    callbacks: [{name: a, timer: 10s, deadline: 8s, execution_time: 200ms}]
+""")
+    arguments = ['simulate', str(graph), '--fail-on-miss']
+    assert program.main([*arguments, '--duration', '100ms']) == 0
+    assert 'never due, so not judged: 1 of the sinks: /slow:a\n' in capsys.readouterr().out
+    graph.write_text(GRAPH.replace('8ms}', '8ms, execution_time: 7ms}'))
+    assert program.main([*arguments, '--duration', '5ms']) == 1
+    assert capsys.readouterr().err == (
+        f'error: {graph}: no job was due at any sink, so no deadline was judged: '
+        'simulate for longer\n')
+
+
+def test_a_run_in_which_nothing_was_due_is_no_better(
+    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = tmp_path / 'empty.mcap'
+    with TraceFile(empty) as file:
+        file.add('task_set', 0, 1, 1, GRAPH, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
+        file.add('shutdown', 200 * MS, 1, 1, 200 * MS)
+    assert program.main(['diff', str(trace), str(empty), '--fail-on-worse']) == 1
+    output = capsys.readouterr()
+    assert 'error' not in output.err and 'worse, never due then' in output.out
+    assert program.main(['diff', str(empty), str(empty), '--fail-on-worse']) == 1
+    output = capsys.readouterr()
+    assert (f'error: {empty} and {empty}: no sink was due in both, so nothing was compared: '
+            in output.err)
+    assert program.main(['diff', str(empty), str(empty)]) == 0
 
 
 @pytest.mark.parametrize(('options', 'says'), [
