@@ -24,6 +24,7 @@ LEVELS = {
     'mddag_executor.errors': 1,
     'mddag_executor.memory': 1,
     'mddag_executor.defaults': 1,
+    'mddag_executor.text': 1,
     'mddag_executor.resources': 2,
     'mddag_executor': 3,  # its __init__.py, to those who want the version
     'mddag_executor.core': 4,

@@ -28,6 +28,7 @@ from mddag_executor.analysis.model import AnalysisError, Task, tasks_of
 from mddag_executor.analysis.non_preemptive import rad_non_preemptive
 from mddag_executor.analysis.sag import Answer, JobSet
 from mddag_executor.analysis.sufficient import Bound, Slowdown
+from mddag_executor.text import counted
 from msg_graph import format_duration, TaskSet
 
 SHARED = (
@@ -124,7 +125,7 @@ def with_sag(analysis: Analysis, tasks: Sequence[Task], jobs: JobSet, answer: An
     return replace(analysis, verdicts=(*analysis.verdicts, Verdict(
         'schedule abstraction', 'sufficient', 'Nasri et al. 2019', RAD_LIVE,
         'all first releases together, later ones exactly periodic', verdict,
-        f'{answer.jobs} jobs, {answer.states} states', why,
+        f'{counted(answer.jobs, "job")}, {counted(answer.states, "state")}', why,
         {'schedulable': answer.schedulable, 'timed_out': answer.timed_out,
          'horizon_ns': jobs.horizon})))
 
@@ -142,7 +143,8 @@ def _longest_path(tasks: Sequence[Task]) -> Verdict:
               f'{_sink(task, sink)}')
     reason = 'each longest path is within its deadline'
     if late:
-        reason = f'too long for {len(late)} of {sum(len(t.sinks) for t in tasks)} sinks'
+        sinks = sum(len(t.sinks) for t in tasks)
+        reason = f'too long for {len(late)} of {counted(sinks, "sink")}'
     return Verdict(
         'longest path', 'necessary', 'Graham 1969', 'any', 'executions take their budgets',
         FAILS if late else HOLDS, figure, reason,
@@ -168,7 +170,7 @@ def _demand(tasks: Sequence[Task], workers: int) -> Verdict:
     if not fits:
         reason = 'when all first releases come together, more is due than can be done'
     elif not demand.complete:
-        reason += f', as far as looked at ({demand.points} instants)'
+        reason += f', in the {counted(demand.points, "instant")} that were looked at'
     figure = (f'{format_duration(demand.work)} due within {format_duration(demand.time)}, '
               f'of {format_duration(workers * demand.time)}')
     if demand.time == 1:
@@ -216,7 +218,7 @@ def _graham(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdic
     return Verdict(
         "Graham's bound", 'sufficient', 'Graham 1969', WORK_CONSERVING,
         'one DAG alone, done within its period', verdict,
-        f'{good} of {len(tasks)} DAGs would be in time, each alone', reason or '',
+        f'{good} of {counted(len(tasks), "DAG")} in time, each alone', reason or '',
         {name: {'alone': HOLDS if ok else NOTHING} for name, ok in within.items()})
 
 
@@ -287,7 +289,7 @@ def _gedf_demand(
             reason = 'too much work in some interval, at each speed that was tried'
         else:
             verdict = HOLDS
-            figure = f'speed 1/{slowdown.factor:.3f}, {slowdown.points} instants'
+            figure = f'speed 1/{slowdown.factor:.3f}, {counted(slowdown.points, "instant")}'
             reason = 'in no interval the work that EDF would have to be behind with'
     return Verdict(
         name, 'sufficient', source, 'gedf or rad, preemptive',
@@ -312,7 +314,7 @@ def _federated(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Ver
         if isinstance(found, str):
             reason = f'DAG {found} takes longer than its period or a deadline on any number'
         else:
-            figure = f'{found.workers} of {workers} workers'
+            figure = f'{found.workers} of {counted(workers, "worker")}'
             verdict, reason = _by(
                 found.workers <= workers, 'heavy DAGs have enough workers for themselves, and the '
                 'light ones fit on the others', 'the DAGs need more workers than there are')

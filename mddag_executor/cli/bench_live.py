@@ -33,6 +33,7 @@ from mddag_executor.live.bench.spec import (
 )
 from mddag_executor.report.tables import percent
 from mddag_executor.resources import find
+from mddag_executor.text import counted
 
 HELP = 'measure executors of rclpy nodes, this one and those of rclpy, side by side'
 DESCRIPTION = 'Measure executors of rclpy nodes, this one and those of rclpy, side by side.'
@@ -169,8 +170,8 @@ def _graph(args: argparse.Namespace) -> Iterator[str | None]:
             plan = ExecutionPlan(task_set, args.seed, utilisation, args.workers)
             if infeasible := plan.infeasible():
                 warn(f'at utilisation {plan.utilisation:.2f} with seed {args.seed} '
-                     f'{len(infeasible)} sinks have a critical path longer than their deadline: '
-                     'no scheduler can keep these')
+                     f'no scheduler can keep the deadlines of {counted(len(infeasible), "sink")}: '
+                     'the critical path is longer')
         yield path
 
 
@@ -266,8 +267,9 @@ def notes(results: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield the lines below the table."""
     first = results[0]
     how = f', medians of {first["repeat"]}' if first['repeat'] > 1 else ''
-    yield (f'{first["seconds"]:g} s each{how}, seed {first["seed"]}, {first["workers"]} '
-           'workers' + (f', {first["groups"]} callback groups' if 'groups' in first else '')
+    yield (f'{first["seconds"]:g} s each{how}, seed {first["seed"]}, '
+           + counted(first['workers'], 'worker')
+           + (f', {first["groups"]} callback groups' if 'groups' in first else '')
            + (', published together' if first.get('phases') == 'together' else ''))
     if first['load'] in DECLARED:
         yield ('in time: of the sink jobs that were due, noticed by the executor or not; CPU: of '
@@ -279,4 +281,4 @@ def notes(results: Sequence[dict[str, Any]]) -> Iterator[str]:
         for run in result['runs']:
             wrong = run.get('attribution', {}).get('wrong', 0)
             if wrong:
-                yield f'{result["executor"]}: {wrong} callbacks ran as the wrong job'
+                yield f'{result["executor"]}: {counted(wrong, "callback")} ran as the wrong job'

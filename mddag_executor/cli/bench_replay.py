@@ -22,6 +22,7 @@ from mddag_executor.cli import common, options
 from mddag_executor.cli.text import format_ns, one_line, printable, Progress, table
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.resources import find
+from mddag_executor.text import counted
 
 if TYPE_CHECKING:
     from mddag_executor.replay.measure import Agreement
@@ -117,7 +118,7 @@ def _speed(args: argparse.Namespace, folder: str) -> dict[str, Any]:
 
 
 def _show_speed(result: dict[str, Any]) -> None:
-    print(f'{result["events"]} events, {result["bytes"] / 1e6:.1f} MB')
+    print(f'{counted(result["events"], "event")}, {result["bytes"] / 1e6:.1f} MB')
     print(table(
         ('what', 'events', 'CPU', 'events a second', 'peak memory'),
         [(name, row['events'], f'{row["cpu_s"]:.2f} s', f'{round(row["events_per_s"]):,}',
@@ -139,7 +140,8 @@ def _accuracy(args: argparse.Namespace, folder: str) -> dict[str, Any]:
             for utilisation in args.utilisation:
                 first = None
                 for workers in args.workers:
-                    line.update(len(runs), f'utilisation {utilisation:g}, {workers} workers')
+                    line.update(len(runs), f'utilisation {utilisation:g}, '
+                                f'{counted(workers, "worker")}')
                     path = os.path.join(folder, f'{turn}-{utilisation}-{workers}.mcap')
                     _record(graph, args, utilisation, workers, path)
                     first = first or path
@@ -215,9 +217,9 @@ def _show_accuracy(result: dict[str, Any]) -> None:
         short = short_names(row['sink'] for row in rows)
         utilisation, workers, recorded = setting
         source = 'the recording itself' if workers == recorded else \
-            f'a recording with {recorded} workers'
-        print(f'utilisation {utilisation:g} of {recorded} workers, {workers} workers, predicted '
-              f'from {source}:')
+            f'a recording with {counted(recorded, "worker")}'
+        print(f'utilisation {utilisation:g} of {counted(recorded, "worker")}, '
+              f'{counted(workers, "worker")}, predicted from {source}:')
         print(table(
             ('DAG', 'sink', 'jobs', 'median', 'predicted', 'error', 'without overheads', 'p99',
              'predicted', 'error', ''),

@@ -37,6 +37,7 @@ from mddag_executor.report.tables import (
     sink_table,
 )
 from mddag_executor.resources import find
+from mddag_executor.text import counted
 
 EXAMPLE = 'mddag demo --seconds 20 --utilisation 0.6'
 
@@ -109,17 +110,19 @@ def _introduction(args: argparse.Namespace, graph: Path) -> Iterator[str]:
     from msg_graph import load
     task_set = load(graph)
     plan = ExecutionPlan(task_set, args.seed, args.utilisation, WORKERS)
-    yield (f'{printable(task_set.file)}: {len(task_set.dags)} DAGs, '
-           f'{len(task_set.vertices)} vertices, {len({c.node for c in task_set.callbacks})} nodes')
-    yield (f'execution times: one draw from the measured distributions (seed {args.seed}), scaled '
-           f'by {plan.factor:.2f} to utilisation {plan.utilisation:.2f} of {WORKERS} workers; '
-           'another seed is another draw')
+    nodes = {callback.node for callback in task_set.callbacks}
+    yield (f'{printable(task_set.file)}: {counted(len(task_set.dags), "DAG")}, '
+           f'{counted(len(task_set.vertices), "vertex", "vertices")}, '
+           f'{counted(len(nodes), "node")}')
+    yield (f'Execution times: one draw from the measured distributions (seed {args.seed}), scaled '
+           f'by {plan.factor:.2f} to utilisation {plan.utilisation:.2f} of {WORKERS} workers. '
+           'Another seed gives another draw.')
     infeasible = plan.infeasible()
     if infeasible:
-        yield (f'of this draw {len(infeasible)} sinks have a critical path longer than their '
-               'deadline: no scheduler can keep these')
+        yield (f'No scheduler can keep the deadlines of {counted(len(infeasible), "sink")}: '
+               'with these times the critical path is longer than the deadline.')
     else:
-        yield 'feasible: no critical path is longer than its deadline'
+        yield 'No critical path is longer than its deadline.'
     yield (f'\n== rclpy nodes under MultiDeadlineExecutor({WORKERS}), policy rad, recording, '
            f'{args.seconds:g} s ==')
 
@@ -133,7 +136,7 @@ def run_live(args: argparse.Namespace, graph: Path, output: Path) -> dict[str, A
         '--trace', str(output / 'demo.mcap'), '--json', '-']
     result = _json_of(_mddag(*command), 'running', seconds + 3)
     if result['measured'] is None:
-        raise DemoError('mddag run: it was stopped before it measured: run the demo again')
+        raise DemoError('mddag run: it ended before it measured anything: run the demo again')
     return result
 
 
@@ -225,8 +228,8 @@ def agreement(live: dict[str, Any], recorded: dict[str, Any]) -> str:
                 f'{name} (live {ours["completed"]} completed, {ours["late"]} late; recorded '
                 f'{theirs["completed"]}, {theirs["late"]})')
     if not wrong:
-        return f'as recorded agrees with live: completed and late are equal for all {n} sinks'
-    return f'as recorded differs from live for {len(wrong)} of {n} sinks: ' + '; '.join(wrong)
+        return f'The replay counts what the executor counted, for all {n} sinks.'
+    return f'The replay counts otherwise for {len(wrong)} of {n} sinks: ' + '; '.join(wrong)
 
 
 def side_by_side(ours: dict[str, Any], baseline: dict[str, Any]) -> str:

@@ -24,6 +24,7 @@ from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, Progress, table, warn
 from mddag_executor.core import POLICIES
 from mddag_executor.errors import InputError, UsageError
+from mddag_executor.text import counted
 
 if TYPE_CHECKING:
     from mddag_executor.simulate.draws import Samples
@@ -220,7 +221,7 @@ def _summary(outcome: Evaluation) -> str:
     of_many = f' of {many} task sets' if many > 1 else ''
     new = outcome.runs - outcome.resumed
     kept = f', {outcome.resumed} of them kept from before' if outcome.resumed else ''
-    text = f'{outcome.runs} runs{of_many}{kept} in {outcome.elapsed_s:.1f} s'
+    text = f'{counted(outcome.runs, "run")}{of_many}{kept} in {outcome.elapsed_s:.1f} s'
     if new:
         each = outcome.elapsed_s / new / len(outcome.experiment.policies)
         text += (f', {1000 * each:.2f} ms for each run and policy '

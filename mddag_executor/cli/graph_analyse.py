@@ -15,6 +15,7 @@ from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, Progress, table
 from mddag_executor.errors import UsageError
+from mddag_executor.text import counted
 
 if TYPE_CHECKING:
     from mddag_executor.analysis import Analysis
@@ -119,7 +120,7 @@ def _summary(analysis: Analysis) -> str:
     from mddag_executor.analysis import FAILS, HOLDS
     from mddag_executor.analysis.verdicts import LIVE, SHARED
     assumed = f'All sufficient tests assume: {SHARED}.\n'
-    begin = f'{assumed}{analysis.workers} workers, budget {analysis.budget}: '
+    begin = f'{assumed}{counted(analysis.workers, "worker")}, budget {analysis.budget}: '
     if any(each.verdict == FAILS for each in analysis.verdicts):
         return begin + 'no scheduler can keep these deadlines'
     proven = {each.scheduler: None for each in analysis.verdicts

@@ -12,6 +12,7 @@ from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, format_ns, one_line, Progress, table
 from mddag_executor.errors import InputError, UsageError
+from mddag_executor.text import counted
 
 if TYPE_CHECKING:
     from mddag_executor.assign import Found, Measured
@@ -154,8 +155,9 @@ def _tell(
     low, high = measured.interval
     own = '' if found is None else ', which took no part in the search'
     if found is not None:
-        print(f'scale {found.scale:.4g}: the deadlines are so many times the critical paths '
-              f'({args.budget}); {len(found.tried)} scales tried', file=stream)
+        print(f'Each deadline is {found.scale:.4g} times the critical path ({args.budget}), after '
+              f'{counted(len(found.tried), "scale")} tried.', file=stream)
     print(one_line(
         f'{args.policy} accepts {100 * measured.ratio:.1f} % (95 % confidence: {100 * low:.1f} to '
-        f'{100 * high:.1f} %) of {measured.runs} runs of seed {measured.seed}{own}'), file=stream)
+        f'{100 * high:.1f} %) of {counted(measured.runs, "run")} with seed {measured.seed}{own}'),
+        file=stream)

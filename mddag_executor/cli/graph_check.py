@@ -15,6 +15,7 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, format_ns, table
+from mddag_executor.text import counted
 
 if TYPE_CHECKING:
     from msg_graph import Dag, TaskSet
@@ -110,9 +111,11 @@ def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
 
 def _summary(task_set: TaskSet, result: dict[str, Any]) -> str:
     text = (
-        f'{len(task_set.dags)} DAGs, {result["vertices"]} vertices, '
-        f'{result["callbacks"]} callbacks, {len(task_set.queue_edges)} queue edges, '
-        f'{len(task_set.paths)} paths')
+        f'{counted(len(task_set.dags), "DAG")}, '
+        f'{counted(result["vertices"], "vertex", "vertices")}, '
+        f'{counted(result["callbacks"], "callback")}, '
+        f'{counted(len(task_set.queue_edges), "queue edge")}, '
+        f'{counted(len(task_set.paths), "path")}')
     if result['utilisation'] is not None:
         text += f', utilisation {result["utilisation"]:.3f}'
         if task_set.workers is not None:

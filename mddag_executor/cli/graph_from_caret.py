@@ -64,7 +64,7 @@ def main(args: argparse.Namespace) -> int:
         system = recorded_system(args.trace)
         every, count = len(list(sketch.callbacks())), system.measure(sketch)
         if count < every:
-            warn(f'{system.name}: {every - count} of {every} callbacks did not run in it')
+            warn(f'{system.name}: {every - count} of the {every} callbacks of {name} did not run')
 
     result = declaration_from_caret(text, name, measure)
     write_declaration(args.output, result)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from mddag_executor.cli import common
 from mddag_executor.cli.text import printable, Progress, warn
 from mddag_executor.errors import UsageError
+from mddag_executor.text import counted
 
 if TYPE_CHECKING:
     from mddag_executor.trace import Imported
@@ -47,8 +48,8 @@ def main(args: argparse.Namespace) -> int:
     imported = _import(args.session, args.output)
     for warning in imported.warnings:
         warn(warning)
-    print(f'{_count(imported.events, "event")} of {_count(imported.kinds, "kind")} from '
-          f'{_count(len(imported.processes), "process", "processes")}: {printable(args.output)}')
+    print(f'{counted(imported.events, "event")} of {counted(imported.kinds, "kind")} from '
+          f'{counted(len(imported.processes), "process", "processes")}: {printable(args.output)}')
     if imported.unread:
         named = ', '.join(f'{printable(provider)} ({count})'
                           for provider, count in imported.unread.most_common())
@@ -67,7 +68,3 @@ def _import(session: str, output: str) -> Imported:
             if error.file != file.name:
                 raise
             raise TraceError(output, error.problem, error.remedy) from None
-
-
-def _count(number: int, one: str, many: str | None = None) -> str:
-    return f'{number} {one if number == 1 else many or one + "s"}'

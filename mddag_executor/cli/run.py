@@ -164,15 +164,16 @@ def _check_arguments(args: argparse.Namespace) -> None:
 def _warn(plan: ExecutionPlan, remapped: bool) -> None:
     """Tell what the draw makes impossible, whatever the executor does, and what is in vain."""
     for sink in plan.infeasible():
-        warn(f'{sink.vertex}: with seed {plan.seed} its critical path takes '
-             f'{sink.critical_path_ns / 1e6:.1f} ms, and its deadline is '
-             f'{sink.deadline_ns / 1e6:.1f} ms: no scheduler can keep it')
+        warn(f'{sink.vertex}: no scheduler can keep its deadline of '
+             f'{sink.deadline_ns / 1e6:.1f} ms: with seed {plan.seed} its critical path takes '
+             f'{sink.critical_path_ns / 1e6:.1f} ms')
     if remapped:
-        warn('--ros-args: nodes made from the declaration have the names that it gives them: '
-             'remappings do not reach them')
+        warn('--ros-args: remappings do not apply to synthetic nodes: they keep the names of the '
+             'declaration')
     if plan.mode == 'spin' and plan.utilisation * plan.workers > 0.9:
-        warn('spinning callbacks share the interpreter lock, so one core; these need '
-             f'{plan.utilisation * plan.workers:.2f}: lower --utilisation, or sleep')
+        warn('spinning callbacks share the interpreter lock, and so one core; these need '
+             f'{plan.utilisation * plan.workers:.2f} cores: lower --utilisation, or use '
+             '--synthetic sleep')
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from mddag_executor.cli.text import format_ns, printable, Progress
 from mddag_executor.core import POLICIES
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
+from mddag_executor.text import counted
 
 if TYPE_CHECKING:
     from mddag_executor.simulate import Load, Run, Settings
@@ -146,13 +147,13 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the table of a run."""
     from mddag_executor.report.tables import never_due_lines, verdicts_line
     jobs = sum(dag['jobs'] for dag in result['dags'].values())
-    yield (f'{result["policy"]}, {result["workers"]} workers, '
+    yield (f'{result["policy"]}, {counted(result["workers"], "worker")}, '
            f'{"preemptive" if result["preemptive"] else "not preemptive"}, '
            f'{format_ns(result["duration_ns"])}, utilisation {result["utilisation"]:.3f}')
-    yield f'{jobs} jobs, {verdicts_line(result["dags"])}'
+    yield f'{counted(jobs, "job")}, {verdicts_line(result["dags"])}'
     yield from never_due_lines(result['dags'])
     if result['ended_ns'] < result['duration_ns']:
-        yield f'stopped at {format_ns(result["ended_ns"], 9)}, with the first miss'
+        yield f'stopped at the first miss, at {format_ns(result["ended_ns"], 9)}'
     miss = result['first_miss']
     if miss is not None:
         completed = miss['completed_ns']

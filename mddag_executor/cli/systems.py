@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common
 from mddag_executor.cli.text import Progress, warn
+from mddag_executor.text import counted
 
 if TYPE_CHECKING:
     from mddag_executor.replay.sketching import System
@@ -49,6 +50,6 @@ def write_declaration(output: str, text: str) -> None:
         return
     count = sum(MARK in line for line in text.splitlines()[2:])
     if count:
-        print(f"{count} blank{'s' * (count > 1)} to fill in, marked '{MARK}'")
+        print(f"{counted(count, 'blank')} to fill in, marked '{MARK}'")
     else:
-        print('no blank left to fill in')
+        print('no blanks to fill in')

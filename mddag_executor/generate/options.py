@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import math
 
 from mddag_executor.errors import MddagError
+from mddag_executor.text import counted
 from msg_graph.duration import DAY
 
 METHODS = ('dirichlet', 'uunifast')
@@ -90,15 +91,16 @@ class Options:
         least = self.vertices[0]
         if self.sinks[0] > max(1, least - 1):
             raise GenerateError(
-                f'--sinks {self.sinks[0]}: a DAG of {least} vertices has at most '
-                f'{max(1, least - 1)}: give fewer, or more --vertices')
+                f'--sinks {self.sinks[0]}: a DAG of {counted(least, "vertex", "vertices")} has at '
+                f'most {max(1, least - 1)}: give fewer, or more --vertices')
         total = self.utilisation * self.workers
         most = self.dags[0] * self.most_per_dag
         if total > most * (1 + 1e-12):
             raise GenerateError(
                 f'--utilisation {self.utilisation:g}: {self.dags[0]} DAGs of at most '
                 f'{self.most_per_dag:g} have {most:g} together, and {total:g} are asked for on '
-                f'{self.workers} workers: give more --dags, or a larger --max-dag-utilisation')
+                f'{counted(self.workers, "worker")}: give more --dags, or a larger '
+                '--max-dag-utilisation')
 
 
 def _bounds(

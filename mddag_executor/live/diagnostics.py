@@ -33,6 +33,7 @@ from typing import NamedTuple, TYPE_CHECKING
 from mddag_executor.core import quantile
 from mddag_executor.core.tally import SinkTally, Tally
 from mddag_executor.live.settings import Thresholds
+from mddag_executor.text import counted
 from rclpy.logging import get_logger
 
 if TYPE_CHECKING:
@@ -151,7 +152,7 @@ class DagWatch:
         if silent >= self._stale_after:
             return STALE, f'nothing has been released for {silent / 1e9:.1f} s'
         if not window.missed:
-            return OK, f'{window.due} results in time'
+            return OK, f'{counted(window.due, "result")} in time'
         message = f'{window.missed} of {window.due} results missed their deadlines'
         if window.missed >= max(
                 limits.warn_burst, limits.error_ratio * window.due):
@@ -234,7 +235,7 @@ class PoolWatch:
         return Status(
             f'{self._thresholds.name}: {WORKERS}',
             ERROR if failed else WARN if lost else OK,
-            ', '.join(lost) or f'{step["ran"]} callbacks ran', values)
+            ', '.join(lost) or f'{counted(step["ran"], "callback")} ran', values)
 
 
 class Diagnostics:

@@ -28,6 +28,7 @@ from typing import Any
 from mddag_executor.errors import MddagError
 from mddag_executor.live.measure import measure, Reading
 from mddag_executor.live.synthetic import SyntheticWorkload
+from mddag_executor.text import counted
 from rclpy.executors import Executor, ExternalShutdownException
 
 WARM_UP_S = 1.0
@@ -183,5 +184,6 @@ def _wait_until_matched(session: Session, workload: SyntheticWorkload) -> None:
             return
         if time.monotonic() > end:
             raise SessionError(
-                f'{unmatched[0]}: publishers and subscriptions of {len(unmatched)} topics have '
-                f'not met within {MATCH_TIMEOUT_S:.0f} s: check ROS_DOMAIN_ID and the network')
+                f'{unmatched[0]}: its publishers and subscriptions have not met within '
+                f'{MATCH_TIMEOUT_S:.0f} s ({counted(len(unmatched), "topic")} in all): check '
+                'ROS_DOMAIN_ID and the network')

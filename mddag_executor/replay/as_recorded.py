@@ -35,6 +35,7 @@ from mddag_executor.replay.seen import Seen
 from mddag_executor.replay.usage import share, Usage
 from mddag_executor.replay.waits import GroupWaits
 from mddag_executor.simulate.compiled import available
+from mddag_executor.text import counted
 from msg_graph import TaskSet
 
 Progress = Callable[[int], None]
@@ -63,8 +64,8 @@ class Replay:
         self.warnings = [*recording.warnings, *mapping.warnings, *follower.warnings()]
         if judge.contradictions:
             self.warnings.append(
-                f'{recording.name}: {judge.contradictions} events contradict those before them '
-                'and are left out')
+                f'{recording.name}: left out: {counted(judge.contradictions, "event")} that '
+                'contradict earlier ones')
         differences = judge.differences() if follower.shut_down else None
         if differences is not None:
             self.warnings.append(f'{recording.name}: {differences}')

@@ -30,6 +30,7 @@ import tempfile
 from typing import Any
 
 from mddag_executor.errors import InputError
+from mddag_executor.text import counted
 from mddag_executor.trace import MessageReader, TraceError, TraceReader
 from mddag_executor.trace.messages import Topic
 import zstandard
@@ -94,7 +95,7 @@ class Bag:
             self._read(file, topics, len(files) == 1)
         if self._stated is not None and self._stated != self.count and not self.warnings:
             self.warnings.append(
-                f'{self.name}: metadata.yaml says that there are {self._stated} messages, but '
+                f'{self.name}: metadata.yaml counts {counted(self._stated, "message")}, but '
                 f'there are {self.count}')
 
     def _files(self) -> list[Path]:
@@ -109,8 +110,8 @@ class Bag:
             if not found:
                 raise BagError(self.name, 'there is neither metadata.yaml nor a bag file', _REMEDY)
             self.warnings.append(
-                f'{self.name}: metadata.yaml is missing (the recorder was killed): used the '
-                f'{len(found)} bag files that are there')
+                f'{self.name}: metadata.yaml is missing (the recorder was killed): used '
+                f'{counted(len(found), "bag file")} from the folder')
             return found
         names, self._stated = _named_files(metadata)
         there = [path / name for name in names if (path / name).is_file()]
@@ -119,8 +120,8 @@ class Bag:
                 str(metadata), 'none of the bag files that it names is there', 'copy them, too')
         if len(there) < len(names):
             self.warnings.append(
-                f'{self.name}: {len(names) - len(there)} of its {len(names)} files are missing: '
-                'what they held is not replayed')
+                f'{self.name}: {len(names) - len(there)} of {counted(len(names), "file")} are '
+                'missing: what they held is not replayed')
         return there
 
     def _read(self, file: Path, topics: Collection[str], only: bool) -> None:

@@ -32,10 +32,10 @@ from mddag_executor.replay.timed import busy_times, Engine, Transports
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import Load, LogEntry, SimulationError
+from mddag_executor.text import counted, listed
 from msg_graph import Dag, TaskSet
 
 DEFAULT_WORKERS = 7
-_LONGEST_LIST = 5
 _MOST_JOBS = 20_000_000
 _STAMP_OF = {'header_stamp': 'header', 'source_timestamp': 'published'}
 _CALLED = {'header_stamp': 'header stamp', 'source_timestamp': 'publication time'}
@@ -97,7 +97,7 @@ class BagReschedule:
         if not releases:
             raise BagError(
                 self._bag.name, f'none of the sources of {self.task_set.file} is in it: it has '
-                + (_listed(sorted(self._bag.topics)) or 'no topics'),
+                + (listed(sorted(self._bag.topics)) or 'no topics'),
                 'give the graph of the nodes that were recorded')
         releases.sort()
         return Load(
@@ -112,8 +112,8 @@ class BagReschedule:
             jobs = [(t, t) for t in range(self.start, self.end, period)] \
                 if (self.end - self.start) // period < _MOST_JOBS else []
             return Source(
-                jobs, f'{len(jobs)} jobs of its timer at its nominal period, from the first '
-                'message on: a bag does not tell when timers ran')
+                jobs, f'{counted(len(jobs), "job")} at the nominal period of its timer, from the '
+                'first message on: a bag does not tell when timers ran')
         if not callback.topics:
             self.warnings.append(
                 f'{self._bag.name}: {dag.name} starts with a service call, which a bag does not '
@@ -129,19 +129,20 @@ class BagReschedule:
         arrivals = list(stamps.arrival)
         if dag.release_from == 'arrival':
             jobs = [(arrival, arrival) for arrival in arrivals]
-            return Source(sorted(jobs), f'{len(jobs)} jobs from the arrival of {topic}')
+            return Source(sorted(jobs), f'{counted(len(jobs), "job")} from the arrival of {topic}')
         column = getattr(stamps, _STAMP_OF[dag.release_from])
         jobs = [(arrival, stamp if 0 < stamp <= arrival else arrival)
                 for arrival, stamp in zip(arrivals, column)]
         what = _CALLED[dag.release_from]
         without = sum(stamp in (UNKNOWN, 0) for stamp in column)
         later = sum(stamp > arrival for arrival, stamp in zip(arrivals, column))
-        for count, why in ((without, f'have no {what}'), (later, f'have a {what} after it')):
+        for count, why in ((without, f'without a {what}'),
+                           (later, f'with a {what} after the arrival')):
             if count:
                 self.warnings.append(
-                    f'{self._bag.name}: {count} of the {len(jobs)} messages of {topic} '
-                    f'({stamps.type}) {why}: they are released at their arrival')
-        return Source(sorted(jobs), f'{len(jobs)} jobs from the {what} of {topic}')
+                    f'{self._bag.name}: {count} of {counted(len(jobs), "message")} of {topic} '
+                    f'({stamps.type}) {why}: released at the arrival')
+        return Source(sorted(jobs), f'{counted(len(jobs), "job")} from the {what} of {topic}')
 
     def _run(self, load: Load) -> list[LogEntry]:
         policy = find_policy(self.policy)
@@ -200,11 +201,6 @@ def _costs(
         assert declared is not None     # checked before
         row.append(declared.draw(generator.random()))
     return row
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - _LONGEST_LIST
-    return ', '.join(names[:_LONGEST_LIST]) + (f', … ({more} more)' if more > 0 else '')
 
 
 def reschedule_bag(

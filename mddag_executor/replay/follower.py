@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 from mddag_executor.core import NEVER
 from mddag_executor.replay.mapping import Mapping
 from mddag_executor.replay.recording import Recording, TASK_SET
+from mddag_executor.text import counted
 
 _PROGRESS_STEP = 4096
 _KEEP_UNDECLARED = 4096
@@ -187,7 +188,7 @@ class Follower:
                 self._strange[f'{event[0]} without some of its fields'] += 1
                 continue
             if not 0 <= event[1] < NEVER:
-                self._strange[f'{event[0]} at a time that cannot be'] += 1
+                self._strange[f'{event[0]} at an impossible time'] += 1
                 continue
             handlers[event[0]](event)
             count += 1
@@ -219,13 +220,13 @@ class Follower:
                 'trace is cut): what was open is judged at the last recorded instant')
         if self.lost:
             lines.append(
-                f'{name}: {self.lost} events were lost while recording: jobs may be missing, or '
-                'count as late that were not')
+                f'{name}: {counted(self.lost, "event")} lost while recording: jobs may be '
+                'missing, or count as late that were not')
         if self._strange:
             what, n = self._strange.most_common(1)[0]
             lines.append(
-                f'{name}: {sum(self._strange.values())} events make no sense and are left out, '
-                f'most of them ({n}) {what}')
+                f'{name}: left out: {counted(sum(self._strange.values()), "event")} that make no '
+                f'sense, most often ({n}) {what}')
         if self.jobs == 0:
             lines.append(f'{name}: no job was released in it')
         return lines
@@ -396,7 +397,7 @@ class Follower:
         if self.shut_down:
             return
         if not self.end <= event[4] < NEVER:
-            self._strange[f'{event[0]} at a time that cannot be'] += 1
+            self._strange[f'{event[0]} at an impossible time'] += 1
             return
         self.end = event[4]
         self.shut_down = True

@@ -24,7 +24,6 @@ import os
 from typing import Any, NamedTuple
 
 from mddag_executor.replay.entities import Callback, Entities, fields_of, INIT_EVENTS, Node
-from mddag_executor.replay.mapping import listed
 from mddag_executor.replay.recording import (
     Head,
     named_errors,
@@ -32,6 +31,7 @@ from mddag_executor.replay.recording import (
     Recording,
     ReplayError,
 )
+from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from msg_graph import Callback as Declared
 from msg_graph import format_duration, TaskSet
@@ -96,8 +96,9 @@ class ImportedRecording:
         lines = [self.name + text[len(self.path):] if text.startswith(self.path) else text
                  for text in self._reader.warnings]
         if self.entities.incomplete:
-            lines.append(f'{self.name}: {self.entities.incomplete} events of the initialisation '
-                         'lack some of their fields and are left out')
+            lines.append(f'{self.name}: left out: '
+                         f'{counted(self.entities.incomplete, "event")} of the initialisation '
+                         'without some of the fields')
         return lines
 
     def events(self, names: Iterable[str]) -> Iterator[tuple[Any, ...]]:
@@ -216,13 +217,14 @@ class ImportedMapping:
                 'give the graph of the nodes that were recorded, or none')
         if missing:
             self.warnings.append(
-                f'{recording.name}: {len(missing)} of the {len(judge.callbacks)} callbacks of '
-                f'{judge.file} are not in it, so they count as never completed: {listed(missing)}')
+                f'{recording.name}: not in it: {len(missing)} of the {len(judge.callbacks)} '
+                f'callbacks of {judge.file}, which count as never completed: {listed(missing)}')
         if self._other_periods:
             self.warnings.append(
-                f'{recording.name}: {len(self._other_periods)} timers have other periods than '
-                f'declared: {listed(self._other_periods)}')
+                f'{recording.name}: {counted(len(self._other_periods), "timer")} with another '
+                f'period than declared: {listed(self._other_periods)}')
         if recording.processes > 1:
             self.warnings.append(
                 f'{recording.name}: {recording.processes} processes ran callbacks, each with '
-                f'workers of its own: the {recording.head.workers} threads are taken together')
+                f'workers of its own: '
+                f'{counted(recording.head.workers, "thread")} are taken together')

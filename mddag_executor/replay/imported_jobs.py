@@ -39,8 +39,8 @@ from mddag_executor.replay.follower import Execution, Observer, Piece
 from mddag_executor.replay.imported import ImportedMapping, ImportedRecording, Target
 from mddag_executor.replay.linked import Publication, Run
 from mddag_executor.replay.links import Linker
-from mddag_executor.replay.mapping import listed
 from mddag_executor.replay.paths import PathBook
+from mddag_executor.text import counted, listed
 from msg_graph import Dag
 
 EXPIRE_AFTER_NS = 1_000_000_000
@@ -286,12 +286,12 @@ class ImportedFollower:
         lines = [f'{name}: {text}' for text in self.linker.losses.lines()]
         if self._strange:
             lines.append(
-                f'{name}: {self._strange} events are at a time that cannot be, and are left out')
+                f'{name}: left out: {counted(self._strange, "event")} at an impossible time')
         lines.extend(f'{name}: {text}' for text in self._timers.lines())
         if self._fallbacks:
             lines.append(
-                f'{name}: {sum(self._fallbacks.values())} releases should be by a stamp that is '
-                'not recorded, and are by the next best one: '
+                f'{name}: {counted(sum(self._fallbacks.values()), "release")} by the next best '
+                'stamp, because the declared one is not recorded: '
                 f'{listed(list(self._fallbacks))}')
         if self._dags and self.jobs == 0:
             lines.append(f'{name}: no job was released in it')
@@ -326,15 +326,15 @@ class _Timers:
     def lines(self) -> list[str]:
         """Return what to say about them."""
         said = (
-            (self._without, 'executions are of timers whose initialisation is not in it: they '
-             'count as released when they started'),
-            (self._off, 'executions of timers are off the grid of their periods (reset, or by '
-             'another clock): they count as released when they started'),
-            (self._skipped, 'periods of timers passed without an execution (late by more than '
-             'one, or events were lost): there are no jobs of them'))
-        return [f'{sum(counts.values())} {text}: '
+            (self._without, 'execution', 'of timers whose initialisation is not in it: released '
+             'when it started'),
+            (self._off, 'execution', 'of timers off the grid of the period (reset, or by another '
+             'clock): released when it started'),
+            (self._skipped, 'period', 'of timers passed without an execution (late by more than '
+             'one, or events were lost): without a job'))
+        return [f'{counted(sum(counts.values()), noun)} {text}: '
                 + listed([f'{name} ({n})' for name, n in counts.most_common()])
-                for counts, text in said if counts]
+                for counts, noun, text in said if counts]
 
 
 def _tell_groups(recording: ImportedRecording, more: Handlers) -> None:

@@ -36,6 +36,7 @@ from mddag_executor.replay.chains import Chains
 from mddag_executor.replay.follower import Execution, Observer, Piece
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.waits import GroupWaits
+from mddag_executor.text import counted
 from msg_graph import TaskSet
 
 KEEP_RESPONSES = 1_000_000
@@ -209,6 +210,6 @@ class Judge(Observer):
         example = min(found + recorded, key=lambda miss: miss.deadline)
         name = 'an undeclared vertex' if example.vertex < 0 \
             else self.tally.vertex_name(example.vertex)
-        return (f'{len(recorded)} of the {self.n_recorded} misses that the executor recorded are '
-                f'not found again, {len(found)} that it did not record are found: the first is '
-                f'job {example.job} at {name}')
+        recorded_misses = counted(self.n_recorded, 'recorded miss', 'recorded misses')
+        return (f'the replay does not find {len(recorded)} of {recorded_misses}, and it finds '
+                f'{len(found)} that were not recorded: the first is job {example.job} at {name}')

@@ -22,9 +22,9 @@ from __future__ import annotations
 from collections import Counter
 
 from mddag_executor.replay.recording import Recording, ReplayError
+from mddag_executor.text import counted, listed
 from msg_graph import Dag, TaskSet, Vertex
 
-_LONGEST_LIST = 5
 _ORPHAN = (-1, -1, -1)
 
 
@@ -94,8 +94,8 @@ class Mapping:
                 f'{listed([c.key for c in recording.task_set.callbacks])}',
                 'give the graph of the nodes that were recorded, or none')
         self.warnings.append(
-            f'{recording.name}: {len(missing)} of the {len(judge.callbacks)} callbacks of '
-            f'{judge.file} are not in it, so they count as never completed: {listed(missing)}')
+            f'{recording.name}: not in it: {len(missing)} of the {len(judge.callbacks)} callbacks '
+            f'of {judge.file}, which count as never completed: {listed(missing)}')
 
     def _report_unreleased(self) -> None:
         if self.same:
@@ -103,8 +103,8 @@ class Mapping:
         missing = [dag.name for dag in self.task_set.dags if dag.index not in self.dag]
         if missing:
             self.warnings.append(
-                f'{self.task_set.file}: the sources of {len(missing)} DAGs are no sources in the '
-                f'recording, so there are no jobs of them: {listed(missing)}')
+                f'{self.task_set.file}: {counted(len(missing), "DAG")} without jobs, because the '
+                f'source is no source in the recording: {listed(missing)}')
 
 
 def _first_vertices(task_set: TaskSet) -> list[int]:
@@ -133,9 +133,3 @@ def _legs(vertex: Vertex, other: Vertex) -> list[int]:
     if sorted(topics) != sorted(theirs):
         return []
     return [theirs.index(topic) for topic in topics]
-
-
-def listed(names: list[str]) -> str:
-    """Return the first names of a list, and how many more there are."""
-    more = len(names) - _LONGEST_LIST
-    return ', '.join(names[:_LONGEST_LIST]) + (f', … ({more} more)' if more > 0 else '')

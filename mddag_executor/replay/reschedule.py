@@ -34,10 +34,10 @@ from mddag_executor.replay.timed import busy_times, Engine
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share, Usage
 from mddag_executor.simulate import LogEntry
+from mddag_executor.text import counted, listed
 from msg_graph import TaskSet
 
 MAX_WORKERS = 4096
-_LONGEST_LIST = 5
 
 
 class Reschedule:
@@ -169,7 +169,7 @@ def reschedule(
     if policy is not None:
         find_policy(policy).mode(preemptive)
     if workers is not None and not 1 <= workers <= MAX_WORKERS:
-        raise UsageError(f'workers: {workers} cannot be: give 1 to {MAX_WORKERS}')
+        raise UsageError(f'workers: {workers} is out of range: give 1 to {MAX_WORKERS}')
     recording = open_declared(path, name, task_set)
     policy, workers = _settings(recording.head, recording.name, policy, workers)
     mapping = map_recording(recording, task_set)
@@ -187,8 +187,8 @@ def reschedule(
     work = builder.build(overheads)
     if work.unknown:
         raise ReplayError(
-            recording.name, f'{len(work.unknown)} callbacks neither completed in it nor declare '
-            f'an execution_time: {", ".join(work.unknown[:_LONGEST_LIST])}',
+            recording.name, f'{counted(len(work.unknown), "callback")} did not complete in it, '
+            f'and no execution_time is declared: {listed(work.unknown)}',
             'give a GRAPH that declares it')
     tables = with_groups(
         tables, builder.callback_of, groups.by_callback(), declared_first=not mapping.same)
@@ -211,5 +211,6 @@ def _settings(
         workers = head.workers
         if not 1 <= workers <= MAX_WORKERS:
             raise ReplayError(
-                name, f'it says that it was recorded with {workers} workers', 'give --workers')
+                name, f'it says that it was recorded with {counted(workers, "worker")}',
+                'give --workers')
     return policy, workers

@@ -28,6 +28,7 @@ from typing import Any
 from mddag_executor.core import Tables, Tally
 from mddag_executor.core.state import SINK_DONE
 from mddag_executor.core.tally import counts, total
+from mddag_executor.text import counted
 from msg_graph import TaskSet
 
 FOLD = 65_536
@@ -104,14 +105,14 @@ class Tolerance:
         if not missed:
             return None
         if self.ratio is None and self.burst is None:
-            return f'{missed} of {due} jobs missed the deadline'
+            return f'{missed} of {counted(due, "job")} missed the deadline'
         broken = []
         if self.ratio is not None and missed > self.ratio * due:
-            broken.append(f'{missed} of {due} jobs missed the deadline ({missed / due:.4%}), '
-                          f'at most {self.ratio:.4%} are tolerated')
+            broken.append(f'{missed} of {counted(due, "job")} missed the deadline '
+                          f'({missed / due:.4%}), tolerated: {self.ratio:.4%}')
         if self.burst is not None and sink['longest_burst'] > self.burst:
-            broken.append(f'{sink["longest_burst"]} jobs in a row missed the deadline, at most '
-                          f'{self.burst} are tolerated')
+            broken.append(f'{counted(sink["longest_burst"], "job")} in a row missed the deadline, '
+                          f'tolerated: {self.burst}')
         return '; '.join(broken) or None
 
     def verdicts(self, dags: Mapping[str, Any]) -> dict[tuple[str, str], str]:

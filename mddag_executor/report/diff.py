@@ -17,6 +17,7 @@ from typing import Any
 from mddag_executor.core.tally import counts, total
 from mddag_executor.report.tables import percent, short_names
 from mddag_executor.report.text import Cell, format_ns, printable, table
+from mddag_executor.text import counted
 
 _KEYS = ('min', 'median', 'p99', 'max')
 _HEADER = ('DAG', 'sink', 'due', 'then', 'in time', 'then', 'late', 'then', 'median', 'change',
@@ -164,14 +165,13 @@ def summary(difference: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines below the tables: one for each run, and the verdict."""
     for mark in ('a', 'b'):
         run = difference[mark]
-        pool = f'imported, {run["workers"]} threads' if run['imported'] else (
-            f'policy {printable(run["policy"])}, {run["workers"]} workers')
+        pool = f'imported, {counted(run["workers"], "thread")}' if run['imported'] else (
+            f'policy {printable(run["policy"])}, ' + counted(run['workers'], 'worker'))
         yield (f'{"first" if mark == "a" else "then"}: {printable(run["trace"])}: '
-               f'{run["due"]} sink jobs due, {run["in_time"]} in time '
+               f'{counted(run["due"], "sink job")} due, {run["in_time"]} in time '
                f'({percent(run["in_time"], run["due"])}), {run["late"]} late, '
                f'{run["expired"]} expired; ' + ('rescheduled, ' if run['rescheduled'] else '')
                + f'{pool}, {format_ns(run["duration_ns"])}')
     n = sum(sink['worse'] for dag in difference['dags'].values()
             for sink in dag['sinks'].values())
-    yield f'{n} sinks are worse in the second run' if n != 1 \
-        else '1 sink is worse in the second run'
+    yield f'worse in the second run: {counted(n, "sink")}'

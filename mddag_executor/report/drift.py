@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from mddag_executor.report.text import printable
+from mddag_executor.text import counted
 
 MOST_LINES = 12
 
@@ -20,7 +21,7 @@ def drift_lines(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """
     if not found:
         return
-    yield f'the run and the declaration disagree in {len(found)} point{"s" * (len(found) > 1)}:'
+    yield f'{counted(len(found), "difference")} between the run and the declaration:'
     for each in found[:MOST_LINES]:
         yield f'  {printable(each["text"])}'
     if len(found) > MOST_LINES:

@@ -11,6 +11,7 @@ from typing import Any
 from mddag_executor.report.drift import drift_lines
 from mddag_executor.report.tables import never_due_lines, percent, verdicts_line
 from mddag_executor.report.text import listed, printable
+from mddag_executor.text import counted
 
 
 def summary(result: dict[str, Any]) -> Iterator[str]:
@@ -25,11 +26,11 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
     skipped = {name: counts['skipped'] for name, counts in result['callbacks'].items()
                if counts['skipped']}
     if skipped:
-        yield f'{sum(skipped.values())} timer releases skipped' + _details(skipped)
+        yield f'{counted(sum(skipped.values()), "timer release")} skipped' + _details(skipped)
     undeclared = {
         name: counts['unattributed' if counts['declared'] else 'ran']
         for name, counts in result['callbacks'].items()}
-    yield (f'{result["undeclared"]} runs of undeclared callbacks'
+    yield (f'{counted(result["undeclared"], "run")} of undeclared callbacks'
            + _details({name: count for name, count in undeclared.items() if count}))
     never = [*result['never_ran'], *(
         name for name, counts in result['callbacks'].items()
@@ -37,11 +38,11 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
     drift = result.get('drift', ())
     yield from drift_lines(drift)
     if never and not any(each['kind'] == 'never ran' for each in drift):
-        yield f'declared callbacks that never ran: {len(never)}: ' + listed(never)
+        yield f'{counted(len(never), "declared callback")} never ran: ' + listed(never)
     if result['trace'] is not None:
         lost = result['trace']['lost']
         yield (f'trace: {printable(str(Path(result["trace"]["path"]).absolute()))}'
-               + (f' ({lost} events lost: the disk was too slow)' if lost else ''))
+               + (f' ({counted(lost, "event")} lost: the disk was too slow)' if lost else ''))
 
 
 def measured_lines(measured: dict[str, Any]) -> Iterator[str]:
@@ -58,8 +59,8 @@ def measured_lines(measured: dict[str, Any]) -> Iterator[str]:
         f'a second, {"-" if cpu is None else f"{cpu:.0f}"} us of CPU each')
     attribution = measured['attribution']
     if attribution['wrong'] or attribution['none']:
-        yield (f'{attribution["wrong"]} callbacks ran as the wrong job, {attribution["none"]} as '
-               'none')
+        yield (f'{counted(attribution["wrong"], "callback")} ran as the wrong job, '
+               f'{attribution["none"]} as part of no job')
 
 
 def _details(numbers: dict[str, int]) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 from mddag_executor.core.tally import counts
 from mddag_executor.report.tables import each_sink, never_due_lines, verdicts_line
 from mddag_executor.report.text import Cell, format_ns, printable, table
+from mddag_executor.text import counted
 
 _TIMES_HEADER = (
     'DAG', 'sink', 'release lag', 'waiting', 'for group', 'executing', 'suspended', 'transport',
@@ -148,9 +149,9 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the tables of a replay."""
     yield verdicts_line(result['dags'])
     yield from never_due_lines(result['dags'])
-    pool = f'policy {printable(result["policy"])}, {result["workers"]} workers'
+    pool = f'policy {printable(result["policy"])}, ' + counted(result['workers'], 'worker')
     if 'recorded_callbacks' in result:      # another executor ran it
-        pool = f'imported: {result["workers"]} threads ran callbacks'
+        pool = f'imported: {counted(result["workers"], "thread")} ran callbacks'
     yield (pool + (', preemptive' if result['preemptive'] else '')
            + f', {format_ns(result["duration_ns"])}, utilisation {_share(result["utilisation"])}'
            + f' (all callbacks: {_share(result["worker_use"]["use"])})')
@@ -166,7 +167,7 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
         return
     undeclared = result['undeclared']
     if undeclared['executions']:
-        yield (f'{undeclared["executions"]} runs of undeclared callbacks, '
+        yield (f'{counted(undeclared["executions"], "run")} of undeclared callbacks, '
                f'{format_ns(undeclared["busy_ns"])} altogether')
     dropped = result['dropped']
     if dropped:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core.tally import counts, never_due, total
 from mddag_executor.report.text import Cell, format_ns, listed, table
+from mddag_executor.text import counted
 
 HEADER = ('DAG', 'sink', 'due', 'in time', 'late', 'expired', 'median', 'p99', 'max', 'deadline')
 
@@ -92,7 +93,7 @@ def percent(part: int, whole: int) -> str:
 def verdicts_line(dags: Mapping[str, Any]) -> str:
     """Return the line that stands below a table of sinks: the verdicts about all of them."""
     every = total(dags)
-    return (f'{every.due} sink jobs due, {every.in_time} in time '
+    return (f'{counted(every.due, "sink job")} due, {every.in_time} in time '
             f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
             + (f', {every.aborted} aborted' if every.aborted else ''))
 
@@ -101,4 +102,4 @@ def never_due_lines(dags: Mapping[str, Any]) -> Iterator[str]:
     """Yield a line about the sinks of which no job was due, where there are any."""
     never = never_due(dags)
     if never:
-        yield f'never due, so not judged: {len(never)} of the sinks: {listed(never)}'
+        yield f'never due, so not judged: {counted(len(never), "sink")}: {listed(never)}'

@@ -7,6 +7,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 import re
 
+from mddag_executor.text import listed as listed_plainly
+
 Cell = str | int | float | None
 
 _LONGEST_LIST = 10
@@ -28,10 +30,8 @@ def printable(text: str) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names for a line of text: the first ones, and how many more there are."""
-    shown = ', '.join(printable(name) for name in names[:_LONGEST_LIST])
-    return shown + (f', … ({len(names) - _LONGEST_LIST} more)'
-                    if len(names) > _LONGEST_LIST else '')
+    """Return names for a line on a terminal: the first ones, and how many more there are."""
+    return listed_plainly([printable(name) for name in names], _LONGEST_LIST)
 
 
 def format_ns(nanoseconds: int, digits: int = 4) -> str:

@@ -15,6 +15,7 @@ import os
 from typing import Any, BinaryIO, TYPE_CHECKING
 
 from mddag_executor.errors import InputError
+from mddag_executor.text import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,9 +104,9 @@ def _title(evaluation: Evaluation) -> str:
     many = len(evaluation.experiments)
     least, most = min(workers), max(workers)
     return (
-        f'{evaluation.runs:,} runs of {evaluation.experiment.duration_ns / 1e9:g} s, '
-        + (f'{many:,} task sets, ' if many > 1 else '')
-        + (f'{most}' if least == most else f'{least} to {most}') + ' workers')
+        f'{counted(evaluation.runs, "run")} of {evaluation.experiment.duration_ns / 1e9:g} s, '
+        + (f'{many} task sets, ' if many > 1 else '')
+        + (counted(most, 'worker') if least == most else f'{least} to {most} workers'))
 
 
 def _points(

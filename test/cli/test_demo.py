@@ -23,9 +23,9 @@ def test_the_demo_says_where_recording_and_live_differ() -> None:
     live = {'dags': {'d': {'sinks': {'/a:x': sink(10), '/b:y': sink(20, 2)}}}}
     same = {'dags': {'d': {'sinks': {'/a:x': sink(10), '/b:y': sink(20, 2)}}}}
     other = {'dags': {'d': {'sinks': {'/a:x': sink(10), '/b:y': sink(20, 3)}}}}
-    assert 'equal for all 2 sinks' in agreement(live, same)
+    assert 'for all 2 sinks' in agreement(live, same)
     assert agreement(live, other) == (
-        'as recorded differs from live for 1 of 2 sinks: /b:y (live 20 completed, 2 late; '
+        'The replay counts otherwise for 1 of 2 sinks: /b:y (live 20 completed, 2 late; '
         'recorded 20, 3)')
     assert replay_table(live, same, other).splitlines()[2].split()[:10] == [
         'b:y', '18', 'of', '20', '18', 'of', '20', '17', 'of', '20']
@@ -62,7 +62,7 @@ def test_the_main_job_end_to_end(
     sinks = [name for dag in live['dags'].values() for name in dag['sinks']]
     assert len(sinks) == 18
     # What the replayer counts is exactly what the executor counted.
-    assert agreement(live, result['recorded']).endswith('equal for all 18 sinks')
+    assert agreement(live, result['recorded']).endswith(', for all 18 sinks.')
     assert result['recorded']['dags'].keys() == live['dags'].keys()
     assert result['rescheduled']['dags'].keys() == live['dags'].keys()
     assert live['never_ran'] == []

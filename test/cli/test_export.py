@@ -183,9 +183,9 @@ def test_diff(
     assert (status, err) == (0, '')
     assert ['/n', 'n:s', '10', '10', '0', '10', '10', '0', '6', 'ms', '-50.0', '%', '6', 'ms',
             '-50.0', '%', '6', 'ms', '-50.0', '%'] in [line.split() for line in out.splitlines()]
-    assert '/n:t' in out and '0 sinks are worse in the second run' in out
+    assert '/n:t' in out and 'worse in the second run: 0 sinks' in out
     status, out, _ = call(capsys, 'diff', after, trace, '--fail-on-worse')
-    assert status == 1 and '1 sink is worse in the second run' in out
+    assert status == 1 and 'worse in the second run: 1 sink' in out
     assert call(capsys, 'diff', after, trace)[0] == 0
     status, out, _ = call(capsys, 'diff', after, trace, '--json', '-')
     result = json.loads(out)

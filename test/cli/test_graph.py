@@ -59,7 +59,7 @@ def test_table(mddag: Mddag, tmp_path: Path) -> None:
     assert rows[2] == ['/n:y', '50', 'ms']
     assert rows[3] == ['/n', '20', 'ms', '1', '-', '-', '/n:u', '20', 'ms']
     assert done.stdout.splitlines()[-1] == (
-        '2 DAGs, 4 vertices, 4 callbacks, 1 queue edges, 1 paths')
+        '2 DAGs, 4 vertices, 4 callbacks, 1 queue edge, 1 path')
 
 
 def test_standard_input_and_output(mddag: Mddag) -> None:

@@ -63,7 +63,7 @@ def test_schedule_abstraction(mddag: Mddag, tmp_path: Path) -> None:
                  './nptest', input=GRAPH, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     line = next(line for line in done.stdout.splitlines() if line.startswith('schedule abs'))
-    assert 'holds' in line and '1 jobs, 2 states' in line
+    assert 'holds' in line and '1 job, 2 states' in line
     assert sorted(path.name for path in (tmp_path / 'jobs').iterdir()) == [
         'edges.csv', 'jobs.csv', 'tasks.csv']
     done = mddag('graph', 'analyse', '-', '--sag-binary', './nptest', '--json', '-', input=GRAPH,

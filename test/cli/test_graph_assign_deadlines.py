@@ -47,7 +47,7 @@ def test_by_path(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [line.split()[-4:] for line in out.splitlines()[1:3]] == [
         ['20', 'ms', '4', 'ms'], ['20', 'ms', '20', 'ms']]
     assert out.splitlines()[-1] == (
-        'rad accepts 100.0 % (95 % confidence: 83.9 to 100.0 %) of 20 runs of seed 0')
+        'rad accepts 100.0 % (95 % confidence: 83.9 to 100.0 %) of 20 runs with seed 0')
     result = json.loads((folder / 'o.json').read_text())
     assert result['deadlines_ns'] == {'/n:x': 4_000_000, '/n:y': 20_000_000}
     assert result['acceptance']['runs'] == 20 and result['acceptance']['ratio'] == 1.0
@@ -66,7 +66,7 @@ def test_by_search(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     deadlines = {c.key: c.deadline_ns for c in load('o.yaml').callbacks if c.deadline_ns}
     assert deadlines == result['deadlines_ns']
     assert deadlines['/n:y'] == pytest.approx(11_050_000, rel=0.01)
-    assert 'of 40 runs of seed 8, which took no part in the search' in out
+    assert 'of 40 runs with seed 8, which took no part in the search' in out
     assert 'scales tried' in out
 
 

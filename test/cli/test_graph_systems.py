@@ -31,7 +31,7 @@ nodes:
 
 def test_from_trace(mddag: Mddag, tmp_path: Path) -> None:
     done = mddag('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
-    assert (done.returncode, done.stdout, done.stderr) == (0, 'no blank left to fill in\n', '')
+    assert (done.returncode, done.stdout, done.stderr) == (0, 'no blanks to fill in\n', '')
     task_set = msg_graph.load(tmp_path / 'g.yaml')
     assert len(task_set.dags) == 11 and len(task_set.vertices) == 86
     with BAG.open('rb') as stream:
@@ -53,7 +53,7 @@ def test_from_caret_with_a_trace(mddag: Mddag, tmp_path: Path) -> None:
     (tmp_path / 'a.yaml').write_text(ARCHITECTURE)
     done = mddag('graph', 'from-caret', 'a.yaml', '--trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, "2 blanks to fill in, marked 'FILL IN'\n")
-    assert done.stderr == f'warning: {BAG}: 1 of 2 callbacks did not run in it\n'
+    assert done.stderr == f'warning: {BAG}: 1 of the 2 callbacks of a.yaml did not run\n'
     text = (tmp_path / 'g.yaml').read_text()
     assert len(re.findall(r'# measured in \d+ executions\n        execution_time: {quant', text)
                ) == 1
@@ -75,7 +75,7 @@ def test_replay_tells_of_drift(mddag: Mddag, tmp_path: Path) -> None:
     done = mddag('replay', BAG, '--json', '-')
     assert done.returncode == 0
     assert json.loads(done.stdout)['drift'] == []
-    assert 'disagree' not in mddag('replay', BAG).stdout
+    assert 'difference' not in mddag('replay', BAG).stdout
     mddag('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
     text = (tmp_path / 'g.yaml').read_text()
     (tmp_path / 'h.yaml').write_text(text.replace('timer: 100ms', 'timer: 200ms'))
@@ -84,13 +84,13 @@ def test_replay_tells_of_drift(mddag: Mddag, tmp_path: Path) -> None:
     found = json.loads((tmp_path / 'r.json').read_text())['drift']
     assert {each['kind'] for each in found} == {'rate'}
     assert done.stdout.splitlines()[-1 - min(len(found), MOST_LINES)].startswith(
-        f'the run and the declaration disagree in {len(found)} point')
+        f'{len(found)} difference')
 
 
 def test_drift_lines() -> None:
     assert list(drift_lines([])) == []
     assert list(drift_lines([{'text': 'a\x1b'}])) == [
-        'the run and the declaration disagree in 1 point:', '  a\\x1b']
+        '1 difference between the run and the declaration:', '  a\\x1b']
     many = list(drift_lines([{'text': str(i)} for i in range(MOST_LINES + 3)]))
     assert (len(many), many[-1]) == (MOST_LINES + 2, '  … (3 more)')
 

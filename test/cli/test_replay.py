@@ -138,7 +138,7 @@ def test_reschedule(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = [line.split() for line in out.splitlines()]
     assert ['/driver', 'filter:run', '8', 'ms', '2', 'of', '3', '2', 'of', '3', '5', 'ms', '6',
             'ms', '9', 'ms', '10', 'ms', '9', 'ms', '10', 'ms'] in lines
-    assert 'policy fifo, 1 workers, preemptive, 40 ms, utilisation 0.450' in out
+    assert 'policy fifo, 1 worker, preemptive, 40 ms, utilisation 0.450' in out
     assert 'first miss: /filter:run, job 2, 1 ms late' in out
     result = json.loads(call(capsys, trace, '--reschedule', '--json', '-')[1])
     assert (result['policy'], result['workers'], result['preemptive']) == ('rad', 2, False)
@@ -255,7 +255,7 @@ def test_other_bad_input_is_one_line(
         ([trace, '--reschedule', '--callbacks'], '--callbacks: '),
         ([trace, '--reschedule', '--policy', 'best'], "policy 'best': there is no such policy: "),
         ([trace, '--reschedule', '--workers', '0'], 'mddag replay: argument --workers: '),
-        ([trace, '--reschedule', '--workers', '99999'], 'workers: 99999 cannot be: give 1 to '),
+        ([trace, '--reschedule', '--workers', '99999'], 'workers: 99999 is out of range: give'),
         (['-', '-'], '-: standard input can be only one of TRACE and GRAPH: name the other'),
         ([], 'mddag replay: the following arguments are required: TRACE'),
     ):

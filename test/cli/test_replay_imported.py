@@ -72,7 +72,7 @@ def test_rescheduled(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
         capsys, trace, trace.with_name('graph.yaml'), '--reschedule', '--workers', 1,
         '--policy', 'rad')
     assert (status, errors) == (0, '')
-    assert 'policy rad, 1 workers' in text
+    assert 'policy rad, 1 worker' in text
     status, _, errors = call(capsys, trace, '--reschedule')
     assert (status, errors.count('\n')) == (2, 1)
     assert errors.startswith(f'error: {trace}: it was imported') and 'GRAPH' in errors

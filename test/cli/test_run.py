@@ -101,8 +101,8 @@ def test_a_synthetic_run_is_counted_measured_and_recorded(graph: Path, mddag: Md
         '--trace', 'out.mcap', '--json', 'result.json')
     assert process.returncode == 0, process.stderr
     assert process.stderr == (
-        'warning: /slow:cb: with seed 0 its critical path takes 17.0 ms, and its deadline is '
-        '10.0 ms: no scheduler can keep it\n')
+        'warning: /slow:cb: no scheduler can keep its deadline of 10.0 ms: with seed 0 its '
+        'critical path takes 17.0 ms\n')
     result = json.loads(Path('result.json').read_text())
     assert (result['policy'], result['workers'], result['synthetic']) == ('rad', 3, 'sleep')
     sinks = result['dags']['main']['sinks']
@@ -231,7 +231,7 @@ def test_the_names_of_synthetic_nodes_are_those_of_the_declaration(
         'run', graph, '--synthetic', 'sleep', '--duration', '0.5s', '--json', 'result.json',
         '--ros-args', '-r', '__ns:=/robot', '-r', '/data:=/other')
     assert process.returncode == 0, process.stderr
-    assert '--ros-args: nodes made from the declaration have the names that it' in process.stderr
+    assert '--ros-args: remappings do not apply to synthetic nodes' in process.stderr
     result = json.loads(Path('result.json').read_text())
     assert (result['undeclared'], result['never_ran'], result['drift']) == (0, [], [])
 

@@ -143,12 +143,12 @@ def test_the_table_for_people(capsys: pytest.CaptureFixture[str], graph: Path) -
     assert lines[0].split()[:6] == ['DAG', 'sink', 'due', 'in', 'time', 'late']
     assert lines[1].split()[:4] == ['lidar', 'filter:near', '10', '3']
     assert lines[2].split()[0] == 'filter:far'
-    assert lines[-3] == 'rad, 1 workers, not preemptive, 100 ms, utilisation 1.100'
+    assert lines[-3] == 'rad, 1 worker, not preemptive, 100 ms, utilisation 1.100'
     assert lines[-2].startswith('10 jobs, 19 sink jobs due, ')
     assert lines[-1] == ('first miss: /filter:far of job 2 of lidar, deadline at 32 ms, '
                          'completed 1 ms late')
     assert main(['simulate', str(graph), '--workers', '1', '--stop-at-first-miss']) == 0
-    assert 'stopped at 33 ms, with the first miss' in capsys.readouterr().out
+    assert 'stopped at the first miss, at 33 ms' in capsys.readouterr().out
 
 
 def test_the_table_and_a_file(

@@ -136,7 +136,7 @@ def test_seed_and_number_count() -> None:
 
 @pytest.mark.parametrize(('change', 'problem'), [
     ({'sinks': (9, 9), 'vertices': (9, 9)}, '--sinks 9: a DAG of 9 vertices has at most 8: '),
-    ({'sinks': (2, 2), 'vertices': (1, 9)}, '--sinks 2: a DAG of 1 vertices has at most 1: '),
+    ({'sinks': (2, 2), 'vertices': (1, 9)}, '--sinks 2: a DAG of 1 vertex has at most 1: '),
     ({'dags': (0, 3)}, '--dags 0: it is out of range: give from 1 to 1000'),
     ({'dags': (5, 3)}, '--dags 5:3: the first is larger: write the smaller one first'),
     ({'vertices': (1, 10 ** 9)}, '--vertices 1e+09: it is out of range: '),

@@ -274,10 +274,9 @@ def test_callbacks_that_the_trace_lacks(tmp_path: Path) -> None:
 """
     outcome = replay(path, loads(more, 'more.yaml'))
     assert outcome.warnings == [
-        f'{path}: 1 of the 8 callbacks of more.yaml are not in it, so they count as never '
-        'completed: /radar:scan',
-        'more.yaml: the sources of 1 DAGs are no sources in the recording, so there are no jobs '
-        'of them: /radar']
+        f'{path}: not in it: 1 of the 8 callbacks of more.yaml, which count as never completed: '
+        '/radar:scan',
+        'more.yaml: 1 DAG without jobs, because the source is no source in the recording: /radar']
     assert outcome.result()['dags']['/radar']['jobs'] == 0
     other = """\
 mddag: 1
@@ -314,8 +313,8 @@ def test_misses_that_are_not_those_recorded_are_said(tmp_path: Path) -> None:
         ('deadline', 26, 2, 0, 4, 0, START_TIME + 24 * MS, START_TIME + 25 * MS),
         ('shutdown', 110, 1, START_TIME + 110 * MS))
     assert replay(path).warnings == [
-        f'{path}: 1 of the 1 misses that the executor recorded are not found again, 0 that it did '
-        'not record are found: the first is job 0 at /fuse:join']
+        f'{path}: the replay does not find 1 of 1 recorded miss, and it finds 0 that were not '
+        'recorded: the first is job 0 at /fuse:join']
     # under other deadlines there is nothing to compare
     assert replay(path, loads(SMALL.replace('12ms', '13ms'), 'g.yaml')).warnings == []
 
@@ -341,17 +340,17 @@ def test_events_that_make_no_sense_are_counted(tmp_path: Path) -> None:
     outcome = replay(path)
     assert outcome.result()['dags']['/camera']['ends']['completed'] == 1
     assert outcome.warnings == [
-        f'{path}: 8 events make no sense and are left out, most of them (2) mddag:job_release of '
-        'a DAG that is not declared',
-        f'{path}: 3 events contradict those before them and are left out']
+        f'{path}: left out: 8 events that make no sense, most often (2) mddag:job_release of a '
+        'DAG that is not declared',
+        f'{path}: left out: 3 events that contradict earlier ones']
 
 
 def test_lost_events_are_said(tmp_path: Path) -> None:
     path = write(tmp_path / 'a.mcap', ('lost', 5, 1, 17), ('lost', 6, 1, 3),
                  ('shutdown', 110, 1, START_TIME + 110 * MS))
     assert replay(path).warnings == [
-        f'{path}: 20 events were lost while recording: jobs may be missing, or count as late that '
-        'were not',
+        f'{path}: 20 events lost while recording: jobs may be missing, or count as late that were '
+        'not',
         f'{path}: no job was released in it']
 
 

@@ -89,7 +89,7 @@ def result_of(path: Path, graph: TaskSet) -> tuple[dict[str, Any], list[str]]:
     return outcome.result(), [w.removeprefix(f'{path}: ') for w in outcome.warnings]
 
 
-TWO = ['2 processes ran callbacks, each with workers of its own: the 6 threads are taken together']
+TWO = ['2 processes ran callbacks, each with workers of its own: 6 threads are taken together']
 
 
 def test_jobs_responses_and_where_the_time_went(recorded: Recorded, graph: TaskSet) -> None:
@@ -163,10 +163,10 @@ def test_late_and_off_the_grid(tmp_path: Path) -> None:
     assert (sink['response_ns']['min'], sink['response_ns']['max']) == (1 * MS, 6 * MS)
     assert result['first_miss']['job'] == 1
     assert warnings == [
-        '1 executions of timers are off the grid of their periods (reset, or by another clock): '
-        'they count as released when they started: /n timer 10ms (1)',
+        '1 execution of timers off the grid of the period (reset, or by another clock): '
+        'released when it started: /n timer 10ms (1)',
         '2 periods of timers passed without an execution (late by more than one, or events were '
-        'lost): there are no jobs of them: /n timer 10ms (2)']
+        'lost): without a job: /n timer 10ms (2)']
 
 
 SOURCE = """\
@@ -194,8 +194,8 @@ def test_releases_of_messages(
     result, warnings = result_of(
         r.write(), loads(SOURCE.format(release_from), 'graph.yaml'))
     assert result['dags']['/n']['sinks']['/n:s']['response_ns']['max'] == response
-    assert [line for line in warnings if 'should be by a stamp' in line] == ([
-        '1 releases should be by a stamp that is not recorded, and are by the next best one: '
+    assert [line for line in warnings if 'the next best stamp' in line] == ([
+        '1 release by the next best stamp, because the declared one is not recorded: '
         '/n:s (header_stamp)'] if said else [])
 
 
@@ -220,8 +220,8 @@ nodes:
     longest = {key: use['longest_ns'] for key, use in result['callbacks'].items()}
     assert longest == {'/n:a': 1 * MS, '/n:b': 2 * MS - 1, '/n:c': 3 * MS - 2, '/gone:d': 0}
     assert warnings == [
-        '1 of the 4 callbacks of graph.yaml are not in it, so they count as never completed: '
-        '/gone:d', '1 timers have other periods than declared: /n:c (33ms instead of 30ms)']
+        'not in it: 1 of the 4 callbacks of graph.yaml, which count as never completed: /gone:d',
+        '1 timer with another period than declared: /n:c (33ms instead of 30ms)']
 
 
 def test_reschedule_keeps_releases_times_and_groups(recorded: Recorded, graph: TaskSet) -> None:

@@ -133,15 +133,15 @@ def test_stamps_that_can_not_be_are_said(tmp_path: Path) -> None:
     path = write_bag(tmp_path / 'bag', stamps=stamps)
     outcome = reschedule_bag(path, loads(BY_HEADER, 'g.yaml'))
     assert [text.split(': ', 1)[1] for text in outcome.warnings] == [
-        f'1 of the 10 messages of /points (std_msgs/msg/Header) {why}: they are released at their '
-        'arrival' for why in ('have no header stamp', 'have a header stamp after it')]
+        f'1 of 10 messages of /points (std_msgs/msg/Header) {why}: released at the arrival'
+        for why in ('without a header stamp', 'with a header stamp after the arrival')]
     assert responses(outcome, '/lidar', '/detector:detect')['min'] == 9 * MS
     chatter = BY_HEADER.replace('/points', '/chatter')
     outcome = reschedule_bag(path, loads(chatter, 'g.yaml'))
-    assert 'have no header stamp' in outcome.warnings[0]
+    assert 'without a header stamp' in outcome.warnings[0]
     published = BY_HEADER.replace('header_stamp', 'source_timestamp')
     outcome = reschedule_bag(path, loads(published, 'g.yaml'))
-    assert '10 of the 10 messages' in outcome.warnings[0]
+    assert '10 of 10 messages' in outcome.warnings[0]
     assert 'no publication time' in outcome.warnings[0]
 
 
@@ -194,7 +194,7 @@ def test_several_files(tmp_path: Path, storage: StoragePlugin) -> None:
     (path / f'drive_1.{suffix}').unlink()
     half = Bag(path, {'/points'})
     assert len(half.stamps['/points'].header) == 10
-    assert '1 of its 2 files are missing' in half.warnings[0]
+    assert '1 of 2 files are missing' in half.warnings[0]
     (path / f'drive_0.{suffix}').unlink()
     with pytest.raises(BagError, match='none of the bag files that it names is there'):
         Bag(path, {'/points'})
@@ -295,7 +295,7 @@ def test_counts_that_differ_are_said(tmp_path: Path) -> None:
     metadata = path / 'metadata.yaml'
     metadata.write_text(metadata.read_text().replace('message_count: 11', 'message_count: 12'))
     assert Bag(path, {'/points'}).warnings == [
-        f'{path}: metadata.yaml says that there are 12 messages, but there are 11']
+        f'{path}: metadata.yaml counts 12 messages, but there are 11']
     assert UNKNOWN < 0
 
 

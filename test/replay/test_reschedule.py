@@ -287,8 +287,8 @@ def test_what_was_not_recorded_takes_the_median_then_the_declared_mean(tmp_path:
     result = outcome.result()
     assert (result['executions'], result['estimated_executions']) == (5, 2)
     with pytest.raises(ReplayError, match=(
-            'a.mcap: 1 callbacks neither completed in it nor declare an execution_time: /slow:cb: '
-            'give a GRAPH')):
+            'a.mcap: 1 callback did not complete in it, and no execution_time is declared: '
+            '/slow:cb: give a GRAPH')):
         reschedule(path, loads(TWO, 'g.yaml'))
 
 

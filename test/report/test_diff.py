@@ -40,7 +40,7 @@ def test_a_run_is_no_worse_than_itself(result: dict[str, Any]) -> None:
         'executions': 3, 'mean_ns': 3 * MS, 'longest_ns': 6 * MS, 'mean_wait_ns': 0}
     lines = list(summary(difference))
     assert '3 sink jobs due, 2 in time (66.67 %), 1 late' in lines[0]
-    assert lines[-1] == '0 sinks are worse in the second run'
+    assert lines[-1] == 'worse in the second run: 0 sinks'
 
 
 @pytest.mark.parametrize(('sink', 'tolerance', 'worse'), [
