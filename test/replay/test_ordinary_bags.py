@@ -142,7 +142,7 @@ def test_stamps_that_can_not_be_are_said(tmp_path: Path) -> None:
     published = BY_HEADER.replace('header_stamp', 'source_timestamp')
     outcome = reschedule_bag(path, loads(published, 'g.yaml'))
     assert '10 of 10 messages' in outcome.warnings[0]
-    assert 'no publication time' in outcome.warnings[0]
+    assert 'without a publication time' in outcome.warnings[0]
 
 
 def test_what_is_not_in_the_bag_is_said(tmp_path: Path) -> None:
