@@ -45,12 +45,12 @@ class Recorder:
         self._clock_offset = clock_offset
         # by themselves: another one may have the address of one that is gone
         self._known: weakref.WeakSet[Any] = weakref.WeakSet()
-        self._say('caret_init', clock_offset, 'jazzy')
-        self._say('rmw_implementation', get_rmw_implementation_identifier())
-        self._say('construct_executor', id(self), 'multi_deadline_executor')
         self._say(
             'task_set', task_set.text if task_set else '', task_set.file if task_set else '',
             policy, workers, default_deadline, max_active_jobs, False)
+        self._say('caret_init', clock_offset, 'jazzy')
+        self._say('rmw_implementation', get_rmw_implementation_identifier())
+        self._say('construct_executor', id(self), 'multi_deadline_executor')
 
     def _say(self, event: str, *fields: Any) -> None:
         now = time.monotonic_ns() + self._clock_offset

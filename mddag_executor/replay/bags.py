@@ -12,6 +12,7 @@ Theory of operation
 * Of each message there are its arrival (log time), its publication where the recorder kept that
   apart, and the stamp at the beginning of its content, where its type begins with a
   `std_msgs/Header` or a time.  Nothing else is decoded.
+* A topic that was recorded with a relative name (`AAA`) is that below the root (`/AAA`).
 * Damage costs what comes after it in that file, and is said.
 """
 
@@ -143,13 +144,14 @@ class Bag:
     def _read_mcap(self, unpacked: Path, file: Path, topics: Collection[str]) -> None:
         reader = MessageReader(unpacked)
         try:
-            for topic, log_time, publish_time, data in reader.messages(topics):
+            relative = {topic[1:] for topic in topics}
+            for topic, log_time, publish_time, data in reader.messages({*topics, *relative}):
                 self._add(topic, log_time, publish_time, data)
         except TraceError as error:
             raise BagError(str(file), error.problem, error.remedy) from None
         self.warnings += [self._called(file) + text[len(reader.path):]
                           for text in reader.warnings]
-        self.topics |= reader.topics
+        self.topics |= {_absolute(topic) for topic in reader.topics}
         self.count += reader.count
         if reader.start is not None and reader.end is not None:
             self._within(reader.start, reader.end)
@@ -161,12 +163,13 @@ class Bag:
             reader = Sqlite3Reader(unpacked)
             reader.open()
             try:
-                self.topics |= {connection.topic for connection in reader.connections}
+                self.topics |= {_absolute(c.topic) for c in reader.connections}
                 count = reader.metadata.message_count
                 self.count += count
                 if count:
                     self._within(reader.metadata.start_time, reader.metadata.end_time - 1)
-                known = {c.id: _topic_of(c) for c in reader.connections if c.topic in topics}
+                known = {c.id: _topic_of(c) for c in reader.connections
+                         if _absolute(c.topic) in topics}
                 wanted = [c for c in reader.connections if c.id in known]
                 for connection, time, data in reader.messages(wanted) if wanted else ():
                     self._add(known[connection.id], time, UNKNOWN, memoryview(data))
@@ -190,9 +193,10 @@ class Bag:
     def _add(self, topic: Topic, arrival: int, published: int, data: memoryview) -> None:
         if not 0 <= arrival < 2**62:
             return
-        stamps = self.stamps.get(topic.name)
+        name = _absolute(topic.name)
+        stamps = self.stamps.get(name)
         if stamps is None:
-            stamps = self.stamps[topic.name] = Stamps()
+            stamps = self.stamps[name] = Stamps()
             stamps.type = topic.message_type
         stamps.arrival.append(arrival)
         different = 0 < published < 2**62 and published != arrival
@@ -221,13 +225,20 @@ def is_ordinary(path: str) -> bool:
     """Tell whether a path is a bag in which nothing was traced, so that it holds no jobs."""
     try:
         if os.path.isdir(path):
-            return any(_BAG_FILE.fullmatch(name) for name in os.listdir(path))
+            files = [name for name in os.listdir(path) if _BAG_FILE.fullmatch(name)]
+            return 'metadata.yaml' in files or any(
+                is_ordinary(os.path.join(path, name)) for name in files)
         kind = _kind(Path(path))
         if kind != _MCAP:
             return kind != b''
-        return not TraceReader(path).has_events()
+        reader = TraceReader(path)
+        return not (reader.written_here or reader.has_events())
     except (InputError, OSError):
         return False        # whoever reads it says why
+
+
+def _absolute(topic: str) -> str:
+    return topic if topic.startswith('/') else f'/{topic}'
 
 
 def _natural(path: Path) -> list[Any]:

@@ -110,11 +110,11 @@ class Recording:
 
 def no_run(reader: TraceReader) -> ReplayError:
     """Return the error for a trace, read to its end, without a run of this executor."""
-    what = 'no run of this executor is recorded in it'
+    what = f'no run of this executor is recorded in it (it has no event {TASK_SET})'
     if reader.warnings:
-        what = 'no run of this executor is recorded in what is left of it, it is damaged'
-    return ReplayError(
-        reader.path, f'{what}: there is no event {TASK_SET}, so there are no jobs', _RECORD)
+        damage = reader.warnings[0].removeprefix(f'{reader.path}: ').partition(': ')[0]
+        what = f'it is damaged ({damage}), and the declaration of its run is lost'
+    return ReplayError(reader.path, what, _RECORD)
 
 
 @contextmanager

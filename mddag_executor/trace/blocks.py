@@ -18,12 +18,16 @@ trusted to be what it seems.
    a record whose opcode has changed.
 5. The CRC of a chunk may be 0, which says that there is none (MCAP specification); plain messages
    never have one.
+6. A chunk that is the same as one before it is left out and noted. Only the first chunk may have a
+   copy right behind it (`trace_file`, rule 5), which stands in for it where it is not sound.
+7. The footer tells where the summary begins. Where it begins elsewhere, right behind the data,
+   something was cut out or put in: then the summary's list of chunks tells where.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import struct
 from typing import BinaryIO
 import zlib
@@ -65,6 +69,12 @@ class Block:
     data_length: int
     size: int           # of its records, uncompressed
     crc: int            # of these; 0 where there is none
+    copy: Block | None = None   # that stands in for it
+
+    @property
+    def copies(self) -> int:
+        """Return how often its messages are in the file, as its summary counts them."""
+        return 1 if self.copy is None else 2
 
 
 @dataclass(frozen=True)
@@ -74,11 +84,13 @@ class Summary:
     messages: int
     chunks: int
     topics: frozenset[str]
+    index: tuple[tuple[int, int], ...] | None
+    """Start time and length of each chunk; None where nothing was cut out or put in."""
 
 
-def open_data(stream: BinaryIO, path: str, size: int) -> int:
+def open_data(stream: BinaryIO, path: str) -> tuple[int, str]:
     """
-    Check the beginning of a file and return where its data section starts.
+    Check the beginning of a file and return where its data section starts, and what wrote it.
 
     :raises TraceError: where it is no MCAP file, or nothing is in it
     """
@@ -91,15 +103,88 @@ def open_data(stream: BinaryIO, path: str, size: int) -> int:
     if len(head) == records.RECORD.size:
         opcode, length = records.RECORD.unpack(head)
         cursor = records.Cursor(stream.read(min(length, 1 << 16)))
+        library = ''
         try:
             cursor.string()     # profile
-            cursor.string()     # library
+            library = cursor.string()
         except ValueError:
             pass
         # A wrong length might lead past the first chunk.
         if opcode == records.HEADER and cursor.position == length:
-            return len(magic) + len(head) + int(length)
+            return len(magic) + len(head) + int(length), library
     raise TraceError(path, 'ends or is damaged before its first event', _REMEDY)
+
+
+def usable(
+    stream: BinaryIO, start: int, size: int, summary: Summary | None, twice: list[int]
+) -> Iterator[Block]:
+    """
+    Yield the blocks of the data section that count, in the order of the file (rules 6 and 7).
+
+    :param twice: takes in the offsets of chunks that are left out
+    :raises Damage: as ``scan`` does, and where chunks are missing
+    """
+    index = list(summary.index) if summary and summary.index is not None else None
+    if index and index[0] in index[1:2]:
+        del index[1]                # the first one's copy
+    seen: set[int] = set()
+    first: Block | None = None      # held back until it is known whether it has a copy
+    place = 0                       # in the index
+    damage: Damage | None = None
+    position = start
+    try:
+        for number, block in enumerate(scan(stream, start, size)):
+            position = block.end
+            same = hash((block.start_time, block.size, block.crc, block.data_length))
+            again = block.chunk and block.crc != 0 and same in seen
+            if index is not None and block.chunk:
+                about = block.start_time, block.end - block.offset
+                if about in index[place:place + 1]:
+                    place += 1
+                elif not again:
+                    raise _missing(index[place:], about, block.offset)
+            if again and number == 1 and first is not None:
+                first = replace(first, copy=block)
+            elif again:
+                twice.append(block.offset)
+            elif number == 0:
+                first = block
+            else:
+                if first is not None:
+                    yield first
+                    first = None
+                yield block
+            seen.add(same)
+        if index is not None and place < len(index):
+            raise _missing(index[place:], None, position)
+    except Damage as error:
+        damage = error
+    if first is not None:
+        yield first
+    if damage is not None:
+        raise damage
+
+
+def _missing(index: list[tuple[int, int]], found: tuple[int, int] | None, offset: int) -> Damage:
+    """Return that chunks of the index are missing before the one that was found."""
+    count = index.index(found) if found in index else len(index)
+    return Damage(
+        f'{count} chunk{" is" if count == 1 else "s are"} missing' if count else
+        'a chunk was put in', offset)
+
+
+def what_was_used(path: str, damage: Damage, found: str, size: int) -> str:
+    """Return the line that says what damage left of a file; ``found`` is what was used."""
+    if damage.offset >= size:
+        return f'{path}: {damage.what}: used all of it, {found}'
+    return (f'{path}: {damage.what} (at byte {damage.offset}): used {found} before it, not the '
+            f'{size - damage.offset} bytes from there on')
+
+
+def used_once(path: str, twice: list[int]) -> str:
+    """Return the line about chunks that were left out as they are in a file twice."""
+    return (f'{path}: chunks that are there twice were used once: {len(twice)}, the first at byte '
+            f'{twice[0]}')
 
 
 def scan(stream: BinaryIO, start: int, size: int) -> Iterator[Block]:
@@ -225,11 +310,13 @@ def _decompress(data: bytes, compression: str, size: int) -> bytes:
     raise ValueError(f'the compression of a chunk, {compression[:20]!r}, is unknown')
 
 
-def read_summary(stream: BinaryIO, size: int) -> tuple[bool, Summary | None]:
+def read_summary(stream: BinaryIO, size: int, data: int) -> tuple[bool, Summary | None]:
     """
     Return whether the file ends as a finished one, and its summary if it has one.
 
     A summary whose CRC is wrong makes the file one that does not end as it should.
+
+    :param data: where the data section starts
     """
     if size < _FOOTER_SIZE:
         return False, None
@@ -243,12 +330,33 @@ def read_summary(stream: BinaryIO, size: int) -> tuple[bool, Summary | None]:
     start, _, crc = records.FOOTER_CONTENT.unpack(content)
     if start == 0:
         return True, None
-    if start > footer_start or (crc and crc != _crc(stream, start, size - len(records.MAGIC) - 4)):
+    end = size - len(records.MAGIC) - 4
+    moved = False
+    if crc and (start > footer_start or crc != _crc(stream, start, end)):
+        start, moved = _data_end(stream, data, size), True      # rule 7
+    if start > footer_start or (crc and moved and crc != _crc(stream, start, end)):
         return False, None
     try:
-        return True, _parse_summary(stream, start, footer_start)
+        return True, _parse_summary(stream, start, footer_start, moved)
     except (ValueError, struct.error):
         return False, None
+
+
+def _data_end(stream: BinaryIO, start: int, size: int) -> int:
+    """Return where the data section ends; the file's size where that is not sound."""
+    end = start
+    try:
+        for block in scan(stream, start, size):
+            end = block.end
+        while end < size:
+            stream.seek(end)
+            opcode, length = records.RECORD.unpack(stream.read(records.RECORD.size))
+            end += records.RECORD.size + length
+            if opcode == records.DATA_END:
+                return int(end)
+    except (Damage, struct.error):
+        pass
+    return size
 
 
 def _crc(stream: BinaryIO, start: int, end: int) -> int:
@@ -263,15 +371,21 @@ def _crc(stream: BinaryIO, start: int, end: int) -> int:
     return crc
 
 
-def _parse_summary(stream: BinaryIO, start: int, end: int) -> Summary | None:
+def _parse_summary(stream: BinaryIO, start: int, end: int, moved: bool) -> Summary | None:
     messages = chunks = None
     topics = set()
+    index: list[tuple[int, int, int]] = []
     while start < end:
         stream.seek(start)
         opcode, length = records.RECORD.unpack(stream.read(records.RECORD.size))
-        if opcode in (records.STATISTICS, records.CHANNEL):
+        if opcode in (records.STATISTICS, records.CHANNEL) or (
+                moved and opcode == records.CHUNK_INDEX):
             cursor = records.Cursor(stream.read(min(length, 1 << 20)))
-            if opcode == records.STATISTICS:
+            if opcode == records.CHUNK_INDEX:
+                head = cursor.take(records.CHUNK_INDEX_HEAD.size)
+                first, _, offset, size = records.CHUNK_INDEX_HEAD.unpack(head)
+                index.append((offset, first, size))
+            elif opcode == records.STATISTICS:
                 head = cursor.take(records.STATISTICS_HEAD.size)
                 messages, _, _, _, _, chunks, _, _ = records.STATISTICS_HEAD.unpack(head)
             else:
@@ -282,4 +396,5 @@ def _parse_summary(stream: BinaryIO, start: int, end: int) -> Summary | None:
         raise ValueError('the summary does not end at the footer')
     if messages is None or chunks is None:
         return None
-    return Summary(messages, chunks, frozenset(topics))
+    return Summary(messages, chunks, frozenset(topics),
+                   tuple(each[1:] for each in sorted(index)) if moved else None)

@@ -24,7 +24,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from mddag_executor.trace import column_layout as cl
 from mddag_executor.trace import records
-from mddag_executor.trace.blocks import Block, Damage, load
+from mddag_executor.trace.blocks import Block, Damage
 from mddag_executor.trace.channels import Channels, Event
 from mddag_executor.trace.reading import Reading
 import numpy as np
@@ -71,7 +71,7 @@ class ColumnReading(Reading):
         return self._by_time(stream, blocks)
 
     def _in_order(self, stream: BinaryIO, block: Block, pending: int) -> _Loaded:
-        rows, others = self._rows(load(stream, block), block)
+        rows, others = self._rows(self._load(stream, block), block)
         if len(rows) > self._room(pending):
             raise self._too_unordered()
         times = rows[:, cl.TIME]
@@ -108,8 +108,8 @@ class ColumnReading(Reading):
                 self._define(opcode, data[position + records.RECORD.size:after], block)
                 self._classify()
                 result[cl.POSITION] = after
-        self.messages += int(result[cl.MESSAGES])
-        self.chunks += block.chunk
+        self.messages += int(result[cl.MESSAGES]) * block.copies
+        self.chunks += block.chunk * block.copies
         return parts[0] if len(parts) == 1 else np.concatenate(parts), others
 
     def _decoded(self, data: bytes, rows: Rows, places: Rows, others: list[Event]) -> Rows:

@@ -14,7 +14,16 @@ import os
 from typing import NamedTuple
 
 from mddag_executor.trace import records
-from mddag_executor.trace.blocks import Block, Damage, load, open_data, read_summary, scan
+from mddag_executor.trace.blocks import (
+    Block,
+    Damage,
+    load,
+    open_data,
+    read_summary,
+    usable,
+    used_once,
+    what_was_used,
+)
 from mddag_executor.trace.channels import DEFINITIONS_LIMIT
 from mddag_executor.trace.reader import open_trace
 
@@ -66,17 +75,19 @@ class MessageReader:
 
         :raises TraceError: where the file cannot be read or is no MCAP file
         """
+        twice: list[int] = []
         with open_trace(self.path) as (stream, size):
+            start, _ = open_data(stream, self.path)
+            _, summary = read_summary(stream, size, start)
             try:
-                _, summary = read_summary(stream, size)
-                stream.seek(0)
-                for block in scan(stream, open_data(stream, self.path, size), size):
+                for block in usable(stream, start, size, summary, twice):
                     yield from self._messages(load(stream, block), block, topics)
             except Damage as damage:
-                self.warnings.append(
-                    f'{self.path}: {damage.what} (at byte {damage.offset}): used {self.count} '
-                    f'messages before it, not the {size - damage.offset} bytes from there on')
+                self.warnings.append(what_was_used(
+                    self.path, damage, f'{self.count} messages', size))
                 return
+        if twice:
+            self.warnings.append(used_once(self.path, twice))
         if summary is not None and summary.messages != self.count:
             self.warnings.append(
                 f'{self.path}: its summary counts {summary.messages} messages, but there are '

@@ -15,11 +15,18 @@ import stat
 from typing import Any, BinaryIO, TYPE_CHECKING
 import warnings
 
-from mddag_executor.trace.blocks import open_data, read_summary
-from mddag_executor.trace.blocks import scan as scan_blocks
+from mddag_executor.trace.blocks import (
+    Block,
+    open_data,
+    read_summary,
+    usable,
+    used_once,
+    what_was_used,
+)
 from mddag_executor.trace.channels import Channels, Event
 from mddag_executor.trace.errors import TraceError, TraceWarning
 from mddag_executor.trace.reading import Reading
+from mddag_executor.trace.records import LIBRARY
 
 if TYPE_CHECKING:
     from mddag_executor.trace.columns import Columns
@@ -39,12 +46,35 @@ def open_trace(path: str) -> Iterator[tuple[BinaryIO, int]]:
     if '\0' in path:
         raise TraceError(path, 'is no file name', 'give the .mcap file')
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):     # a pipe would wait for its writer
+        mode = os.stat(path).st_mode
+        if stat.S_ISDIR(mode):
+            raise no_trace(path)
+        if not stat.S_ISREG(mode):      # a pipe would wait for its writer
             raise TraceError(path, 'is no file', 'give the .mcap file itself')
         with open(path, 'rb') as stream:
             yield stream, os.fstat(stream.fileno()).st_size
     except OSError as error:
         raise TraceError(path, f'cannot be read ({error.strerror})', _REMEDY) from None
+
+
+def no_trace(folder: str) -> TraceError:
+    """
+    Return the error for a folder that was given instead of a trace: it says what is in it.
+
+    :raises OSError: where it cannot be looked into
+    """
+    names = sorted(os.listdir(folder))
+    traces = [name for name in names if name.endswith('.mcap')]
+    if not names:
+        return TraceError(folder, 'is an empty folder', 'give a trace, an .mcap file')
+    if any('metadata' in files for _, _, files in os.walk(folder)):
+        return TraceError(folder, 'is a folder that LTTng recorded to',
+                          "make a trace of it with 'mddag import ctf'")
+    if traces:
+        more = f' or one of {len(traces) - 1} more in it' if len(traces) > 1 else ''
+        return TraceError(
+            folder, 'is a folder', f'give the trace {os.path.join(folder, traces[0])}{more}')
+    return TraceError(folder, 'is a folder without a trace', 'give a trace, an .mcap file')
 
 
 class TraceReader:
@@ -65,8 +95,10 @@ class TraceReader:
         self.warnings: list[str] = []
         self.fields: dict[str, tuple[str, ...]] = {}
         with open_trace(self.path) as (stream, size):
-            open_data(stream, self.path, size)
-            self._finished, self._summary = read_summary(stream, size)
+            self._start, library = open_data(stream, self.path)
+            #: Whether this program wrote the file.
+            self.written_here = library == LIBRARY
+            self._finished, self._summary = read_summary(stream, size, self._start)
 
     @property
     def message_count(self) -> int | None:
@@ -131,24 +163,33 @@ class TraceReader:
         channels = Channels(set(names), True)
         reading = ColumnReading(self.path, channels, kinds, scan)
         self.fields = channels.fields
+        twice: list[int] = []
         with open_trace(self.path) as (stream, size):
-            blocks = scan_blocks(stream, open_data(stream, self.path, size), size)
-            yield from reading.columns(stream, blocks)
-        self._warn(reading, size)
+            yield from reading.columns(stream, self._blocks(stream, size, twice))
+        self._warn(reading, size, twice)
 
     def _read(self, channels: Channels, in_time_order: bool) -> Iterator[Event]:
         reading = Reading(self.path, channels)
         self.fields = channels.fields
+        twice: list[int] = []
         with open_trace(self.path) as (stream, size):
-            blocks = scan_blocks(stream, open_data(stream, self.path, size), size)
+            blocks = self._blocks(stream, size, twice)
             if in_time_order:
                 yield from reading.by_time(stream, blocks)
             else:
                 yield from reading.by_file(stream, blocks)
-        self._warn(reading, size)
+        self._warn(reading, size, twice)
 
-    def _warn(self, reading: Reading, size: int) -> None:
-        for text in (self._missing(reading, size), reading.undecoded()):
+    def _blocks(self, stream: BinaryIO, size: int, twice: list[int]) -> Iterator[Block]:
+        return usable(stream, self._start, size, self._summary, twice)
+
+    def _warn(self, reading: Reading, size: int, twice: list[int]) -> None:
+        lines = [self._missing(reading, size), reading.undecoded()]
+        if reading.restored:
+            lines.append(f'{self.path}: the first chunk is damaged: used its copy')
+        if twice:
+            lines.append(used_once(self.path, twice))
+        for text in lines:
             if text and text not in self.warnings:
                 self.warnings.append(text)
 
@@ -159,8 +200,7 @@ class TraceReader:
         stated = (f'{summary.chunks} chunks with {summary.messages} messages are said to be there'
                   if summary else 'what there should be is not known')
         if damage:
-            return (f'{self.path}: {damage.what} (at byte {damage.offset}): used {found} before '
-                    f'it, not the {size - damage.offset} bytes from there on; {stated}')
+            return f'{what_was_used(self.path, damage, found, size)}; {stated}'
         if not self._finished:
             return (f'{self.path}: the summary at the end is damaged or missing: used all of the '
                     f'data, {found}')

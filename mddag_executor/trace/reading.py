@@ -53,6 +53,7 @@ class Reading:
         self.chunks = 0             # used
         self.messages = 0           # in what was used, of all channels
         self.damage: Damage | None = None
+        self.restored = False       # whether a copy stood in for a damaged chunk
         self._path = path
         self._channels = channels
         self._undecoded: Counter[str] = Counter()       # by topic and reason
@@ -61,7 +62,7 @@ class Reading:
         """Yield the events in the order of the file."""
         try:
             for block in blocks:
-                for events in self._decode(load(stream, block), block):
+                for events in self._decode(self._load(stream, block), block):
                     yield from events
         except Damage as damage:
             self._keep(damage)
@@ -117,7 +118,7 @@ class Reading:
         """Return the events of a block in the order of time."""
         room = self._room(pending)
         events: list[Event] = []
-        for some in self._decode(load(stream, block), block):
+        for some in self._decode(self._load(stream, block), block):
             events += some
             if len(events) > room:
                 raise self._too_unordered()
@@ -125,6 +126,15 @@ class Reading:
         if events and events[0][1] < block.start_time:
             raise Damage('a chunk holds an event from before the time in its head', block.offset)
         return events
+
+    def _load(self, stream: BinaryIO, block: Block) -> bytes:
+        try:
+            return load(stream, block)
+        except Damage:
+            if block.copy is None:
+                raise
+        self.restored = True
+        return load(stream, block.copy)
 
     def _room(self, pending: int) -> int:
         """Return how many events may be loaded beside those that are."""
@@ -173,8 +183,8 @@ class Reading:
                 add = events.append
                 self._define(opcode, data[position + _CONTENT:after], block)
             position = after
-        self.messages += messages
-        self.chunks += block.chunk
+        self.messages += messages * block.copies
+        self.chunks += block.chunk * block.copies
         yield events
 
     def _add_any(self, events: list[Event], channel: int, message: bytes) -> None:

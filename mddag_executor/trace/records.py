@@ -14,6 +14,8 @@ from __future__ import annotations
 import struct
 
 MAGIC = b'\x89MCAP0\r\n'
+LIBRARY = 'mddag_executor'
+"""Stands in the header of files that this program wrote."""
 
 HEADER = 0x01
 FOOTER = 0x02
@@ -30,6 +32,7 @@ DATA_END = 0x0F
 RECORD = struct.Struct('<BQ')               # opcode, length of the content
 MESSAGE_HEAD = struct.Struct('<HIQQ')       # channel, sequence, log_time, publish_time
 CHUNK_HEAD = struct.Struct('<QQQI')         # start, end, size, CRC; compression and records follow
+CHUNK_INDEX_HEAD = struct.Struct('<QQQQ')   # start, end, offset, length; more follows
 FOOTER_CONTENT = struct.Struct('<QQI')      # summary start, summary offset start, summary CRC
 # messages, schemas, channels, attachments, metadata, chunks, start, end; per channel counts follow
 STATISTICS_HEAD = struct.Struct('<QHIIIIQQ')

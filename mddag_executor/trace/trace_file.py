@@ -14,6 +14,8 @@ Theory of operation:
    file is finished. They make seeking possible and tell a reader what should be there; nothing
    else depends on them.
 4. When writing fails the file is cut back to its last whole chunk.
+5. Without the declaration a trace is of no use. Where it is recorded first, it gets a chunk of its
+   own, and that chunk is written twice: one that is damaged later costs nothing.
 
 All methods are for one thread; `TraceWriter` is what many threads may call.
 """
@@ -35,7 +37,7 @@ from mddag_executor.trace.schema import camel_case, EVENTS, EventType
 import zstandard
 
 CHUNK_LIMIT = 256 * 1024
-LIBRARY = 'mddag_executor'
+_TWICE = 'mddag:task_set'
 _COMPRESSION_LEVEL = 1      # of zstd; higher levels cost more than they save on such data
 
 
@@ -146,7 +148,7 @@ class TraceFile:
             reason = getattr(error, 'strerror', None) or str(error)
             raise TraceError(self.path, f'cannot be written ({reason})',
                              'name a file in an existing folder that you may write') from None
-        content = records.string('ros2') + records.string(LIBRARY)
+        content = records.string('ros2') + records.string(records.LIBRARY)
         self._write(records.MAGIC + records.record(records.HEADER, content))
 
     def define(self, event: EventType) -> str:
@@ -222,6 +224,17 @@ class TraceFile:
             channel.count += 1
             self._records.append(message)
             self._size += len(message)
+            if channel.event.key == _TWICE and self.given == 1:
+                self._write_twice(channel)
+
+    def _write_twice(self, channel: _Channel) -> None:
+        """Write the open chunk and a copy of it (rule 5); the channel is the only one in it."""
+        chunk = self._records, self._size, channel.index
+        self.flush()
+        self._records, self._size, channel.index = chunk
+        channel.count += 1
+        self.flush()
+        self.written -= 1
 
     def _extend_group(self, group: Group, entry: Sequence[Any], vpid: int) -> None:
         parts = group.parts

@@ -209,8 +209,8 @@ def no_declaration(path: Path) -> None:
     (b'8 bytes!', 'is no MCAP file: give a trace'),
     (b'\x89MCAP0\r\n', 'ends or is damaged before its first event: give a trace'),
     (b'PK\x03\x04' * 100, 'is no MCAP file: give a trace'),
-    (nothing_recorded, 'no run of this executor is recorded in it: there is no event '
-     'mddag:task_set, so there are no jobs: record a run with mddag run'),
+    (nothing_recorded, 'no run of this executor is recorded in it (it has no event '
+     'mddag:task_set): record a run with mddag run'),
     (no_declaration, 'it was recorded without a declaration, so there are no jobs: record'),
 ])
 @pytest.mark.parametrize('options', [[], ['--reschedule']])
@@ -246,8 +246,8 @@ def test_other_bad_input_is_one_line(
         ([trace, tmp_path / 'gone.yaml'], f'{tmp_path}/gone.yaml: '),
         ([trace, other], f'{trace}: none of the callbacks of {other} is in it: it has '
          '/driver:tick, /filter:run: give the graph of the nodes that were recorded, or none'),
-        ([tmp_path], f'{tmp_path}: no run of this executor is recorded in it, so there are no'),
-        ([empty], f'{empty}: is no file: give the .mcap file itself'),
+        ([tmp_path], f'{tmp_path}: is a folder: give the trace {trace}'),
+        ([empty], f'{empty}: is an empty folder: give a trace, an .mcap file'),
         ([trace, '--json', tmp_path / 'gone' / 'a.json'], f'{tmp_path}/gone/a.json: there is no'),
         ([trace, '--workers', '2'], '--workers: a run is replayed as it was recorded: add '),
         ([trace, '--policy', 'rad'], '--policy: a run is replayed as it was recorded: add '),

@@ -74,11 +74,13 @@ def test_a_trace_cut_anywhere(sound: bytes, whole: dict[str, Any], tmp_path: Pat
         never_above(result, whole)
         # The first says what is missing of the file, the second, if any, that the end is.
         assert outcome.warnings[0].startswith(f'{path}: ')
-        assert len(outcome.warnings) == 1 + (not result['recording']['shut_down'])
+        assert all(
+            'the end of the run is not recorded' in text or 'no job was released in it' in text
+            for text in outcome.warnings[1:])
         jobs.append(sum(dag['jobs'] for dag in result['dags'].values()))
         assert reschedule(path, workers=1).tally.jobs
     assert jobs == sorted(jobs)
-    assert 0 < jobs[0] < jobs[-1]
+    assert jobs[0] < jobs[-1]
 
 
 def test_flipped_bits(sound: bytes, whole: dict[str, Any], tmp_path: Path) -> None:

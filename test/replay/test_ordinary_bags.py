@@ -17,11 +17,14 @@ from mddag_executor.replay import bags
 from mddag_executor.replay.bags import Bag, BagError, is_ordinary, UNKNOWN
 from mddag_executor.replay.bags_reschedule import BagReschedule, reschedule_bag
 from mddag_executor.simulate import SimulationError, START
+from mddag_executor.trace import records, TraceFile
 from msg_graph import loads
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 import zstandard
+
+from ..trace.helpers import records_of
 
 MS = 1_000_000
 BEGIN = 1_732_166_766_000_000_000
@@ -61,14 +64,14 @@ def header(stamp: int) -> bytes:
 
 def write_bag(
     path: Path, storage: StoragePlugin = StoragePlugin.MCAP,
-    compression: CompressionMode | None = None, stamps: Any = None,
+    compression: CompressionMode | None = None, stamps: Any = None, topic: str = '/points',
 ) -> Path:
     """Write a bag of ten scans, each 5 ms after its stamp, and a message of another topic."""
     writer = Writer(path, version=9, storage_plugin=storage)
     if compression is not None:
         writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
-        points = writer.add_connection('/points', 'std_msgs/msg/Header', typestore=STORE)
+        points = writer.add_connection(topic, 'std_msgs/msg/Header', typestore=STORE)
         chatter = writer.add_connection('/chatter', 'std_msgs/msg/String', typestore=STORE)
         text = STORE.types['std_msgs/msg/String']('hello')
         writer.write(
@@ -328,3 +331,54 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         status, out, err = call(*arguments)
         assert (status, out) == (2, '')
         assert err.startswith('error: ') and says in err and err.count('\n') == 1
+
+
+@pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_relative_topic_is_that_below_the_root(tmp_path: Path, storage: StoragePlugin) -> None:
+    relative = write_bag(tmp_path / 'relative', storage, topic='points')
+    absolute = write_bag(tmp_path / 'absolute', storage)
+    outcomes = [reschedule_bag(bag, loads(GRAPH)) for bag in (relative, absolute)]
+    assert [outcome.warnings for outcome in outcomes] == [[], []]
+    assert outcomes[0].result()['dags'] == outcomes[1].result()['dags']
+    assert Bag(relative, ['/points']).topics == {'/points', '/chatter'}
+
+
+def test_a_chunk_that_is_there_twice_is_used_once(tmp_path: Path) -> None:
+    bag = tmp_path / 'bag.mcap'
+    with bag.open('wb') as stream:
+        writer = McapWriter(stream, chunk_size=60, compression=CompressionType.NONE)
+        writer.start()
+        schema = writer.register_schema('std_msgs/msg/Header', 'ros2msg', b'')
+        channel = writer.register_channel('/points', 'cdr', schema)
+        for i in range(9):
+            writer.add_message(channel, BEGIN + i * MS, header(BEGIN), BEGIN + i * MS)
+        writer.finish()
+    data = bag.read_bytes()
+    chunks = [(start, end) for opcode, start, end in records_of(data) if opcode == records.CHUNK]
+    (start, _), (end, _) = chunks[3:5]
+    whole = list(Bag(bag, ['/points']).stamps['/points'].arrival)
+    for changed, says, lost in (
+        (data[:end] + data[start:end] + data[end:],
+         'chunks that are there twice were used once: 1', False),
+        (data[:start] + data[end:], '1 chunk is missing', True),
+    ):
+        bag.write_bytes(changed)
+        read = Bag(bag, ['/points'])
+        arrivals = list(read.stamps['/points'].arrival)
+        assert arrivals == whole[:len(arrivals)]
+        assert (len(arrivals) < len(whole)) == lost
+        assert [says in line for line in read.warnings] == [True]
+
+
+def test_a_folder_says_what_is_in_it(tmp_path: Path) -> None:
+    """A folder with a trace of this executor is no bag, and an empty one is nothing."""
+    (tmp_path / 'run').mkdir()
+    with TraceFile(tmp_path / 'run' / 'a.mcap') as file:
+        file.add('caret_init', BEGIN, 1, 1, 5, 'jazzy')
+    assert not is_ordinary(str(tmp_path / 'run'))
+    assert is_ordinary(str(write_bag(tmp_path / 'bag')))
+    # nor is what is left of one a bag, however little it is
+    data = (tmp_path / 'run' / 'a.mcap').read_bytes()
+    for size in (len(data) // 2, 60, 45):
+        (tmp_path / 'run' / 'a.mcap').write_bytes(data[:size])
+        assert not is_ordinary(str(tmp_path / 'run' / 'a.mcap'))

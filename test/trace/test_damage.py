@@ -13,12 +13,13 @@ from collections.abc import Iterator
 import os
 from pathlib import Path
 import random
+import re
 import struct
 from typing import Any
 import zlib
 
 import lz4.frame
-from mddag_executor.trace import records, TraceError, TraceReader
+from mddag_executor.trace import records, TraceError, TraceFile, TraceReader
 from mddag_executor.trace.schema import EVENTS
 import pytest
 import zstandard
@@ -108,6 +109,10 @@ def test_warnings_have_counts(tmp_path: Path, sample: Any) -> None:
     text = read(path)[1][0]
     assert f': used 2 chunks with 7 messages before it, not the {unread} bytes from there on; ' \
            '4 chunks with 14 messages are said to be there' in text
+    path.write_bytes(data[:spans(data)[2][0]])
+    assert read(path)[1] == [
+        f'{path}: the file ends without a finish record: used all of it, 2 chunks with 7 '
+        'messages; what there should be is not known']
     path.write_bytes(data[:-1])
     assert read(path)[1] == [f'{path}: the summary at the end is damaged or missing: used all of '
                              'the data, 4 chunks with 14 messages']
@@ -230,7 +235,7 @@ def test_what_is_no_trace(tmp_path: Path, content: bytes, problem: str) -> None:
 
 def test_what_is_no_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / 'pipe')
-    for path in (tmp_path, tmp_path / 'pipe', '/dev/zero'):
+    for path in (tmp_path / 'pipe', '/dev/zero'):
         with pytest.raises(TraceError, match='is no file: give the .mcap file itself'):
             TraceReader(path)
     for name in ('missing', 'missing/a.mcap', 'x' * 1000):
@@ -245,6 +250,83 @@ def test_what_is_no_file(tmp_path: Path) -> None:
         (tmp_path / 'secret').chmod(0)
         with pytest.raises(TraceError, match='Permission denied'):
             TraceReader(tmp_path / 'secret')
+
+
+@pytest.mark.parametrize(('files', 'says'), [
+    ([], 'is an empty folder: give a trace, an .mcap file'),
+    (['notes.txt'], 'is a folder without a trace: give a trace, an .mcap file'),
+    (['run.mcap', 'notes.txt'], 'is a folder: give the trace {}/run.mcap'),
+    (['a.mcap', 'b.mcap'], 'is a folder: give the trace {}/a.mcap or one of 1 more in it'),
+    (['ust/uid/1/metadata'], "is a folder that LTTng recorded to: make a trace of it with 'mddag "
+     "import ctf'"),
+])
+def test_a_folder_says_what_is_in_it(tmp_path: Path, files: list[str], says: str) -> None:
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(TraceError) as error:
+        TraceReader(tmp_path)
+    assert str(error.value) == f'{tmp_path}: {says.format(tmp_path)}'
+
+
+def spans(data: bytes) -> list[tuple[int, int]]:
+    """Return where each chunk with its indexes begins and ends."""
+    starts = [start for opcode, start, _ in records_of(data)
+              if opcode in (records.CHUNK, records.DATA_END)]
+    return list(zip(starts, starts[1:]))
+
+
+@pytest.mark.parametrize('number', range(len(SIZES)))
+def test_a_chunk_cut_out(tmp_path: Path, sample: Any, number: int) -> None:
+    data, chunks = sample
+    path = tmp_path / 'a.mcap'
+    start, end = spans(data)[number]
+    assert check(path, data[:start] + data[end:], chunks) == number
+    said = re.search(r': 1 chunk is missing \(at byte (\d+)\): used (\d) chunks with ',
+                     read(path)[1][0])
+    assert said is not None
+    assert int(said[1]) <= start and int(said[2]) == number
+
+
+@pytest.mark.parametrize('number', range(len(SIZES)))
+def test_a_doubled_chunk_is_used_once(tmp_path: Path, sample: Any, number: int) -> None:
+    data, chunks = sample
+    path = tmp_path / 'a.mcap'
+    start, end = spans(data)[number]
+    for place in sorted({end, spans(data)[-1][1]}):     # right behind it, and at the end
+        changed = data[:place] + data[start:end] + data[place:]
+        for size in (len(changed), len(changed) - 9):       # with its summary, and without
+            path.write_bytes(changed[:size])
+            for in_time_order in (False, True):
+                events, warnings = read(path, in_time_order)
+                assert events == [event for chunk in chunks for event in chunk]
+                if number or place > end:
+                    assert (f'{path}: chunks that are there twice were used once: 1, the first at '
+                            f'byte {place}') in warnings
+
+
+def test_the_declaration_survives_a_bad_chunk(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    recorded = [helpers.sample(EVENTS['mddag:task_set'], 0),
+                *(helpers.sample(EVENTS['mddag:expire'], number) for number in range(1, 9))]
+    with TraceFile(path) as file:
+        file.extend(recorded, helpers.VPID)
+    assert file.written == len(recorded)
+    data = path.read_bytes()
+    events = read_back(recorded)
+    assert read(path) == (events, [])
+    assert TraceReader(path).message_count == len(recorded) + 1
+    for start, end in spans(data)[:2]:
+        flipped = bytearray(data)
+        flipped[start + 80] ^= 1
+        for changed in (flipped, flipped[:-9], data[:start] + data[end:]):
+            path.write_bytes(changed)
+            for in_time_order in (False, True):
+                assert read(path, in_time_order)[0] == events
+            assert TraceReader(path).task_set_text == events[0][4]
+        path.write_bytes(flipped)
+        assert read(path)[1] == (
+            [f'{path}: the first chunk is damaged: used its copy'] if start < 100 else [])
 
 
 def test_a_file_that_goes_away_or_shrinks(tmp_path: Path, sample: Any) -> None:

@@ -249,7 +249,7 @@ def test_a_disk_that_gets_full(tmp_path: Path) -> None:
     assert 0 < len(there) == recorded - dropped
     assert reported == 0
     assert path.stat().st_size < 20_000         # cut back to whole chunks
-    assert len(warnings) == 1 and 'the 0 bytes from there on' in warnings[0]
+    assert len(warnings) == 1 and 'record: used all of it, ' in warnings[0]
 
 
 def test_the_error_does_not_hide_an_exception(tmp_path: Path) -> None:
