@@ -349,22 +349,25 @@ class Pool:
             self.dispatcher.resume(work)
         return True
 
+    def _give_place(self, seat: Seat) -> None:
+        """Have a spare thread take over a worker's place; the caller holds the lock."""
+        worker, seat.worker = seat.worker, -1
+        if seat.thread is None:  # spin_once: the workers' threads run while it waits
+            return
+        self._lenders.append(seat)
+        spare = self._spares.pop() if self._spares else self._new_seat(worker)
+        spare.worker = worker
+        self._seats[worker] = spare
+
     @contextmanager
     def lend(self, running: Running) -> Iterator[None]:
         """Lend the place of a running callback's worker to a spare thread."""
         seat = running.seat
-        if seat.worker < 0:  # it has lent its place already
-            yield
-            return
         with self._lock:
-            worker, seat.worker = seat.worker, -1
-            self._scheduler.lend(running.work.x)
-            self.lent += 1
-            if seat.thread is not None:
-                self._lenders.append(seat)
-                spare = self._spares.pop() if self._spares else self._new_seat(worker)
-                spare.worker = worker
-                self._seats[worker] = spare
+            if seat.worker >= 0:  # else it has lent its place before, and goes on without
+                self._give_place(seat)
+                self._scheduler.lend(running.work.x)
+                self.lent += 1
             self._dispatch(self.dispatcher.tick())
         seat.waits = True
         try:

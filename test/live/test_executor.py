@@ -125,6 +125,50 @@ def test_synchronous_call_inside_spin_once(make_executor, make_node):
     assert len(answers) == 1 and answers[0] is not None
 
 
+def test_two_synchronous_calls_in_one_callback_inside_spin_once(make_executor, make_node):
+    node, answers = make_node(), []
+    node.create_service(Trigger, '/ask', lambda request, response: response)
+    client = node.create_client(Trigger, '/ask', callback_group=ReentrantCallbackGroup())
+
+    def ask_twice() -> None:
+        for _ in range(2):
+            answers.append(client.call(Trigger.Request(), timeout_sec=5.0))
+
+    executor = make_executor()
+    executor.add_node(node)
+    assert client.wait_for_service(5.0)
+    executor.create_task(ask_twice)
+    executor.spin_once(1.0)
+    assert len(answers) == 2 and None not in answers
+
+
+def test_shutdown_does_not_wait_for_the_second_call_of_a_callback(make_executor, make_node):
+    """As it does not for the first: nobody would answer it any more."""
+    node, done = make_node(), threading.Event()
+    group = ReentrantCallbackGroup()
+    node.create_service(Trigger, '/ask', lambda request, response: response)
+    client = node.create_client(Trigger, '/ask', callback_group=group)
+    nobody = node.create_client(Trigger, '/nobody', callback_group=group)
+
+    def ask_twice() -> None:
+        client.call(Trigger.Request(), timeout_sec=5.0)
+        nobody.call(Trigger.Request())
+        done.set()
+
+    executor = make_executor()
+    executor.add_node(node)
+    assert client.wait_for_service(5.0)
+    executor.create_task(ask_twice)
+    try:
+        with Spinning(executor):
+            assert wait_for(lambda: nobody._pending_requests)
+            assert executor.shutdown(2.0)
+    finally:
+        for future in list(nobody._pending_requests.values()):
+            future.set_result(None)
+    assert done.wait(5.0)
+
+
 def test_guard_condition(make_executor, make_node):
     node, calls = make_node(), []
     guard = node.create_guard_condition(lambda: calls.append(1))
