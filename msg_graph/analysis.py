@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a DAG that reports show: topological order, longest path, utilisation."""
+"""Figures of a DAG that reports show: topological order, longest path, load."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ def mean_execution_times(dag: Dag) -> list[int] | None:
     return means
 
 
-def utilisation(dag: Dag) -> float | None:
+def load_of(dag: Dag) -> float | None:
     """
-    Return the share of one processor that the DAG needs with mean execution times.
+    Return the load of the DAG in cores, with mean execution times: sum(C) / T.
 
     None where an execution time is not declared.
     """

@@ -75,13 +75,13 @@ class Analysis:
 
     workers: int
     budget: str
-    utilisation: float
+    load: float
     verdicts: tuple[Verdict, ...]
 
     def result(self) -> dict[str, Any]:
         """Return the result format of ``graph analyse --json``."""
-        return {'workers': self.workers, 'budget': self.budget, 'utilisation': self.utilisation,
-                'assumptions': SHARED,
+        return {'workers': self.workers, 'budget': self.budget, 'load': self.load,
+                'utilisation': self.load / self.workers, 'assumptions': SHARED,
                 'tests': [asdict(verdict) for verdict in self.verdicts]}
 
 
@@ -158,8 +158,8 @@ def _utilisation(tasks: Sequence[Task], workers: int) -> Verdict:
     return Verdict(
         'utilisation', 'necessary', 'Liu and Layland 1973', 'any',
         'releases as often as declared, executions of their budgets', HOLDS if fits else FAILS,
-        f'U = {total:.3f} of {workers}',
-        'U <= m' if fits else 'U > m: work piles up without end',
+        f'{total / workers:.3f} of {counted(workers, "worker")}',
+        'at most 1' if fits else 'above 1: work piles up without end',
         {task.dag.name: task.utilisation for task in tasks})
 
 
@@ -337,12 +337,12 @@ def _li(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
     verdict, reason = NOTHING, obstacle
     if obstacle is None:
         verdict, reason = _by(
-            sufficient.li(tasks, workers), 'U <= m / b, and each longest path <= D / b',
-            'U > m / b, or a longest path > D / b')
+            sufficient.li(tasks, workers), 'load <= m / b, and each longest path <= D / b',
+            'load > m / b, or a longest path > D / b')
     return Verdict(
         'GEDF capacity bound', 'sufficient', 'Li et al. 2013 and 2014', 'gedf or rad, preemptive',
         'one deadline for each DAG, equal to its period', verdict,
-        f'b = {bound:.3f}, m / U = {workers / total if total else float("inf"):.3f}, '
+        f'b = {bound:.3f}, m / load = {workers / total if total else float("inf"):.3f}, '
         f'D / len = {1 / path if path else float("inf"):.3f}', reason or '')
 
 

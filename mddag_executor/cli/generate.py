@@ -41,8 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--sets', type=options.positive_int, metavar='N',
         help='make N task sets, OUT/set_0000.yaml and so on (default: one, OUT itself)')
     add('--utilisation', type=_numbers, default=(0.5, 0.5), metavar='U[:U]',
-        help='normalised: of all DAGs, by workers, with mean execution times; with --sets two '
-        'bounds, over which the sets are spread evenly (default: 0.5)')
+        help='utilisation: the load of all DAGs divided by the workers, with mean execution '
+        'times; with --sets two bounds, over which the sets are spread evenly (default: 0.5)')
     add('--workers', type=options.positive_int, default=_DEFAULT.workers, metavar='M',
         help='declared number of workers (default: %(default)s)')
     _add_pair(add, '--dags', options.positive_int, _DEFAULT.dags, 'number of DAGs')
@@ -58,8 +58,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--method', choices=METHODS, default=_DEFAULT.method,
         help='how the utilisation is dealt out to DAGs and callbacks: Dirichlet-rescale or '
         'UUniFast(-Discard) (default: %(default)s)')
-    add('--max-dag-utilisation', type=options.number, default=_DEFAULT.most_per_dag, metavar='U',
-        help='the largest utilisation of one DAG (default: %(default)s)')
+    add('--max-dag-load', '--max-dag-utilisation', type=options.number,
+        default=_DEFAULT.most_per_dag, metavar='L',
+        help='the largest load of one DAG, in cores; the second name is the older one '
+        '(default: %(default)s)')
     add('--periods', type=_periods, default=_DEFAULT.periods_ns, metavar='TIME,TIME…',
         help='each DAG gets one of these (default: 10ms,20ms,50ms,100ms,200ms)')
     add('--tightness', type=_numbers, default=_DEFAULT.tightness, metavar='F[:F]',
@@ -140,7 +142,7 @@ def _every(args: argparse.Namespace) -> Iterator[Options]:
     base = Options(
         dags=args.dags, vertices=args.vertices, sinks=args.sinks,
         edge_probability=args.edge_probability, or_share=args.or_share, workers=args.workers,
-        method=args.method, most_per_dag=args.max_dag_utilisation, periods_ns=args.periods,
+        method=args.method, most_per_dag=args.max_dag_load, periods_ns=args.periods,
         tightness=args.tightness, deadline_of=args.deadline_of, spread=args.spread,
         seed=args.seed)
     for number in range(sets):

@@ -3,8 +3,8 @@
 """
 The verb `graph check`: validate a declaration and show the DAG tasks that it gives.
 
-Critical path and utilisation are those of the mean execution times, so that both tell of the same
-load; where an execution time is not declared they are not known (`-`, in JSON null).
+Critical path, load and utilisation are those of the mean execution times. Where an execution time
+is not declared they are not known (`-`, in JSON null).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import argparse
 from collections.abc import Iterator
 from typing import Any, TYPE_CHECKING
 
+from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, format_ns, table
 from mddag_executor.text import counted
@@ -27,10 +28,10 @@ mddag graph check config/autoware.yaml --json -
 """
 DESCRIPTION = """\
 Validate a declaration and show the DAG tasks that it gives: period, number of vertices, sinks with
-deadlines, critical path and utilisation, the last two with the mean execution times (- where one
-is not declared)."""
+deadlines, critical path and load in cores, the last two with the mean execution times (- where one
+is not declared). The utilisation is the load of all DAGs divided by the workers."""
 
-_HEADER = ('DAG', 'period', 'vertices', 'critical path', 'utilisation', 'sink', 'deadline')
+_HEADER = ('DAG', 'period', 'vertices', 'critical path', 'load', 'sink', 'deadline')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,23 +59,26 @@ def check_result(task_set: TaskSet) -> dict[str, Any]:
     Return the result of `graph check` for machines.
 
     Times are in ns; `rad_offset_ns` is the reference absolute deadline (RAD) minus the release of
-    each vertex, in the order of `vertices`. `critical_path_ns` and `utilisation` are None where
-    an execution time is not declared.
+    each vertex, in the order of `vertices`. `load` is in cores, `utilisation` is load divided by
+    `workers`. They and `critical_path_ns` are None where an execution time is not declared.
     """
     from mddag_executor.core import Tables
+    workers = defaults.workers(None, task_set)
     tables = Tables.build(task_set)
     dags = {}
     for dag in task_set.dags:
         first = tables.first_vertex[dag.index]
         offsets = tables.rad_offset[first:first + len(dag.vertices)]
-        dags[dag.name] = _dag_result(dag, offsets)
-    shares = [dag['utilisation'] for dag in dags.values()]
+        dags[dag.name] = _dag_result(dag, offsets, workers)
+    loads = [dag['load'] for dag in dags.values()]
+    load = None if None in loads else sum(loads)
     return {
         'dags': dags,
         'vertices': len(task_set.vertices),
         'callbacks': len(task_set.callbacks),
-        'workers': task_set.workers,
-        'utilisation': None if None in shares else sum(shares),
+        'workers': workers,
+        'load': load,
+        'utilisation': None if load is None else load / workers,
         'queue_edges': [
             {'reader': edge.reader, 'topic': edge.topic, 'writers': list(edge.writers)}
             for edge in task_set.queue_edges],
@@ -82,9 +86,9 @@ def check_result(task_set: TaskSet) -> dict[str, Any]:
     }
 
 
-def _dag_result(dag: Dag, rad_offsets: list[int]) -> dict[str, Any]:
-    from msg_graph.analysis import mean_execution_times, path_lengths, utilisation
-    means = mean_execution_times(dag)
+def _dag_result(dag: Dag, rad_offsets: list[int], workers: int) -> dict[str, Any]:
+    from msg_graph.analysis import load_of, mean_execution_times, path_lengths
+    means, load = mean_execution_times(dag), load_of(dag)
     return {
         'period_ns': dag.period_ns,
         'vertices': [vertex.name for vertex in dag.vertices],
@@ -92,18 +96,19 @@ def _dag_result(dag: Dag, rad_offsets: list[int]) -> dict[str, Any]:
         'sinks': {dag.vertices[i].name: dag.vertices[i].deadline_ns for i in dag.sinks},
         'rad_offset_ns': rad_offsets,
         'critical_path_ns': None if means is None else max(path_lengths(dag, means)),
-        'utilisation': utilisation(dag),
+        'load': load,
+        'utilisation': None if load is None else load / workers,
     }
 
 
 def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
     """Yield a row for each sink; what concerns the whole DAG stands at its first one."""
     for name, dag in result['dags'].items():
-        path, share = dag['critical_path_ns'], dag['utilisation']
+        path, load = dag['critical_path_ns'], dag['load']
         row: list[Cell] = [
             name, format_ns(dag['period_ns']), len(dag['vertices']),
             None if path is None else format_ns(path),
-            None if share is None else f'{share:.4f}']
+            None if load is None else f'{load:.4f}']
         for sink, deadline in dag['sinks'].items():
             yield [*row, sink, format_ns(deadline)]
             row = [''] * len(row)
@@ -117,8 +122,6 @@ def _summary(task_set: TaskSet, result: dict[str, Any]) -> str:
         f'{counted(len(task_set.queue_edges), "queue edge")}, '
         f'{counted(len(task_set.paths), "path")}')
     if result['utilisation'] is not None:
-        text += f', utilisation {result["utilisation"]:.3f}'
-        if task_set.workers is not None:
-            share = result['utilisation'] / task_set.workers
-            text += f' ({share:.3f} of {task_set.workers} workers)'
+        text += (f', load {result["load"]:.3f}, utilisation {result["utilisation"]:.3f} of '
+                 f'{counted(result["workers"], "worker")}')
     return text

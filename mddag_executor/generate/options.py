@@ -38,7 +38,7 @@ class Options:
     :ivar utilisation: normalised: of all DAGs together, by workers.
     :ivar workers: number of workers, which is declared.
     :ivar method: how the utilisation is dealt out to DAGs, and a DAG's to its callbacks.
-    :ivar most_per_dag: the largest utilisation of one DAG.
+    :ivar most_per_dag: the largest load of one DAG, in cores.
     :ivar periods_ns: each DAG gets one of these.
     :ivar tightness: a deadline as a multiple of its base.
     :ivar deadline_of: that base: the DAG's period, or the longest path to the sink.
@@ -75,7 +75,7 @@ class Options:
         _number('--or-share', self.or_share, 0.0, 1.0)
         _number('--spread', self.spread, 0.0, 0.99)
         _number('--utilisation', self.utilisation, 0.0, 100.0, above=True)
-        _number('--max-dag-utilisation', self.most_per_dag, 0.0, 1000.0, above=True)
+        _number('--max-dag-load', self.most_per_dag, 0.0, 1000.0, above=True)
         _bounds('--workers', (self.workers, self.workers), 1, 1024)
         for option, value, choices in (('--method', self.method, METHODS),
                                        ('--deadline-of', self.deadline_of, BASES)):
@@ -97,10 +97,10 @@ class Options:
         most = self.dags[0] * self.most_per_dag
         if total > most * (1 + 1e-12):
             raise GenerateError(
-                f'--utilisation {self.utilisation:g}: {self.dags[0]} DAGs of at most '
-                f'{self.most_per_dag:g} have {most:g} together, and {total:g} are asked for on '
+                f'--utilisation {self.utilisation:g}: a load of {total:g} does not fit into '
+                f'{counted(self.dags[0], "DAG")} of at most {self.most_per_dag:g} on '
                 f'{counted(self.workers, "worker")}: give more --dags, or a larger '
-                '--max-dag-utilisation')
+                '--max-dag-load')
 
 
 def _bounds(

@@ -75,8 +75,8 @@ def deal(dice: Dice, method: str, total: float, most: Sequence[float]) -> list[f
     """
     if total > sum(most) * (1 + 1e-9):
         raise GenerateError(
-            f'--utilisation: {total:g} do not fit into DAGs of at most {sum(most):g} together: '
-            'give more --dags, or a larger --max-dag-utilisation')
+            f'--utilisation: a load of {total:g} does not fit into DAGs of {sum(most):g} in all: '
+            'give more --dags, or a larger --max-dag-load')
     if method == 'dirichlet':
         return dirichlet_rescale(dice, total, most)
     for _ in range(_MOST_TRIES):
@@ -84,8 +84,8 @@ def deal(dice: Dice, method: str, total: float, most: Sequence[float]) -> list[f
         if all(share <= limit for share, limit in zip(shares, most)):
             return shares
     raise GenerateError(
-        f'--method uunifast: {_MOST_TRIES} draws had a DAG with too large a utilisation: use '
-        "'dirichlet', more --dags, or a larger --max-dag-utilisation")
+        f'--method uunifast: {_MOST_TRIES} draws had a DAG with too large a load: use '
+        "'dirichlet', more --dags, or a larger --max-dag-load")
 
 
 def dirichlet_rescale(dice: Dice, total: float, most: Sequence[float]) -> list[float]:

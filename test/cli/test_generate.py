@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mddag_executor.cli import main as program
 from msg_graph import load, loads
-from msg_graph.analysis import utilisation
+from msg_graph.analysis import load_of
 import pytest
 
 from .helpers import caller
@@ -30,7 +30,7 @@ def test_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
     assert (status, err) == (0, '')
     task_set = loads(out)
     assert (task_set.workers, len(task_set.dags)) == (2, 3)
-    assert sum(utilisation(dag) or 0 for dag in task_set.dags) == pytest.approx(1.2, abs=1e-5)
+    assert sum(load_of(dag) or 0 for dag in task_set.dags) == pytest.approx(1.2, abs=1e-5)
     assert {dag.period_ns for dag in task_set.dags} <= {10_000_000, 25_000_000}
     assert all(len(dag.sinks) == 2 for dag in task_set.dags)
     assert '\n# tightness: 0.4 to 0.9\n# deadline_of: period\n' in out
@@ -53,7 +53,7 @@ def test_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [file.name for file in files] == [f'set_{i:04d}.yaml' for i in range(5)]
     for i, file in enumerate(files):
         task_set = load(file)
-        total = sum(utilisation(dag) or 0 for dag in task_set.dags)
+        total = sum(load_of(dag) or 0 for dag in task_set.dags)
         assert total / 3 == pytest.approx(0.2 + 0.1 * i, abs=1e-5)
         assert file.read_bytes() == (folder / 'again' / file.name).read_bytes()
     assert len({file.read_text() for file in files}) == 5
@@ -72,7 +72,7 @@ def test_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (['--utilisation', '0.6:0.2', '--sets', '3', '-o', 'x'], '--utilisation 0.6:0.2: the first'),
     (['--utilisation', '-1'], '--utilisation -1: it is out of range: give above 0 to 100'),
     (['--utilisation', 'a'], "mddag generate: argument --utilisation: 'a' is no number: "),
-    (['--utilisation', '0.1:3', '--sets', '9', '-o', 'x'], '--utilisation 3: 8 DAGs of at most '),
+    (['--utilisation', '0.1:3', '--sets', '9', '-o', 'x'], '--utilisation 3: a load of '),
     (['--utilisation', '1e-7'], '--utilisation 1e-07: it leaves a callback less than 1 us: '),
     (['--sinks', '5', '--vertices', '5'], '--sinks 5: a DAG of 5 vertices has at most 4: '),
     (['--dags', '3:1'], '--dags 3:1: the first is larger: write the smaller one first'),

@@ -40,12 +40,12 @@ def test_json(mddag: Mddag, tmp_path: Path) -> None:
                 'period_ns': 10_000_000, 'vertices': ['/n:t', '/n:x', '/n:y'],
                 'edges': [[0, 1], [0, 2]], 'sinks': {'/n:x': 5_000_000, '/n:y': 50_000_000},
                 'rad_offset_ns': [5_000_000, 5_000_000, 50_000_000],
-                'critical_path_ns': 7_000_000, 'utilisation': 0.9},
+                'critical_path_ns': 7_000_000, 'load': 0.9, 'utilisation': 0.9 / 7},
             '/n': {
                 'period_ns': 20_000_000, 'vertices': ['/n:u'], 'edges': [],
                 'sinks': {'/n:u': 20_000_000}, 'rad_offset_ns': [20_000_000],
-                'critical_path_ns': None, 'utilisation': None}},
-        'vertices': 4, 'callbacks': 4, 'workers': None, 'utilisation': None,
+                'critical_path_ns': None, 'load': None, 'utilisation': None}},
+        'vertices': 4, 'callbacks': 4, 'workers': 7, 'load': None, 'utilisation': None,
         'queue_edges': [{'reader': '/n:y', 'topic': None, 'writers': ['/n:x']}],
         'paths': {'p': ['/n:t', '/n:x', '/n:y']}}
 
@@ -76,8 +76,23 @@ def test_standard_input_and_output(mddag: Mddag) -> None:
 def test_total_of_the_workload(mddag: Mddag) -> None:
     done = mddag('graph', 'check', CONFIG / 'autoware.yaml')
     assert done.stdout.splitlines()[-1] == (
-        '11 DAGs, 86 vertices, 84 callbacks, 32 queue edges, 5 paths, utilisation 5.102 '
-        '(0.729 of 7 workers)')
+        '11 DAGs, 86 vertices, 84 callbacks, 32 queue edges, 5 paths, load 5.102, '
+        'utilisation 0.729 of 7 workers')
+
+
+def test_utilisation_is_one_thing_in_all_commands(mddag: Mddag, tmp_path: Path) -> None:
+    (tmp_path / 'g.yaml').write_text(
+        'mddag: 1\nworkers: 2\nnodes:\n  - node: /n\n    callbacks:\n'
+        '      - {name: t, timer: 10ms, deadline: 10ms, execution_time: 4ms}\n')
+    trace = ['simulate', 'g.yaml', '--duration', '1s', '--trace', 'g.mcap']
+    for command in (
+            ['graph', 'check', 'g.yaml'], ['graph', 'analyse', 'g.yaml'], trace,
+            ['replay', 'g.mcap'], ['replay', 'g.mcap', '--reschedule']):
+        done = mddag(*command, '--json', '-', cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        result = json.loads(done.stdout)
+        assert result['utilisation'] == pytest.approx(0.2, abs=0.002), command
+        assert result.get('load', 0.4) == 0.4
 
 
 @pytest.mark.parametrize(('text', 'line'), [

@@ -42,7 +42,7 @@ def test_json(mddag: Mddag) -> None:
     assert (done.returncode, done.stderr) == (0, '')
     result = json.loads(done.stdout)
     assert (result['workers'], result['budget']) == (5, 'mean')
-    assert round(result['utilisation'], 3) == 5.102
+    assert (round(result['load'], 3), round(result['utilisation'], 3)) == (5.102, 1.02)
     tests = {test['name']: test for test in result['tests']}
     assert len(tests) == 11
     assert 'no execution takes longer' in result['assumptions']

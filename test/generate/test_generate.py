@@ -12,7 +12,7 @@ from mddag_executor.generate import BASES, generate, GenerateError, METHODS, Opt
 from mddag_executor.generate.shapes import draw_shape, MOST_COPIES
 from mddag_executor.generate.shares import Dice
 from msg_graph import loads, TaskSet
-from msg_graph.analysis import mean_execution_times, path_lengths, utilisation
+from msg_graph.analysis import load_of, mean_execution_times, path_lengths
 import pytest
 
 
@@ -61,7 +61,7 @@ def test_every_task_set_is_what_was_asked_for(options: Options) -> None:
     assert generate(options, 3) == text
     assert task_set.workers == options.workers
     assert options.dags[0] <= len(task_set.dags) <= options.dags[1]
-    each = [utilisation(dag) or 0.0 for dag in task_set.dags]
+    each = [load_of(dag) or 0.0 for dag in task_set.dags]
     rounding = sum(1 / dag.period_ns for dag in task_set.dags)  # a DAG's time is in whole ns
     assert sum(each) == pytest.approx(options.utilisation * options.workers, abs=rounding)
     assert max(each) <= options.most_per_dag + rounding
@@ -146,7 +146,8 @@ def test_seed_and_number_count() -> None:
     ({'or_share': -0.1}, '--or-share -0.1: it is out of range: '),
     ({'spread': 1.0}, '--spread 1: it is out of range: give from 0 to 0.99'),
     ({'utilisation': 0.0}, '--utilisation 0: it is out of range: give above 0 to 100'),
-    ({'utilisation': 0.9, 'dags': (3, 3)}, '--utilisation 0.9: 3 DAGs of at most 1 have 3 toget'),
+    ({'utilisation': 0.9, 'dags': (3, 3)},
+     '--utilisation 0.9: a load of 3.6 does not fit into 3 DAGs of at most 1 '),
     ({'utilisation': 1e-6}, '--utilisation 1e-06: it leaves a callback less than 1 us: give more'),
     ({'method': 'fair'}, "--method 'fair': choose one of dirichlet, uunifast"),
     ({'deadline_of': 'x'}, "--deadline-of 'x': choose one of period, path"),

@@ -77,7 +77,7 @@ def test_shares_are_the_same_for_all_places() -> None:
 
 
 def test_no_room() -> None:
-    with pytest.raises(GenerateError, match='--utilisation: 3 do not fit into DAGs of at most 2 '):
+    with pytest.raises(GenerateError, match='a load of 3 does not fit into DAGs of 2 in all'):
         deal(Dice(''), 'dirichlet', 3.0, [1.0, 1.0])
     with pytest.raises(GenerateError, match='--method uunifast: 10000 draws had a DAG with'):
         deal(Dice(''), 'uunifast', 9.999, [1.0] * 10)

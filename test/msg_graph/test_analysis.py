@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Topological order, longest paths and utilisation."""
+"""Topological order, longest paths and load."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_diamond() -> None:
     assert means == [1_000_000, 5_000_000, 2_000_000, 4_000_000, 7_000_000]
     assert analysis.path_lengths(DIAMOND, means) == [
         8_000_000, 7_000_000, 2_000_000, 6_000_000, 9_000_000]
-    assert analysis.utilisation(DIAMOND) == 1.9
+    assert analysis.load_of(DIAMOND) == 1.9
 
 
 def test_unknown_where_an_execution_time_is_missing() -> None:
@@ -42,7 +42,7 @@ def test_unknown_where_an_execution_time_is_missing() -> None:
             - {name: s, subscription: /a, deadline: 1ms}
     """).dags[0]
     assert analysis.mean_execution_times(dag) is None
-    assert analysis.utilisation(dag) is None
+    assert analysis.load_of(dag) is None
 
 
 @st.composite

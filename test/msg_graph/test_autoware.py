@@ -65,7 +65,7 @@ def test_deadlines_are_those_of_the_paper(autoware: TaskSet) -> None:
 
 def test_load_is_that_of_the_paper(autoware: TaskSet) -> None:
     """On seven cores the mean load is about that of the paper's most frequent runs, 0.7."""
-    shares = [analysis.utilisation(dag) for dag in autoware.dags]
+    shares = [analysis.load_of(dag) for dag in autoware.dags]
     assert sum(share for share in shares if share) / 7 == pytest.approx(0.729, abs=0.001)
 
 
