@@ -240,6 +240,9 @@ def check_report(path: str | None) -> None:
     """
     check_output(path)
     if path is not None:
+        if os.path.splitext(path)[1].lower() not in ('', '.html', '.htm'):
+            raise UsageError(
+                f'--report {path}: a report is an HTML file: let its name end in .html')
         from mddag_executor.report.html import check_available
         check_available()
 

@@ -9,17 +9,20 @@ The exporter observes a replay and hands out rows while it goes on; what it keep
 are open and, because a callback may still run when its job has ended, the last few that were, and
 executions that have ended until it is known what they completed.
 
-Executions (``ExecutionRow``), in the order in which they were completed.  A row is one run of a
-callback on a worker; a coroutine that was suspended has several, ``first`` tells the first.  What
-no DAG declares has neither DAG nor job.
+Executions (``ExecutionRow``): a row is one run of a callback on a worker; a coroutine that was
+suspended has several, ``first`` tells the first.  What no DAG declares has neither DAG nor job.
 
-Jobs (``JobRow``), in the order in which they were judged.  A row is the verdict about one job at
-one sink: ``in_time``, ``late``, ``overdue`` (not completed when the run ended past its deadline),
-``expired`` or ``aborted``; the last three have no completion.
+Jobs (``JobRow``): a row is the verdict about one job at one sink: ``in_time``, ``late``,
+``overdue`` (not completed when the run ended past its deadline), ``expired`` or ``aborted``; the
+last three have no completion.
 
 Columns that end in ``_ns`` are whole nanoseconds: times on the trace's clock, or durations.
 ``start_s`` and ``release_s`` are seconds since the run's first release (or execution, where one
 came before).
+
+Rows come in the order of their releases, what has no release by its readiness (``Ordered``).  The
+exporter hands them out as they end, so as many as ``MOST_ORDERED`` are held back and sorted: a row
+that ended after more than so many later ones stands where it ended.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 import csv
+import heapq
 import io
 from typing import Any, BinaryIO, get_args, get_type_hints, NamedTuple, Protocol
 
@@ -49,6 +53,7 @@ from msg_graph import TaskSet
 
 KEEP_ENDED = 4096
 MOST_HELD = 1024
+MOST_ORDERED = 65536
 BATCH = 65536
 
 _VERDICTS = {SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired', SINK_ABORTED: 'aborted'}
@@ -254,6 +259,58 @@ def export_schedule(schedule: Schedule, target: Target) -> None:
     exporter.finish()
 
 
+class Ordered:
+    """
+    A target that puts rows into the order of time, and passes them on.
+
+    :param target: where to.
+    :param execution: gives the time by which an execution comes.
+    """
+
+    def __init__(self, target: Target, execution: Callable[[ExecutionRow], int]) -> None:
+        self._target = target
+        self._execution = execution
+        self._count = 0
+        self._executions: list[tuple[int, int, Ran]] = []
+        self._verdicts: list[tuple[int, int, int, tuple[JobRow, int]]] = []
+
+    def begin(self, task_set: TaskSet, tables: Tables) -> None:
+        """Take in what the run is of."""
+        self._target.begin(task_set, tables)
+
+    def execution(self, ran: Ran) -> None:
+        """Take in an execution."""
+        self._count += 1
+        heapq.heappush(self._executions, (self._execution(ran.row), self._count, ran))
+        if len(self._executions) > MOST_ORDERED:
+            self._target.execution(heapq.heappop(self._executions)[-1])
+
+    def verdict(self, row: JobRow, vertex: int) -> None:
+        """Take in a verdict."""
+        self._count += 1
+        heapq.heappush(self._verdicts, (row.release_ns, vertex, self._count, (row, vertex)))
+        if len(self._verdicts) > MOST_ORDERED:
+            self._target.verdict(*heapq.heappop(self._verdicts)[-1])
+
+    def finish(self) -> None:
+        """Pass on what is left."""
+        for *_, ran in sorted(self._executions):
+            self._target.execution(ran)
+        for *_, verdict in sorted(self._verdicts):
+            self._target.verdict(*verdict)
+        self._target.finish()
+
+
+def by_release(row: ExecutionRow) -> int:
+    """Return the release of an execution's job, the readiness of what has none."""
+    return row.ready_ns if row.release_ns is None else row.release_ns
+
+
+def by_start(row: ExecutionRow) -> int:
+    """Return when an execution started: so tracks are filled from the left."""
+    return row.start_ns
+
+
 class _Rows:
     """A target that takes rows of one kind, in batches."""
 
@@ -374,8 +431,8 @@ def check_available(form: str) -> None:
 def target(form: str, file: BinaryIO, jobs: bool) -> Target:
     """Return what writes a format: ``csv``, ``parquet`` or ``pftrace``."""
     if form == 'csv':
-        return CsvRows(file, jobs)
+        return Ordered(CsvRows(file, jobs), by_release)
     if form == 'parquet':
-        return ParquetRows(file, jobs)
+        return Ordered(ParquetRows(file, jobs), by_release)
     from mddag_executor.report.perfetto import PerfettoTarget
-    return PerfettoTarget(file)
+    return Ordered(PerfettoTarget(file), by_start)

@@ -15,7 +15,8 @@ Tracks stand in four groups:
 
 Executions of one track may overlap (a reentrant group, jobs that overlap): then it has several
 tracks of one name, as Perfetto demands that slices of a track nest.  An execution goes to the
-first of them that is free when it starts.
+first of them that is free when it starts.  So executions have to come by their start, and jobs by
+their release (``export.Ordered``).
 
 Names stand in the file once (interned); each packet says with a flag that it needs them.  Times
 are the trace's, in nanoseconds.

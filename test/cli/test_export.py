@@ -95,6 +95,8 @@ def test_another_graph_judges(
     (['diff', 'TRACE', 'TRACE', '--tolerance', '-5%'], 'error: '),
     (['replay', 'TRACE', '--report', 'no/such/out.html'], 'there is no directory'),
     (['replay', 'GRAPH', '--report', 'out.html'], 'error: '),
+    (['replay', 'TRACE', '--report', 'x.pdf'], '--report x.pdf: a report is an HTML file: '),
+    (['simulate', 'GRAPH', '--report', 'x.PDF'], '--report x.PDF: a report is an HTML file: '),
 ])
 def test_bad_input(
     arguments: list[str], error: str, graph: Path, trace: Path, tmp_path: Path,

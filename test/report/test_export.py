@@ -13,6 +13,7 @@ from typing import Any
 from mddag_executor.replay import replay
 from mddag_executor.replay.follower import Piece
 from mddag_executor.replay.judge import Judge
+from mddag_executor.report import export
 from mddag_executor.report.export import Exporter, KEEP_ENDED, MOST_HELD, target
 from mddag_executor.simulate.recording import write_trace
 import pytest
@@ -60,6 +61,29 @@ def test_jobs_as_csv(tmp_path: Path) -> None:
         'release_ns': str(runs.START + 30 * MS), 'deadline_ns': str(runs.START + 38 * MS),
         'completed_ns': str(runs.START + 40 * MS), 'response_ns': str(10 * MS),
         'slack_ns': str(-2 * MS), 'verdict': 'late'}
+
+
+def test_rows_come_in_the_order_of_their_releases(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task_set = runs.autoware()
+    load, run = runs.simulated(task_set, ms=500, utilisation=1.2, preemptive=True)
+    path = tmp_path / 'run.mcap'
+    write_trace(path, task_set, load, run)
+
+    def releases(jobs: bool) -> list[int]:
+        return [int(row['release_ns']) for row in read_csv(exported(path, 'csv', jobs))]
+
+    for jobs in (False, True):
+        assert releases(jobs) == sorted(releases(jobs))
+    whole = releases(True)
+    monkeypatch.setattr(export, 'MOST_ORDERED', 10)     # more rows than are held back
+    assert sorted(releases(True)) == whole
+    monkeypatch.undo()
+    parsed = Parsed(exported(path, 'pftrace'))
+    groups = {name: [start for parent, start in parsed.begins if parent == name]
+              for name in ('workers', 'jobs by sink')}
+    assert all(len(times) > 100 and times == sorted(times) for times in groups.values())
 
 
 def test_csv_is_harmless(tmp_path: Path) -> None:
@@ -171,6 +195,7 @@ class Parsed:
         event_type = pb2.TrackEvent
         order = {event_type.TYPE_SLICE_END: 0, event_type.TYPE_INSTANT: 1,
                  event_type.TYPE_SLICE_BEGIN: 2}
+        self.begins: list[tuple[str, int]] = []     # as they stand in the file: group, start
         for place, packet in enumerate(trace.packet):
             names.update((e.iid, e.name) for e in packet.interned_data.event_names)
             keys.update((e.iid, e.name) for e in packet.interned_data.debug_annotation_names)
@@ -179,6 +204,8 @@ class Parsed:
             event = packet.track_event
             notes = {keys[n.name_iid]: n.string_value or n.int_value
                      for n in event.debug_annotations}
+            if event.type == event_type.TYPE_SLICE_BEGIN:
+                self.begins.append((self.path(event.track_uuid).split(' > ')[0], packet.timestamp))
             name = event.name or (names[event.name_iid] if event.name_iid else '')
             events.setdefault(event.track_uuid, []).append(
                 (packet.timestamp, order[event.type], place, event, name, notes))
