@@ -79,4 +79,5 @@ def reschedule_bag(
     with Progress('replaying'):
         return run(
             path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
-            times=times, seed=args.seed, dispatch_overhead=args.overheads or 0, name=name)
+            times=times, seed=args.seed, dispatch_overhead=args.overheads or 0, name=name,
+            skip=args.skip)

@@ -51,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     recorded.add_arguments(
         parser, 'compare with what the scheduler would have done in B with the recorded releases '
         'and execution times (in an ordinary bag A, too)')
+    recorded.add_skip(parser)
     add('--callbacks', action='store_true', help='show a table of all callbacks, too')
     add('--fail-on-worse', action='store_true',
         help='exit with status 1 if a sink missed a larger share of its deadlines in B, or its '
@@ -131,7 +132,8 @@ def _result(
     if reschedule or recorded.is_bag(path):
         outcome = recorded.rescheduled(args, path, name, task_set)
     else:
-        outcome, _ = recorded.as_recorded(path, name, task_set, doing=f'replaying {name}')
+        outcome, _ = recorded.as_recorded(
+            path, name, task_set, doing=f'replaying {name}', skip=args.skip)
     for warning in outcome.warnings:
         warn(warning)
     return outcome.result(), outcome.task_set

@@ -40,6 +40,15 @@ def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
     add('--preemptive', action='store_true',
         help='with --reschedule: what is more urgent takes the worker of what runs')
     bags.add_arguments(parser)
+    parser.set_defaults(skip=0)     # who leaves out a warm-up: add_skip
+
+
+def add_skip(parser: argparse.ArgumentParser) -> None:
+    """Declare `--skip`."""
+    parser.add_argument(
+        '--skip', type=options.or_zero(options.duration), default=0, metavar='TIME',
+        help='leave out a warm-up: jobs that were released less than this after the first one, as '
+        '1s, are not judged (default: all are)')
 
 
 def check(args: argparse.Namespace, *files: str | None) -> None:
@@ -84,7 +93,7 @@ def check_declared(path: str, name: str) -> None:
 
 def as_recorded(
     path: str, name: str, task_set: TaskSet | None, watcher: Watcher | None = None,
-    own: type[Recording] | None = None, doing: str = 'replaying',
+    own: type[Recording] | None = None, doing: str = 'replaying', skip: int = 0,
 ) -> tuple[Replay, Recording | None]:
     """
     Replay a recorded run; return what came of it, and the recording where it is of this executor.
@@ -98,7 +107,7 @@ def as_recorded(
     with Progress(doing) as line:
         recording = open_recording(path, name, own or Recording)
         outcome = replay_recording(
-            recording, task_set, line.events, watcher)
+            recording, task_set, line.events, watcher, skip=skip)
     return outcome, recording if isinstance(recording, Recording) else None
 
 
@@ -120,4 +129,4 @@ def rescheduled(
         return reschedule(
             path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
             overheads=recorded, dispatch_overhead=0 if recorded else args.overheads, name=name,
-            progress=line.events)
+            progress=line.events, skip=args.skip)

@@ -45,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'that the trace was recorded with)')
     recorded.add_arguments(
         parser, 'run the scheduler over the recorded releases and execution times')
+    recorded.add_skip(parser)
     add('--callbacks', action='store_true', help='show a table of all callbacks, too')
     verdicts.add_arguments(parser)
     options.add_report(parser)
@@ -71,7 +72,7 @@ def main(args: argparse.Namespace) -> int:
         if args.reschedule or recorded.is_bag(path):
             outcome = recorded.rescheduled(args, path, name, task_set)
         else:
-            outcome = _replay(path, name, task_set, watch, drift)
+            outcome = _replay(path, name, task_set, watch, drift, args.skip)
     for warning in outcome.warnings:
         warn(warning)
     result = outcome.result()
@@ -96,10 +97,12 @@ def _check_arguments(args: argparse.Namespace) -> None:
 
 
 def _replay(
-    path: str, name: str, task_set: TaskSet | None, watch: Watch | None, drift: list[Drift]
+    path: str, name: str, task_set: TaskSet | None, watch: Watch | None, drift: list[Drift],
+    skip: int,
 ) -> Replay:
     from mddag_executor.replay.drift import drift_of_import, WatchedRecording
-    outcome, recording = recorded.as_recorded(path, name, task_set, watch, WatchedRecording)
+    outcome, recording = recorded.as_recorded(
+        path, name, task_set, watch, WatchedRecording, skip=skip)
     if isinstance(recording, WatchedRecording):
         drift.extend(recording.drift(outcome.task_set))
     elif task_set is not None:

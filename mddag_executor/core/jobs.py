@@ -17,11 +17,14 @@ from mddag_executor.core.state import (
     HERE,
     IDLE,
     JOB_END,
+    JUDGE_FROM,
     LAST_HERE,
+    NOT_JUDGED,
     OPEN,
     SINK_ABORTED,
     SINK_EXPIRED,
     SINK_MISSED,
+    SKIP,
     State,
 )
 from mddag_executor.core.tables import NEVER, Tables
@@ -43,6 +46,8 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     s.free_slot[dag] = s.job_next[slot]
     s.job_index[slot] = job
     s.job_release[slot] = release
+    if s.scalars[SKIP] > 0 and s.scalars[JUDGE_FROM] == -NEVER:
+        s.scalars[JUDGE_FROM] = release + s.scalars[SKIP]
     s.job_state[slot] = OPEN
     s.job_sinks_left[slot] = t.first_sink[dag + 1] - t.first_sink[dag] if dag < t.n_dags else 0
     s.job_late[slot] = 0
@@ -110,6 +115,18 @@ def _link_newest(s: State, dag: int, slot: int) -> None:
     s.n_open[dag] += 1
 
 
+def is_judged(s: State, slot: int) -> bool:
+    """Tell whether a job was released when there are verdicts already (rule 6)."""
+    return s.job_release[slot] >= s.scalars[JUDGE_FROM]
+
+
+def judge(s: State, slot: int, kind: int, vertex: int, deadline: int, time: int) -> None:
+    """Say what came of a sink of a job, if it is judged (rule 6)."""
+    if is_judged(s, slot):
+        s.decisions.append(
+            (kind, s.job_dag[slot], vertex, s.job_index[slot], deadline, time))
+
+
 def close_job(s: State, slot: int, end: int, now: int) -> None:
     """End an open job (rule 8): it leaves the open jobs and, when nothing is active, its slot."""
     dag = s.job_dag[slot]
@@ -125,7 +142,8 @@ def close_job(s: State, slot: int, end: int, now: int) -> None:
     s.n_open[dag] -= 1
     s.job_state[slot] = end
     if dag < len(s.oldest) - 1:  # jobs of the undeclared DAG are nobody's to judge
-        s.decisions.append((JOB_END, dag, -1, s.job_index[slot], end, now))
+        judged = -1 if is_judged(s, slot) else NOT_JUDGED
+        s.decisions.append((JOB_END, dag, judged, s.job_index[slot], end, now))
     if s.job_active[slot] == 0:
         _free(s, slot)
 
@@ -168,7 +186,7 @@ def _give_up_sinks(t: Tables, s: State, slot: int, kind: int) -> None:
         vertex = t.sinks[i]
         if s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0:
             deadline = s.job_release[slot] + t.sink_deadline[vertex]
-            s.decisions.append((kind, dag, vertex, s.job_index[slot], deadline, -1))
+            judge(s, slot, kind, vertex, deadline, -1)
 
 
 def overdue(t: Tables, s: State, slot: int, now: int) -> bool:
@@ -193,8 +211,7 @@ def finish(t: Tables, s: State, now: int) -> None:
                 if deadline <= now and s.x_pending[
                         s.job_base[slot] + t.region_offset[vertex]] >= 0:
                     s.job_late[slot] += 1
-                    s.decisions.append(
-                        (SINK_MISSED, dag, vertex, s.job_index[slot], deadline, -1))
+                    judge(s, slot, SINK_MISSED, vertex, deadline, -1)
             slot = s.job_next[slot]
 
 

@@ -31,7 +31,8 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
     waiting one.  Migration is free; overheads are added to what is left to execute.
 6.  **Verdicts.**  A sink that completes after its absolute deadline (release plus its relative
     deadline) is late; at the deadline is in time.  ``finish`` judges what is open when the run
-    ends: an absolute deadline at or before the end has been missed.
+    ends: an absolute deadline at or before the end has been missed.  Jobs that are released less
+    than ``SKIP`` after the first one, or before ``JUDGE_FROM``, get no verdicts: a warm-up.
 7.  **Misses.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops what is left of it, as soon
     as the miss is known: at a late completion, or when something of it comes first in the ready
     queue after the deadline of a sink that is not done.  What has started runs on.
@@ -55,7 +56,7 @@ from __future__ import annotations
 
 from heapq import heappop, heappush
 
-from mddag_executor.core.jobs import abort_job, close_job, deactivate, overdue
+from mddag_executor.core.jobs import abort_job, close_job, deactivate, judge, overdue
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import add_stale, is_stale, poll, wait_for_poll
 from mddag_executor.core.state import (
@@ -317,7 +318,7 @@ def _complete_vertex(
         return
     if t.sink_deadline[vertex] >= 0:
         deadline = s.job_release[slot] + t.sink_deadline[vertex]
-        s.decisions.append((SINK_DONE, dag, vertex, s.job_index[slot], deadline, now))
+        judge(s, slot, SINK_DONE, vertex, deadline, now)
         s.job_sinks_left[slot] -= 1
         if now > deadline:
             s.job_late[slot] += 1

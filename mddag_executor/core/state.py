@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from mddag_executor.core.tables import Tables
+from mddag_executor.core.tables import NEVER, Tables
 
 # States of an execution.
 IDLE, WAITING, RUNNING, SUSPENDED, DONE, DROPPED = range(6)
@@ -26,11 +26,13 @@ ELSEWHERE, HERE, LAST_HERE = range(3)
 
 # Columns of ``scalars``.
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
- N_SCALARS) = range(9)
+ JUDGE_FROM, SKIP, N_SCALARS) = range(11)
 
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  The deadline is that of the
-# sink; the time that of the decision, for a sink that completed the completion, else -1.
+# sink; the time that of the decision, for a sink that completed the completion, else -1.  Instead
+# of a vertex the end of a job has -1, or NOT_JUDGED.
 SINK_DONE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, JOB_END, DROP = range(6)
+NOT_JUDGED = -2
 
 Entry = tuple[int, int, int, int, int]
 """What the ready queue holds: the four integers of a key, then the execution."""
@@ -129,6 +131,7 @@ def fill_state(
     s.scalars[DISPATCH_OVERHEAD] = dispatch_overhead
     s.scalars[SWITCH_OVERHEAD] = switch_overhead
     s.scalars[POLLING] = polling
+    s.scalars[JUDGE_FROM] = -NEVER
     if polling != 0:
         for _ in range(t.n_entities + 1):
             add_queue(s.entity_queue)

@@ -21,6 +21,7 @@ from mddag_executor.core.state import (
     EXPIRED,
     JOB_END,
     LATE,
+    NOT_JUDGED,
     SINK_ABORTED,
     SINK_DONE,
     SINK_EXPIRED,
@@ -190,7 +191,8 @@ class Tally:
         """Count decisions of the core."""
         for kind, dag, vertex, job, deadline, time in decisions:
             if kind == JOB_END:
-                self.ends[dag][deadline] += 1
+                if vertex != NOT_JUDGED:
+                    self.ends[dag][deadline] += 1
             elif kind == DROP:
                 self.dropped += 1
             else:

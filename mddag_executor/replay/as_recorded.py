@@ -93,7 +93,8 @@ class Replay:
                 sink['breakdown'] = self._judge.chains.result(self.task_set, first + local)
                 sink['slack_ns'] = slack(sink)
         return {
-            **result, 'rescheduled': False, 'callbacks': self._usage.callbacks(),
+            **result, 'rescheduled': False, 'skip_ns': self._judge.skip,
+            'callbacks': self._usage.callbacks(),
             'undeclared': self._usage.undeclared.result(),
             'worker_use': self._usage.workers(head.workers, duration),
             'dropped': dict(sorted(self._follower.dropped.items())),
@@ -134,6 +135,7 @@ def replay(
     progress: Progress | None = None,
     watcher: Watcher | None = None,
     compiled: bool | None = None,
+    skip: int = 0,
 ) -> Replay:
     """
     Replay a trace as recorded.
@@ -147,16 +149,18 @@ def replay(
     :param progress: told now and then how many events have been read.
     :param watcher: who else is told of the run.
     :param compiled: whether to use compiled code where that can be; None: for long traces.
+    :param skip: how long after the first release jobs are not judged (a warm-up), ns.
     :raises mddag_executor.trace.TraceError: when it is no trace.
     :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, or none of
         the declaration's callbacks.
     """
-    return replay_recording(open_recording(path, name), task_set, progress, watcher, compiled)
+    return replay_recording(
+        open_recording(path, name), task_set, progress, watcher, compiled, skip)
 
 
 def replay_recording(
     recording: AnyRecording, task_set: TaskSet | None, progress: Progress | None = None,
-    watcher: Watcher | None = None, compiled: bool | None = None,
+    watcher: Watcher | None = None, compiled: bool | None = None, skip: int = 0,
 ) -> Replay:
     """
     Replay an open recording as recorded; see ``replay``.
@@ -168,10 +172,10 @@ def replay_recording(
     batches = watcher if isinstance(watcher, BatchWatcher) else None
     if watcher is batches and isinstance(recording, Recording) and (
             worth_it(recording.message_count) if compiled is None else compiled and available()):
-        found = replay_compiled(recording, mapping, progress, batches)
+        found = replay_compiled(recording, mapping, progress, batches, skip)
         if found is not None:
             return found
-    parts = _Parts(recording, mapping, watcher)
+    parts = _Parts(recording, mapping, watcher, skip)
     follower = parts.follower
     follower.run(progress)
     if isinstance(follower, ImportedFollower):
@@ -182,13 +186,13 @@ def replay_recording(
 
 def replay_compiled(
     recording: Recording, mapping: AnyMapping, progress: Progress | None = None,
-    watcher: BatchWatcher | None = None,
+    watcher: BatchWatcher | None = None, skip: int = 0,
 ) -> Replay | None:
     """Replay a recording in compiled code; None where that can only be done in Python."""
     from mddag_executor.replay.fast import FastReplay
     from mddag_executor.replay.fast_arrays import Declined
     assert isinstance(mapping, Mapping)
-    parts = _Parts(recording, mapping, watcher, in_batches=True)
+    parts = _Parts(recording, mapping, watcher, skip, in_batches=True)
     follower = parts.follower
     assert isinstance(follower, Follower)
     try:
@@ -206,11 +210,11 @@ class _Parts:
 
     def __init__(
         self, recording: AnyRecording, mapping: AnyMapping,
-        watcher: Watcher | None, in_batches: bool = False,
+        watcher: Watcher | None, skip: int, in_batches: bool = False,
     ) -> None:
         self.groups = RecordedGroups()
         waits = GroupWaits(self.groups)
-        self.judge = Judge(mapping.task_set, mapping.same, waits)
+        self.judge = Judge(mapping.task_set, mapping.same, waits, skip)
         self.usage = Usage(mapping.task_set, waits)
         observers: list[Observer] = [waits, self.judge, self.usage]
         self.paths = OwnPaths(mapping.task_set)

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import Decision, new_state
+from mddag_executor.core.state import Decision, JUDGE_FROM, new_state
 from mddag_executor.replay.bags import Bag, BagError, UNKNOWN
 from mddag_executor.replay.timed import busy_times, Engine, Transports
 from mddag_executor.replay.tolerances import MissTally
@@ -59,6 +59,7 @@ class BagReschedule:
     def __init__(
         self, bag: Bag, task_set: TaskSet, *, policy: str, workers: int, preemptive: bool,
         times: Sequence[Sequence[int]] | None, seed: int, dispatch_overhead: int,
+        skip: int = 0,
     ) -> None:
         self._bag = bag
         self.task_set = task_set
@@ -67,6 +68,8 @@ class BagReschedule:
         self.preemptive = preemptive
         self.dispatch_overhead = dispatch_overhead
         self.start, self.end = bag.start or 0, (bag.end or 0) + 1
+        self.skip = skip
+        self.judge_from = self.start + skip if skip else -NEVER
         self.warnings = bag.warnings
         self.notes: list[str] = []
         self.tables = Tables.build(task_set, max_active_jobs=NEVER)
@@ -151,10 +154,12 @@ class BagReschedule:
             dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
         engine = Engine(
             self.tables, state, policy.key, load, Transports.none(self.tables))
+        state.scalars[JUDGE_FROM] = self.judge_from
         engine.run(self.end)
         finish(self.tables, state, self.end)
-        for dag in load.dags:
-            self.tally.released(dag)
+        for dag, release in zip(load.dags, load.releases):
+            if release >= self.judge_from:
+                self.tally.released(dag)
         self.tally.add(state.decisions)
         self.decisions = state.decisions
         return engine.log
@@ -175,7 +180,7 @@ class BagReschedule:
             'policy': self.policy, 'workers': self.workers, 'preemptive': self.preemptive,
             'duration_ns': self.duration_ns,
             'utilisation': share(self.demand, self.workers, self.duration_ns),
-            **self.tally.result(), 'rescheduled': True,
+            **self.tally.result(), 'rescheduled': True, 'skip_ns': self.skip,
             'executions': self.executions, 'estimated_executions': 0,
             'overheads': {
                 'included': False, 'added_ns': self.dispatch_overhead,
@@ -213,6 +218,7 @@ def reschedule_bag(
     times: Sequence[Sequence[int]] | None = None,
     seed: int = 0,
     dispatch_overhead: int = 0,
+    skip: int = 0,
     name: str | None = None,
 ) -> BagReschedule:
     """
@@ -223,6 +229,7 @@ def reschedule_bag(
     :param workers: size of the pool; None: as declared, else 7.
     :param times: execution times by DAG and vertex, ns; None: drawn from the declared ones.
     :param dispatch_overhead: added to each execution, ns.
+    :param skip: how long after the bag's first message jobs are not judged (a warm-up), ns.
     :param name: what messages call the bag, where that is not its path.
     :raises BagError: where there is no bag, or none of the sources is in it.
     :raises mddag_executor.simulate.SimulationError: where an execution time is not known.
@@ -244,4 +251,5 @@ def reschedule_bag(
         raise BagError(bag.name, what.removeprefix(f'{bag.name}: '), 'record one anew')
     return BagReschedule(
         bag, task_set, policy=policy, workers=workers or task_set.workers or DEFAULT_WORKERS,
-        preemptive=preemptive, times=times, seed=seed, dispatch_overhead=dispatch_overhead)
+        preemptive=preemptive, times=times, seed=seed, dispatch_overhead=dispatch_overhead,
+        skip=skip)

@@ -98,7 +98,8 @@ class FastReplay:
         names = set(self._follower.handlers)
         if self._watched is not None:
             names |= self._watched.names()
-        self._do['begin_run'](self._tables.address, self._state.address)
+        self._do['begin_run'](
+            self._tables.address, self._state.address, self._judge.skip)
         try:
             count = 0
             for columns in self._recording.columns(names, fw.KINDS, self._do['scan']):

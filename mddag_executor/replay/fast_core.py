@@ -47,7 +47,8 @@ def on_release(t: Any, s: Any, w: Any, now: int, dag: int, job: int, release: in
         row = insert(w.slots, dag, job, 0, 0)
         count_row(w, fw.SLOTS, len(w.slots))
     w.slots[row, fw.S_SLOT] = slot
-    w.released[dag] += 1
+    if jobs.is_judged(s, slot):
+        w.released[dag] += 1
     base = s.job_base[slot]
     for x in range(base, base + t.n_region[dag]):
         w.chain[x, fw.K_KNOWN] = 0

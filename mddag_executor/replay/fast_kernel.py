@@ -19,7 +19,7 @@ from __future__ import annotations
 from typing import Any
 
 from mddag_executor.core import jobs
-from mddag_executor.core.state import fill_state
+from mddag_executor.core.state import fill_state, SKIP
 from mddag_executor.core.tables import NEVER
 from mddag_executor.replay import fast_work as fw
 from mddag_executor.replay.fast_core import (
@@ -120,9 +120,11 @@ def on_event(t: Any, s: Any, w: Any, i: int) -> int:
     return fw.ALL_DONE if fine else fw.DECLINED
 
 
-def begin_run(tables: int, state: int) -> None:
+def begin_run(tables: int, state: int, skip: int) -> None:
     """Make the core's state as ``judge`` has it."""
-    fill_state(as_tables(tables), as_state(state), 1, 0, 0, 0, 0, 0)
+    s = as_state(state)
+    fill_state(as_tables(tables), s, 1, 0, 0, 0, 0, 0)
+    s.scalars[SKIP] = skip
 
 
 def finish_run(tables: int, state: int, work: int, now: int) -> bool:

@@ -21,15 +21,18 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core.jobs import is_judged
 from mddag_executor.core.state import (
     Decision,
     DROP,
     IDLE,
     JOB_END,
+    JUDGE_FROM,
     SINK_ABORTED,
     SINK_DONE,
     SINK_EXPIRED,
     SINK_MISSED,
+    SKIP,
 )
 from mddag_executor.core.tables import CONTINUE
 from mddag_executor.replay.chains import Chains
@@ -63,10 +66,13 @@ class Judge(Observer):
     :param task_set: the declaration that judges.
     :param compare: whether recorded misses must equal those found.
     :param waits: knows what was waited for; told before.
+    :param skip: how long after the first release jobs are not judged, ns.
+    :param judge_from: jobs released before are not judged.
     """
 
     def __init__(
-        self, task_set: TaskSet, compare: bool, waits: GroupWaits | None = None
+        self, task_set: TaskSet, compare: bool, waits: GroupWaits | None = None, skip: int = 0,
+        judge_from: int = -NEVER,
     ) -> None:
         self._waits = waits
         # by DAG, vertex, job and ready time: how long an execution waited for its group, ns
@@ -82,6 +88,8 @@ class Judge(Observer):
         #: Who else is told what the core decides.
         self.listeners: list[Callable[[Sequence[Decision]], None]] = []
         self._scheduler = Scheduler(self.tables, 1, propagate=False)
+        self._scheduler.state.scalars[SKIP] = self.skip = skip
+        self._scheduler.state.scalars[JUDGE_FROM] = judge_from
         self._slots: dict[tuple[int, int], int] = {}
         self._newest: dict[int, int] = {}
         #: Whether recorded misses must equal those found.
@@ -97,6 +105,11 @@ class Judge(Observer):
         self._scheduler.expect(dag, [int(v in vertices) for v in range(first, last)])
 
     @property
+    def judge_from(self) -> int:
+        """Return the first release that is judged."""
+        return self._scheduler.state.scalars[JUDGE_FROM]
+
+    @property
     def expected(self) -> dict[str, list[int]]:
         """Return the columns of the core's state that tell what is expected here."""
         state = self._scheduler.state
@@ -107,7 +120,8 @@ class Judge(Observer):
         self._newest[dag] = job
         slot = self._scheduler.release(dag, job, release, now)
         self._slots[(dag, job)] = slot
-        self.tally.released(dag)
+        if is_judged(self._scheduler.state, slot):
+            self.tally.released(dag)
         self.chains.begin(slot, release)
 
     def started(self, dag: int, vertex: int, job: int, ready: int, start: int) -> None:
@@ -192,6 +206,8 @@ class Judge(Observer):
 
     def differ(self, miss: Miss, side: int) -> None:
         """Take in a miss that was found here (side 1) or recorded (-1)."""
+        if self.skip:
+            return  # what was recorded is of all jobs
         difference = self._open_misses.pop(miss, 0) + side
         if difference:
             self._open_misses[miss] = difference

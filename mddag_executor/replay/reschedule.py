@@ -16,7 +16,7 @@ from typing import Any
 from mddag_executor.core import NEVER, POLICIES, Tables
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import Decision, new_state
+from mddag_executor.core.state import Decision, JUDGE_FROM, new_state
 from mddag_executor.errors import UsageError
 from mddag_executor.replay.as_recorded import Progress, recording_result, Replay
 from mddag_executor.replay.following import (
@@ -53,7 +53,7 @@ class Reschedule:
     def __init__(
         self, recording: AnyRecording, follower: AnyFollower, recorded: Replay, work: RecordedLoad,
         tables: Tables, policy: str, workers: int, preemptive: bool, overheads: bool,
-        dispatch_overhead: int = 0,
+        dispatch_overhead: int = 0, judge_from: int = -NEVER, skip: int = 0,
     ) -> None:
         self._recording = recording
         self._follower = follower
@@ -66,6 +66,8 @@ class Reschedule:
         self.preemptive = preemptive
         self.overheads = overheads
         self.dispatch_overhead = dispatch_overhead
+        self.judge_from = judge_from
+        self.skip = skip
         self.warnings = recorded.warnings
         self.log: list[LogEntry]
         self.decisions: list[Decision]
@@ -77,6 +79,7 @@ class Reschedule:
         state = new_state(
             self.tables, self.workers, preemptive=policy.mode(self.preemptive), propagate=2,
             dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
+        state.scalars[JUDGE_FROM] = self.judge_from
         load, end = self._work.load, self._follower.end
         engine = Engine(
             self.tables, state, policy.key, load, self._work.transports)
@@ -84,8 +87,8 @@ class Reschedule:
         self.log = engine.log
         self.decisions = state.decisions
         finish(self.tables, state, end)
-        for time, dag in zip(load.times, load.dags):
-            if time < end:
+        for time, dag, release in zip(load.times, load.dags, load.releases or load.times):
+            if time < end and release >= self.judge_from:
                 self.tally.released(dag)
         self.tally.add(state.decisions)
 
@@ -120,7 +123,7 @@ class Reschedule:
             'policy': self.policy, 'workers': self.workers, 'preemptive': self.preemptive,
             'duration_ns': duration,
             'utilisation': share(self._work.demand, self.workers, duration),
-            **verdicts, 'first_miss': miss, 'rescheduled': True,
+            **verdicts, 'first_miss': miss, 'rescheduled': True, 'skip_ns': self.skip,
             'executions': self._work.executions, 'estimated_executions': self._work.estimated,
             'overheads': {
                 'included': self.overheads, 'added_ns': self.dispatch_overhead,
@@ -147,6 +150,7 @@ def reschedule(
     dispatch_overhead: int = 0,
     name: str | None = None,
     progress: Progress | None = None,
+    skip: int = 0,
 ) -> Reschedule:
     """
     Run the core over the releases and execution times of a trace.
@@ -161,6 +165,7 @@ def reschedule(
     :param dispatch_overhead: added to each execution, ns.
     :param name: what messages call the trace, where that is not its path.
     :param progress: told now and then how many events have been read.
+    :param skip: how long after the first release jobs are not judged (a warm-up), ns.
     :raises mddag_executor.trace.TraceError: when it is no trace.
     :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, none of the
         declaration's callbacks, or an execution time that is neither recorded nor declared.
@@ -177,7 +182,7 @@ def reschedule(
     bound = head.max_active_jobs if head.max_active_jobs > 0 else NEVER
     tables = Tables.build(
         mapping.task_set, default_deadline=head.default_deadline, max_active_jobs=bound)
-    judge = Judge(mapping.task_set, compare=mapping.same)
+    judge = Judge(mapping.task_set, compare=mapping.same, skip=skip)
     usage = Usage(mapping.task_set)
     groups = RecordedGroups()
     builder = LoadBuilder(mapping.task_set, tables, groups, head.workers)
@@ -194,7 +199,7 @@ def reschedule(
         tables, builder.callback_of, groups.by_callback(), declared_first=not mapping.same)
     return Reschedule(
         recording, follower, recorded, work, tables, policy, workers, preemptive, overheads,
-        dispatch_overhead)
+        dispatch_overhead, judge.judge_from, skip)
 
 
 def _settings(

@@ -11,7 +11,7 @@ response time grew by more than that.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from mddag_executor.core.tally import counts, total
@@ -20,8 +20,12 @@ from mddag_executor.report.text import Cell, format_ns, printable, table
 from mddag_executor.text import counted
 
 _KEYS = ('min', 'median', 'p99', 'max')
-_HEADER = ('DAG', 'sink', 'due', 'then', 'in time', 'then', 'late', 'then', 'median', 'change',
-           'p99', 'change', 'max', 'change', '')
+_HEADER = ('DAG', 'sink', 'due', 'then', 'in time', 'then', 'share', 'then', 'late', 'then',
+           'median', 'change', 'p99', 'change', 'max', 'change', '')
+
+_COUNTS: tuple[Callable[[Mapping[str, Any]], Cell], ...] = (
+    lambda side: side['due'], lambda side: side['in_time'],
+    lambda side: percent(side['in_time'], side['due']), lambda side: side['late'])
 
 
 def compare(
@@ -66,7 +70,8 @@ def _run(result: Mapping[str, Any]) -> dict[str, Any]:
         'trace': result['recording']['trace'], 'policy': result['policy'],
         'workers': result['workers'], 'duration_ns': result['duration_ns'],
         'utilisation': result['utilisation'], 'imported': 'recorded_callbacks' in result,
-        'rescheduled': result['rescheduled'], **every._asdict()}
+        'rescheduled': result['rescheduled'], 'skip_ns': result['skip_ns'],
+        **every._asdict()}
 
 
 def _side(sink: Mapping[str, Any] | None) -> dict[str, Any] | None:
@@ -113,8 +118,8 @@ def sinks_table(difference: Mapping[str, Any]) -> str:
         shown = dag_name
         for name, sink in dag['sinks'].items():
             row: list[Cell] = [shown, short[name]]
-            for key in ('due', 'in_time', 'late'):
-                row.extend(None if side is None else side[key]
+            for cell in _COUNTS:
+                row.extend(None if side is None else cell(side)
                            for side in (sink['a'], sink['b']))
             for key in _KEYS[1:]:
                 row.extend(_response(sink, key))
@@ -172,6 +177,9 @@ def summary(difference: Mapping[str, Any]) -> Iterator[str]:
                f'({percent(run["in_time"], run["due"])}), {run["late"]} late, '
                f'{run["expired"]} expired; ' + ('rescheduled, ' if run['rescheduled'] else '')
                + f'{pool}, {format_ns(run["duration_ns"])}')
+    if difference['a']['skip_ns']:
+        yield ('left out in both: jobs released in the first '
+               + format_ns(difference['a']['skip_ns']))
     n = sum(sink['worse'] for dag in difference['dags'].values()
             for sink in dag['sinks'].values())
     yield f'worse in the second run: {counted(n, "sink")}'

@@ -253,7 +253,7 @@ class Exporter(Observer):
 
 def export_schedule(schedule: Schedule, target: Target) -> None:
     """Hand out the rows of a schedule that was computed."""
-    judge = Judge(schedule.task_set, compare=False)
+    judge = Judge(schedule.task_set, compare=False, judge_from=schedule.judge_from)
     exporter = Exporter(target)
     tell(schedule, [judge, *exporter.observers(schedule.task_set, judge)])
     exporter.finish()

@@ -159,7 +159,7 @@ def of_run(task_set: TaskSet, load: Load, run: Run) -> ReportData:
 def _told(schedule: Schedule) -> Watch:
     """Return a watch that was told of a schedule."""
     watch = Watch()
-    judge = Judge(schedule.task_set, compare=False)
+    judge = Judge(schedule.task_set, compare=False, judge_from=schedule.judge_from)
     tell(schedule, [judge, *watch.observers(schedule.task_set, judge)])
     return watch
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from mddag_executor.core.tally import counts
-from mddag_executor.report.tables import each_sink, never_due_lines, verdicts_line
+from mddag_executor.report.tables import each_sink, never_due_lines, percent, verdicts_line
 from mddag_executor.report.text import Cell, format_ns, printable, table
 from mddag_executor.text import counted
 
@@ -20,8 +20,8 @@ CALLBACKS_HEADER = (
 RECORDED_HEADER = ('callback', 'executions', 'busy', 'shortest', 'mean', 'longest')
 PATHS_HEADER = ('path', 'arrived', 'case', 'count', 'min', 'median', 'p99', 'max')
 _COMPARISON_HEADER = (
-    'DAG', 'sink', 'deadline', 'in time', 'recorded', 'median', 'recorded', 'p99', 'recorded',
-    'max', 'recorded')
+    'DAG', 'sink', 'deadline', 'in time', 'share', 'recorded', 'share', 'median',
+    'recorded', 'p99', 'recorded', 'max', 'recorded')
 
 
 def times_table(dags: Mapping[str, Any]) -> str:
@@ -136,7 +136,8 @@ def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> st
             sink.shown_dag, sink.shown_name, format_ns(sink.result['relative_deadline_ns'])]
         for side in sides:
             verdicts = counts(side)
-            row.append(f'{verdicts.in_time} of {verdicts.due}')
+            row.extend((f'{verdicts.in_time} of {verdicts.due}',
+                        percent(verdicts.in_time, verdicts.due)))
         for key in ('median', 'p99', 'max'):
             for side in sides:
                 response = side['response_ns']
@@ -149,6 +150,8 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the tables of a replay."""
     yield verdicts_line(result['dags'])
     yield from never_due_lines(result['dags'])
+    if result['skip_ns']:
+        yield f'left out: jobs released in the first {format_ns(result["skip_ns"])}'
     pool = f'policy {printable(result["policy"])}, ' + counted(result['workers'], 'worker')
     if 'recorded_callbacks' in result:      # another executor ran it
         pool = f'imported: {counted(result["workers"], "thread")} ran callbacks'

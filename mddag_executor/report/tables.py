@@ -18,7 +18,8 @@ from mddag_executor.core.tally import counts, never_due, total
 from mddag_executor.report.text import Cell, format_ns, listed, table
 from mddag_executor.text import counted
 
-HEADER = ('DAG', 'sink', 'due', 'in time', 'late', 'expired', 'median', 'p99', 'max', 'deadline')
+HEADER = ('DAG', 'sink', 'due', 'in time', 'share', 'late', 'expired', 'median', 'p99', 'max',
+          'deadline')
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
@@ -61,12 +62,13 @@ def each_sink(dags: Mapping[str, Any]) -> Iterator[Sink]:
 def sink_table(dags: Mapping[str, Any]) -> str:
     """Return a table with a row for each sink: counts, and response times by its deadline."""
     some_aborted = total(dags).aborted > 0
-    header = [*HEADER[:6], *(['aborted'] if some_aborted else []), *HEADER[6:]]
+    header = [*HEADER[:7], *(['aborted'] if some_aborted else []), *HEADER[7:]]
     rows: list[list[Cell]] = []
     for sink in each_sink(dags):
         verdicts = counts(sink.result)
         rows.append([
-            sink.shown_dag, sink.shown_name, verdicts.due, verdicts.in_time, verdicts.late,
+            sink.shown_dag, sink.shown_name, verdicts.due, verdicts.in_time,
+            percent(verdicts.in_time, verdicts.due), verdicts.late,
             verdicts.expired, *([verdicts.aborted] if some_aborted else []),
             *response_cells(sink.result['response_ns']),
             format_ns(sink.result['relative_deadline_ns'])])

@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
+from mddag_executor.core import NEVER
 from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END
 from mddag_executor.replay import Reschedule
 from mddag_executor.replay.bags_reschedule import BagReschedule
@@ -42,6 +43,7 @@ class Schedule(NamedTuple):
     :ivar end: when it ended, ns; what is open then is judged if ``judged``.
     :ivar numbers: by DAG, what a job of the load is called; None: as in the load.
     :ivar delay: how long messages take; None: no time.
+    :ivar judge_from: jobs released before are not judged.
     """
 
     task_set: TaskSet
@@ -53,13 +55,14 @@ class Schedule(NamedTuple):
     judged: bool = True
     numbers: list[list[int]] | None = None
     delay: Delay | None = None
+    judge_from: int = -NEVER
 
 
 def of_rescheduled(outcome: Reschedule | BagReschedule) -> Schedule:
     """Return the schedule of a recording or a bag that was rescheduled."""
     if isinstance(outcome, BagReschedule):
         return Schedule(outcome.task_set, outcome.load, outcome.log, outcome.decisions,
-                        outcome.end, outcome.end)
+                        outcome.end, outcome.end, judge_from=outcome.judge_from)
     transports, tables = outcome.work.transports, outcome.tables
     edges = {
         (v, tables.successors[i]): i - tables.first_successor[tables.first_vertex[dag]]
@@ -72,7 +75,7 @@ def of_rescheduled(outcome: Reschedule | BagReschedule) -> Schedule:
 
     return Schedule(
         outcome.task_set, outcome.work.load, outcome.log, outcome.decisions, outcome.end_ns,
-        outcome.end_ns, True, outcome.work.jobs, delay)
+        outcome.end_ns, True, outcome.work.jobs, delay, outcome.judge_from)
 
 
 def tell(schedule: Schedule, observers: Sequence[Observer]) -> None:

@@ -60,8 +60,8 @@ def test_the_tables(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = call(capsys, trace)
     assert (status, err) == (0, '')
     lines = [line.split() for line in out.splitlines()]
-    assert ['/driver', 'filter:run', '3', '2', '1', '0', '6', 'ms', '10', 'ms', '10', 'ms', '8',
-            'ms'] in lines
+    assert ['/driver', 'filter:run', '3', '2', '66.67', '%', '1', '0', '6', 'ms', '10', 'ms', '10',
+            'ms', '8', 'ms'] in lines
     assert ('Where the response times went: means, and the worst job of each sink:'
             in out.splitlines())
     assert ['/driver', 'filter:run', '0', 'ns', '1', 'ms', '0', 'ns', '6', 'ms', '0', 'ns', '0',
@@ -136,8 +136,9 @@ def test_reschedule(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
         '--overheads', 'none')
     assert (status, err) == (0, '')
     lines = [line.split() for line in out.splitlines()]
-    assert ['/driver', 'filter:run', '8', 'ms', '2', 'of', '3', '2', 'of', '3', '5', 'ms', '6',
-            'ms', '9', 'ms', '10', 'ms', '9', 'ms', '10', 'ms'] in lines
+    assert ['/driver', 'filter:run', '8', 'ms', '2', 'of', '3', '66.67', '%', '2', 'of', '3',
+            '66.67', '%', '5', 'ms', '6', 'ms', '9', 'ms', '10', 'ms', '9', 'ms', '10',
+            'ms'] in lines
     assert 'policy fifo, 1 worker, preemptive, 40 ms, utilisation 0.450' in out
     assert 'first miss: /filter:run, job 2, 1 ms late' in out
     result = json.loads(call(capsys, trace, '--reschedule', '--json', '-')[1])

@@ -42,25 +42,27 @@ paths:
 """
 
 
-def said(path: Path, compiled: bool, graph: TaskSet | None = None) -> tuple[str, Any] | None:
+def said(
+    path: Path, compiled: bool, graph: TaskSet | None = None, skip: int = 0
+) -> tuple[str, Any] | None:
     """Return the result and the drift of a replay; None where it is declined."""
     recording = WatchedRecording(path)
     if compiled:
-        outcome = replay_compiled(recording, map_recording(recording, graph))
+        outcome = replay_compiled(recording, map_recording(recording, graph), skip=skip)
         if outcome is None:
             return None
     else:
-        outcome = replay_recording(recording, graph, compiled=False)
+        outcome = replay_recording(recording, graph, compiled=False, skip=skip)
     drift = [each.result() for each in recording.drift(outcome.task_set)]
     return json.dumps(outcome.result(), indent=0), drift
 
 
-def compare(path: Path, graph: TaskSet | None = None) -> bool:
+def compare(path: Path, graph: TaskSet | None = None, skip: int = 0) -> bool:
     """Compare the two; tell whether the compiled one took it."""
-    found = said(path, True, graph)
+    found = said(path, True, graph, skip)
     if found is None:
         return False
-    expected = said(path, False, graph)
+    expected = said(path, False, graph, skip)
     assert expected is not None
     assert found[0].split('\n') == expected[0].split('\n')
     assert found[1] == expected[1]
@@ -85,6 +87,13 @@ def test_paths_and_every_kind_of_verdict(tmp_path: Path, seed: int) -> None:
     VirtualRun(path, loads(text, 'g.yaml'), seed, duration=400 * MS,
                chances=Chances(undeclared=1))
     assert compare(path)
+
+
+@pytest.mark.parametrize('skip', [1, 100 * MS, 399 * MS])
+def test_a_warm_up(tmp_path: Path, skip: int) -> None:
+    path = tmp_path / 'a.mcap'
+    VirtualRun(path, loads(SMALL + PATHS, 'g.yaml'), 4, duration=400 * MS)
+    assert compare(path, skip=skip)
 
 
 def test_another_declaration(tmp_path: Path) -> None:

@@ -174,6 +174,34 @@ def test_junit_on_the_command_line(
 
 
 @pytest.mark.parametrize('mode', [[], ['--reschedule']])
+def test_a_warm_up_is_left_out(
+    trace: Path, tmp_path: Path, mode: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The jobs 2 and 3, released 20 ms and 30 ms after the first, are the late ones."""
+    for skip, due, late in (('0', 10, 2), ('20ms', 8, 2), ('20001us', 7, 1), ('31ms', 6, 0)):
+        arguments = ['replay', str(trace), *mode, '--skip', skip]
+        assert program.main([*arguments, '--fail-on-miss']) == (late > 0)
+        output = capsys.readouterr()
+        assert output.err == '' and f'{due} sink jobs due, {due - late} in time' in output.out
+        assert ('left out: jobs released in the first' in output.out) == (skip != '0')
+        assert program.main([*arguments, '--json', '-']) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert result['dags']['/n']['jobs'] == due
+        assert result['dags']['/n']['ends'] == {
+            'completed': due - late, 'late': late, 'aborted': 0, 'expired': 0}
+        assert result['skip_ns'] == {'0': 0, '20ms': 20 * MS, '20001us': 20_001_000}.get(
+            skip, 31 * MS)
+    page = tmp_path / 'report.html'
+    assert program.main([*arguments, '--report', str(page)]) == 0
+    assert '6 sink jobs due, 6 in time (100.00 %)' in page.read_text()
+    capsys.readouterr()
+    assert program.main(['diff', str(trace), str(trace), *mode, '--skip', '31ms']) == 0
+    output = capsys.readouterr().out
+    assert 'left out in both: jobs released in the first 31 ms' in output
+    assert output.splitlines()[1].split()[2:8] == ['6', '6', '6', '6', '100.00', '%']
+
+
+@pytest.mark.parametrize('mode', [[], ['--reschedule']])
 def test_where_nothing_was_due_nothing_is_proven(
     trace: Path, tmp_path: Path, mode: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
