@@ -66,7 +66,8 @@ def test_the_tables(result: dict[str, Any]) -> None:
     difference = compare(result, after)
     line = sinks_table(difference).splitlines()[1].split()
     assert line == ['/driver', 'filter:run', '3', '3', '2', '1', '66.67', '%', '33.33', '%',
-                    '1', '2', '6', 'ms', '+50.0', '%', '10', 'ms', '+100.0', '%', '10', 'ms', '+100.0', '%', 'worse']
+                    '1', '2', '6', 'ms', '+50.0', '%', '10', 'ms', '+100.0', '%', '10', 'ms',
+                    '+100.0', '%', 'worse']
     table = [row.split() for row in callbacks_table(difference).splitlines()]
     assert ['/driver:tick', '3', '3', '3', 'ms', '3', 'ms', '6', 'ms', '6', 'ms', '0', 'ns', '0',
             'ns'] in table
