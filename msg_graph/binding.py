@@ -13,18 +13,23 @@ with periods, subscriptions with topics and services with names.
    out in the order of their declaration: nodes make their entities in the order in which tools
    count the callbacks.
 3. A sync callback has one entity for each of its topics, its *legs*.
-4. What no declared callback is left for is not declared.
+4. What no declared callback is left for is not declared. It is called by its node, its function
+   and what it is, as in `/camera: on_image (subscription /image)`.
 """
 
 from __future__ import annotations
 
 from heapq import heappop, heappush
+import re
 
 from msg_graph.model import Callback, TaskSet
 
 # A timer made from a float of seconds is off by rounding (rclpy cuts off fractions of a ns), and
 # declared periods like 33.333ms are rounded themselves.
 _PERIOD_TOLERANCE = 1e-3
+
+_PYTHON = re.compile(r'(?:[\w<>]+\.)*(\w+|<lambda>)')
+_CPP = re.compile(r'[\w:<>*& ]*?\b(\w+)\([^()]*\)')
 
 
 class Binder:
@@ -108,6 +113,29 @@ class Binder:
         place = heappop(free)
         self._bound[place].add(start)
         return self._callbacks[place]
+
+
+def function_of(symbol: str) -> str | None:
+    """
+    Return the name of the function that a recorded symbol stands for, None where it has none.
+
+    :param symbol: `package.module.Class.function`, or what rclcpp records.
+    """
+    found = _PYTHON.fullmatch(symbol) or _CPP.fullmatch(symbol)
+    return None if found is None else found[1]
+
+
+def entity_name(node: str, symbol: str, what: str) -> str:
+    """
+    Return what a callback is called that is not declared.
+
+    :param symbol: that of its function; empty where there is none.
+    :param what: its kind and what starts it, as `timer 100ms`.
+    """
+    function = function_of(symbol)
+    if not node:
+        return f'{function or "callback"} ({what})'
+    return f'{node}: {what}' if function is None else f'{node}: {function} ({what})'
 
 
 def _legs(callback: Callback) -> list[tuple[str, str]]:

@@ -5,12 +5,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import functools
 import types
 from typing import Any
 
 from mddag_executor.core import Tables
 from mddag_executor.live.attribution import Origin
 from msg_graph import Callback, TaskSet
+from msg_graph.binding import entity_name
 from rclpy.exceptions import InvalidHandle
 
 TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
@@ -103,6 +105,25 @@ class Entry:
         # taken from before a callback runs: it raises once the entity is destroyed
         self.handle = entity.handle if kind in _HANDLED else None
 
+    @property
+    def symbol(self) -> str:
+        """Return module and name of what it calls, as ``rclcpp_callback_register`` has it."""
+        function: Any = getattr(self.entity, 'callback', None)
+        while isinstance(function, functools.partial):
+            function = function.func
+        if function is None:
+            function = None if self.kind in (CLIENT, TASK) else type(self.entity)
+        elif not hasattr(function, '__qualname__'):
+            function = type(function)
+        return '' if function is None else f'{function.__module__}.{function.__qualname__}'
+
+    @property
+    def name(self) -> str:
+        """Return the key of its declared callback, or what an undeclared one is called."""
+        if self.callback is not None:
+            return self.callback.key
+        return entity_name(self.node, self.symbol, f'{self.kind} {self.label}'.rstrip())
+
     def count_into(self, counts: dict[str, dict[str, Any]]) -> None:
         """
         Add what there is to count to the counts of this entry's callback.
@@ -111,8 +132,7 @@ class Entry:
         """
         if self.callback is None and not self.ready + self.skipped + self.dropped:
             return
-        name = f'{self.node}:{self.label}' if self.callback is None else self.callback.key
-        total = counts.setdefault(name, {
+        total = counts.setdefault(self.name, {
             'kind': self.kind, 'declared': self.callback is not None, 'waiting': 0,
             **dict.fromkeys(COUNTS, 0)})
         for key in COUNTS:

@@ -170,7 +170,9 @@ class MultiDeadlineExecutor(Stepping):
             self._dispatcher, self._registry, task_set, self, self._fail, self._recorder,
             self._pool, self._gathering)
         self._new_tasks: deque[Work] = deque()
-        self._task_entry = Entry(TASK, None, '', None, -1, 0, 'task')
+        self._task_entry = Entry(TASK, None, '', None, -1, 0, '')
+        if self._recorder is not None:
+            self._recorder.entities((), [self._task_entry])
         self._rates = RateWatch(self._registry)
         self._intake = None
         super().__init__(context=context)

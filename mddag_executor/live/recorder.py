@@ -18,13 +18,6 @@ from rclpy.logging import get_logger
 from rclpy.utilities import get_rmw_implementation_identifier
 
 
-def _symbol(callback: Any) -> str:
-    """Return a name for a callback, as CARET's ``rclcpp_callback_register`` has it."""
-    module = getattr(callback, '__module__', None) or '?'
-    name = getattr(callback, '__qualname__', None) or type(callback).__qualname__
-    return f'{module}.{name}'
-
-
 class Recorder:
     """
     The trace of one executor.
@@ -97,8 +90,9 @@ class Recorder:
             self._say('rcl_service_init', entity, node, entity, entry.label)
             self._say('rclcpp_service_callback_added', entity, entry.address)
         else:
+            self._say('rclcpp_callback_register', entry.address, entry.name)
             return
-        self._say('rclcpp_callback_register', entry.address, _symbol(entry.entity.callback))
+        self._say('rclcpp_callback_register', entry.address, entry.symbol)
         group = getattr(entry.entity, 'callback_group', None)
         if group is not None and group not in self._known:
             self._known.add(group)

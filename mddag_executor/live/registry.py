@@ -23,6 +23,7 @@ from mddag_executor.live.entries import (
 )
 from msg_graph import Callback, TaskSet
 from msg_graph.binding import Binder
+from msg_graph.duration import exact_duration
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.qos import HistoryPolicy
@@ -35,10 +36,6 @@ KINDS = (
 def source_depth(period_ns: int, deadline_ns: int) -> int:
     """Return how many releases of a timer source may wait: as many as can still be in time."""
     return max(1, -(-deadline_ns // period_ns))
-
-
-def _timer_label(period_ns: int) -> str:
-    return f'timer {period_ns} ns'
 
 
 def looked_after(entity: Any) -> bool:
@@ -126,7 +123,7 @@ class Registry:
         if entry.kind != TIMER or entry.callback is not None or self._binder is None:
             return False
         try:
-            return entry.label != _timer_label(entry.entity.timer_period_ns)
+            return entry.label != exact_duration(entry.entity.timer_period_ns)
         except InvalidHandle:
             return False  # destroyed meanwhile
 
@@ -194,20 +191,23 @@ class Registry:
         return [entry for entry in self._entries.values() if entry.kind == TIMER]
 
     def _new_entry(self, kind: str, entity: Any, node: str) -> Entry | None:
-        callback, topic, depth, label = None, '', 0, kind
+        callback, topic, depth, label = None, '', 0, ''
         try:
             if kind == TIMER:
                 period = entity.timer_period_ns
-                depth, label = 1, _timer_label(period)
+                depth, label = 1, exact_duration(period)
                 callback = self._binder.bind_timer(node, period) if self._binder else None
             elif kind == SUBSCRIPTION:
                 topic = label = entity.topic_name
                 qos = entity.qos_profile
                 depth = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else 0
                 callback = self._binder.bind_subscription(node, topic) if self._binder else None
-            elif kind == SERVICE:
+            elif kind in (SERVICE, CLIENT):
                 label = entity.service_name if hasattr(entity, 'service_name') else entity.srv_name
-                callback = self._binder.bind_service(node, label) if self._binder else None
+                if kind == SERVICE and self._binder is not None:
+                    callback = self._binder.bind_service(node, label)
+            elif kind == GUARD:
+                label = 'condition'
         except Exception as error:
             if type(error).__name__ == 'InvalidHandle':
                 return None  # destroyed between being listed and looked at

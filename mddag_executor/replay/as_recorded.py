@@ -26,6 +26,7 @@ from mddag_executor.replay.imported import ImportedRecording
 from mddag_executor.replay.imported_jobs import ImportedFollower
 from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.mapping import Mapping
+from mddag_executor.replay.names import CallbackNames
 from mddag_executor.replay.own_paths import OwnPaths
 from mddag_executor.replay.path_flows import Flows
 from mddag_executor.replay.path_results import path_results
@@ -227,7 +228,9 @@ class _Parts:
                 watcher.begin(mapping.task_set, self.judge, self.usage)
             else:
                 observers.extend(watcher.observers(mapping.task_set, self.judge))
-            handlers.append(watcher.handlers())
+            names = CallbackNames()
+            watcher.name_by(names)
+            handlers.append(names.handlers())
         self.seen = Seen()
         self.follower = make_follower(
             recording, mapping, observers, merged(*handlers), [self.seen])

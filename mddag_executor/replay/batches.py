@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from mddag_executor.core.state import Decision
 from mddag_executor.replay import fast_work as fw
-from mddag_executor.replay.follower import Event, Observer
+from mddag_executor.replay.follower import Observer
 from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.usage import Usage
 from msg_graph import TaskSet
@@ -47,8 +47,8 @@ class Watcher(Protocol):
     def observers(self, task_set: TaskSet, judge: Judge) -> Sequence[Observer]:
         """Return observers; they are told after the judge.  What was told before is forgotten."""
 
-    def handlers(self) -> dict[str, Callable[[Event], None]]:
-        """Return what else the follower is to tell."""
+    def name_by(self, names: Callable[[int], str]) -> None:
+        """Take in what tells the names of callbacks that are not declared, by their address."""
 
 
 @runtime_checkable

@@ -45,8 +45,9 @@ from mddag_executor.core.state import (
     SINK_MISSED,
 )
 from mddag_executor.errors import MddagError
-from mddag_executor.replay.follower import Event, Execution, Observer, Piece
+from mddag_executor.replay.follower import Execution, Observer, Piece
 from mddag_executor.replay.judge import Judge
+from mddag_executor.replay.names import no_names
 from mddag_executor.report.text import printable
 from mddag_executor.report.timeline_log import Schedule, tell
 from msg_graph import TaskSet
@@ -134,7 +135,7 @@ class Exporter(Observer):
 
     def __init__(self, target: Target) -> None:
         self.target = target
-        self._symbols: dict[int, str] = {}
+        self._name_of: Callable[[int], str] = no_names
         self._jobs: dict[tuple[int, int], int] = {}
         # by vertex, job and ready time: what has ended, until it is known what it completed
         self._held: dict[tuple[int, int, int], Ran] = {}
@@ -152,12 +153,9 @@ class Exporter(Observer):
         self.target.begin(task_set, judge.tables)
         return [self]
 
-    def handlers(self) -> dict[str, Callable[[Event], None]]:
-        """Return what else the follower is to tell: names of callbacks."""
-        return {'ros2:rclcpp_callback_register': self._registered}
-
-    def _registered(self, event: Event) -> None:
-        self._symbols[event[4]] = event[5]
+    def name_by(self, names: Callable[[int], str]) -> None:
+        """Take in what tells the names of callbacks that are not declared."""
+        self._name_of = names
 
     def released(self, dag: int, job: int, release: int, now: int) -> None:
         """Open a job."""
@@ -173,7 +171,7 @@ class Exporter(Observer):
         reference = None if release is None else release + self._tables.rad_offset[vertex]
         row = ExecutionRow(
             self._dags[dag] if vertex >= 0 else None, job if vertex >= 0 else None,
-            self._names[vertex] if vertex >= 0 else self._undeclared(callback), worker, first,
+            self._names[vertex] if vertex >= 0 else self._name_of(callback), worker, first,
             self._seconds(start), release, ready, start, end, start - ready if first else None,
             end - start, reference, None if reference is None else reference - end)
         if vertex < 0:
@@ -218,9 +216,6 @@ class Exporter(Observer):
         for key in list(self._held):
             self._hand_out(key)
         self.target.finish()
-
-    def _undeclared(self, callback: int) -> str:
-        return self._symbols.get(callback) or f'callback {callback:#x}'
 
     def _seconds(self, time: int) -> float:
         if self._origin is None:

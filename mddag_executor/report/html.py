@@ -21,7 +21,7 @@ from mddag_executor.errors import MddagError
 from mddag_executor.replay import Replay, Reschedule
 from mddag_executor.replay.bags_reschedule import BagReschedule
 from mddag_executor.replay.batches import Batch
-from mddag_executor.replay.follower import Event, Observer
+from mddag_executor.replay.follower import Observer
 from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.usage import Usage
 from mddag_executor.report.html_data import (
@@ -77,9 +77,9 @@ class Watch:
         judge.listeners.append(self.timeline.decided)
         return [self.timeline, self.usage]
 
-    def handlers(self) -> dict[str, Callable[[Event], None]]:
-        """Return what else the follower is to tell."""
-        return self.timeline.handlers()
+    def name_by(self, names: Callable[[int], str]) -> None:
+        """Take in what tells the names of callbacks that are not declared."""
+        self.timeline.name_by(names)
 
     def data(
         self, title: str, facts: list[tuple[str, str]], task_set: TaskSet, workers: int,

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mddag_executor.core.state import (
     Decision,
@@ -37,6 +37,7 @@ from mddag_executor.core.state import (
 from mddag_executor.replay import batches
 from mddag_executor.replay.batches import Batch, CALLBACK, VERTEX
 from mddag_executor.replay.follower import Observer, Piece
+from mddag_executor.replay.names import no_names
 import numpy as np
 import numpy.typing as npt
 
@@ -182,7 +183,7 @@ class Timeline(Observer):
         self._blocks: list[_Block] = [self._open]
         self._numbers = 1
         self._undeclared: dict[int, int] = {}
-        self._symbols: dict[int, str] = {}
+        self._name_of: Callable[[int], str] = no_names
 
     # --- what is told ----------------------------------------------------------------------------
 
@@ -280,13 +281,9 @@ class Timeline(Observer):
         return np.column_stack((row, job, pieces[:, WORKED_BY], pieces[:, BECAME_READY],
                                 pieces[:, STARTED], pieces[:, ENDED]))
 
-    def handlers(self) -> dict[str, Callable[[tuple[Any, ...]], None]]:
-        """Return what else a follower of events is to tell: names of callbacks."""
-        return {'ros2:rclcpp_callback_register': self._registered}
-
-    def _registered(self, event: tuple[Any, ...]) -> None:
-        if len(self._symbols) < BLOCK:
-            self._symbols[event[4]] = event[5]
+    def name_by(self, names: Callable[[int], str]) -> None:
+        """Take in what tells the names of callbacks that are not declared."""
+        self._name_of = names
 
     def _undeclared_row(self, callback: int) -> int:
         row = self._undeclared.get(callback)
@@ -314,9 +311,7 @@ class Timeline(Observer):
 
     def undeclared_names(self) -> list[str]:
         """Return the names of undeclared callbacks: of row -1, of row -2, and so on."""
-        return [OTHERS if callback == -1 and place == MOST_UNDECLARED
-                else self._symbols.get(callback) or (
-                    'undeclared callbacks' if callback <= 0 else f'callback {callback:#x}')
+        return [OTHERS if callback == -1 and place == MOST_UNDECLARED else self._name_of(callback)
                 for place, callback in enumerate(self._undeclared)]
 
     def columns(self) -> Columns:

@@ -24,6 +24,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+from msg_graph.binding import entity_name
+from msg_graph.duration import exact_duration
+
 KEEP_TIMES = 100_000
 
 Event = tuple[Any, ...]
@@ -41,6 +44,7 @@ class Entity:
     :ivar period_ns: the timer's period.
     :ivar callback: its callback's address; None where the trace does not tell.
     :ivar group: its mutually exclusive callback group, or None.
+    :ivar symbol: of its function; empty where the trace does not tell.
     """
 
     kind: str
@@ -49,6 +53,7 @@ class Entity:
     period_ns: int | None
     callback: Address | None
     group: Address | None
+    symbol: str
 
 
 @dataclass
@@ -85,8 +90,10 @@ class Census:
         self._links: dict[Address, list[Address]] = {}
         self._exclusive: set[Address] = set()
         self._group: dict[Address, Address] = {}
+        self._symbols: dict[Address, str] = {}
         self._running: dict[tuple[int, int], list[tuple[Address, int]]] = {}
-        self.handlers: dict[str, Callable[[Event], None]] = {
+        #: What takes in who there is.
+        self.who: dict[str, Callable[[Event], None]] = {
             'ros2:rcl_node_init': self._node,
             'ros2:rcl_publisher_init': self._publisher,
             'ros2:rcl_subscription_init': self._subscription,
@@ -101,6 +108,10 @@ class Census:
             'ros2_caret:callback_group_add_timer': self._in_group,
             'ros2_caret:callback_group_add_subscription': self._in_group,
             'ros2_caret:callback_group_add_service': self._in_group,
+            'ros2:rclcpp_callback_register': self._register,
+        }
+        self.handlers: dict[str, Callable[[Event], None]] = {
+            **self.who,
             'ros2:callback_start': self._start,
             'ros2:callback_end': self._end,
             'ros2:rclcpp_publish': self._publish,
@@ -152,6 +163,9 @@ class Census:
     def _in_group(self, event: Event) -> None:
         self._group[event[2], event[5]] = (event[2], event[4])
 
+    def _register(self, event: Event) -> None:
+        self._symbols[event[2], event[4]] = event[5]
+
     def _start(self, event: Event) -> None:
         callback = (event[2], event[4])
         self._running.setdefault((event[2], event[3]), []).append((callback, event[1]))
@@ -193,8 +207,20 @@ class Census:
             if name is None:
                 continue
             group = self._group.get(address)
-            yield Entity(kind, name, start, period, self._callback(address),
-                         group if group in self._exclusive else None)
+            callback = self._callback(address)
+            yield Entity(kind, name, start, period, callback,
+                         group if group in self._exclusive else None,
+                         '' if callback is None else self._symbols.get(callback, ''))
+
+    def names(self) -> dict[int, str]:
+        """Return by address what callbacks are called that no declaration names."""
+        found = {address: symbol for (_, address), symbol in self._symbols.items()}
+        for entity in self.entities():
+            if entity.callback is not None:
+                what = exact_duration(entity.period_ns) if entity.period_ns else entity.start
+                found[entity.callback[1]] = entity_name(
+                    entity.node, entity.symbol, f'{entity.kind} {what}')
+        return found
 
     def _callback(self, address: Address) -> Address | None:
         """Return what the links from a handle end in."""

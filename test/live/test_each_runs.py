@@ -118,5 +118,5 @@ def test_each_time_that_a_timer_is_due_counts(make_executor, make_node):
     with Spinning(executor):
         assert wait_for(lambda: len(calls) >= MANY)
         timer.cancel()
-    counts = executor.statistics()['callbacks']['/node:timer 5000000 ns']
+    counts = executor.statistics()['callbacks']['/node: <lambda> (timer 5ms)']
     assert counts['ready'] - counts['waiting'] == counts['ran'] == len(calls)

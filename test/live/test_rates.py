@@ -113,7 +113,7 @@ def test_an_executor_warns_once_of_a_slow_timer_and_counts_what_it_skips(
     text = capfd.readouterr().err
     assert text.count('cannot keep its rate') == 1
     assert 'the timer of /slow with a period of 10 ms' in text
-    counts = executor.statistics()['callbacks']['/slow:timer 10000000 ns']
+    counts = executor.statistics()['callbacks']['/slow: body (timer 10ms)']
     # one runs, one waits: of each 35 ms there are one or two periods that nothing comes of
     assert counts['skipped'] + counts['ran'] + counts['waiting'] > 2 * counts['ran']
 
@@ -159,6 +159,6 @@ def test_a_timer_that_gets_its_declared_period_later_is_the_declared_one(
     timer = node.create_timer(0.05, lambda: None)
     with Spinning(executor):
         assert wait_for(lambda: executor.statistics()['callbacks'].get(
-            '/node:timer 50000000 ns', {}).get('ran', 0) >= 2)
+            '/node: <lambda> (timer 50ms)', {}).get('ran', 0) >= 2)
         timer.timer_period_ns = 20_000_000
         assert wait_for(lambda: executor.statistics()['dags']['tick']['jobs'] >= 2)
