@@ -130,6 +130,15 @@ def judge(s: State, slot: int, kind: int, vertex: int, deadline: int, time: int)
 def close_job(s: State, slot: int, end: int, now: int) -> None:
     """End an open job (rule 8): it leaves the open jobs and, when nothing is active, its slot."""
     dag = s.job_dag[slot]
+    if dag < len(s.oldest) - 1:  # jobs of the undeclared DAG are nobody's to judge
+        judged = -1 if is_judged(s, slot) else NOT_JUDGED
+        s.decisions.append((JOB_END, dag, judged, s.job_index[slot], end, now))
+    withdraw_job(s, slot, end)
+
+
+def withdraw_job(s: State, slot: int, end: int) -> None:
+    """Close an open job as ``close_job``, without a decision: what became of it is not known."""
+    dag = s.job_dag[slot]
     before, after = s.job_previous[slot], s.job_next[slot]
     if before < 0:
         s.oldest[dag] = after
@@ -141,9 +150,6 @@ def close_job(s: State, slot: int, end: int, now: int) -> None:
         s.job_previous[after] = before
     s.n_open[dag] -= 1
     s.job_state[slot] = end
-    if dag < len(s.oldest) - 1:  # jobs of the undeclared DAG are nobody's to judge
-        judged = -1 if is_judged(s, slot) else NOT_JUDGED
-        s.decisions.append((JOB_END, dag, judged, s.job_index[slot], end, now))
     if s.job_active[slot] == 0:
         _free(s, slot)
 

@@ -10,6 +10,7 @@ from mddag_executor.core.state import (
     add_group,
     add_slot,
     Decision,
+    EXPIRED,
     N_IDLE,
     N_STALE,
     new_state,
@@ -127,6 +128,10 @@ class Scheduler:
     def abort(self, slot: int, now: int) -> None:
         """Abort the open job in a slot."""
         jobs.abort_job(self.tables, self.state, slot, now)
+
+    def withdraw(self, slot: int) -> None:
+        """Close the open job in a slot without any decision: what became of it is not known."""
+        jobs.withdraw_job(self.state, slot, EXPIRED)
 
     def expire_idle(self, now: int) -> None:
         """Expire every job that can no longer complete."""

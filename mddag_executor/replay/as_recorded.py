@@ -93,6 +93,9 @@ class Replay:
                 sink = sinks[dag.vertices[local].name]
                 sink['breakdown'] = self._judge.chains.result(self.task_set, first + local)
                 sink['slack_ns'] = slack(sink)
+            if isinstance(self._follower, ImportedFollower):
+                withdrawn = self._follower.doubts.withdrawn
+                result['dags'][dag.name]['unjudged'] = withdrawn.get(dag.index, 0)
         return {
             **result, 'rescheduled': False, 'skip_ns': self._judge.skip,
             'callbacks': self._usage.callbacks(),

@@ -92,6 +92,9 @@ class Observer:
     def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
         """Take in that a job was aborted or, else, has expired."""
 
+    def withdrawn(self, dag: int, job: int) -> None:
+        """Take in that nobody can tell what became of a job: it is not to be judged."""
+
     def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
         """Take in a miss as the executor saw it; `completed` is -1 where it never did."""
 

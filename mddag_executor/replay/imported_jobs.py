@@ -23,7 +23,8 @@ what the linker says (see ``links``), and tells the same observers.
    when a message has reached its reader is not recorded, so the way there counts as waiting.
 4. A job that has not completed `EXPIRE_AFTER_NS` past its latest deadline, and of which nothing
    runs, is told to have expired, as the executor's core does it.  What is open at the end of the
-   recording is judged as of the last event.
+   recording is judged as of the last event.  A job of which nobody can tell what it did, because
+   of what is missing in the recording (see ``doubts``), is withdrawn instead: it is not judged.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from mddag_executor.core import NEVER
+from mddag_executor.replay.doubts import Doubts
 from mddag_executor.replay.entities import Callback
 from mddag_executor.replay.follower import Execution, Observer, Piece
 from mddag_executor.replay.imported import ImportedMapping, ImportedRecording, Target
@@ -79,6 +81,7 @@ class ImportedFollower:
         self.shut_down = False
         self.jobs = 0
         self.dropped: Counter[str] = Counter()
+        self.doubts = Doubts(mapping.task_set.dags)
         self.linker = Linker(recording.entities, self)
         self._strange = 0
         self._workers: dict[tuple[int, int], int] = {}
@@ -136,6 +139,9 @@ class ImportedFollower:
             if progress is not None and count % _PROGRESS_STEP == 0:
                 progress(count)
         self.linker.finish()
+        for dag, jobs in enumerate(self._open):
+            for release, job in jobs:
+                self._close(dag, job, release)
         for observer in self._observers:
             observer.finished(self.end)
 
@@ -183,12 +189,15 @@ class ImportedFollower:
             run.of = dag, vertex, job
             self._expire(run.start)
             self.jobs += 1
+            self.doubts.opened(dag, job)
             self._open[dag].append((release, job))
             if self.start is None or release < self.start:
                 self.start = release
             for observer in self._observers:
                 observer.released(dag, job, release, run.start)
-        elif message is not None and message.run is not None and message.run.of is not None:
+        elif message is None or message.run is None:
+            self.doubts.ran_for_unknown(key, run.start, message is not None or run.stamp != 0)
+        elif message.run.of is not None:
             dag, before, job = message.run.of
             after = self._next.get((before, key))
             if after is not None:
@@ -224,6 +233,8 @@ class ImportedFollower:
         if dag >= 0:
             self._active[(dag, job)] -= 1
             whole = self._is_whole(vertex, job, run.leg)
+            if whole:
+                self.doubts.done(dag, vertex, job)
             execution = Execution(run.ready, run.start, run.end, run.end - run.start)
             leg = run.leg if self._sizes[vertex] > 1 else 0
             for observer in self._observers:
@@ -248,10 +259,29 @@ class ImportedFollower:
             while jobs and now - jobs[0][0] > self._patience[dag]:
                 if self._active[(dag, jobs[0][1])] > 0:
                     break
-                _, job = jobs.popleft()
+                release, job = jobs.popleft()
                 del self._active[(dag, job)]
-                for observer in self._observers:
-                    observer.ended(dag, job, False, now)
+                if not self._close(dag, job, release):
+                    for observer in self._observers:
+                        observer.ended(dag, job, False, now)
+
+    def _close(self, dag: int, job: int, release: int) -> bool:
+        """Take a job that cannot be judged out of the run; tell whether it is one."""
+        doubted = self.doubts.close(dag, job, release)
+        if doubted:
+            for observer in self._observers:
+                observer.withdrawn(dag, job)
+        return doubted
+
+    def missing(self, callback: Callback | None, run: Run | None, time: int) -> None:
+        """Take in that something is not recorded."""
+        if callback is None:
+            self.doubts.discarded(time)
+        elif (target := self._target.get(callback.number)) is not None:
+            self.doubts.ran_for_unknown(target.callback.key, time)
+        if run is not None and run.of is not None:
+            dag, _, job = run.of
+            self._active[(dag, job)] -= 1
 
     # --- messages --------------------------------------------------------------------------------
 
@@ -260,6 +290,9 @@ class ImportedFollower:
         for sink in self._sinks:
             sink.published(message)
         publisher = message.publisher
+        of = None if message.run is None else message.run.of
+        if of is not None and (message.stamp or message.within):
+            self.doubts.sent(of[0], of[2], message.topic)
         if (publisher is None or publisher.node is None
                 or publisher.topic not in self.paths.topics):
             return
@@ -284,6 +317,11 @@ class ImportedFollower:
         """Return what is missing or doubtful, one line each."""
         name = self._recording.name
         lines = [f'{name}: {text}' for text in self.linker.losses.lines()]
+        if self.doubts.withdrawn:
+            dags = [f'{self._dags[dag].name} ({n})' for dag, n in self.doubts.withdrawn.items()]
+            lines.append(
+                f'{name}: {sum(self.doubts.withdrawn.values())} jobs are not judged, because what '
+                f'they did may be among what is missing: {listed(dags)}')
         if self._strange:
             lines.append(
                 f'{name}: left out: {counted(self._strange, "event")} at an impossible time')

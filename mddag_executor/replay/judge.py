@@ -173,6 +173,12 @@ class Judge(Observer):
             self._scheduler.expire(slot, now)
             self._decided(slot)
 
+    def withdrawn(self, dag: int, job: int) -> None:
+        """Close a job that is open without a verdict."""
+        slot = self._slots.pop((dag, job), None)
+        if slot is not None:
+            self._scheduler.withdraw(slot)
+
     def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
         """Compare a recorded miss."""
         if self.compare:

@@ -22,6 +22,7 @@ class Run:
     :ivar stamp: source timestamp of the message that it runs for; 0: none is known.
     :ivar stated: the message's header stamp, where the recording has it; else 0.
     :ivar taken: when the message was taken, ns; 0: that is not recorded.
+    :ivar inner: when another one last began in its thread while it ran, ns; 0: none did.
     :ivar ready: for those who use it: when it became ready, ns.
     :ivar of: for those who use it: DAG, vertex and job that it belongs to.
     :ivar leg: for those who use it: which leg of the vertex it is.
@@ -29,7 +30,7 @@ class Run:
     """
 
     __slots__ = ('callback', 'thread', 'start', 'end', 'stamp', 'stated', 'taken', 'message',
-                 'ready', 'of', 'leg', 'places')
+                 'inner', 'ready', 'of', 'leg', 'places')
 
     def __init__(self, callback: Callback, thread: Thread, start: int) -> None:
         self.callback = callback
@@ -40,6 +41,7 @@ class Run:
         self.stated = 0
         self.taken = 0
         self.message: Publication | None = None
+        self.inner = 0
         self.ready = start
         self.of: tuple[int, int, int] | None = None
         self.leg = 0
@@ -96,6 +98,14 @@ class Sink(Protocol):
     def ended(self, run: Run) -> None:
         """Take in that an execution has ended."""
 
+    def missing(self, callback: Callback | None, run: Run | None, time: int) -> None:
+        """
+        Take in that something is not recorded.
+
+        :param callback: it ran, nobody can tell for what; None: events were discarded.
+        :param run: its execution, where only the end is not recorded.
+        """
+
 
 class Losses:
     """What was lost in a recording, by what it affects."""
@@ -104,6 +114,7 @@ class Losses:
         self.ends: Counter[str] = Counter()
         self.starts: Counter[str] = Counter()
         self.messages: Counter[str] = Counter()
+        self.unlinked: Counter[str] = Counter()
         self.untold: Counter[str] = Counter()
         self.partial: Counter[str] = Counter()
         self.ambiguous: Counter[str] = Counter()
@@ -115,12 +126,14 @@ class Losses:
     def lines(self) -> list[str]:
         """Return what to say about it."""
         said = (
-            (self.ends, 'executions have no end in it (the events were lost): they count as not '
-             'completed'),
+            (self.ends, 'executions have no end in it (the events were lost)'),
             (self.starts, 'executions have no start in it (the events were lost): they are left '
              'out'),
             (self.messages, 'executions ran for messages whose publication is not in it: they '
              'belong to no job and no path'),
+            (self.unlinked, 'executions ran for messages whose publication cannot be told: not '
+             'all publications of their topics have a source timestamp in it: they belong to no '
+             'job and no path'),
             (self.untold, 'executions of subscriptions have no message in it (its taking is not '
              'recorded): they belong to no job and no path'),
             (self.partial, 'publications lack the tracepoint rclcpp_publish that others of their '
@@ -134,7 +147,7 @@ class Losses:
                  if counts]
         if self.discarded:
             lines.insert(0, f'the tracer discarded {self.discarded} events or more: executions '
-                         'and messages may be missing, and jobs count as late that were not')
+                         'and messages may be missing')
         return lines
 
 

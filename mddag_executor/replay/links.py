@@ -36,7 +36,8 @@ may run before the tracer has recorded the stamp of the message that it runs for
    and index of the ring buffer that it went through (`rclcpp_ring_buffer_enqueue`, `_dequeue`).
 5. `rmw_take` inside an execution is a message that the callback took itself (a queue edge).
 6. What does not fit (an end without a start, a start without an end, a message whose publication
-   is not in the recording, a publisher's that lacks a tracepoint) is counted by callback or topic.
+   is not in the recording, a publisher's that lacks a tracepoint) is counted by callback or topic,
+   and the sink is told where nobody can tell what a callback ran for.
 
 Publications are kept until `KEEP` newer ones of their topic have come.
 """
@@ -84,6 +85,7 @@ class Linker:
         self._threads: dict[Thread, _Thread] = {}
         self._queue: deque[tuple[int, Function[..., None], tuple[Any, ...]]] = deque()
         self._by_stamp: dict[str, dict[int, Publication | None]] = {}
+        self._unstamped: set[str] = set()       # topics
         self._by_address: dict[tuple[int, int], Publication] = {}
         self._by_slot: dict[tuple[int, int, int], tuple[Publication, bool]] = {}
         self._by_rclcpp: set[Publisher] = set()
@@ -137,7 +139,10 @@ class Linker:
         known[1](event, thread, state)
 
     def finish(self) -> None:
-        """Tell what is left; what runs has no end."""
+        """Tell what is left; what runs has no end, or, where others ran after it, may have one."""
+        for run in self.running:
+            if run.inner:
+                self._without_end(run, run.inner)
         while self._queue:
             _, tell, arguments = self._queue.popleft()
             tell(*arguments)
@@ -165,7 +170,7 @@ class Linker:
         if any(run.callback is callback for run in state.stack) or len(state.stack) > _DEEPEST:
             while state.stack:
                 run = state.stack.pop()
-                self.losses.ends[run.callback.label] += 1
+                self._without_end(run, now)
                 if run.callback is callback:
                     break
         run = Run(callback, thread, now)
@@ -177,6 +182,8 @@ class Linker:
                     or callback.kind in ('timer', 'service')):
                 run.stamp = run.stated = run.taken = 0      # it was taken for something else
                 run.message = None
+        if state.stack:
+            state.stack[-1].inner = now
         state.stack.append(run)
         state.fresh = False
         state.last = None
@@ -188,12 +195,20 @@ class Linker:
             topic = run.callback.start
             message = self._find(topic, run.stamp)
             if message is None:
-                twice = run.stamp in self._by_stamp.get(topic, ())
-                (self.losses.ambiguous if twice else self.losses.messages)[
-                    run.callback.label] += 1
+                self._not_found(run, topic)
         elif message is None and run.callback.kind == 'subscription' and not run.taken:
             self.losses.untold[run.callback.label] += 1
         self._sink.started(run, message)
+
+    def _not_found(self, run: Run, topic: str) -> None:
+        losses = self.losses
+        if run.stamp in self._by_stamp.get(topic, ()):
+            losses.ambiguous[run.callback.label] += 1
+            self._sink.missing(run.callback, None, run.start)
+        elif self._unstamped.isdisjoint((topic, '')):
+            losses.messages[run.callback.label] += 1
+        else:
+            losses.unlinked[run.callback.label] += 1
 
     def _find(self, topic: str, stamp: int) -> Publication | None:
         found = self._by_stamp.get(topic, {}).get(stamp)
@@ -207,15 +222,20 @@ class Linker:
             # else it began before the recording did
             if not state.fresh or callback.made >= self._entities.begin:
                 self.losses.starts[callback.label] += 1
+                self._queue.append((now, self._sink.missing, (callback, None, now)))
             state.fresh = False
             return
         while True:
             run = state.stack.pop()
             if run.callback is callback:
                 break
-            self.losses.ends[run.callback.label] += 1
+            self._without_end(run, now)
         run.end = now
         self._queue.append((now, self._sink.ended, (run,)))
+
+    def _without_end(self, run: Run, now: int) -> None:
+        self.losses.ends[run.callback.label] += 1
+        self._queue.append((now, self._sink.missing, (run.callback, run, now)))
 
     # --- publications ----------------------------------------------------------------------------
 
@@ -228,8 +248,13 @@ class Linker:
         run = state.stack[-1] if state.stack else None
         message = Publication(publisher, run, self._get(event, 'message'))
         state.last = message
-        self._queue.append((event[1], self._sink.published, (message,)))
+        self._queue.append((event[1], self._tell_published, (message,)))
         return message
+
+    def _tell_published(self, message: Publication) -> None:
+        if not message.stamp and not message.within:
+            self._unstamped.add(message.topic)
+        self._sink.published(message)
 
     def _intra_publish(self, event: Event, thread: Thread, state: _Thread) -> None:
         message = self._publication(event, thread, state)
@@ -361,3 +386,4 @@ class Linker:
 
     def _lost(self, event: Event, thread: Thread, state: _Thread) -> None:
         self.losses.discarded += self._get(event, 'count')
+        self._queue.append((event[1], self._sink.missing, (None, None, event[1])))

@@ -74,6 +74,10 @@ class Recorded:
         """Return the names of the events in the order of time."""
         return [event[3] for event in sorted(self._events, key=lambda event: event[0])]
 
+    def times(self) -> list[int]:
+        """Return the times of the events, ns since `BEGIN`, in their order."""
+        return sorted(event[0] - BEGIN for event in self._events)
+
     # --- who is who ------------------------------------------------------------------------------
 
     def node(self, handle: int, name: str, time: int = 0, pid: int = 1) -> None:

@@ -132,7 +132,68 @@ def test_the_path(recorded: Recorded, graph: TaskSet) -> None:
     assert path['reaction_time']['max'] == age[0] + 100 * MS
 
 
-def test_a_lost_message_expires_the_job_and_is_said(recorded: Recorded, graph: TaskSet) -> None:
+def test_a_job_whose_message_was_lost_has_expired(recorded: Recorded, graph: TaskSet) -> None:
+    """What reached nobody is the robot's fault, whatever else comes from outside."""
+    recorded.run(PLAN, 5, 3000 * MS, 3001 * MS)
+    recorded.run(GRAB, 1, 2007 * MS, 2009 * MS)
+    recorded.publish(IMAGE, 1, 2008 * MS)
+    recorded.receive(DETECT, 2, 2015 * MS, 2016 * MS, 77)
+    recorded.run(GRAB, 1, 4007 * MS, 4008 * MS)
+    result, _ = result_of(recorded.write(), graph)
+    camera = result['dags']['/camera']
+    assert (camera['ends']['completed'], camera['ends']['expired'], camera['unjudged']) == (
+        N, 1, 0)
+
+
+def test_nothing_is_judged_without_links(recorded: Recorded, graph: TaskSet) -> None:
+    stamps = [place for place, name in enumerate(recorded.names()) if 'bind' in name]
+    result, warnings = result_of(recorded.write(but=stamps), graph)
+    camera = result['dags']['/camera']
+    assert (camera['jobs'], camera['unjudged']) == (N, N)
+    assert not any(camera['ends'].values())
+    assert not any(camera['sinks']['/fuse:join'][key]
+                   for key in ('completed', 'late', 'overdue', 'expired'))
+    assert f'{N} jobs are not judged' in '\n'.join(warnings)
+    assert not [line for line in warnings if 'is not in it' in line]
+
+
+def test_whatever_event_is_lost_no_job_is_late_or_expired(
+    recorded: Recorded, graph: TaskSet
+) -> None:
+    recorded.run(PLAN, 5, 3000 * MS, 3001 * MS)
+    recorded.run(GRAB, 1, 3007 * MS, 3008 * MS)
+    for tid in (2, 3, 4, 9):    # some other callback: what has no end does not run until the end
+        recorded.run(77, tid, 3002 * MS, 3003 * MS, pid=2 if tid == 9 else 1)
+    before, _ = result_of(recorded.write(), graph)
+    first = recorded.names().index('ros2:callback_start')
+    for lost in range(first, len(recorded.names())):
+        result, _ = result_of(recorded.write(but=[lost]), graph)
+        for name, dag in result['dags'].items():
+            whole = before['dags'][name]
+            assert dag['ends']['expired'] <= whole['ends']['expired'], (lost, name)
+            assert dag['ends']['late'] == 0, (lost, name)
+            for sink in dag['sinks'].values():
+                assert sink['late'] == 0, (lost, name, recorded.names()[lost])
+
+
+def test_what_the_tracer_discarded_is_not_held_against_a_job(
+    recorded: Recorded, graph: TaskSet
+) -> None:
+    """From 200 to 300 ms nothing is recorded; the jobs before and after are judged."""
+    recorded.add('mddag:lost', 300 * MS, 0, 50)
+    recorded.run(PLAN, 5, 3000 * MS, 3001 * MS)
+    recorded.run(GRAB, 1, 3007 * MS, 3008 * MS)
+    gap = [place for place, time in enumerate(recorded.times()) if 215 * MS <= time < 300 * MS]
+    result, warnings = result_of(recorded.write(but=gap), graph)
+    camera = result['dags']['/camera']
+    assert (camera['ends']['completed'], camera['unjudged']) == (N - 1, 1)
+    assert camera['sinks']['/fuse:join']['late'] == 0
+    assert [line for line in warnings if line.startswith('the tracer discarded 50 events')]
+
+
+def test_a_lost_link_is_said_and_its_job_is_not_judged(
+    recorded: Recorded, graph: TaskSet
+) -> None:
     names = recorded.names()
     bound = [place for place, name in enumerate(names) if 'bind' in name]
     first = bound[0]        # the first image's source timestamp
@@ -140,10 +201,12 @@ def test_a_lost_message_expires_the_job_and_is_said(recorded: Recorded, graph: T
     recorded.run(GRAB, 1, 3007 * MS, 3008 * MS)
     result, warnings = result_of(recorded.write(but=[first]), graph)
     sink = result['dags']['/camera']['sinks']['/fuse:join']
-    assert (sink['completed'], sink['expired']) == (N - 1, 1)
+    assert (sink['completed'], sink['expired']) == (N - 1, 0)
+    assert result['dags']['/camera']['unjudged'] == 1
     assert [line for line in warnings if '/detect subscription /image (1)' in line] == [
-        '1 executions ran for messages whose publication is not in it: they belong to no job and '
-        'no path: /detect subscription /image (1)']
+        '1 executions ran for messages whose publication cannot be told: not all publications of '
+        'their topics have a source timestamp in it: they belong to no job and no path: '
+        '/detect subscription /image (1)']
     assert [line for line in warnings if 'periods of timers' in line]
 
 

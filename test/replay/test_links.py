@@ -263,5 +263,16 @@ def test_what_else_the_thread_writes_is_not_the_publication(recorded: Recorded) 
     told, warnings = linked(recorded.write())
     assert told.published_at == [('/image', 101 * MS, 101 * MS + 1, 0), ('/image', 201 * MS, 0, 0)]
     assert [link[2] for link in told.links if link[0].startswith('/detector')] == [None, None]
-    assert warnings == ['2 executions ran for messages whose publication is not in it: they '
-                        'belong to no job and no path: /detector subscription /image (2)']
+    assert warnings == [
+        '2 executions ran for messages whose publication cannot be told: not all publications of '
+        'their topics have a source timestamp in it: they belong to no job and no path: '
+        '/detector subscription /image (2)']
+
+
+def test_a_message_from_outside_is_said_to_be_not_in_it(recorded: Recorded) -> None:
+    recorded.run(CAMERA, 1, 100 * MS, 103 * MS)
+    recorded.publish(IMAGE, 1, 101 * MS)
+    recorded.receive(DETECT, 2, 305 * MS, 306 * MS, 77)
+    assert linked(recorded.write())[1] == [
+        '1 executions ran for messages whose publication is not in it: they belong to no job and '
+        'no path: /detector subscription /image (1)']
