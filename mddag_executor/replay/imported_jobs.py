@@ -320,8 +320,8 @@ class ImportedFollower:
         if self.doubts.withdrawn:
             dags = [f'{self._dags[dag].name} ({n})' for dag, n in self.doubts.withdrawn.items()]
             lines.append(
-                f'{name}: {sum(self.doubts.withdrawn.values())} jobs are not judged, because what '
-                f'they did may be among what is missing: {listed(dags)}')
+                f'{name}: not judged, because what is missing may be theirs: '
+                f'{counted(sum(self.doubts.withdrawn.values()), "job")}: {listed(dags)}')
         if self._strange:
             lines.append(
                 f'{name}: left out: {counted(self._strange, "event")} at an impossible time')

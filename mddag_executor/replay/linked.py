@@ -9,6 +9,7 @@ from typing import Protocol
 
 from mddag_executor.replay.entities import Callback, Publisher
 from mddag_executor.replay.paths import Places
+from mddag_executor.text import counted
 
 Thread = tuple[int, int]        # process and thread
 
@@ -126,28 +127,25 @@ class Losses:
     def lines(self) -> list[str]:
         """Return what to say about it."""
         said = (
-            (self.ends, 'executions have no end in it (the events were lost)'),
-            (self.starts, 'executions have no start in it (the events were lost): they are left '
-             'out'),
-            (self.messages, 'executions ran for messages whose publication is not in it: they '
-             'belong to no job and no path'),
-            (self.unlinked, 'executions ran for messages whose publication cannot be told: not '
-             'all publications of their topics have a source timestamp in it: they belong to no '
-             'job and no path'),
-            (self.untold, 'executions of subscriptions have no message in it (its taking is not '
-             'recorded): they belong to no job and no path'),
-            (self.partial, 'publications lack the tracepoint rclcpp_publish that others of their '
-             'publisher have: they count from rcl_publish on'),
-            (self.ambiguous, 'executions ran for messages with the topic and source timestamp of '
-             'another one: they belong to no job and no path'),
-            (self.overwritten, 'messages were overwritten in a ring buffer before they were '
-             'taken'),
-            (self.unknown, 'executions are of callbacks whose initialisation is not in it'))
-        lines = [f'{sum(counts.values())} {text}: {_most(counts)}' for counts, text in said
-                 if counts]
+            (self.ends, 'execution', 'without an end in it (the event was lost)'),
+            (self.starts, 'execution', 'without a start in it (the event was lost): left out'),
+            (self.messages, 'execution', 'for a message whose publication is not in it: of no job '
+             'and no path'),
+            (self.unlinked, 'execution', 'for a message whose publication cannot be told (not all '
+             'of its topic have a source timestamp in it): of no job and no path'),
+            (self.untold, 'execution', 'of a subscription without a message in it (its taking is '
+             'not recorded): of no job and no path'),
+            (self.partial, 'publication', 'without the tracepoint rclcpp_publish that others of '
+             'the publisher have: counted from rcl_publish on'),
+            (self.ambiguous, 'execution', 'for a message with the topic and source timestamp of '
+             'another one: of no job and no path'),
+            (self.overwritten, 'message', 'overwritten in a ring buffer, never taken'),
+            (self.unknown, 'execution', 'of a callback whose initialisation is not in it'))
+        lines = [f'{counted(sum(counts.values()), noun)} {text}: {_most(counts)}'
+                 for counts, noun, text in said if counts]
         if self.discarded:
-            lines.insert(0, f'the tracer discarded {self.discarded} events or more: executions '
-                         'and messages may be missing')
+            lines.insert(0, f'the tracer discarded {counted(self.discarded, "event")} or more: '
+                         'executions and messages may be missing')
         return lines
 
 

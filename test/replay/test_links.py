@@ -139,8 +139,7 @@ def test_overwritten_messages_are_said(recorded: Recorded) -> None:
     recorded.run(DETECT, 2, 205 * MS, 206 * MS, within=True)
     told, warnings = linked(recorded.write())
     assert told.links[-1][2] == 201 * MS
-    assert warnings == ['1 messages were overwritten in a ring buffer before they were taken: '
-                        '/image (1)']
+    assert warnings == ['1 message overwritten in a ring buffer, never taken: /image (1)']
 
 
 def test_a_callback_in_several_threads_at_once(recorded: Recorded) -> None:
@@ -199,8 +198,8 @@ def test_same_stamps_on_other_topics_and_on_the_same(recorded: Recorded) -> None
     recorded.publish(IMAGE, 3, 102 * MS, stamp=50)
     told, warnings = linked(recorded.write())
     assert told.links[-1][2] is None
-    assert warnings == ['1 executions ran for messages with the topic and source timestamp of '
-                        'another one: they belong to no job and no path: '
+    assert warnings == ['1 execution for a message with the topic and source timestamp of another '
+                        'one: of no job and no path: '
                         '/detector subscription /image (1)']
 
 
@@ -264,9 +263,8 @@ def test_what_else_the_thread_writes_is_not_the_publication(recorded: Recorded) 
     assert told.published_at == [('/image', 101 * MS, 101 * MS + 1, 0), ('/image', 201 * MS, 0, 0)]
     assert [link[2] for link in told.links if link[0].startswith('/detector')] == [None, None]
     assert warnings == [
-        '2 executions ran for messages whose publication cannot be told: not all publications of '
-        'their topics have a source timestamp in it: they belong to no job and no path: '
-        '/detector subscription /image (2)']
+        '2 executions for a message whose publication cannot be told (not all of its topic have a '
+        'source timestamp in it): of no job and no path: /detector subscription /image (2)']
 
 
 def test_a_message_from_outside_is_said_to_be_not_in_it(recorded: Recorded) -> None:
@@ -274,5 +272,5 @@ def test_a_message_from_outside_is_said_to_be_not_in_it(recorded: Recorded) -> N
     recorded.publish(IMAGE, 1, 101 * MS)
     recorded.receive(DETECT, 2, 305 * MS, 306 * MS, 77)
     assert linked(recorded.write())[1] == [
-        '1 executions ran for messages whose publication is not in it: they belong to no job and '
-        'no path: /detector subscription /image (1)']
+        '1 execution for a message whose publication is not in it: of no job and no path: '
+        '/detector subscription /image (1)']
