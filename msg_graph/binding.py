@@ -19,15 +19,20 @@ with periods, subscriptions with topics and services with names.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from heapq import heappop, heappush
 import re
+from typing import NamedTuple
 
+from msg_graph.duration import format_duration
+from msg_graph.errors import shown
 from msg_graph.model import Callback, TaskSet
 
 # A timer made from a float of seconds is off by rounding (rclpy cuts off fractions of a ns), and
 # declared periods like 33.333ms are rounded themselves.
 _PERIOD_TOLERANCE = 1e-3
 
+_WORDS = {'subscription': 'topic', 'service': 'service'}
 _PYTHON = re.compile(r'(?:[\w<>]+\.)*(\w+|<lambda>)')
 _CPP = re.compile(r'[\w:<>*& ]*?\b(\w+)\([^()]*\)')
 
@@ -113,6 +118,54 @@ class Binder:
         place = heappop(free)
         self._bound[place].add(start)
         return self._callbacks[place]
+
+
+class Entity(NamedTuple):
+    """A timer, subscription or service that ran: its node, and what starts it."""
+
+    node: str
+    kind: str
+    start: str = ''
+    period_ns: int | None = None
+
+
+def entities_of(callback: Callback) -> list[Entity]:
+    """Return the entities that a declared callback stands for."""
+    return [Entity(callback.node, 'subscription' if kind == 'topic' else kind,
+                   '' if kind == 'timer' else start, callback.timer_period_ns)
+            for kind, start in _legs(callback)]
+
+
+def meant(callback: Callback, undeclared: Iterable[Entity]) -> str | None:
+    """
+    Return which entity a declared callback that nothing stands for probably means, as a question.
+
+    That is one of another node or topic whose name has a namespace more or less, or a timer of its
+    node with another period.
+    """
+    timers = []
+    for wanted in entities_of(callback):
+        for other in undeclared:
+            if other.kind != wanted.kind or not _same_below(other.node, wanted.node):
+                continue
+            if wanted.kind == 'timer':
+                timers.append(other)
+            elif other.node != wanted.node and _same_below(other.start, wanted.start):
+                return f'did you mean the node {shown(other.node)}?'
+            elif other.start != wanted.start and _same_below(other.start, wanted.start):
+                return f'did you mean the {_WORDS[other.kind]} {shown(other.start)}?'
+    period = callback.timer_period_ns or 0
+    for other in sorted(timers, key=lambda each: abs((each.period_ns or 0) - period)):
+        if other.node == callback.node:
+            return f'did you mean its timer of {format_duration(other.period_ns or 0)}?'
+        if abs((other.period_ns or 0) - period) <= _PERIOD_TOLERANCE * period:
+            return f'did you mean the node {shown(other.node)}?'
+    return None
+
+
+def _same_below(name: str, other: str) -> bool:
+    """Tell whether two names are the same, but for namespaces before one of them."""
+    return name.endswith(other) or other.endswith(name)
 
 
 def function_of(symbol: str) -> str | None:

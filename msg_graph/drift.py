@@ -15,7 +15,8 @@ The rules, for live runs and for recordings alike. What was seen comes as counts
    released, by more than ``TOLERANCE``. It takes ``LEAST`` expected ones. Dropped messages count
    as got: losing them is no fault of the declaration. A sync is not judged by this rule, as how
    its messages come together is not declared.
-4. *never ran*: a callback never ran, while it should have done so at least twice.
+4. *never ran*: a callback never ran, while it should have done so at least twice. Where something
+   undeclared ran that may be meant (``binding.meant``), that is asked.
 5. Where all DAGs of a callback may span processes (``release_from: header_stamp``) and its node
    was not seen here, it may well run elsewhere, and nothing is said of it.
 6. Of callbacks that follow each other only the first that disagrees by rule 2, 3 or 4 is
@@ -24,11 +25,12 @@ The rules, for live runs and for recordings alike. What was seen comes as counts
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from typing import Any
 
 from msg_graph.analysis import topological_order
+from msg_graph.binding import Entity, meant
 from msg_graph.duration import format_duration
 from msg_graph.errors import printable
 from msg_graph.model import Callback, Dag, TaskSet
@@ -64,6 +66,7 @@ class Observed:
     :ivar ran: by callback how often it ran.
     :ivar publishes: by callback the topics that it published, declared or not.
     :ivar nodes: the nodes that were seen; None where that is not known.
+    :ivar undeclared: what was seen and is not declared.
     """
 
     duration_ns: int = 0
@@ -72,6 +75,7 @@ class Observed:
     ran: dict[str, int] = field(default_factory=dict)
     publishes: dict[str, Set[str]] = field(default_factory=dict)
     nodes: Set[str] | None = None
+    undeclared: Sequence[Entity] = ()
 
 
 @dataclass(frozen=True)
@@ -144,9 +148,10 @@ def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift
                  default=0)
     if observed.duration_ns < 2 * slowest + latest:
         return None
+    text = f'{callback.key} never ran in {format_duration(observed.duration_ns)}'
+    question = meant(callback, observed.undeclared)
     return Drift('never ran', callback.key, None, None, 0,
-                 printable(f'{callback.key} never ran in '
-                           f'{format_duration(observed.duration_ns)}'))
+                 printable(text if question is None else f'{text}: {question}'))
 
 
 def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift | None:

@@ -22,11 +22,13 @@ from mddag_executor.live.entries import (
     WAITABLE,
 )
 from msg_graph import Callback, TaskSet
-from msg_graph.binding import Binder
+from msg_graph.binding import Binder, Entity
 from msg_graph.duration import exact_duration
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.qos import HistoryPolicy
+
+_MOST_UNDECLARED = 4096
 
 KINDS = (
     ('timers', TIMER), ('subscriptions', SUBSCRIPTION), ('services', SERVICE),
@@ -71,6 +73,7 @@ class Registry:
         self._retired: list[Entry] = []
         self._past: dict[str, dict[str, Any]] = {}
         self._published: dict[str, set[str]] = {}
+        self._undeclared: dict[Entity, None] = {}
         self._names: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
 
     def __getitem__(self, entity: Any) -> Entry | None:
@@ -182,6 +185,10 @@ class Registry:
         return {
             entry.callback.key for entry in self._entries.values() if entry.callback is not None}
 
+    def undeclared(self) -> list[Entity]:
+        """Return the timers, subscriptions and services there were that are not declared."""
+        return list(self._undeclared)
+
     def subscriptions(self) -> list[Entry]:
         """Return the entries of the subscriptions that there are now."""
         return [entry for entry in self._entries.values() if entry.kind == SUBSCRIPTION]
@@ -191,7 +198,7 @@ class Registry:
         return [entry for entry in self._entries.values() if entry.kind == TIMER]
 
     def _new_entry(self, kind: str, entity: Any, node: str) -> Entry | None:
-        callback, topic, depth, label = None, '', 0, ''
+        callback, topic, depth, label, period = None, '', 0, '', None
         try:
             if kind == TIMER:
                 period = entity.timer_period_ns
@@ -214,6 +221,10 @@ class Registry:
             raise
         entry = Entry(kind, entity, node, callback, self._group(entity), depth, label)
         entry.at_once = callback is None and kind == SUBSCRIPTION and keeps_time(entity)
+        if callback is None and kind in (TIMER, SUBSCRIPTION, SERVICE):
+            if len(self._undeclared) < _MOST_UNDECLARED:
+                start = '' if kind == TIMER else label
+                self._undeclared[Entity(node, kind, start, period)] = None
         if callback is not None:
             assert self._task_set is not None
             link(entry, self._task_set, self._tables, topic)

@@ -47,4 +47,5 @@ class Watch:
             got={key: count['ready'] for key, count in counts.items()},
             ran={key: count['ran'] for key, count in counts.items()},
             publishes={**self._executor._registry.publishes()},
-            nodes={key.rpartition(':')[0] for key in counts}))
+            nodes={key.rpartition(':')[0] for key in counts},
+            undeclared=self._executor._registry.undeclared()))

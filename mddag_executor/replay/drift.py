@@ -22,7 +22,7 @@ import os
 from mddag_executor.replay.recording import Recording, TASK_SET
 from mddag_executor.trace.census import Address, Census, Event
 from msg_graph import TaskSet
-from msg_graph.binding import Binder
+from msg_graph.binding import Binder, Entity
 from msg_graph.drift import Drift, drift, Observed, Releases
 
 _RELEASE, _DISPATCH, _DROP = 'mddag:job_release', 'mddag:dispatch', 'mddag:drop'
@@ -133,6 +133,7 @@ class WatchedRecording(Recording):
         observed.got, observed.ran = dict(got), dict(ran)
         observed.publishes = dict(publishes)
         observed.nodes = set(self._census.publishers) or None
+        observed.undeclared = _undeclared(self._census, judge)
         return drift(judge, observed)
 
 
@@ -152,13 +153,21 @@ def declared_keys(census: Census, task_set: TaskSet) -> dict[Address, str]:
     return found
 
 
+def _undeclared(census: Census, judge: TaskSet) -> list[Entity]:
+    """Return what a declaration does not name."""
+    declared = declared_keys(census, judge)
+    return [Entity(e.node, e.kind, e.start, e.period_ns) for e in census.entities()
+            if e.callback not in declared]
+
+
 def drift_of_import(census: Census, judge: TaskSet) -> list[Drift]:
     """
     Return where a recording of another executor and a declaration disagree.
 
     Such a recording has no jobs; the starts of a source's callback count as its releases.
     """
-    observed = Observed(nodes=set(census.publishers))
+    observed = Observed(
+        nodes=set(census.publishers), undeclared=_undeclared(census, judge))
     first, last = [], []
     sources = {dag.vertices[dag.source].callback.key for dag in judge.dags}
     for address, key in declared_keys(census, judge).items():

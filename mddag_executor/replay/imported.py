@@ -24,6 +24,7 @@ import os
 from typing import Any, NamedTuple
 
 from mddag_executor.replay.entities import Callback, Entities, fields_of, INIT_EVENTS, Node
+from mddag_executor.replay.mapping import asked, first_meant
 from mddag_executor.replay.recording import (
     Head,
     named_errors,
@@ -35,6 +36,7 @@ from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from msg_graph import Callback as Declared
 from msg_graph import format_duration, TaskSet
+from msg_graph.binding import Entity
 
 _START = 'ros2:callback_start'
 _OWN = ('mddag:job_release', 'mddag:dispatch')
@@ -208,17 +210,23 @@ class ImportedMapping:
         return found
 
     def _report(self, recording: ImportedRecording, judge: TaskSet, found: set[str]) -> None:
-        missing = [c.key for c in judge.callbacks if c.key not in found]
+        absent = [c for c in judge.callbacks if c.key not in found]
+        missing = [c.key for c in absent]
+        others = [Entity(c.node.name, c.kind, c.start, c.period)
+                  for c in recording.entities.every
+                  if c.node is not None and c.number not in self.target]
         if len(missing) == len(judge.callbacks):
             known = [c.label for c in recording.entities.every if c.kind != 'service']
             has = f'it has {listed(known)}' if known else 'it does not say what its callbacks are'
             raise ReplayError(
                 recording.name, f'none of the callbacks of {judge.file} is in it: {has}',
+                first_meant(absent, others) or
                 'give the graph of the nodes that were recorded, or none')
         if missing:
             self.warnings.append(
                 f'{recording.name}: not in it: {len(missing)} of the {len(judge.callbacks)} '
-                f'callbacks of {judge.file}, which count as never completed: {listed(missing)}')
+                f'callbacks of {judge.file}, which count as never completed: {listed(missing)}'
+                + asked(absent, others))
         if self._other_periods:
             self.warnings.append(
                 f'{recording.name}: {counted(len(self._other_periods), "timer")} with another '

@@ -20,10 +20,12 @@ run: its jobs were not released, its sinks not completed.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable, Sequence
 
 from mddag_executor.replay.recording import Recording, ReplayError
 from mddag_executor.text import counted, listed
-from msg_graph import Dag, TaskSet, Vertex
+from msg_graph import Callback, Dag, TaskSet, Vertex
+from msg_graph.binding import entities_of, Entity, meant
 
 _ORPHAN = (-1, -1, -1)
 
@@ -85,17 +87,23 @@ class Mapping:
     def _compare(self, recording: Recording, judge: TaskSet) -> None:
         """Find out which callbacks of the graph the trace does not have."""
         known = {callback.key for callback in recording.task_set.callbacks}
-        missing = [c.key for c in judge.callbacks if c.key not in known]
+        absent = [c for c in judge.callbacks if c.key not in known]
+        missing = [c.key for c in absent]
         if not missing:
             return
+        wanted = {callback.key for callback in judge.callbacks}
+        others = [each for callback in recording.task_set.callbacks if callback.key not in wanted
+                  for each in entities_of(callback)]
         if len(missing) == len(judge.callbacks):
             raise ReplayError(
                 recording.name, f'none of the callbacks of {judge.file} is in it: it has '
                 f'{listed([c.key for c in recording.task_set.callbacks])}',
+                first_meant(absent, others) or
                 'give the graph of the nodes that were recorded, or none')
         self.warnings.append(
             f'{recording.name}: not in it: {len(missing)} of the {len(judge.callbacks)} callbacks '
-            f'of {judge.file}, which count as never completed: {listed(missing)}')
+            f'of {judge.file}, which count as never completed: {listed(missing)}'
+            + asked(absent, others))
 
     def _report_unreleased(self) -> None:
         if self.same:
@@ -133,3 +141,15 @@ def _legs(vertex: Vertex, other: Vertex) -> list[int]:
     if sorted(topics) != sorted(theirs):
         return []
     return [theirs.index(topic) for topic in topics]
+
+
+def first_meant(absent: Iterable[Callback], others: Sequence[Entity]) -> str | None:
+    """Return the first question about what is meant by callbacks that are not in a recording."""
+    questions = ((c.key, meant(c, others)) for c in absent)
+    return next((f'{key}: {each}' for key, each in questions if each is not None), None)
+
+
+def asked(absent: Iterable[Callback], others: Sequence[Entity]) -> str:
+    """Return the same for the end of a line, empty where there is no question."""
+    question = first_meant(absent, others)
+    return '' if question is None else f': {question}'

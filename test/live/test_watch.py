@@ -74,3 +74,33 @@ def test_no_drift(make_executor: Callable[..., Any], make_node: Callable[..., No
     # A busy machine may skip releases; nothing else can differ here.
     assert {(each.kind, each.callback) for each in watch.drift(executor.statistics())} <= {
         ('rate', '/camera:grab')}
+
+
+def test_what_never_ran_and_is_probably_meant(
+        make_executor: Callable[..., Any], make_node: Callable[..., Node]) -> None:
+    """A namespace more, and a timer of another period; the nodes are gone when it is asked."""
+    task_set = loads("""
+mddag: 1
+nodes:
+  - node: /camera
+    callbacks: [{name: grab, timer: 20ms, deadline: 20ms}]
+  - node: /eye
+    callbacks: [{name: see, subscription: /image, period: 30ms, deadline: 20ms}]
+""")
+    executor = make_executor(task_set, num_workers=2)
+    watch = Watch(executor, task_set)
+    camera, eye = make_node('camera'), make_node('eye', namespace='/robot')
+    image = camera.create_publisher(Empty, '/robot/image', 10)
+    seen: list[int] = []
+    eye.create_subscription(Empty, 'image', lambda _: seen.append(1), 10)
+    camera.create_timer(0.025, lambda: image.publish(Empty()))
+    for node in (camera, eye):
+        executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(seen) > 8, 10.0)
+        for node in (camera, eye):
+            executor.remove_node(node)
+            node.destroy_node()
+    texts = {each.callback: each.text for each in watch.drift(executor.statistics())}
+    assert texts['/camera:grab'].endswith(': did you mean its timer of 25ms?')
+    assert texts['/eye:see'].endswith(": did you mean the node '/robot/eye'?")

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from msg_graph.binding import Binder
+from msg_graph.binding import Binder, Entity, entity_name, meant
 import pytest
 
 from .helpers import graph
@@ -126,3 +126,44 @@ def test_release_of_what_is_not_bound() -> None:
         binder.release(first)
     with pytest.raises(KeyError):
         binder.release(TASKS.callback('/a:t0'))
+
+
+@pytest.mark.parametrize(('callback', 'seen', 'question'), [
+    ('/b:s', Entity('/robot/b', 'subscription', '/robot/x'), "did you mean the node '/robot/b'?"),
+    ('/b:s', Entity('/robot/b', 'subscription', '/x'), "did you mean the node '/robot/b'?"),
+    ('/b:s', Entity('/b', 'subscription', '/robot/x'), "did you mean the topic '/robot/x'?"),
+    ('/a:q', Entity('/a', 'service', '/a/ask'), "did you mean the service '/a/ask'?"),
+    ('/a:j0', Entity('/robot/a', 'subscription', '/robot/y'), "did you mean the node '/robot/a'?"),
+    ('/b:t', Entity('/b', 'timer', '', 50_000_000), 'did you mean its timer of 50ms?'),
+    ('/b:t', Entity('/robot/b', 'timer', '', 33_333_333), "did you mean the node '/robot/b'?"),
+    ('/b:t', Entity('/robot/b', 'timer', '', 50_000_000), None),
+    ('/b:s', Entity('/bb', 'subscription', '/x'), None),
+    ('/b:s', Entity('/robot/b', 'subscription', '/y'), None),
+    ('/b:s', Entity('/robot/b', 'service', '/x'), None),
+])
+def test_a_namespace_more_or_another_period_is_probably_meant(
+        callback: str, seen: Entity, question: str | None) -> None:
+    assert meant(TASKS.callback(callback), [Entity('/other', seen.kind, '/z', 1000), seen]) \
+        == question
+
+
+def test_a_namespace_less_is_probably_meant() -> None:
+    tasks = graph("""
+- node: /robot/b
+  callbacks:
+    - {name: s, subscription: /robot/x, period: 1s, deadline: 1ms}
+""")
+    assert meant(tasks.callback('/robot/b:s'), [Entity('/b', 'subscription', '/x')]) == \
+        "did you mean the node '/b'?"
+
+
+@pytest.mark.parametrize(('symbol', 'name'), [
+    ('robot.camera.Camera.on_image', '/n: on_image (timer 1s)'),
+    ('__main__.main.<locals>.tick', '/n: tick (timer 1s)'),
+    ('robot.camera.<lambda>', '/n: <lambda> (timer 1s)'),
+    ('void ns::on_timer(int, char const*)', '/n: on_timer (timer 1s)'),
+    ('std::_Bind<void (Ping::*(Ping*))()>', '/n: timer 1s'),
+    ('', '/n: timer 1s'),
+])
+def test_undeclared_ones_are_called_by_node_and_function(symbol: str, name: str) -> None:
+    assert entity_name('/n', symbol, 'timer 1s') == name

@@ -319,6 +319,13 @@ def test_a_graph_of_other_nodes(recorded: Recorded) -> None:
         replay(recorded.write(), other)
 
 
+def test_a_graph_without_the_namespace_gets_a_question(recorded: Recorded) -> None:
+    other = loads('mddag: 1\nnodes:\n  - node: /robot/fuse\n    callbacks:\n'
+                  '      - {name: t, timer: 50ms, deadline: 5ms}\n', 'x.yaml')
+    with pytest.raises(ReplayError, match="/robot/fuse:t: did you mean the node '/fuse'\\?$"):
+        replay(recorded.write(), other)
+
+
 def test_cut_anywhere_it_says_something_or_judges_what_is_there(
     recorded: Recorded, graph: TaskSet
 ) -> None:
