@@ -30,7 +30,8 @@ Rules 1, 2, 3 and 6 concern callbacks and are in ``links``, the others, which ma
    deadline, shorter or longer than the period, and nothing else has one.
 7. DAGs are numbered by their sources' places in the file. The vertices of a DAG are numbered by
    their callbacks' places in the file, several of one callback in the order of the vertices that
-   start them, that is of the publishers.
+   start them, that is of the publishers. The edges of a vertex are listed in the order of the
+   topics that it publishes, those of one topic by index.
 8. Errors are collected in stages, as far as none is a consequence of another: who starts whom and
    who reads what; then cycles, deadlines and paths; then what the vertices show.
 9. The number of vertices and edges is bounded before they are made, as rule 4 multiplies.
@@ -190,12 +191,16 @@ def _dag(
     for after, befores in enumerate(predecessors):
         for before in befores:
             successors[before].append(after)
+    callbacks = [links.callbacks[expansion.callback[vertex]] for vertex in members]
+    for callback, after_it in zip(callbacks, successors):
+        topics = {topic: n for n, topic in enumerate(callback.publishes)}
+        after_it.sort(key=lambda v: min(topics[t] for t in callbacks[v].topics if t in topics))
     times_here = Counter(expansion.callback[vertex] for vertex in members)
     seen: Counter[int] = Counter()
     vertices = []
     for i, member in enumerate(members):
         place = expansion.callback[member]
-        callback = links.callbacks[place]
+        callback = callbacks[i]
         seen[place] += 1
         vertex_name = callback.key
         if len(expansion.of_callback[place]) > 1:
@@ -215,7 +220,7 @@ def _dag(
         vertices=tuple(vertices),
         source=local[expansion.of_callback[source][0]],
         sinks=tuple(v.index for v in vertices if not v.successors),
-        edges=tuple((i, after) for i, each in enumerate(successors) for after in each),
+        edges=tuple((i, after) for i, each in enumerate(successors) for after in sorted(each)),
         release_from=first.release_from,
         on_miss=first.on_miss,
         max_active_jobs=first.max_active_jobs,

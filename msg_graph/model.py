@@ -117,7 +117,8 @@ class Vertex:
     :ivar dag: index of its DAG.
     :ivar index: its place in its DAG.
     :ivar predecessors: indices, in the DAG, of the vertices that start it, ascending.
-    :ivar successors: indices, in the DAG, of the vertices that it starts, ascending.
+    :ivar successors: indices, in the DAG, of the vertices that it starts, in the order of the
+        topics that it publishes, those of one topic ascending.
     :ivar deadline_ns: relative deadline; not None if and only if it is a sink.
     """
 

@@ -8,10 +8,10 @@ smaller runs first.  The first integer is the *priority* (only it decides about 
 preemption needs a strictly smaller one), the others break ties, so that two runs and two machines
 agree.  The ties are those of the paper's own program.
 
-A key function gets the tables, the global vertex index, the job's release and index, the
-*readiness*, which grows with the time at which the callback became ready, and the *order*, which
-counts how callbacks became ready.  It must stay free of anything but integer arithmetic on its
-arguments, because it is compiled for the simulator and called as it is by the live executor.
+A key function gets the tables, the global vertex index, the job's release and index, and the
+*order*, a running number of what enters the ready queue (rule 3 of ``rules``).  It must stay free
+of anything but integer arithmetic on its arguments, because it is compiled for the simulator and
+called as it is by the live executor.
 """
 
 from __future__ import annotations
@@ -23,40 +23,40 @@ from mddag_executor.core.tables import Tables
 from mddag_executor.errors import MddagError
 
 Key = tuple[int, int, int, int]
-KeyFunction = Callable[[Tables, int, int, int, int, int], Key]
+KeyFunction = Callable[[Tables, int, int, int, int], Key]
 
 
-def key_rad(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+def key_rad(t: Tables, v: int, release: int, job: int, order: int) -> Key:
     """Return the key of extended GEDF: reference absolute deadline, vertex, DAG."""
     return (release + t.rad_offset[v], t.index_in_dag[v], t.dag_of[v], order)
 
 
-def key_rm(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+def key_rm(t: Tables, v: int, release: int, job: int, order: int) -> Key:
     """Return the key of rate monotonic: period, job index, order of becoming ready."""
-    return (t.period[t.dag_of[v]], job, readiness, order)
+    return (t.period[t.dag_of[v]], job, order, 0)
 
 
-def key_wc(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
-    """Return the key of the paper's work-conserving baseline: job index, then readiness."""
-    return (job, readiness, order, 0)
+def key_wc(t: Tables, v: int, release: int, job: int, order: int) -> Key:
+    """Return the key of the paper's work-conserving baseline: job index, then order."""
+    return (job, order, 0, 0)
 
 
-def key_fifo(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+def key_fifo(t: Tables, v: int, release: int, job: int, order: int) -> Key:
     """Return the key of plain order of becoming ready."""
-    return (readiness, order, 0, 0)
+    return (order, 0, 0, 0)
 
 
-def key_gedf(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+def key_gedf(t: Tables, v: int, release: int, job: int, order: int) -> Key:
     """Return the key of GEDF with one deadline for each DAG, its latest."""
     return (release + t.dag_deadline[t.dag_of[v]], t.index_in_dag[v], t.dag_of[v], order)
 
 
-def key_dm(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+def key_dm(t: Tables, v: int, release: int, job: int, order: int) -> Key:
     """Return the key of deadline monotonic: relative reference deadline, then as ``rm``."""
-    return (t.rad_offset[v], job, readiness, order)
+    return (t.rad_offset[v], job, order, 0)
 
 
-def key_ros2(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+def key_ros2(t: Tables, v: int, release: int, job: int, order: int) -> Key:
     """
     Return the key of rclcpp's executor within a polling round: the place in the wait set.
 
@@ -71,17 +71,17 @@ def key_ros2(t: Tables, v: int, release: int, job: int, readiness: int, order: i
     return (t.entity[v], order, 0, 0)
 
 
-def key_picas(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+def key_picas(t: Tables, v: int, release: int, job: int, order: int) -> Key:
     """
     Return the key of PiCAS: the fixed priority of the callback, then order of becoming ready.
 
     Source: H. Choi, Y. Xiang and H. Kim, "PiCAS: New Design of Priority-Driven Chain-Aware
     Scheduling for ROS2", RTAS 2021.  ``Tables.chain_rank`` says how chains and DAGs are ordered.
     """
-    return (t.chain_rank[v], readiness, order, 0)
+    return (t.chain_rank[v], order, 0, 0)
 
 
-def key_llf(t: Tables, v: int, release: int, job: int, readiness: int, order: int) -> Key:
+def key_llf(t: Tables, v: int, release: int, job: int, order: int) -> Key:
     """Return the key of least laxity first by the remaining critical path: latest start."""
     return (release + t.latest_start[v], t.index_in_dag[v], t.dag_of[v], order)
 
@@ -117,7 +117,7 @@ class Policy(NamedTuple):
 POLICIES: dict[str, Policy] = {p.name: p for p in (
     Policy('rad', key_rad, True, 'reference absolute deadline (extended GEDF of the paper)'),
     Policy('rm', key_rm, True, 'rate monotonic: the shortest period first'),
-    Policy('wc', key_wc, False, 'work-conserving baseline of the paper: job index, readiness'),
+    Policy('wc', key_wc, False, 'work-conserving baseline of the paper: job index, order'),
     Policy('fifo', key_fifo, False, 'order of becoming ready'),
     Policy('gedf', key_gedf, True, 'one deadline for each DAG: its latest'),
     Policy('dm', key_dm, True, 'deadline monotonic: the shortest relative deadline first'),

@@ -19,8 +19,11 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
     each leg is ready when its message is there, and the countdown is taken at its completion:
     the vertex completes with the leg that made it whole.
 3.  **Order.**  Ready executions wait in a heap by the key of the policy; the smallest goes first.
-    The readiness part of keys grows with time; at one instant what was preempted and put back
-    comes before what became ready then (design section 9).
+    Ties that a policy leaves go by the *order*: one running number, given when an execution
+    becomes ready and again when it is put back.  At one instant, as in the paper's own program,
+    first come the completions, workers in ascending order, and of each its successors in the
+    reverse of the order in which its edges are listed; then the releases, DAGs in ascending
+    order; then, while workers are given out, what is preempted.
 4.  **Callback groups.**  Each group has at most one owner, from its first dispatch to its
     completion (also while preempted or suspended).  What would run next but whose group is busy
     is set aside in the group's own heap; when the owner completes, the group's smallest returns.
@@ -85,10 +88,6 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tables import ABORT, Tables
 
-PUT_BACK = 0
-FRESH = 1
-
-
 # --- readiness -----------------------------------------------------------------------------------
 
 def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
@@ -98,14 +97,13 @@ def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
     s.x_ready[x] = now
     s.x_started[x] = -1
     s.x_left[x] = s.x_cost[x]
-    _enqueue(t, s, key, x, now, FRESH)
+    _enqueue(t, s, key, x)
 
 
-def _enqueue(t: Tables, s: State, key: KeyFunction, x: int, now: int, fresh: int) -> None:
+def _enqueue(t: Tables, s: State, key: KeyFunction, x: int) -> None:
     slot = s.x_slot[x]
     s.scalars[ORDER] += 1
-    k = key(t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], 2 * now + fresh,
-            s.scalars[ORDER])
+    k = key(t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], s.scalars[ORDER])
     entry = (k[0], k[1], k[2], k[3], x)
     s.x_key[x] = entry
     s.x_state[x] = WAITING
@@ -242,7 +240,7 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
     _leave_worker(s, victim)
     s.x_left[victim] += s.scalars[SWITCH_OVERHEAD] - (now - s.x_started[victim])
     _start(s, x, worker, now)
-    _enqueue(t, s, key, victim, now, PUT_BACK)
+    _enqueue(t, s, key, victim)
     return x
 
 

@@ -170,7 +170,7 @@ class _Columns:
             lists['region_offset'].append(region)
             lists['n_legs'].append(legs)
             lists['n_predecessors'].append(countdown)
-            lists['successors'].extend(first + s for s in vertex.successors)
+            lists['successors'].extend(first + s for s in reversed(vertex.successors))
             lists['first_successor'].append(len(lists['successors']))
             lists['group'].append(self._group(vertex.callback.node, vertex.callback.group))
             region += legs

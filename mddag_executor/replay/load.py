@@ -39,7 +39,7 @@ from mddag_executor.core import quantile, Tables
 from mddag_executor.replay.dispatches import Dispatches
 from mddag_executor.replay.follower import Execution, Observer, Piece
 from mddag_executor.replay.groups import RecordedGroups
-from mddag_executor.replay.timed import edges_of, Transports
+from mddag_executor.replay.timed import edge_numbers, edges_of, Transports
 from mddag_executor.simulate import Load
 from msg_graph import Dag, TaskSet
 
@@ -117,7 +117,10 @@ class LoadBuilder(Observer):
         # when each round of timers ended
         self._rounds = array('q')
         # by global vertex and leg: the edges (numbers in their DAG) that its message makes true
-        self._edges_into = [legs for dag in task_set.dags for legs in _edges_into(dag)]
+        numbers = edge_numbers(tables)
+        self._edges_into = [
+            legs for dag in task_set.dags
+            for legs in _edges_into(dag, tables.first_vertex[dag.index], numbers)]
         # (time when ready, what it took, its dispatch or -1): undeclared callbacks, and legs that
         # completed nothing
         self._others: list[tuple[int, int, int]] = []
@@ -297,19 +300,18 @@ class LoadBuilder(Observer):
         return typical
 
 
-def _edges_into(dag: Dag) -> list[list[list[int]]]:
+def _edges_into(
+    dag: Dag, first: int, numbers: dict[tuple[int, int], int]
+) -> list[list[list[int]]]:
     """Return for each vertex and leg the edges, by number in the DAG, that its message is of."""
-    edges: dict[tuple[int, int], int] = {}
-    for vertex in dag.vertices:
-        for after in vertex.successors:
-            edges[vertex.index, after] = len(edges)
     result: list[list[list[int]]] = []
     for vertex in dag.vertices:
+        edges = {p: numbers[first + p, first + vertex.index] for p in vertex.predecessors}
         topics = vertex.callback.topics if vertex.predecessors else ()
         if vertex.predecessors and len(topics) <= 1:
-            result.append([[edges[p, vertex.index] for p in vertex.predecessors]])
+            result.append([list(edges.values())])
             continue
         result.append([
-            [edges[p, vertex.index] for p in vertex.predecessors
-             if topic in dag.vertices[p].callback.publishes] for topic in topics])
+            [edge for p, edge in edges.items() if topic in dag.vertices[p].callback.publishes]
+            for topic in topics])
     return result

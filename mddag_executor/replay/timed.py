@@ -60,6 +60,14 @@ def edges_of(tables: Tables) -> list[int]:
     return [after - before for before, after in zip(first, first[1:])]
 
 
+def edge_numbers(tables: Tables) -> dict[tuple[int, int], int]:
+    """Return the number of each edge in its DAG, by the global vertices that it joins."""
+    first = tables.first_successor
+    return {
+        (vertex, tables.successors[i]): i - first[tables.first_vertex[tables.dag_of[vertex]]]
+        for vertex in range(tables.n_vertices) for i in range(first[vertex], first[vertex + 1])}
+
+
 class Engine:
     """
     One rescheduled run.

@@ -25,6 +25,7 @@ from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END
 from mddag_executor.replay import Reschedule
 from mddag_executor.replay.bags_reschedule import BagReschedule
 from mddag_executor.replay.follower import Execution, Observer, Piece
+from mddag_executor.replay.timed import edge_numbers
 from mddag_executor.simulate import END, Load, LogEntry, START
 from msg_graph import TaskSet
 
@@ -63,11 +64,7 @@ def of_rescheduled(outcome: Reschedule | BagReschedule) -> Schedule:
     if isinstance(outcome, BagReschedule):
         return Schedule(outcome.task_set, outcome.load, outcome.log, outcome.decisions,
                         outcome.end, outcome.end, judge_from=outcome.judge_from)
-    transports, tables = outcome.work.transports, outcome.tables
-    edges = {
-        (v, tables.successors[i]): i - tables.first_successor[tables.first_vertex[dag]]
-        for v, dag in enumerate(tables.dag_of[:len(outcome.task_set.vertices)])
-        for i in range(tables.first_successor[v], tables.first_successor[v + 1])}
+    transports, edges = outcome.work.transports, edge_numbers(outcome.tables)
 
     def delay(dag: int, job: int, before: int, after: int) -> int:
         return int(transports.delays[

@@ -43,22 +43,20 @@ as_log = at(VectorType(6))
 as_vector = at(VectorType())
 
 
-def key_of_policy(
-    t: Any, v: int, release: int, job: int, readiness: int, order: int
-) -> Key:
+def key_of_policy(t: Any, v: int, release: int, job: int, order: int) -> Key:
     """
     Return the key of the policy whose number the tables have in one more field, ``policy``.
 
     This is no compiled function but one that numba is told how to compile, because only these can
     be handed from function to function in code that is kept on disk.
     """
-    key: Key = list(POLICIES.values())[t.policy].key(t, v, release, job, readiness, order)
+    key: Key = list(POLICIES.values())[t.policy].key(t, v, release, job, order)
     return key
 
 
 def bind_policies(space: dict[str, Any]) -> None:
     """Tell numba how to compile ``key_of_policy``, with the key functions in a namespace."""
-    arguments = 't, v, release, job, readiness, order'
+    arguments = 't, v, release, job, order'
     *others, last = (row.key.__name__ for row in POLICIES.values())
     lines = [f'def choose({arguments}):']
     for number, key in enumerate(others):
@@ -66,5 +64,4 @@ def bind_policies(space: dict[str, Any]) -> None:
     lines.append(f'    return {last}({arguments})')
     exec('\n'.join(lines), space)
     chosen = space['choose']
-    overload(key_of_policy, strict=False)(
-        lambda t, v, release, job, readiness, order: chosen)
+    overload(key_of_policy, strict=False)(lambda t, v, release, job, order: chosen)

@@ -10,10 +10,9 @@ what waits in an unsorted list and looks everything up anew each time.
 Its reading of the documents:
 
 * At one instant completions come first, workers in ascending order, each making its successors
-  ready by index; then releases in DAG order; then work is handed out, one by one, as long as there
-  is anything to hand out. Work is handed out only at instants at which something happened.
-* What becomes ready at one instant is ordered: what was preempted then, successors of completions,
-  releases.
+  ready, the last listed first; then releases in DAG order; then work is handed out, one by one, as
+  long as there is anything to hand out. Work is handed out only at instants at which something
+  happened. What is preempted queues up again, behind all that is there.
 * A DAG with ``max_active_jobs`` open jobs loses the oldest when one more is released: it expires.
   What it has ready or running goes on, without consequences.
 * ``abort`` takes effect at a late completion, and when what is next to be handed out belongs to a
@@ -43,9 +42,6 @@ from .dag_paths import least_laxity, reachable_sinks, ways_to
 Event = tuple[int, str, int, int, int, int]
 """(tick, 'start' | 'end' | 'preempt', worker, DAG, vertex in its DAG, job)."""
 
-PREEMPTED, SUCCESSOR, RELEASED = range(3)
-
-
 @dataclass(eq=False)
 class Job:
     """A job with its sinks' verdicts."""
@@ -65,7 +61,7 @@ class Execution:
     job: Job
     vertex: Vertex
     left: int
-    arrival: tuple[int, int, int]
+    arrival: int
     has_run: bool = False
 
 
@@ -164,7 +160,7 @@ class BruteForce:
         if self.policy == 'picas':
             return self._fixed_priorities()[execution.vertex.callback.key]
         assert self.policy == 'fifo'
-        return execution.arrival[0]
+        return execution.arrival
 
     def _place(self, callback: Callback) -> int:
         """Return the place of a callback in the wait set."""
@@ -211,15 +207,15 @@ class BruteForce:
             self._give_up(of_dag[0], 'expired')
         job = Job(dag, sum(job.dag is dag for job in self.jobs), self.now)
         self.jobs.append(job)
-        self._ready(job, dag.vertices[dag.source], RELEASED)
+        self._ready(job, dag.vertices[dag.source])
 
-    def _ready(self, job: Job, vertex: Vertex, why: int) -> None:
+    def _ready(self, job: Job, vertex: Vertex) -> None:
         self.waiting.append(Execution(
-            job, vertex, self.ticks[job.dag.index][vertex.index], self._arrival(why)))
+            job, vertex, self.ticks[job.dag.index][vertex.index], self._arrival()))
 
-    def _arrival(self, why: int) -> tuple[int, int, int]:
+    def _arrival(self) -> int:
         self.sequence += 1
-        return (self.now, why, self.sequence)
+        return self.sequence
 
     def _open_sinks(self, job: Job) -> list[int]:
         return [sink for sink in job.dag.sinks if sink not in job.done]
@@ -268,9 +264,9 @@ class BruteForce:
         if vertex.index in job.dag.sinks:
             self._complete_sink(job, vertex.index)
         if job.outcome is None:
-            for after in vertex.successors:
+            for after in reversed(vertex.successors):
                 if job.done.issuperset(job.dag.vertices[after].predecessors):
-                    self._ready(job, job.dag.vertices[after], SUCCESSOR)
+                    self._ready(job, job.dag.vertices[after])
 
     def _complete_sink(self, job: Job, sink: int) -> None:
         late = self.now > self._deadline(job, sink)
@@ -327,7 +323,7 @@ class BruteForce:
         self._note('preempt', worker, victim)
         self._start(best, worker)
         victim.left += self.switch_overhead
-        victim.arrival = self._arrival(PREEMPTED)
+        victim.arrival = self._arrival()
         self.waiting.append(victim)
         return True
 

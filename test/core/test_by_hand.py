@@ -86,12 +86,11 @@ def test_equal_deadlines_go_by_vertex_then_by_dag(policy: str) -> None:
 
 @pytest.mark.parametrize('policy', ['rad', 'gedf'])
 def test_equal_deadlines_go_by_vertex_before_readiness(policy: str) -> None:
-    # One worker does x until 4; meanwhile v3 (vertex 2) gets ready before v2 (vertex 1).
     # At 2 v3 (vertex 3) has been ready since 1, and w has just made v2 (vertex 2) ready.
     callbacks = [source('v', 100), after('v', 'w'), after('w', 'v2', 90), after('v', 'v3', 90)]
     ticks = dict.fromkeys(('v', 'w', 'v2', 'v3'), 1)
     assert starts(case(callbacks, ticks, policy=policy), 50) == ['v.0', 'w.0', 'v2.0', 'v3.0']
-    assert starts(case(callbacks, ticks, policy='fifo'), 50) == ['v.0', 'w.0', 'v3.0', 'v2.0']
+    assert starts(case(callbacks, ticks, policy='fifo'), 50) == ['v.0', 'v3.0', 'w.0', 'v2.0']
 
 
 OVERTAKING = [source('a', 4), after('a', 'a2', 100), source('b', 4), after('b', 'b2', 100)]
@@ -129,16 +128,20 @@ def test_at_one_instant_successors_come_before_releases(policy: str) -> None:
         'long.0', 's.0', 's2.0', 's.1', 's2.1', 'long.1']
 
 
-def test_completions_at_one_instant_count_by_worker_and_successors_by_index() -> None:
-    callbacks = [source('a', 50), after('a', 'a2', 50), after('a', 'a3', 50),
+@pytest.mark.parametrize('policy', ['fifo', 'wc', 'rm'])
+def test_completions_at_one_instant_go_by_worker_then_the_last_listed_first(policy: str) -> None:
+    # a publishes x and y, in this order; a3 takes x, so the edges of a are listed a3, a2, a4.
+    callbacks = [source('a', 50), after('y', 'a2', 50), after('x', 'a3', 50), after('y', 'a4', 50),
                  source('b', 50), after('b', 'b2', 50)]
-    ticks = {'a': 2, 'a2': 1, 'a3': 1, 'b': 2, 'b2': 1}
-    assert log(case(callbacks, ticks, workers=2, policy='fifo'), 50) == [
+    callbacks[0]['publishes'] = ['/x', '/y']
+    ticks = {'a': 2, 'a2': 1, 'a3': 1, 'a4': 1, 'b': 2, 'b2': 1}
+    assert log(case(callbacks, ticks, workers=2, policy=policy), 50) == [
         (0, 'start', 0, 'a.0'), (0, 'start', 1, 'b.0'),
         (2, 'end', 0, 'a.0'), (2, 'end', 1, 'b.0'),
-        (2, 'start', 0, 'a2.0'), (2, 'start', 1, 'a3.0'),
-        (3, 'end', 0, 'a2.0'), (3, 'end', 1, 'a3.0'),
-        (3, 'start', 0, 'b2.0'), (4, 'end', 0, 'b2.0')]
+        (2, 'start', 0, 'a4.0'), (2, 'start', 1, 'a2.0'),
+        (3, 'end', 0, 'a4.0'), (3, 'end', 1, 'a2.0'),
+        (3, 'start', 0, 'a3.0'), (3, 'start', 1, 'b2.0'),
+        (4, 'end', 0, 'a3.0'), (4, 'end', 1, 'b2.0')]
 
 
 # --- workers and preemption ----------------------------------------------------------------------
@@ -180,10 +183,10 @@ def test_an_equal_priority_does_not_preempt() -> None:
     assert starts(case(callbacks, {'b': 1, 'a': 15}), 18) == ['b.0', 'a.0', 'b.1']
 
 
-def test_what_was_put_back_comes_before_what_gets_ready_at_that_instant() -> None:
+def test_what_is_preempted_goes_behind_what_gets_ready_at_that_instant() -> None:
     # rm. 1: v on worker 0, w on worker 1; 4: w ends and makes w2 ready, h and g come again:
-    # h takes worker 1, g takes worker 0 from v. 5: of v and w2 (both period 20, job 0) v goes
-    # first, though it was put back after w2 got ready.
+    # h takes worker 1, g takes worker 0 from v. 5: of v and w2 (both period 20, job 0) w2 goes
+    # first, as v was put back after w2 got ready.
     callbacks = [single('h', 4), single('g', 4), single('v', 20), source('w', 20),
                  after('w', 'w2', 20)]
     ticks = {'h': 1, 'g': 1, 'v': 10, 'w': 3, 'w2': 10}
@@ -191,7 +194,7 @@ def test_what_was_put_back_comes_before_what_gets_ready_at_that_instant() -> Non
     assert [each for each in found if each[0] >= 4] == [
         (4, 'end', 1, 'w.0'), (4, 'start', 1, 'h.1'), (4, 'preempt', 0, 'v.0'),
         (4, 'start', 0, 'g.1'), (5, 'end', 0, 'g.1'), (5, 'end', 1, 'h.1'),
-        (5, 'start', 0, 'v.0'), (5, 'start', 1, 'w2.0')]
+        (5, 'start', 0, 'w2.0'), (5, 'start', 1, 'v.0')]
 
 
 def test_what_was_preempted_goes_on_when_a_worker_is_free() -> None:

@@ -132,7 +132,11 @@ def check_same(tasks: TaskSet, specs: list[Spec]) -> None:
         for i, vertex in enumerate(dag.vertices):
             assert (vertex.dag, vertex.index) == (index, i)
             assert list(vertex.predecessors) == sorted(a for a, b in expected if b == i)
-            assert list(vertex.successors) == sorted(b for a, b in expected if a == i)
+            listed = specs[written[i][0]].publishes
+            assert list(vertex.successors) == sorted(
+                (b for a, b in expected if a == i),
+                key=lambda b: (min(listed.index(topic) for topic in specs[written[b][0]].topics
+                                   if topic in listed), b))
             assert vertex.deadline_ns == (7_000_000 if i in sinks else None)
     queue = [(e.reader, e.topic, list(e.writers)) for e in tasks.queue_edges]
     assert queue == [

@@ -40,6 +40,10 @@ def test_the_graph_is_that_of_the_facts(file: str) -> None:
         assert [v.callback.key for v in dag.vertices] == facts.callbacks.split()
         assert ' '.join(f'{a}-{b}' for a, b in dag.edges) == ' '.join(
             sorted(facts.edges.split(), key=lambda edge: [int(i) for i in edge.split('-')]))
+        listed = [edge.split('-') for edge in facts.edges.split()]
+        for vertex in dag.vertices:
+            assert vertex.successors == tuple(
+                int(after) for before, after in listed if int(before) == vertex.index)
         assert dag.sinks == tuple(facts.deadlines)
         assert dag.source == 0
         assert dag.vertices[0].callback.kind == 'timer'

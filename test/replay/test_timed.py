@@ -10,7 +10,7 @@ from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Tables
 from mddag_executor.core.state import new_state, SINK_DONE
 from mddag_executor.replay import reschedule
-from mddag_executor.replay.timed import busy_times, edges_of, Engine, Transports
+from mddag_executor.replay.timed import busy_times, edge_numbers, edges_of, Engine, Transports
 from mddag_executor.simulate import END, Load, PREEMPT, START
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
@@ -34,19 +34,25 @@ nodes:
     callbacks:
       - {name: d, timer: 100ms, deadline: 20ms, dag: d}
 """
-# edges of DAG a: a to b, a to c, b to c
 
 
 def engine(
     delays: list[int], workers: int = 2, preemptive: bool = False, horizon: int = 100 * MS,
     late: int = 50 * MS, jobs: int = 1, bound: int = 64,
 ) -> tuple[list[tuple[int, int, int]], list[tuple[int, ...]]]:
-    """Run a (4 ms), b (2 ms), c (3 ms), and d (1 ms, later); return starts and completed sinks."""
+    """
+    Run a (4 ms), b (2 ms), c (3 ms), and d (1 ms, later); return starts and completed sinks.
+
+    :param delays: of the messages from a to b, from a to c and from b to c.
+    """
     task_set = loads(CHAIN, 'g.yaml')
     tables = Tables.build(task_set, max_active_jobs=bound)
     load = Load([*(job * MS for job in range(jobs)), late], [0] * jobs + [1],
                 [*range(jobs), 0], [4 * MS, 2 * MS, 3 * MS] * jobs + [MS], [0, 3 * jobs], [3, 1])
-    transports = Transports(delays * jobs, [0, 0], [3, 0])
+    numbers = edge_numbers(tables)
+    by_edge = [delay for _, delay in sorted(zip(
+        (numbers[edge] for edge in ((0, 1), (0, 2), (1, 2))), delays))]
+    transports = Transports(by_edge * jobs, [0, 0], [3, 0])
     state = new_state(tables, workers, preemptive=preemptive, propagate=2)
     run = Engine(tables, state, find_policy('rad').key, load, transports)
     run.run(horizon)
