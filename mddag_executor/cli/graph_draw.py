@@ -20,9 +20,11 @@ mddag graph draw config/autoware.yaml -o autoware.mmd
 """
 DESCRIPTION = """\
 Draw the DAGs of a declaration. Each DAG is a frame, and in it each node. Timers are ellipses,
-subscriptions rounded boxes, sync callbacks hexagons, services arrows; sinks have a double border
-and their deadline. Solid arrows are trigger edges, dotted ones queue edges. The colour is the RAD
-offset (reference absolute deadline minus release): red is most urgent.
+subscriptions rounded boxes, sync callbacks hexagons, services parallelograms; sinks have a double
+border and their deadline. Solid arrows are trigger edges. Dotted arrows are queue edges, and begin
+at the name of what is read and of its writer. The colour is the RAD offset: the time from the
+release of a job to the earliest deadline that a callback leads to; red is the most urgent. DAGs
+stand in the order of the file.
 
 The ending of OUT says what it becomes: .svg, .png and .pdf need Graphviz (Debian, Ubuntu:
 'sudo apt install graphviz'); .dot (Graphviz's language) and .mmd (Mermaid) need nothing.

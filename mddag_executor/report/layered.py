@@ -31,6 +31,9 @@ from mddag_executor.report.picture import Box, DagFrame, Picture
 ASPECT = 1.6
 _CHARACTER, _LINE = 6.2, 14.0
 _PADDING = 10.0
+# How much larger than its text a shape has to be, for the text to stand inside.
+_ROOM = {'timer': (1.4, 1.4), 'subscription': (1.0, 1.0), 'sync': (1.45, 1.1),
+         'service': (1.6, 1.2)}
 _GAP_X, _GAP_Y, _GAP_DAG = 46.0, 10.0, 24.0
 _TITLE = 26.0
 
@@ -70,8 +73,12 @@ def _dag(dag: DagFrame, after: dict[str, list[str]]) -> Placed:
     boxes = {box.mark: box for node in dag.nodes for box in node.boxes}
     layers = _layers(list(boxes), after)
     _order(layers, after)
-    sizes = {mark: (max(map(len, text)) * _CHARACTER + 16, len(text) * _LINE + 6)
-             for mark, text in texts.items()}
+    sizes = {}
+    for mark, text in texts.items():
+        wide, high = _ROOM[boxes[mark].kind]
+        border = 10.0 * boxes[mark].sink
+        sizes[mark] = ((max(map(len, text)) * _CHARACTER + 16) * wide + border,
+                       (len(text) * _LINE + 6) * high + border)
     found = []
     left, top = 0.0, 0.0
     for layer in layers:

@@ -88,7 +88,24 @@ def test_dot() -> None:
     assert re.search(r'"d0v3" .*peripheries=2', text)
     assert not re.search(r'"d0v1" .*peripheries', text)
     dotted = [line.split(' [')[0].strip() for line in text.splitlines() if 'dotted' in line]
-    assert dotted == ['"d0v1" -> "d0v2"', '"d0v2" -> "d1v0"']
+    assert dotted[0].startswith('"k')     # in the legend
+    assert dotted[1:] == ['"d1v0q0" -> "d1v0"', '"d0v2q0" -> "d0v2"']
+    assert '"d1v0q0" [label="/c\\nfrom n:y\\n"' in text
+    assert '"d0v2q0" [label="member variable\\nfrom n:x\\n"' in text
+
+
+@pytest.mark.skipif(shutil.which('dot') is None, reason='Graphviz is not installed')
+@pytest.mark.parametrize('name', ['autoware.yaml', 'autoware_multi.yaml'])
+def test_dags_stand_in_the_order_of_the_file_and_the_legend_below(name: str) -> None:
+    result = picture(msg_graph.load(CONFIG / name))
+    done = subprocess.run(['dot', '-Tjson'], input=to_dot(result), text=True, check=True,
+                          stdout=subprocess.PIPE, timeout=60)
+    objects = json.loads(done.stdout)['objects']
+    frames = {item['name']: [float(number) for number in item['bb'].split(',')]
+              for item in objects if item['name'].startswith('cluster_')}
+    order = [f'cluster_{dag.mark}' for dag in result.dags] + ['cluster_legend']
+    tops = [frames[mark][3] for mark in order]
+    assert tops == sorted(tops, reverse=True)
 
 
 def test_mermaid() -> None:
