@@ -255,6 +255,7 @@ class Dispatcher(Dropping):
                 or state.job_state[slot] != OPEN):
             if not self.verdicts.was_aborted(dag, job):
                 return False
+            entry.ready += 1
             self.verdicts.note_drop(entry, Origin(slot, dag, job, target[0]), 'aborted', now)
             return True
         x = state.job_base[slot] + self.tables.region_offset[target[0]] + target[1]

@@ -15,13 +15,19 @@ from mddag_executor.core import rad_offsets, Tables
 from mddag_executor.core.state import (
     ABORTED,
     COMPLETED,
+    DROP,
     EXPIRED,
     JOB_END,
     LATE,
+    ORDER,
+    RUNNING,
     SINK_ABORTED,
     SINK_DONE,
     SINK_EXPIRED,
+    WAITING,
 )
+from mddag_executor.simulate import END, LogEntry, PREEMPT, Settings
+from mddag_executor.simulate.engine import run
 from msg_graph import Dag
 
 from .dag_paths import least_laxity
@@ -249,6 +255,25 @@ def test_every_job_ends_in_exactly_one_way(case: Case, last_release: int) -> Non
     for dag_result in run.result()['dags'].values():
         counted.update(dag_result['ends'])
     assert sum(counted.values()) == len(released)
+
+
+@examples(300)
+@given(cases(overheads=True), st.integers(5, 50))
+def test_whatever_gets_ready_ends_or_is_dropped_or_is_still_there(case: Case, horizon: int) -> None:
+    """Also of jobs that are aborted or expire."""
+    tables = Tables.build(case.task_set)
+    settings = Settings(
+        case.policy, case.workers, horizon * TICK, case.preemptive,
+        dispatch_overhead_ns=case.dispatch_overhead * TICK,
+        switch_overhead_ns=case.switch_overhead * TICK)
+    state, key = settings.start(tables)
+    log: list[LogEntry] = []
+    run(tables, state, key, case.load(horizon), horizon * TICK, False, log)
+    kinds = Counter(kind for _, kind, *_ in log)
+    ready = state.scalars[ORDER] - kinds[PREEMPT]
+    dropped = sum(kind == DROP for kind, *_ in state.decisions)
+    there = Counter(state.x_state)
+    assert ready == kinds[END] + dropped + there[WAITING] + there[RUNNING]
 
 
 @examples(100)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import random
 import threading
 import time
 from typing import Any
@@ -338,6 +339,26 @@ def test_abort_drops_what_is_left_of_a_late_job(make_executor, make_node):
     assert dag['sinks']['/sink:last']['aborted'] > 0
     assert sum(executor.statistics()['dropped'].values()) > 0
     assert len(chain.jobs['last']) < len(chain.jobs['tick'])
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_whatever_became_ready_ran_was_dropped_or_waits(make_executor, make_node, seed):
+    """Jobs are aborted at any point: also while what is going to publish still runs."""
+    generator = random.Random(seed)
+    dawdle = {name: lambda: time.sleep(generator.choice((0, 0.012, 0.03, 0.06)))
+              for name in ('relay', 'early', 'last')}
+    chain = Chain(make_node, dawdle)
+    executor = make_executor(with_source('on_miss: abort'), num_workers=2)
+    with Spinning(executor):
+        chain.start(executor)
+        assert wait_for(lambda: len(chain.jobs['tick']) >= 40, 20)
+        chain.timer.cancel()
+        assert wait_for(lambda: not executor.statistics()['queue']
+                        and executor.statistics()['idle_workers'] == 2)
+    statistics = executor.statistics()
+    assert sum(statistics['dropped'].values()) > 0
+    for name, counts in statistics['callbacks'].items():
+        assert counts['ready'] == counts['ran'] + counts['dropped'] + counts['waiting'], name
 
 
 def test_a_lost_message_expires_its_job(make_executor, make_node):
