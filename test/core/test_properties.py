@@ -259,7 +259,7 @@ def test_every_job_ends_in_exactly_one_way(case: Case, last_release: int) -> Non
 
 @examples(300)
 @given(cases(overheads=True), st.integers(5, 50))
-def test_whatever_gets_ready_ends_or_is_dropped_or_is_still_there(case: Case, horizon: int) -> None:
+def test_whatever_gets_ready_ends_or_is_dropped_or_is_there(case: Case, horizon: int) -> None:
     """Also of jobs that are aborted or expire."""
     tables = Tables.build(case.task_set)
     settings = Settings(
