@@ -14,12 +14,13 @@ ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: help env demo test soak fuzz lint docs clean distclean
+.PHONY: help env demo test check-fresh soak fuzz lint docs clean distclean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo       run the Autoware workload under the executor, record and replay it'
 	@echo 'make test       run all tests (PYTEST_ARGS=... for some of them)'
+	@echo 'make check-fresh  make demo and make test in new installations of Debian (CHECK_FRESH=...)'
 	@echo 'make soak       the Autoware workload with random faults for SOAK_SECONDS (600)'
 	@echo 'make fuzz       read damaged traces and bags for FUZZ_SECONDS (600) each'
 	@echo 'make lint       run the linters and mypy only'
@@ -35,7 +36,14 @@ demo: env
 	@$(BIN)/mddag demo $(DEMO_ARGS)
 
 test: env
+	@sh .ci/tools install
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+# Needs root, or sudo; debootstrap; a connection.
+CHECK_FRESH ?= bookworm trixie
+
+check-fresh:
+	@bash .ci/check-fresh $(CHECK_FRESH)
 
 FUZZ_SECONDS ?= 600
 

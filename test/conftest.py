@@ -5,16 +5,24 @@ What all tests share: a ROS domain of their own, an order, and guards against le
 
 Every session (and every worker of pytest-xdist) claims a ROS domain that no other session on this
 machine has, and discovery stays on this machine, so tests neither hear a robot nor disturb one.
+Each has a folder for temporary files, too, which has to be empty at its end; by this folder in
+their environment its processes are known, of which none may be left.
+
+A test marked `needs('graphviz')` is skipped where `.ci/tools` misses that program, and the last
+line says so. With CI in the environment nothing may be missing: such a test fails.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 import contextlib
-import fcntl
+from functools import cache
+import importlib
 import os
 from pathlib import Path
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -35,6 +43,9 @@ ORDER = ('msg_graph', 'core', 'trace', 'simulate', 'analysis', 'replay', 'report
 # Domains above 101 collide with the ephemeral ports of Linux; low ones are what people use.
 DOMAINS = range(40, 102)
 
+CI = bool(os.environ.get('CI'))
+NEEDS = 'needs '
+
 _session = contextlib.ExitStack()
 
 if __name__ == 'test.conftest':
@@ -50,33 +61,71 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ['ROS_DOMAIN_ID'] = str(_claim_domain())
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     os.environ.pop('ROS_STATIC_PEERS', None)
-    os.environ['ROS_LOG_DIR'] = _session.enter_context(
-        tempfile.TemporaryDirectory(prefix='mddag-test-log-', ignore_cleanup_errors=True))
+    # What pytest itself keeps stays where it is.
+    os.environ.setdefault('PYTEST_DEBUG_TEMPROOT', tempfile.gettempdir())
+    folder = _session.enter_context(
+        tempfile.TemporaryDirectory(prefix='mddag-test-', ignore_cleanup_errors=True))
+    os.environ['TMPDIR'] = tempfile.tempdir = folder
+    os.environ['ROS_LOG_DIR'] = str(Path(folder, 'log'))
     hypothesis.settings.register_profile(
         'mddag', deadline=None, print_blob=True,
         # The same examples on every run of continuous integration; new ones at home.
-        derandomize=bool(os.environ.get('CI')))
+        derandomize=CI)
     hypothesis.settings.load_profile('mddag')
+    if CI:  # what is not there is an error
+        pytest.importorskip = lambda name, *_, **__: importlib.import_module(name)
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
     _session.close()
+    reporter = config.pluginmanager.get_plugin('terminalreporter')
+    if reporter is None:
+        return
+    reasons = Counter(report.longrepr[2] for report in reporter.stats.get('skipped', ()))
+    counts = {tool: reasons[f'Skipped: {NEEDS}{tool}'] for tool in missing_tools()
+              if f'Skipped: {NEEDS}{tool}' in reasons}
+    if counts:
+        reporter.write_line(
+            'not tested: ' + ', '.join(f'what {tool} is needed for ({count} tests)'
+                                       for tool, count in counts.items())
+            + ': sudo apt install ' + ' '.join(missing_tools()[tool] for tool in counts))
 
 
 def _claim_domain() -> int:
-    """Return a domain that is locked for as long as this session lasts."""
+    """Return a domain that no other session has for as long as this one lasts."""
     start = os.getpid() % len(DOMAINS)
     for domain in (*DOMAINS[start:], *DOMAINS[:start]):
-        path = Path(tempfile.gettempdir(), f'mddag-test-domain-{domain}.{os.getuid()}.lock')
-        lock = path.open('w')
+        # A name without a file: it is gone with the process, and reaches as far as DDS does.
+        claim = socket.socket(socket.AF_UNIX)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            claim.bind(f'\0mddag-test-domain-{domain}')
         except OSError:
-            lock.close()
+            claim.close()
             continue
-        _session.enter_context(lock)
+        _session.enter_context(claim)
         return domain
     raise pytest.UsageError('every ROS domain for tests is in use by another test session')
+
+
+# --- what is not here ----------------------------------------------------------------------------
+
+@cache
+def missing_tools() -> dict[str, str]:
+    """Return the programs that tests lack, and Debian's packages with them."""
+    done = subprocess.run(['sh', str(HERE.parent / '.ci' / 'tools'), 'missing'],
+                          capture_output=True, text=True, check=True)
+    return dict(line.split(' ', 1) for line in sorted(done.stdout.splitlines()))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    for mark in item.iter_markers('needs'):
+        tool, = mark.args
+        if tool in missing_tools():
+            say = pytest.fail if CI else pytest.skip
+            say(f'{NEEDS}{tool}')
+
+
+# --- order ---------------------------------------------------------------------------------------
 
 
 # What runs ROS, or looks at how time passes. Side by side (`make test`) they are one group, which
@@ -112,6 +161,39 @@ def _rank(item: pytest.Item) -> tuple[bool, int]:
     folder = parts[0] if len(parts) > 1 else ''
     place = ORDER.index(folder) if folder in ORDER else ORDER.index('live')
     return item.get_closest_marker('slow') is not None, place
+
+
+# --- leftovers -----------------------------------------------------------------------------------
+
+@pytest.fixture(scope='session', autouse=True)
+def nothing_left_behind() -> Iterator[None]:
+    """Fail a session that leaves temporary files behind, or processes for more than a while."""
+    yield
+    end = time.monotonic() + 10.0
+    while processes := _processes():
+        if time.monotonic() > end:
+            for pid in processes:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            break
+        time.sleep(0.05)
+    files = sorted(path.name for path in Path(tempfile.gettempdir()).iterdir()
+                   if path.name != 'log')
+    assert (processes, files) == ({}, []), 'the tests left these processes and files behind'
+
+
+def _processes() -> dict[int, str]:
+    """Return what runs with this session's folder in its environment."""
+    found = {}
+    mark = f'TMPDIR={tempfile.gettempdir()}\0'.encode()
+    for process in Path('/proc').glob('[0-9]*'):
+        with contextlib.suppress(OSError):  # it has ended, or it is another user's
+            if mark in (process / 'environ').read_bytes() + b'\0':
+                command = (process / 'cmdline').read_bytes().replace(b'\0', b' ').decode()
+                # Those of the standard library end with this process.
+                if 'multiprocessing.' not in command:
+                    found[int(process.name)] = command
+    return found
 
 
 @pytest.fixture

@@ -3,8 +3,7 @@
 """
 The package in a colcon workspace: built, tested and used from there.
 
-It needs colcon in the environment of the tests (pip install colcon-common-extensions); without an
-installation of ROS, the rclpy that it finds there is that of the package index.
+Without an installation of ROS, the rclpy that colcon's packages find is that of the package index.
 """
 
 from __future__ import annotations
@@ -20,14 +19,11 @@ import pytest
 
 TOP = Path(__file__).resolve().parent.parent
 NAME = 'mddag_executor'
-NEEDED = ('colcon_core', 'colcon_ros', 'colcon_python_setup_py', 'colcon_test_result')
 COLCON = 'import sys; from colcon_core.command import main; sys.exit(main())'
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        any(find_spec(name) is None for name in NEEDED),
-        reason='colcon is not installed here: pip install colcon-common-extensions')]
+for name in ('colcon_bash', 'colcon_package_selection', 'colcon_ros', 'colcon_test_result'):
+    pytest.importorskip(name, reason='colcon is not installed')
+pytestmark = pytest.mark.slow
 
 needs_ros2 = pytest.mark.skipif(
     any(find_spec(name) is None for name in ('ros2cli', 'ros2launch', 'ros2pkg', 'ros2run'))
@@ -66,7 +62,6 @@ def in_workspace(
         env={**os.environ, 'COLCON_TRACE': '', 'PYTHON': sys.executable})
 
 
-@pytest.mark.skipif(shutil.which('bash') is None, reason='there is no bash')
 def test_what_was_built_is_what_runs(workspace: Path):
     installed = workspace / 'install' / NAME
     program = installed / 'lib' / NAME / 'mddag'  # where `ros2 run` looks

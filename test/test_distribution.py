@@ -194,7 +194,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
             (source / name).write_bytes((TOP / name).read_bytes())
     build(source, 'sdist', place)
     with tarfile.open(next(place.glob('*.tar.gz'))) as archive:
-        archive.extractall(place / 'unpacked', filter='data')
+        # Python 3.11.2 (Debian 12) has none, and no argument for it.
+        archive.extraction_filter = getattr(tarfile, 'data_filter', None)
+        archive.extractall(place / 'unpacked')
     unpacked, = (place / 'unpacked').iterdir()
     build(unpacked, 'wheel', place)
     return place

@@ -70,6 +70,8 @@ def test_ruff() -> None:
     run('ruff', 'check', '--no-cache', '--output-format', 'concise', *ROOTS)
 
 
+# What it finds depends on the Python, and on the types that numpy has for it.
+@pytest.mark.skipif(sys.version_info[:2] != (3, 12), reason='mypy runs with Python 3.12 only')
 def test_mypy() -> None:
     run('mypy')
 

@@ -26,7 +26,7 @@ def test_text(mddag: Mddag, tmp_path: Path, ending: str, begin: str) -> None:
     assert 'callback_16' in text
 
 
-@pytest.mark.skipif(shutil.which('dot') is None, reason='Graphviz is not installed')
+@pytest.mark.needs('graphviz')
 @pytest.mark.parametrize(('ending', 'begin'), [
     ('svg', b'<?xml'), ('png', b'\x89PNG'), ('pdf', b'%PDF')])
 def test_graphviz(mddag: Mddag, tmp_path: Path, ending: str, begin: bytes) -> None:
@@ -36,7 +36,7 @@ def test_graphviz(mddag: Mddag, tmp_path: Path, ending: str, begin: bytes) -> No
     assert (tmp_path / f'o.{ending}').read_bytes().startswith(begin)
 
 
-@pytest.mark.skipif(shutil.which('dot') is None, reason='Graphviz is not installed')
+@pytest.mark.needs('graphviz')
 def test_a_large_graph(mddag: Mddag, tmp_path: Path) -> None:
     lines = ['mddag: 1', 'nodes:']
     for dag in range(60):

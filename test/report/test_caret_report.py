@@ -12,7 +12,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from mddag_executor.cli import main as program
-from mddag_executor.trace import import_ctf, TraceError
+from mddag_executor.trace import import_ctf
 import pytest
 
 from ..replay.cases_by_hand import slow_cases
@@ -20,7 +20,9 @@ from ..replay.test_caret_sample import GRAPH, rows, SESSION
 from ..report import test_html_browser as pages
 
 pytest.importorskip('bokeh', reason='Bokeh is not installed')
-pytestmark = pytest.mark.skipif(not SESSION.is_dir(), reason='the recording is not there')
+pytestmark = [
+    pytest.mark.skipif(not SESSION.is_dir(), reason='the recording is not there'),
+    pytest.mark.needs('babeltrace2')]
 browser = pages.browser
 FILTER = '/filter_node:callback_0'
 
@@ -31,12 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp('caret')
     trace, graph = path / 'sample.mcap', path / 'graph.yaml'
     graph.write_text(GRAPH)
-    try:
-        import_ctf(SESSION, trace)
-    except TraceError as error:
-        if 'not installed' in str(error):
-            pytest.skip('python3-bt2 is not installed')
-        raise
+    import_ctf(SESSION, trace)
     assert program.main([
         'replay', str(trace), str(graph), '--report', str(path / 'report.html'), '--json',
         str(path / 'result.json'), '--junit', str(path / 'junit.xml')]) == 0
@@ -107,6 +104,7 @@ def test_perfetto_has_carets_callback_times(folder: Path) -> None:
     assert list(zip(sorted(times[1]), sorted(times[2]))) == filter_times()
 
 
+@pytest.mark.needs('chromium')
 def test_the_report_opens_and_shows_it(browser: Any, folder: Path) -> None:
     pages.opened(browser, folder / 'report.html')
     assert pages.complaints(browser) == []

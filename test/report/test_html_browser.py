@@ -24,8 +24,7 @@ CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') \
     or shutil.which('google-chrome')
 DRIVER = shutil.which('chromedriver')
 
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None or DRIVER is None, reason='Chromium or its driver is not installed')
+pytestmark = pytest.mark.needs('chromium')
 
 FLAGS = (
     '--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
@@ -38,7 +37,6 @@ PATIENCE_S = 60.0
 
 @pytest.fixture(scope='module')
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    from selenium.common.exceptions import WebDriverException
     from selenium.webdriver.chrome.service import Service
     options = webdriver.ChromeOptions()
     options.binary_location = CHROMIUM
@@ -47,10 +45,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         options.add_argument(flag)
     options.set_capability('goog:loggingPrefs', {'browser': 'ALL'})
     os.environ.setdefault('SE_OFFLINE', 'true')
-    try:
-        driver = webdriver.Chrome(options=options, service=Service(DRIVER))
-    except WebDriverException as error:
-        pytest.skip(f'Chromium does not start here: {(error.msg or "").splitlines()[:1]}')
+    driver = webdriver.Chrome(options=options, service=Service(DRIVER))
     driver.set_script_timeout(PATIENCE_S)
     driver.set_page_load_timeout(PATIENCE_S)
     yield driver

@@ -8,7 +8,6 @@ from dataclasses import replace
 import json
 from pathlib import Path
 import re
-import shutil
 import subprocess
 
 from hypothesis import given
@@ -130,7 +129,7 @@ def test_labels_hold_any_text(text: str) -> None:
     assert back == printable(text)
 
 
-@pytest.mark.skipif(shutil.which('dot') is None, reason='Graphviz is not installed')
+@pytest.mark.needs('graphviz')
 def test_graphviz_reads_hostile_names_as_they_are() -> None:
     result = drawn()
     first = result.dags[0]

@@ -9,7 +9,6 @@ from pathlib import Path
 import struct
 from typing import Any
 
-from mddag_executor.trace.ctf import interpreters
 import pytest
 
 CLOCK_OFFSET = 1_732_000_000_000_000_000
@@ -45,11 +44,8 @@ Kind = tuple[str, Sequence[tuple[str, str]]]
 
 
 def needs_babeltrace() -> pytest.MarkDecorator:
-    """Return the mark of tests that read sessions, which some Python's `bt2` has to do."""
-    import subprocess
-    there = any(subprocess.run([python, '-c', 'import bt2'], capture_output=True).returncode == 0
-                for python in interpreters())
-    return pytest.mark.skipif(not there, reason='python3-bt2 is not installed')
+    """Return the mark of tests that read sessions."""
+    return pytest.mark.needs('babeltrace2')
 
 
 def session(
