@@ -63,7 +63,7 @@ class Entry:
         'kind', 'entity', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'dropped', 'skipped', 'busy_ns',
         'unattributed', 'removed', 'address', 'handle', 'enters', 'soon', 'soon_from',
-        'publishes', 'light', 'at_once')
+        'publishes', 'light', 'at_once', '__weakref__')
 
     def __init__(
         self, kind: str, entity: Any, node: str, callback: Callback | None, group: int,
@@ -123,6 +123,10 @@ class Entry:
         if self.callback is not None:
             return self.callback.key
         return entity_name(self.node, self.symbol, f'{self.kind} {self.label}'.rstrip())
+
+    def is_through(self) -> bool:
+        """Return whether nothing of it waits or runs."""
+        return self.ready <= self.ran + self.dropped
 
     def count_into(self, counts: dict[str, dict[str, Any]]) -> None:
         """

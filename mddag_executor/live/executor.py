@@ -310,7 +310,7 @@ class MultiDeadlineExecutor(Stepping):
     def _look_after(self) -> None:
         """Do what is to be done now and then while somebody spins."""
         self._submit_tasks()
-        if self._rates.look() and self._registry.retimed():
+        if self._rates.look() and self._registry.is_stale():
             self._changed = True
         if self._gathering is not None:
             self._gathering.look()

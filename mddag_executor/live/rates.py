@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import time
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from mddag_executor.live.entries import Entry
 from mddag_executor.live.registry import Registry
@@ -63,7 +64,7 @@ class RateWatch:
         self._warn = warn
         self._clock = clock
         self._next = self._looked = clock()
-        self._known: dict[Entry, _Known] = {}
+        self._known = WeakKeyDictionary[Entry, _Known]()
 
     def look(self) -> bool:
         """Look at all timers, unless that was done just now; return whether it was not."""
@@ -72,8 +73,8 @@ class RateWatch:
             return False
         since, self._looked, self._next = self._looked, now, now + LOOK_S
         before = self._known
-        self._known = {
-            entry: before.get(entry) or _Known(since) for entry in self._registry.timers()}
+        self._known = WeakKeyDictionary({
+            entry: before.get(entry) or _Known(since) for entry in self._registry.timers()})
         for entry, known in self._known.items():
             if now < known.next:
                 continue

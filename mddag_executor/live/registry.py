@@ -118,9 +118,15 @@ class Registry:
         self._free_groups()
         return added, gone
 
-    def retimed(self) -> bool:
-        """Return whether an undeclared timer has another period now: it may be declared."""
-        return any(self._retimed(entry) for entry in self.timers())
+    def is_stale(self) -> bool:
+        """
+        Return whether `refresh` would change something though no entity has come or gone.
+
+        An undeclared timer has another period: it may be declared. Or what still ran of an entity
+        that had gone is through.
+        """
+        return (any(self._retimed(entry) for entry in self.timers())
+                or any(entry.is_through() for entry in self._retired))
 
     def _retimed(self, entry: Entry) -> bool:
         if entry.kind != TIMER or entry.callback is not None or self._binder is None:
@@ -141,7 +147,7 @@ class Registry:
         """Keep of retired entries that are through only their counts: memory is bounded."""
         retired, self._retired = self._retired, []
         for entry in retired:
-            if entry.ready <= entry.ran + entry.dropped:
+            if entry.is_through():
                 entry.count_into(self._past)
                 if entry.callback is not None:
                     self._published.setdefault(entry.callback.key, set()).update(entry.publishes)
