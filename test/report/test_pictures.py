@@ -93,7 +93,7 @@ def test_dot() -> None:
     assert '"d0v2q0" [label="member variable\\nfrom n:x\\n"' in text
 
 
-@pytest.mark.skipif(shutil.which('dot') is None, reason='Graphviz is not installed')
+@pytest.mark.needs('graphviz')
 @pytest.mark.parametrize('name', ['autoware.yaml', 'autoware_multi.yaml'])
 def test_dags_stand_in_the_order_of_the_file_and_the_legend_below(name: str) -> None:
     result = picture(msg_graph.load(CONFIG / name))
