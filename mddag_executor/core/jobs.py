@@ -13,6 +13,7 @@ from mddag_executor.core.state import (
     ABORTED,
     ELSEWHERE,
     EXPIRED,
+    FAILED,
     FREE,
     HERE,
     IDLE,
@@ -23,6 +24,7 @@ from mddag_executor.core.state import (
     OPEN,
     SINK_ABORTED,
     SINK_EXPIRED,
+    SINK_FAILED,
     SINK_MISSED,
     SKIP,
     State,
@@ -184,6 +186,12 @@ def abort_job(t: Tables, s: State, slot: int, now: int) -> None:
     """Abort an open job (rule 7): each sink that has not completed is missed and aborted."""
     _give_up_sinks(t, s, slot, SINK_ABORTED)
     close_job(s, slot, ABORTED, now)
+
+
+def fail_job(t: Tables, s: State, slot: int, now: int) -> None:
+    """Fail an open job (rule 8): each sink that has not completed is missed and failed."""
+    _give_up_sinks(t, s, slot, SINK_FAILED)
+    close_job(s, slot, FAILED, now)
 
 
 def _give_up_sinks(t: Tables, s: State, slot: int, kind: int) -> None:

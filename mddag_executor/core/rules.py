@@ -39,11 +39,13 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
 7.  **Misses.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops what is left of it, as soon
     as the miss is known: at a late completion, or when something of it comes first in the ready
     queue after the deadline of a sink that is not done.  What has started runs on.
-8.  **Ends.**  A job ends in exactly one of completed, late, aborted, expired.  After an abort
-    executions of the job that have not started are dropped; after an expiry they run (live: each
+8.  **Ends.**  A job ends in exactly one of completed, late, aborted, expired, failed.  It fails
+    when an execution of it fails (a callback lets an exception out): that vertex has not
+    delivered, so each sink that has not completed is missed.  After an abort executions of the
+    job that have not started are dropped; after an expiry or a failure they run (live: each
     stands for a message, which is never lost silently) but make no further edge true and are not
-    judged.  The slot is free for the next job when none of its executions waits, runs or is
-    suspended.
+    judged.  What fails after its job has ended changes nothing.  The slot is free for the next
+    job when none of its executions waits, runs or is suspended.
 9.  **Polling.**  Under a policy that polls (``ros2``), the ready queue is what the last poll
     found.  When an idle worker finds nothing to run there, it polls: the first waiting execution
     of every entity (timer, subscription, …) becomes one round's queue.  What becomes ready later
@@ -59,7 +61,7 @@ from __future__ import annotations
 
 from heapq import heappop, heappush
 
-from mddag_executor.core.jobs import abort_job, close_job, deactivate, judge, overdue
+from mddag_executor.core.jobs import abort_job, close_job, deactivate, fail_job, judge, overdue
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import add_stale, is_stale, poll, wait_for_poll
 from mddag_executor.core.state import (
@@ -295,6 +297,14 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
             _complete_vertex(t, s, key, slot, vertex, now)
     deactivate(s, slot)
     return whole
+
+
+def fail(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
+    """End a running execution that failed, and with it its job (rule 8); see ``complete``."""
+    slot = s.x_slot[x]
+    if s.job_state[slot] == OPEN and s.job_dag[slot] < t.n_dags:
+        fail_job(t, s, slot, now)
+    return complete(t, s, key, x, now)
 
 
 def _release_group(s: State, group: int) -> None:

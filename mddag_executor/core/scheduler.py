@@ -100,6 +100,11 @@ class Scheduler:
         """End a running execution; False for a leg that did not make its vertex whole."""
         return rules.complete(self.tables, self.state, self._key, x, now)
 
+    def fail_open(self, slot: int, now: int) -> None:
+        """Fail the job in a slot unless it has ended already."""
+        if self.state.job_state[slot] == OPEN:
+            jobs.fail_job(self.tables, self.state, slot, now)
+
     def drop(self, x: int, now: int) -> None:
         """Drop a waiting execution: it never runs."""
         rules.drop(self.state, x, now)

@@ -18,8 +18,8 @@ from mddag_executor.core.tables import NEVER, Tables
 # States of an execution.
 IDLE, WAITING, RUNNING, SUSPENDED, DONE, DROPPED = range(6)
 
-# States of a job.  Of the last four every ended job is in exactly one.
-FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED = range(6)
+# States of a job.  Of the last five every ended job is in exactly one.
+FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED = range(7)
 
 # Where a vertex is expected to run; LAST_HERE: here, is no sink, and nothing after it runs here.
 ELSEWHERE, HERE, LAST_HERE = range(3)
@@ -31,7 +31,7 @@ ELSEWHERE, HERE, LAST_HERE = range(3)
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  The deadline is that of the
 # sink; the time that of the decision, for a sink that completed the completion, else -1.  Instead
 # of a vertex the end of a job has -1, or NOT_JUDGED.
-SINK_DONE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, JOB_END, DROP = range(6)
+SINK_DONE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, JOB_END, DROP, SINK_FAILED = range(7)
 NOT_JUDGED = -2
 
 Entry = tuple[int, int, int, int, int]

@@ -19,18 +19,21 @@ from mddag_executor.core.state import (
     Decision,
     DROP,
     EXPIRED,
+    FAILED,
     JOB_END,
     LATE,
     NOT_JUDGED,
     SINK_ABORTED,
     SINK_DONE,
     SINK_EXPIRED,
+    SINK_FAILED,
     SINK_MISSED,
 )
 from mddag_executor.core.tables import Tables
 from msg_graph import TaskSet
 
-_OUTCOMES = {COMPLETED: 'completed', LATE: 'late', ABORTED: 'aborted', EXPIRED: 'expired'}
+_OUTCOMES = {COMPLETED: 'completed', LATE: 'late', ABORTED: 'aborted', EXPIRED: 'expired',
+             FAILED: 'failed'}
 
 
 def quantile(ordered: Sequence[int], q: float) -> int:
@@ -56,6 +59,7 @@ class Counts(NamedTuple):
     late: int
     expired: int
     aborted: int
+    failed: int
 
     @property
     def missed(self) -> int:
@@ -66,16 +70,16 @@ class Counts(NamedTuple):
 def counts(sink: Mapping[str, Any]) -> Counts:
     """Return the verdicts that a sink's result holds."""
     overdue = sink.get('overdue', 0)
-    aborted = sink.get('aborted', 0)
+    aborted, failed = sink.get('aborted', 0), sink.get('failed', 0)
     in_time = sink['completed'] - (sink['late'] - overdue)
-    due = sink['completed'] + overdue + sink['expired'] + aborted
-    return Counts(due, in_time, sink['late'], sink['expired'], aborted)
+    due = sink['completed'] + overdue + sink['expired'] + aborted + failed
+    return Counts(due, in_time, sink['late'], sink['expired'], aborted, failed)
 
 
 def total(dags: Mapping[str, Any]) -> Counts:
     """Return the verdicts about all sinks of a result."""
     every = [counts(sink) for dag in dags.values() for sink in dag['sinks'].values()]
-    return Counts(*(sum(column) for column in zip(*every))) if every else Counts(0, 0, 0, 0, 0)
+    return Counts(*(sum(column) for column in zip(Counts(0, 0, 0, 0, 0, 0), *every)))
 
 
 def never_due(dags: Mapping[str, Any]) -> list[str]:
@@ -134,6 +138,7 @@ class SinkTally:
         self.completed = 0
         self.late = 0
         self.expired = 0
+        self.failed = 0
         self.aborted = 0
         self.overdue = 0
         self.shortest: int | None = None
@@ -161,7 +166,7 @@ class SinkTally:
         return {
             'relative_deadline_ns': self.relative_deadline_ns, 'completed': self.completed,
             'late': self.late, 'overdue': self.overdue, 'expired': self.expired,
-            'aborted': self.aborted, 'response_ns': response}
+            'failed': self.failed, 'aborted': self.aborted, 'response_ns': response}
 
 
 class Tally:
@@ -211,6 +216,8 @@ class Tally:
             sink.overdue += 1
         elif kind == SINK_EXPIRED:
             sink.expired += 1
+        elif kind == SINK_FAILED:
+            sink.failed += 1
         elif kind == SINK_ABORTED:
             sink.aborted += 1
         if missed and (self.first_miss is None or (

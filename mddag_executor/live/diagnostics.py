@@ -69,16 +69,17 @@ class Results(NamedTuple):
     late: int
     expired: int
     aborted: int
+    failed: int
 
     @property
     def missed(self) -> int:
         """Return how many were not in time."""
-        return self.late + self.expired + self.aborted
+        return self.late + self.expired + self.aborted + self.failed
 
     @property
     def due(self) -> int:
         """Return how many have been judged."""
-        return self.completed + self.expired + self.aborted
+        return self.completed + self.expired + self.aborted + self.failed
 
     def minus(self, earlier: Results) -> Results:
         """Return what has come since."""
@@ -90,7 +91,7 @@ def read_results(tally: Tally, dag: int, sinks: list[SinkTally]) -> Results:
     return Results(
         tally.jobs[dag], sum(s.completed for s in sinks),
         sum(s.late - s.overdue for s in sinks), sum(s.expired for s in sinks),
-        sum(s.aborted for s in sinks))
+        sum(s.aborted for s in sinks), sum(s.failed for s in sinks))
 
 
 def last_responses(sink: SinkTally, count: int) -> list[int]:
@@ -139,7 +140,7 @@ class DagWatch:
             'period_ms': _ms(self._period_ns), 'jobs': str(results.jobs),
             'results': str(results.due), 'missed': str(results.missed),
             'late': str(results.late), 'expired': str(results.expired),
-            'aborted': str(results.aborted),
+            'aborted': str(results.aborted), 'failed': str(results.failed),
             'window_results': str(window.due), 'window_missed': str(window.missed),
             'window_missed_ratio': f'{ratio:.4f}', **self._response_times()}
         return Status(f'{self._thresholds.name}: {self._name}', level, message, values)
@@ -154,6 +155,8 @@ class DagWatch:
         if not window.missed:
             return OK, f'{counted(window.due, "result")} in time'
         message = f'{window.missed} of {window.due} results missed their deadlines'
+        if window.failed:
+            message += f', {window.failed} because a callback raised'
         if window.missed >= max(
                 limits.warn_burst, limits.error_ratio * window.due):
             return ERROR, message

@@ -21,7 +21,7 @@ from time import monotonic_ns
 from typing import Protocol
 
 from mddag_executor.core import Scheduler, Tables
-from mddag_executor.core.rules import complete, make_ready
+from mddag_executor.core.rules import complete, fail, make_ready
 from mddag_executor.core.state import IDLE, OPEN, SUSPENDED
 from mddag_executor.live.attribution import Attribution, Origin
 from mddag_executor.live.crossings import Crossings
@@ -310,25 +310,35 @@ class Dispatcher(Dropping):
         self.scheduler.suspend(work.x)
         self._work[work.x] = work
 
-    def complete(self, work: Work, start: int, end: int, now: int, seat: Seat) -> None:
-        """End a running execution that ended at ``end``; ``now`` is the core's time."""
+    def complete(
+        self, work: Work, start: int, end: int, now: int, seat: Seat, failed: bool = False
+    ) -> None:
+        """
+        End a running execution that ended at ``end``; ``now`` is the core's time.
+
+        :param failed: whether its callback has let an exception out.
+        """
         x = work.x
         work.x = -1
         work.entry.ran += 1
         state = self.scheduler.state
         origin = work.origin
         record = self.record
+        end_it = fail if failed else complete
+        work.entry.failed += failed
         if record is None:
-            complete(self.tables, state, self._key, x, end)
+            end_it(self.tables, state, self._key, x, end)
         elif origin is None:
             self._record_run(work, start, end, seat)
-            complete(self.tables, state, self._key, x, end)
+            end_it(self.tables, state, self._key, x, end)
         else:
             tables = self.tables
             slot, dag, job, vertex = origin
             deadline = state.job_release[slot] + tables.rad_offset[vertex]
             leg = x - state.job_base[slot] - tables.region_offset[vertex]
-            whole = complete(tables, state, self._key, x, end)
+            whole = end_it(tables, state, self._key, x, end)
+            if failed:  # told first, or its completion would count
+                record('fail', now, seat.vtid, dag, tables.index_in_dag[vertex], job)
             record(
                 EXECUTION, start, seat.vtid, work.entry.address, dag, tables.index_in_dag[vertex],
                 job, seat.worker, work.ready_ns, deadline, end, now, whole, leg)

@@ -22,7 +22,7 @@ TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
 SOON_FROM = 8
 
 _HANDLED = (TIMER, SUBSCRIPTION, SERVICE)
-COUNTS = ('ready', 'ran', 'dropped', 'skipped', 'unattributed', 'busy_ns')
+COUNTS = ('ready', 'ran', 'failed', 'dropped', 'skipped', 'unattributed', 'busy_ns')
 
 
 class AtOnce:
@@ -61,8 +61,8 @@ class Entry:
 
     __slots__ = (
         'kind', 'entity', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
-        'topic', 'waiting', 'ready', 'ran', 'dropped', 'skipped', 'busy_ns',
-        'unattributed', 'removed', 'address', 'handle', 'enters', 'soon', 'soon_from',
+        'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
+        'busy_ns', 'unattributed', 'removed', 'address', 'handle', 'enters', 'soon', 'soon_from',
         'publishes', 'light', 'at_once', '__weakref__')
 
     def __init__(
@@ -86,6 +86,8 @@ class Entry:
         self.waiting: dict[int, None] = {}
         self.ready = 0
         self.ran = 0
+        # how many times its callback let an exception out
+        self.failed = 0
         self.dropped = 0
         self.skipped = 0
         self.busy_ns = 0

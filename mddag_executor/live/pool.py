@@ -268,6 +268,7 @@ class Pool:
         running = current.running = seat.running
         waits_for: Any = None
         ran = True
+        raised: BaseException | None = None
         start = monotonic_ns() + dispatcher.clock_offset
         try:
             if self._gathering is None or not more:
@@ -277,7 +278,7 @@ class Pool:
         except Destroyed:
             ran = False
         except BaseException as error:
-            dispatcher.fail(error)
+            raised = error
         end = monotonic_ns() + dispatcher.clock_offset
         current.running = previous
         if running.published:
@@ -288,10 +289,13 @@ class Pool:
             if not ran:
                 dispatcher.give_up(work, now)
             elif waits_for is None:
-                dispatcher.complete(work, start, end, now, seat)
+                dispatcher.complete(work, start, end, now, seat, raised is not None)
             else:
                 dispatcher.suspend(work, start, end, seat)
             self._next(seat, more, now)
+        if raised is not None:  # now, when its job has failed for whoever catches it
+            dispatcher.fail(raised)
+            raised = None   # it refers to this frame
         if waits_for is not None:
             self._resume_when_done(work, waits_for)
         if dispatcher.verdicts.misses:

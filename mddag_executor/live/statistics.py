@@ -20,9 +20,9 @@ def statistics(
     Return the counts of a run.
 
     ``dags``, ``deadline_missed`` and ``first_miss`` are as in ``replay --json``.  ``callbacks``
-    has for each entity what became ready, ran, waits, was dropped (QoS depth, destroyed, aborted)
-    or skipped (timers), and its busy time in ns.  ``unattributed`` counts messages of declared
-    callbacks whose publication was not found; they ran as undeclared ones.
+    has for each entity what became ready, ran, failed (raised), waits, was dropped (QoS depth,
+    destroyed, aborted) or skipped (timers), and its busy time in ns.  ``unattributed`` counts
+    messages of declared callbacks whose publication was not found; they ran as undeclared ones.
     """
     with dispatcher.lock:
         result = dispatcher.verdicts.tally.result()

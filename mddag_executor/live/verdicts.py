@@ -20,6 +20,7 @@ from mddag_executor.core.state import (
     SINK_ABORTED,
     SINK_DONE,
     SINK_EXPIRED,
+    SINK_FAILED,
     SINK_MISSED,
 )
 from mddag_executor.live.attribution import Origin
@@ -31,7 +32,7 @@ KEEP_ABORTED = 4096
 NO_ORIGIN = Origin(-1, -1, -1, -1)
 
 _WHY = {SINK_DONE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
-        SINK_ABORTED: 'aborted'}
+        SINK_ABORTED: 'aborted', SINK_FAILED: 'failed'}
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class DeadlineMiss:
     A sink that missed its deadline; times in ns since the epoch.
 
     ``completed_ns`` is None where it never completed: ``kind`` tells why (``late``, ``overdue``
-    at the run's end, ``expired``, ``aborted``).
+    at the run's end, ``expired``, ``aborted``, or ``failed``: a callback of the job raised).
     """
 
     dag: str

@@ -126,6 +126,22 @@ def on_job_end(t: Any, s: Any, w: Any, now: int, dag: int, job: int, aborted: bo
     return take_decisions(t, s, w, slot, seen)
 
 
+def on_fail(t: Any, s: Any, w: Any, now: int, dag: int, vertex: int, job: int) -> bool:
+    """Take in that an execution failed; False where it is for Python."""
+    place = mapped(w, dag, vertex)
+    if place < 0:
+        return False
+    if w.map_vertex[place] < 0:
+        return True
+    found = find(w.slots, w.map_dag[dag], job, 0, 0)
+    if found < 0:
+        return True
+    slot = w.slots[found, fw.S_SLOT]
+    seen = len(s.decisions)
+    jobs.fail_job(t, s, slot, now)
+    return take_decisions(t, s, w, slot, seen)
+
+
 def on_deadline(w: Any, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
     """Take in a recorded miss."""
     if w.scalars[fw.COMPARE] == 0:

@@ -26,6 +26,7 @@ from mddag_executor.replay.fast_core import (
     note_miss,
     on_complete,
     on_deadline,
+    on_fail,
     on_job_end,
     on_release,
 )
@@ -114,6 +115,9 @@ def on_event(t: Any, s: Any, w: Any, i: int) -> int:
     elif kind == fw.DEADLINE:
         note_time(w, now)
         on_deadline(w, w.rows[i, 4], w.rows[i, 5], w.rows[i, 6], w.rows[i, 7], w.rows[i, 8])
+    elif kind == fw.FAIL:
+        note_time(w, now)
+        fine = on_fail(t, s, w, now, w.rows[i, 4], w.rows[i, 5], w.rows[i, 6])
     elif kind == fw.EXPIRE or kind == fw.ABORT:
         note_time(w, now)
         fine = on_job_end(t, s, w, now, w.rows[i, 4], w.rows[i, 5], kind == fw.ABORT)

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 
 # Kinds of rows (0: an event that is not decoded, see ``trace.columns``).
 (OTHER, START, END, RELEASE, DISPATCH, COMPLETE, DEADLINE, EXPIRE, ABORT, PUBLISH,
- RCL_PUBLISH) = range(11)
+ RCL_PUBLISH, FAIL) = range(12)
 KINDS = {
     'ros2:callback_start': START, 'ros2:callback_end': END, 'mddag:job_release': RELEASE,
     'mddag:dispatch': DISPATCH, 'mddag:complete': COMPLETE, 'mddag:deadline': DEADLINE,
     'mddag:expire': EXPIRE, 'mddag:abort': ABORT, 'ros2:rclcpp_publish': PUBLISH,
-    'ros2:rcl_publish': RCL_PUBLISH}
+    'ros2:rcl_publish': RCL_PUBLISH, 'mddag:fail': FAIL}
 
 # Why the compiled code came back: all is done, an event for Python, something is full, the output
 # is to be taken away, or this is nothing for it.

@@ -5,8 +5,8 @@ What the events of a run say: releases, executions, completions, ends of jobs.
 
 Theory of operation
 -------------------
-The executor records `job_release`, `complete`, `expire`, `abort`, `deadline` and `drop` in the
-order in which its scheduler core saw them, with times that never decrease.  So in the order of
+The executor records `job_release`, `fail`, `complete`, `expire`, `abort`, `deadline` and `drop` in
+the order in which its scheduler core saw them, with times that never decrease.  So in the order of
 time (a stable one: what has the same time stays in the order of the file) they are the same
 sequence again, and whoever feeds it to a core gets the same verdicts.
 
@@ -95,6 +95,9 @@ class Observer:
     def withdrawn(self, dag: int, job: int) -> None:
         """Take in that nobody can tell what became of a job: it is not to be judged."""
 
+    def failed(self, dag: int, vertex: int, job: int, now: int) -> None:
+        """Take in that an execution of a vertex failed: its job does; told before it completes."""
+
     def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
         """Take in a miss as the executor saw it; `completed` is -1 where it never did."""
 
@@ -153,6 +156,7 @@ class Follower:
             'mddag:complete': self._complete,
             'mddag:deadline': self._deadline,
             'mddag:drop': self._drop,
+            'mddag:fail': self._fail,
             'mddag:expire': self._expire,
             'mddag:abort': self._abort,
             'mddag:lost': self._lost,
@@ -359,6 +363,14 @@ class Follower:
             self._open.pop(last[0], None)
         for completed in self._tell_completed:
             completed(dag, vertex, job, leg, whole, end, execution)
+
+    def _fail(self, event: Event) -> None:
+        _, now, _, _, dag, vertex, job = event
+        self._advance(now)
+        dag, vertex, _ = self._mapping.look_up(dag, vertex, 0)
+        if dag >= 0:
+            for observer in self._observers:
+                observer.failed(dag, vertex, job, now)
 
     def _expire(self, event: Event) -> None:
         self._job_end(event, False)

@@ -6,7 +6,8 @@ The verdicts of a recorded run: its events through the scheduler core, once more
 Theory of operation
 -------------------
 The core is fed what the executor fed its own: releases, completions, and, because they depend on
-settings and on messages that are not in the trace, the expiries and aborts as they were recorded.
+settings and on messages that are not in the trace, the expiries, aborts and failures as they were
+recorded.
 The bounds that would decide about them anew are lifted.  So each sink has the verdicts that the
 executor counted, or, under another declaration, those that it would have counted had the callbacks
 run at the same times.
@@ -31,6 +32,7 @@ from mddag_executor.core.state import (
     SINK_ABORTED,
     SINK_DONE,
     SINK_EXPIRED,
+    SINK_FAILED,
     SINK_MISSED,
     SKIP,
 )
@@ -46,7 +48,7 @@ KEEP_RESPONSES = 1_000_000
 """How many response times are kept for each sink: beyond that, quantiles are of the last ones."""
 
 _KEEP_WAITED = 4096
-_MISSES = {SINK_MISSED, SINK_ABORTED, SINK_EXPIRED}
+_MISSES = {SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, SINK_FAILED}
 
 
 class Miss(NamedTuple):
@@ -178,6 +180,13 @@ class Judge(Observer):
         slot = self._slots.pop((dag, job), None)
         if slot is not None:
             self._scheduler.withdraw(slot)
+
+    def failed(self, dag: int, vertex: int, job: int, now: int) -> None:
+        """Fail an open job."""
+        slot = self._slots.get((dag, job))
+        if slot is not None:
+            self._scheduler.fail_open(slot, now)
+            self._decided(slot)
 
     def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
         """Compare a recorded miss."""

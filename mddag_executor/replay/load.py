@@ -66,6 +66,7 @@ class RecordedLoad(NamedTuple):
     transports: Transports
     dispatch_ns: int | None = None
     transport_ns: int | None = None
+    failed: frozenset[tuple[int, int]] = frozenset()
 
 
 class _Jobs:
@@ -127,6 +128,7 @@ class LoadBuilder(Observer):
         self._leg: tuple[Execution, tuple[int, int, int]] | None = None
         self._untaken: tuple[int, int, int] | None = None
         self._dispatches = Dispatches(n_workers)
+        self._failed: set[tuple[int, int]] = set()
         #: By global vertex: the address of the callback that ran as it.
         self.callback_of: dict[int, int] = {}
 
@@ -202,6 +204,12 @@ class LoadBuilder(Observer):
             if end < max(ends):
                 jobs.arrived[row * jobs.n_edges + edge] = end
 
+    def failed(self, dag: int, vertex: int, job: int, now: int) -> None:
+        """Keep what failed: it does so again."""
+        row = self._jobs[dag].row.get(job)
+        if row is not None:
+            self._failed.add((vertex, row))
+
     def build(self, overheads: bool = True) -> RecordedLoad:
         """Return what was collected."""
         import numpy as np
@@ -243,7 +251,8 @@ class LoadBuilder(Observer):
         return RecordedLoad(
             self._load(costs, bases, [ready for ready, _, _ in others], overheads),
             [jobs.numbers for jobs in self._jobs], demand, executions, estimated, list(unknown),
-            transports, usual if len(measured) else None, transport)
+            transports, usual if len(measured) else None, transport,
+            frozenset(self._failed))
 
     def _load(
         self, costs: list[int], bases: list[int], others: list[int], overheads: bool

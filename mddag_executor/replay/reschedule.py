@@ -82,7 +82,7 @@ class Reschedule:
         state.scalars[JUDGE_FROM] = self.judge_from
         load, end = self._work.load, self._follower.end
         engine = Engine(
-            self.tables, state, policy.key, load, self._work.transports)
+            self.tables, state, policy.key, load, self._work.transports, self._work.failed)
         engine.run(end)
         self.log = engine.log
         self.decisions = state.decisions

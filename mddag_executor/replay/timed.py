@@ -24,7 +24,7 @@ A message whose job has ended meanwhile is ignored.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from heapq import heappop, heappush
 from typing import NamedTuple
 
@@ -73,17 +73,20 @@ class Engine:
     One rescheduled run.
 
     :param state: of the core, empty, made with ``propagate=2``.
+    :param failed: the vertices and jobs whose executions fail.
     :ivar log: every start, end and preemption.
     """
 
     def __init__(
         self, tables: Tables, state: State, key: KeyFunction, load: Load, transports: Transports,
+        failed: Set[tuple[int, int]] = frozenset(),
     ) -> None:
         self._t = tables
         self._s = state
         self._key = key
         self._load = load
         self._transports = transports
+        self._failed = failed
         self._first_edge = [tables.first_successor[v] for v in tables.first_vertex]
         self._early = not state.scalars[PREEMPTIVE]
         self._finish_at = [NEVER] * len(state.worker_x)
@@ -143,7 +146,8 @@ class Engine:
         slot = self._s.x_slot[x]
         job = self._s.job_index[slot]
         vertex = self._s.x_vertex[x]
-        rules.complete(self._t, self._s, self._key, x, now)
+        end = rules.fail if (vertex, job) in self._failed else rules.complete
+        end(self._t, self._s, self._key, x, now)
         if self._early:
             for after in self._at_once(slot, job, vertex):
                 self._arrive(slot, job, after, now)

@@ -104,11 +104,12 @@ class Tolerance:
         due, missed = verdicts.due, verdicts.missed
         if not missed:
             return None
+        failed = f' ({verdicts.failed} failed: a callback raised)' if verdicts.failed else ''
         if self.ratio is None and self.burst is None:
-            return f'{missed} of {counted(due, "job")} missed the deadline'
+            return f'{missed} of {counted(due, "job")} missed the deadline{failed}'
         broken = []
         if self.ratio is not None and missed > self.ratio * due:
-            broken.append(f'{missed} of {counted(due, "job")} missed the deadline '
+            broken.append(f'{missed} of {counted(due, "job")} missed the deadline{failed} '
                           f'({missed / due:.4%}), tolerated: {self.ratio:.4%}')
         if self.burst is not None and sink['longest_burst'] > self.burst:
             broken.append(f'{counted(sink["longest_burst"], "job")} in a row missed the deadline, '

@@ -42,6 +42,7 @@ from mddag_executor.core.state import (
     SINK_ABORTED,
     SINK_DONE,
     SINK_EXPIRED,
+    SINK_FAILED,
     SINK_MISSED,
 )
 from mddag_executor.errors import MddagError
@@ -57,7 +58,8 @@ MOST_HELD = 1024
 MOST_ORDERED = 65536
 BATCH = 65536
 
-_VERDICTS = {SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired', SINK_ABORTED: 'aborted'}
+_VERDICTS = {SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired', SINK_ABORTED: 'aborted',
+             SINK_FAILED: 'failed'}
 
 
 class ExecutionRow(NamedTuple):

@@ -9,7 +9,7 @@
 (() => {
   const EXACT = 4000;                   // executions drawn one by one at most
   const CELLS = 24000;                  // lines times intervals otherwise
-  const KINDS = ['late', 'not completed when the run ended', 'expired', 'aborted'];
+  const KINDS = ['late', 'not completed when the run ended', 'expired', 'aborted', 'failed'];
   const CLASSES = [                     // by slack over deadline: less than, colour
     [0, '#d7191c'], [0.1, '#fd8d3c'], [0.25, '#fec44f'], [0.5, '#9ecae1'], [Infinity, '#3182bd']];
   const UNKNOWN = 5, COLOURS = [...CLASSES.map((c) => c[1]), '#969696'];

@@ -20,10 +20,11 @@ from mddag_executor.report.replays import (
 )
 from mddag_executor.report.tables import response_cells, short_names
 from mddag_executor.report.text import format_ns, printable
-from mddag_executor.report.timeline import ABORTED, DONE, EXPIRED, OVERDUE
+from mddag_executor.report.timeline import ABORTED, DONE, EXPIRED, FAILED, OVERDUE
 
 _KINDS = {
-    DONE: 'late', OVERDUE: 'not completed at the end', EXPIRED: 'expired', ABORTED: 'aborted'}
+    DONE: 'late', OVERDUE: 'not completed at the end', EXPIRED: 'expired', ABORTED: 'aborted',
+    FAILED: 'failed'}
 _COLOURS = {
     'release_lag_ns': '#c7c7c7', 'waiting_ns': '#fd8d3c', 'executing_ns': '#3182bd',
     'suspended_ns': '#9e9ac8', 'transport_ns': '#74c476', 'unknown_ns': '#636363'}
@@ -71,8 +72,8 @@ def sinks_html(data: ReportData) -> str:
     """Return the table of sinks: verdicts, and response times by the deadline."""
     result = data.tally.result()['dags']
     short = short_names(name for dag in result.values() for name in dag['sinks'])
-    header = ('DAG', 'sink', 'due', 'in time', 'missed', 'late', 'expired', 'aborted', 'median',
-              'p99', 'max', 'deadline')
+    header = ('DAG', 'sink', 'due', 'in time', 'missed', 'late', 'expired', 'failed', 'aborted',
+              'median', 'p99', 'max', 'deadline')
     rows = []
     for dag_name, dag in result.items():
         for name, sink in dag['sinks'].items():
@@ -80,7 +81,7 @@ def sinks_html(data: ReportData) -> str:
             rows.append((
                 dag_name, short[name], verdicts.due, verdicts.in_time,
                 verdicts.missed, verdicts.late, verdicts.expired,
-                verdicts.aborted, *response_cells(sink['response_ns']),
+                verdicts.failed, verdicts.aborted, *response_cells(sink['response_ns']),
                 format_ns(sink['relative_deadline_ns'])))
     return f'<div class="wide">{html_table(header, rows, 2, bad=4)}</div>'
 

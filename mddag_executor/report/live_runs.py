@@ -23,6 +23,10 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
         yield from measured_lines(measured)
     dropped = result['dropped']
     yield f'{sum(dropped.values())} dropped' + _details(dropped)
+    raised = {name: counts['failed'] for name, counts in result['callbacks'].items()
+              if counts['failed']}
+    if raised:
+        yield f'{sum(raised.values())} runs of callbacks that raised' + _details(raised)
     skipped = {name: counts['skipped'] for name, counts in result['callbacks'].items()
                if counts['skipped']}
     if skipped:

@@ -20,6 +20,7 @@ from mddag_executor.text import counted
 
 HEADER = ('DAG', 'sink', 'due', 'in time', 'share', 'late', 'expired', 'median', 'p99', 'max',
           'deadline')
+_RARE = ('failed', 'aborted')        # shown where there are any
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
@@ -61,15 +62,16 @@ def each_sink(dags: Mapping[str, Any]) -> Iterator[Sink]:
 
 def sink_table(dags: Mapping[str, Any]) -> str:
     """Return a table with a row for each sink: counts, and response times by its deadline."""
-    some_aborted = total(dags).aborted > 0
-    header = [*HEADER[:7], *(['aborted'] if some_aborted else []), *HEADER[7:]]
+    every = total(dags)
+    rare = [name for name in _RARE if getattr(every, name)]
+    header = [*HEADER[:7], *rare, *HEADER[7:]]
     rows: list[list[Cell]] = []
     for sink in each_sink(dags):
         verdicts = counts(sink.result)
         rows.append([
             sink.shown_dag, sink.shown_name, verdicts.due, verdicts.in_time,
             percent(verdicts.in_time, verdicts.due), verdicts.late,
-            verdicts.expired, *([verdicts.aborted] if some_aborted else []),
+            verdicts.expired, *(getattr(verdicts, name) for name in rare),
             *response_cells(sink.result['response_ns']),
             format_ns(sink.result['relative_deadline_ns'])])
     return table(header, rows)
@@ -97,7 +99,8 @@ def verdicts_line(dags: Mapping[str, Any]) -> str:
     every = total(dags)
     return (f'{counted(every.due, "sink job")} due, {every.in_time} in time '
             f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
-            + (f', {every.aborted} aborted' if every.aborted else ''))
+            + ''.join(f', {getattr(every, name)} {name}' for name in _RARE
+                      if getattr(every, name)))
 
 
 def never_due_lines(dags: Mapping[str, Any]) -> Iterator[str]:

@@ -32,6 +32,7 @@ from mddag_executor.core.state import (
     SINK_ABORTED,
     SINK_DONE,
     SINK_EXPIRED,
+    SINK_FAILED,
     SINK_MISSED,
 )
 from mddag_executor.replay import batches
@@ -48,8 +49,9 @@ MOST_UNDECLARED = 200
 OTHERS = 'other undeclared callbacks'
 
 # What came of a sink's job, as the pictures and exports call it.
-DONE, OVERDUE, EXPIRED, ABORTED = range(4)
-_KINDS = {SINK_DONE: DONE, SINK_MISSED: OVERDUE, SINK_EXPIRED: EXPIRED, SINK_ABORTED: ABORTED}
+DONE, OVERDUE, EXPIRED, ABORTED, FAILED = range(5)
+_KINDS = {SINK_DONE: DONE, SINK_MISSED: OVERDUE, SINK_EXPIRED: EXPIRED, SINK_ABORTED: ABORTED,
+          SINK_FAILED: FAILED}
 
 _FIRST_WIDTH = 1 << 16      # of a bin, ns
 _ADDRESS = 2 ** 64 - 1

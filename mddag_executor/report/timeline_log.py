@@ -17,7 +17,7 @@ execution that publishes it, or as much later (or earlier) as ``delays`` says.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from typing import NamedTuple
 
 from mddag_executor.core import NEVER
@@ -45,6 +45,7 @@ class Schedule(NamedTuple):
     :ivar numbers: by DAG, what a job of the load is called; None: as in the load.
     :ivar delay: how long messages take; None: no time.
     :ivar judge_from: jobs released before are not judged.
+    :ivar failed: the vertices and jobs (of the load) whose executions failed.
     """
 
     task_set: TaskSet
@@ -57,6 +58,7 @@ class Schedule(NamedTuple):
     numbers: list[list[int]] | None = None
     delay: Delay | None = None
     judge_from: int = -NEVER
+    failed: Set[tuple[int, int]] = frozenset()
 
 
 def of_rescheduled(outcome: Reschedule | BagReschedule) -> Schedule:
@@ -72,7 +74,8 @@ def of_rescheduled(outcome: Reschedule | BagReschedule) -> Schedule:
 
     return Schedule(
         outcome.task_set, outcome.work.load, outcome.log, outcome.decisions, outcome.end_ns,
-        outcome.end_ns, True, outcome.work.jobs, delay, outcome.judge_from)
+        outcome.end_ns, True, outcome.work.jobs, delay, outcome.judge_from,
+        outcome.work.failed)
 
 
 def tell(schedule: Schedule, observers: Sequence[Observer]) -> None:
@@ -179,6 +182,9 @@ class _Teller:
         piece = Piece(
             self._callback[v] if declared else 0, dag if declared else -1, v if declared else -1,
             number, worker, before.ready, before.since, now, before.busy == 0)
+        if kind == END and (v, job) in self._schedule.failed:
+            for observer in self._observers:
+                observer.failed(dag, v, number, now)
         last = 0
         if kind == END and declared and self._vertices[v].predecessors:
             last = max(1, len(self._vertices[v].callback.topics)) - 1

@@ -61,16 +61,17 @@ def test_the_result_for_machines(capsys: pytest.CaptureFixture[str], graph: Path
         'policy': 'rad', 'workers': 2, 'preemptive': False, 'duration_ns': 30_000_000,
         'utilisation': 0.55, 'deadline_missed': False, 'first_miss': None, 'never_due': [],
         'dags': {'lidar': {
-            'jobs': 3, 'ends': {'completed': 3, 'late': 0, 'aborted': 0, 'expired': 0},
+            'jobs': 3,
+            'ends': {'completed': 3, 'late': 0, 'aborted': 0, 'expired': 0, 'failed': 0},
             'sinks': {
                 '/filter:near': {
                     'relative_deadline_ns': 5_000_000, 'completed': 3, 'late': 0, 'overdue': 0,
-                    'expired': 0, 'aborted': 0,
+                    'expired': 0, 'failed': 0, 'aborted': 0,
                     'response_ns': {'min': 3_000_000, 'median': 3_000_000, 'p99': 3_000_000,
                                     'max': 3_000_000}},
                 '/filter:far': {
                     'relative_deadline_ns': 12_000_000, 'completed': 3, 'late': 0, 'overdue': 0,
-                    'expired': 0, 'aborted': 0,
+                    'expired': 0, 'failed': 0, 'aborted': 0,
                     'response_ns': {'min': 10_000_000, 'median': 10_000_000,
                                     'p99': 10_000_000, 'max': 10_000_000}}}}},
         'file': str(graph), 'judge': 'horizon', 'seed': 0, 'ended_ns': 30_000_000,
@@ -140,7 +141,7 @@ def test_the_paper_workload(capsys: pytest.CaptureFixture[str]) -> None:
 def test_the_table_for_people(capsys: pytest.CaptureFixture[str], graph: Path) -> None:
     assert main(['simulate', str(graph), '--workers', '1', '--duration', '100ms']) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split()[:6] == ['DAG', 'sink', 'due', 'in', 'time', 'late']
+    assert lines[0].split()[:6] == ['DAG', 'sink', 'due', 'in', 'time', 'share']
     assert lines[1].split()[:4] == ['lidar', 'filter:near', '10', '3']
     assert lines[2].split()[0] == 'filter:far'
     assert lines[-3] == 'rad, 1 worker, not preemptive, 100 ms, utilisation 1.100'

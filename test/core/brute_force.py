@@ -100,7 +100,7 @@ class BruteForce:
         self.misses: list[Miss] = []
         self.counts = {
             (dag.index, sink): {'completed': 0, 'late': 0, 'overdue': 0, 'expired': 0,
-                                'aborted': 0}
+                                'failed': 0, 'aborted': 0}
             for dag in self.dags for sink in dag.sinks}
         self.responses: dict[tuple[int, int], list[int]] = {key: [] for key in self.counts}
         self.sequence = 0
@@ -364,7 +364,7 @@ class BruteForce:
                 'jobs': sum(job.dag is dag for job in self.jobs),
                 'ends': {outcome: sum(job.dag is dag and job.outcome == outcome
                                       for job in self.jobs)
-                         for outcome in ('completed', 'late', 'aborted', 'expired')},
+                         for outcome in ('completed', 'late', 'aborted', 'expired', 'failed')},
                 'sinks': {dag.vertices[sink].name: self._sink(dag, sink) for sink in dag.sinks}}
             for dag in self.dags}
 

@@ -4,11 +4,12 @@
 
 from __future__ import annotations
 
-from mddag_executor.core import NEVER
+from mddag_executor.core import NEVER, rules
 from mddag_executor.core.state import (
     ABORTED,
     DROP,
     EXPIRED,
+    FAILED,
     FREE,
     IDLE,
     JOB_END,
@@ -16,6 +17,7 @@ from mddag_executor.core.state import (
     SINK_ABORTED,
     SINK_DONE,
     SINK_EXPIRED,
+    SINK_FAILED,
     SINK_MISSED,
     WAITING,
 )
@@ -60,6 +62,44 @@ def test_what_still_runs_of_an_expired_job_does_not_touch_its_successor() -> Non
     assert third == slot
     assert scheduler.state.x_pending[scheduler.execution(third, J)] == 2
     assert scheduler.state.x_state[leg] == IDLE
+
+
+def test_a_job_fails_with_what_fails_of_it() -> None:
+    """What has a message already runs, and is not judged; nothing is missed twice."""
+    scheduler = live()
+    slot = start_job(scheduler)
+    x, leg = scheduler.execution(slot, X), scheduler.execution(slot, J, 0)
+    scheduler.ready(x, 1)
+    scheduler.ready(leg, 1)
+    first = scheduler.take(0, 1)
+    assert first in (x, leg)
+    rules.fail(scheduler.tables, scheduler.state, scheduler.policy.key, first, 2)
+    assert scheduler.decisions() == [
+        (SINK_FAILED, 0, J, 0, 50 * US, -1), (JOB_END, 0, -1, 0, FAILED, 2)]
+    second = scheduler.take(0, 3)
+    assert {first, second} == {x, leg}
+    rules.fail(scheduler.tables, scheduler.state, scheduler.policy.key, second, 4)
+    assert scheduler.decisions() == []
+    assert scheduler.state.job_state[slot] == FREE
+
+
+def test_what_fails_after_the_end_of_its_job_changes_nothing() -> None:
+    scheduler = live(max_active_jobs=1)
+    slot = start_job(scheduler)
+    scheduler.ready(scheduler.execution(slot, X), 1)
+    x = scheduler.take(0, 1)
+    scheduler.release(0, 1, 10, 10)
+    assert scheduler.decisions()[-1] == (JOB_END, 0, -1, 0, EXPIRED, 10)
+    rules.fail(scheduler.tables, scheduler.state, scheduler.policy.key, x, 11)
+    assert scheduler.decisions() == []
+
+
+def test_an_undeclared_callback_that_fails_is_judged_by_nobody() -> None:
+    scheduler = live()
+    x = scheduler.undeclared(0, -1, 1)
+    assert scheduler.take(0, 1) == x
+    rules.fail(scheduler.tables, scheduler.state, scheduler.policy.key, x, 2)
+    assert scheduler.decisions() == [] and scheduler.state.job_state[0] == FREE
 
 
 def test_only_idle_jobs_expire_and_only_after_their_time() -> None:

@@ -124,6 +124,7 @@ class Chances:
     coroutine: float = 0.1
     undeclared: float = 0.2
     early_message: float = 0.3
+    failed: float = 0.05
 
 
 @dataclass
@@ -314,6 +315,9 @@ class VirtualRun:
             self.scheduler.suspend(work.x)
             self._at(now + self.random.randrange(MS), lambda later: self._resume(work))
             return
+        if declared and self.random.random() < self.chances.failed:
+            self.scheduler.fail_open(work.slot, end)
+            self.record('fail', now, vtid, work.dag, vertex, work.job)
         whole = self.scheduler.complete(work.x, end)
         if declared:
             self.executions[key] = self.executions.get(key, 0) + 1

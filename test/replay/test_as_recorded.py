@@ -48,7 +48,7 @@ def test_replay_counts_what_the_driver_counted(
 def test_every_kind_of_verdict_occurs(tmp_path: Path) -> None:
     """The differential test would be worth little if nothing ever went wrong in its runs."""
     text = SMALL.replace('timer: 20ms,', 'timer: 20ms, on_miss: abort,')
-    seen = dict.fromkeys(('completed', 'late', 'expired', 'aborted', 'overdue'), 0)
+    seen = dict.fromkeys(('completed', 'late', 'expired', 'failed', 'aborted', 'overdue'), 0)
     for seed in range(8):
         path = tmp_path / f'{seed}.mcap'
         run = VirtualRun(path, loads(text, 'g.yaml'), seed, duration=400 * MS,
@@ -128,7 +128,7 @@ def test_a_job_to_the_millisecond(tmp_path: Path) -> None:
     assert result['utilisation'] == pytest.approx(14 / 200)
     camera = result['dags']['/camera']
     assert camera['jobs'] == 1
-    assert camera['ends'] == {'completed': 1, 'late': 0, 'aborted': 0, 'expired': 0}
+    assert camera['ends'] == {'completed': 1, 'late': 0, 'aborted': 0, 'expired': 0, 'failed': 0}
     join = camera['sinks']['/fuse:join']
     assert (join['completed'], join['late'], join['relative_deadline_ns']) == (1, 0, 18 * MS)
     assert join['response_ns'] == dict.fromkeys(('min', 'median', 'p99', 'max'), 15 * MS)

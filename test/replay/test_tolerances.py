@@ -188,7 +188,7 @@ def test_a_warm_up_is_left_out(
         result = json.loads(capsys.readouterr().out)
         assert result['dags']['/n']['jobs'] == due
         assert result['dags']['/n']['ends'] == {
-            'completed': due - late, 'late': late, 'aborted': 0, 'expired': 0}
+            'completed': due - late, 'late': late, 'aborted': 0, 'expired': 0, 'failed': 0}
         assert result['skip_ns'] == {'0': 0, '20ms': 20 * MS, '20001us': 20_001_000}.get(
             skip, 31 * MS)
     page = tmp_path / 'report.html'
