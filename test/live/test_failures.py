@@ -77,7 +77,7 @@ def test_the_job_of_a_callback_that_raises_has_failed(
     graph = CHAIN.replace('50ms', '5s').replace('10ms', '5s')
     executor = make_executor(loads(graph), trace=trace, on_deadline_miss=misses.append)
     chain.start(executor)
-    caught = spin_until(executor, lambda: len(chain.jobs['relay']) >= 12)
+    caught = spin_until(executor, lambda: sum(j.job % 2 for j in chain.jobs['relay']) >= 5)
     chain.timer.cancel()
     caught += spin_until(executor, lambda: len(chain.jobs['relay']) == len(chain.jobs['tick'])
                          == len(chain.jobs['early']) and executor.statistics()['queue'] == 0)
@@ -147,7 +147,7 @@ def test_an_exception_that_is_handled_changes_nothing(make_executor, make_node) 
     chain = Chain(make_node, {'relay': handles})
     executor = make_executor(loads(CHAIN))
     chain.start(executor)
-    assert spin_until(executor, lambda: len(chain.jobs['last']) >= 6) == []
+    assert spin_until(executor, lambda: any(j.job % 2 for j in chain.jobs['last'])) == []
     executor.shutdown(5.0)
     assert executor.statistics()['dags']['chain']['ends']['failed'] == 0
     assert executor.statistics()['callbacks']['/middle:relay']['failed'] == 0
@@ -178,7 +178,7 @@ def test_a_leg_of_a_sync_that_raises(make_executor, make_node, leg: str) -> None
     executor.add_node(join)
     assert wait_for(lambda: all(p.get_subscription_count() == 1 for p in publishers))
     timer.reset()
-    spin_until(executor, lambda: len(ran) >= 6)
+    spin_until(executor, lambda: sum(job % 2 for job in ran) >= 3)  # periods may be missed
     timer.cancel()
     spin_until(executor, lambda: executor.statistics()['queue'] == 0)
     executor.shutdown(5.0)
