@@ -67,10 +67,14 @@ def loads(
     :raises GraphError: it is not YAML, or breaks a rule of the language or of the model.
     """
     text = decode(text, name) if isinstance(text, bytes) else text
-    with _no_collection():
-        declaration = parse_declaration(text, name, None if path is None else fspath(path))
-        return derive_task_set(declaration, flat_text(declaration) if declaration.composed
-                               else text)
+    try:
+        with _no_collection():
+            declaration = parse_declaration(text, name, None if path is None else fspath(path))
+            return derive_task_set(declaration, flat_text(declaration) if declaration.composed
+                                   else text)
+    except GraphError as error:
+        from msg_graph.blanks import with_blanks
+        raise with_blanks(error, text, name) from None
 
 
 @contextmanager

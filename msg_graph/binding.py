@@ -29,8 +29,8 @@ from msg_graph.errors import shown
 from msg_graph.model import Callback, TaskSet
 
 # A timer made from a float of seconds is off by rounding (rclpy cuts off fractions of a ns), and
-# declared periods like 33.333ms are rounded themselves.
-_PERIOD_TOLERANCE = 1e-3
+# declared periods like 33.3ms or 16.7ms are rounded themselves.
+_PERIOD_TOLERANCE = 2e-3
 
 _WORDS = {'subscription': 'topic', 'service': 'service'}
 _PYTHON = re.compile(r'(?:[\w<>]+\.)*(\w+|<lambda>)')
@@ -63,14 +63,13 @@ class Binder:
         """
         Return the callback of a timer.
 
-        The declared period may differ by a thousandth; of several the nearest one is meant.
+        The declared period may differ by 0.2 %; of several the nearest one is meant.
 
         :param node: fully qualified name of the timer's node.
         """
         declared = [
             period for period in self._periods.get(node, ())
-            if abs(period - period_ns) <= _PERIOD_TOLERANCE * period
-            and self._free[node, 'timer', str(period)]]
+            if is_period(period_ns, period) and self._free[node, 'timer', str(period)]]
         if not declared:
             return None
         nearest = min(declared, key=lambda period: (abs(period - period_ns), period))
@@ -120,6 +119,11 @@ class Binder:
         return self._callbacks[place]
 
 
+def is_period(period_ns: int, declared_ns: int) -> bool:
+    """Tell whether a timer's period is the declared one."""
+    return abs(declared_ns - period_ns) <= _PERIOD_TOLERANCE * declared_ns
+
+
 class Entity(NamedTuple):
     """A timer, subscription or service that ran: its node, and what starts it."""
 
@@ -158,7 +162,7 @@ def meant(callback: Callback, undeclared: Iterable[Entity]) -> str | None:
     for other in sorted(timers, key=lambda each: abs((each.period_ns or 0) - period)):
         if other.node == callback.node:
             return f'did you mean its timer of {format_duration(other.period_ns or 0)}?'
-        if abs((other.period_ns or 0) - period) <= _PERIOD_TOLERANCE * period:
+        if is_period(other.period_ns or 0, period):
             return f'did you mean the node {shown(other.node)}?'
     return None
 

@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 What is known becomes entries. What is not stands as a comment that is an entry once its first
 ``# `` is gone, with ``FILL IN`` and a proposal, so that ``mddag graph check`` names what is still
-open:
+open (``open_blanks``), all of it at once, instead of the errors that come of it:
 
 1. *deadline* of a sink: the shortest period of the sources that lead to it.
 2. *period* of a subscription whose topic nobody publishes, and of a service: the measured time
@@ -22,11 +22,13 @@ A named path becomes an entry where each of its nodes has just one callback that
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
+import re
 
 from msg_graph.duration import DAY, exact_duration, format_duration, MICROSECOND
-from msg_graph.errors import printable
+from msg_graph.errors import GraphError, GraphErrors, printable
 from msg_graph.fields import check_path
 from msg_graph.flat import quantiles_text
 from msg_graph.model import ExecutionTime
@@ -34,12 +36,38 @@ from msg_graph.sketch import Sketch, SketchCallback, SketchPath, UNDEFINED
 from msg_graph.yamltext import plain_scalar
 
 MARK = 'FILL IN'
+_OPEN = re.compile(rf'\s*#\s+(?:(\w+:).*\s#\s+)?{MARK}: (.*)')
+_ENTRY = re.compile(r'\s*- (?:name|node):|\s*-\s*\{')
 _MOST_EDGES = 60
+_LITTLE = 1e-4      # of a period
 
 
 def declaration_with_blanks(sketch: Sketch) -> str:
     """Return the text of a declaration with marked blanks."""
     return '\n'.join(_Writer(sketch).lines()) + '\n'
+
+
+def open_blanks(text: str, file: str) -> list[GraphError]:
+    """Return an error for each blank that is left in a declaration."""
+    return [GraphError(
+        file, number,
+        f"{match[1] or 'this'} is a blank to fill in ({match[2]})",
+        "correct the value and take the '# ' away" if match[1] else 'do so, then remove the line')
+        for number, line in enumerate(text.splitlines(), 1)
+        if MARK in line and (match := _OPEN.fullmatch(line)) is not None]
+
+
+def with_blanks(error: GraphError, text: str, file: str) -> GraphError:
+    """Return an error with the blanks of its file, and without what is wrong because of them."""
+    blanks = open_blanks(text, file)
+    if not blanks:
+        return error
+    starts = [number for number, line in enumerate(text.splitlines(), 1) if _ENTRY.match(line)]
+    unfinished = {bisect_right(starts, blank.line or 0) for blank in blanks}
+    others = [each for each in error.errors if each.file != file or each.line is None
+              or bisect_right(starts, each.line) not in unfinished]
+    found = (*blanks, *others)
+    return found[0] if len(found) == 1 else GraphErrors(found)
 
 
 class _Writer:
@@ -116,6 +144,9 @@ class _Writer:
 
     def _trigger(self, callback: SketchCallback) -> str:
         if callback.kind == 'timer':
+            if callback.guessed and not (callback.publishes or callback.maybe):
+                return (f'        # timer: 100ms  # {MARK}: what starts it? Nothing is seen of '
+                        'the node but its name; remove it if it has no callbacks')
             if callback.guessed and callback.interval_ns is None:
                 return (f'        # timer: 100ms  # {MARK}: what starts it? No message came while '
                         'it was looked at')
@@ -126,7 +157,7 @@ class _Writer:
             if not MICROSECOND <= period_ns <= DAY:
                 return (f'        # timer: 100ms  # {MARK}: its period is said to be '
                         f'{exact_duration(period_ns)}')
-            return f'        timer: {exact_duration(period_ns)}'
+            return f'        timer: {_whole(period_ns)}'
         if callback.kind == 'sync':
             return f'        sync: [{", ".join(callback.starts)}]'
         return f'        {callback.kind}: {callback.starts[0]}'
@@ -267,8 +298,15 @@ def _is_cut(members: list[str], successors: _Next, edge: tuple[str, str]) -> boo
 
 def _period(source: SketchCallback) -> str:
     if source.period_ns is not None:
-        return exact_duration(source.period_ns)
+        return _whole(source.period_ns)
     return _rounded(source.interval_ns or 0)
+
+
+def _whole(period_ns: int) -> str:
+    """Return a timer's period as people write it: rounded to 1 us, where that changes little."""
+    rounded = round(period_ns / MICROSECOND) * MICROSECOND
+    close = abs(rounded - period_ns) <= _LITTLE * period_ns
+    return exact_duration(rounded if close else period_ns)
 
 
 def _rounded(nanoseconds: int) -> str:

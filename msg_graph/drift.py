@@ -107,7 +107,7 @@ def drift(task_set: TaskSet, observed: Observed) -> list[Drift]:
     found: dict[str, list[Drift]] = {}
     for callback in task_set.callbacks:
         extra = [topic for topic in sorted(observed.publishes.get(callback.key, ()))
-                 if topic not in callback.publishes and not is_background(topic)]
+                 if topic not in callback.publishes and not is_background(topic, callback.node)]
         found[callback.key] = [
             Drift('publishes', callback.key, topic, None, None,
                   printable(f'{callback.key} publishes {topic}, which it does not declare'))

@@ -23,6 +23,9 @@ _BACKGROUND_SERVICES = {
     'describe_parameters', 'get_parameter_types', 'get_parameters', 'list_parameters',
     'set_parameters', 'set_parameters_atomically', 'get_type_description',
     'get_logger_levels', 'set_logger_levels'}
+_LIFECYCLE = {
+    'change_state', 'get_state', 'get_available_states', 'get_available_transitions',
+    'get_transition_graph', 'transition_event'}
 
 
 @dataclass
@@ -104,11 +107,13 @@ class Sketch:
             yield from node.callbacks.values()
 
 
-def is_background(name: str) -> bool:
+def is_background(name: str, node: str) -> bool:
     """
-    Tell whether a topic or service is one that every node has, or an action's inner one.
+    Tell whether a node has a topic or service as every node has, or is an action's inner one.
 
-    A declaration is about what a system is there for, not about what the client library adds.
+    So it is with what every lifecycle node has. A declaration is about what a system is there for,
+    not about what the client library adds.
     """
-    return (name in _BACKGROUND_TOPICS or '/_action/' in name
-            or name.rpartition('/')[2] in _BACKGROUND_SERVICES)
+    before, _, word = name.rpartition('/')
+    return (name in _BACKGROUND_TOPICS or '/_action/' in name or word in _BACKGROUND_SERVICES
+            or (word in _LIFECYCLE and before == node))

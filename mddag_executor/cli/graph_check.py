@@ -16,7 +16,7 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, format_ns, table
-from mddag_executor.text import counted
+from mddag_executor.text import counted, listed
 
 if TYPE_CHECKING:
     from msg_graph import Dag, TaskSet
@@ -124,4 +124,8 @@ def _summary(task_set: TaskSet, result: dict[str, Any]) -> str:
     if result['utilisation'] is not None:
         text += (f', load {result["load"]:.3f}, utilisation {result["utilisation"]:.3f} of '
                  f'{counted(result["workers"], "worker")}')
+    from msg_graph.blanks import open_blanks
+    left = [str(each.line) for each in open_blanks(task_set.text, task_set.file)]
+    if left:
+        text += f'\n{counted(len(left), "blank")} left, in line {listed(left)}'
     return text

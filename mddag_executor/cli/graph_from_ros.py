@@ -50,7 +50,7 @@ def main(args: argparse.Namespace) -> int:
     sketch = sketch_of(found)
     if not sketch.nodes:
         raise InputError(
-            'ROS graph', 'no node with topics or services of its own was found',
+            'ROS graph', 'no node was found',
             'start the nodes, check ROS_DOMAIN_ID, or give a longer --timeout')
     write_declaration(args.output, declaration_with_blanks(sketch))
     return 0

@@ -11,14 +11,18 @@ a while, without looking into the messages, and supposes:
 
 1. A node that subscribes a topic has a callback for it, and so for a service.
 2. A topic comes from the callbacks of its node that run as often (``TOLERANCE``), from each of
-   them perhaps; from a timer of its node where none does. Topics of one node that come as often
-   share the timer.
+   them perhaps; where none does, from those of which it is not known how often they run; from a
+   timer of its node where there is none of these. Topics of one node that come as often share the
+   timer.
 3. A topic of which no message came may come from any callback of its node; where there is none,
-   from a timer of unknown period.
+   from a timer of unknown period. So it is with a node of which nothing is seen: it may have
+   timers.
 
 A topic's rate is that of its messages' source timestamps, divided by the number of its publishers.
-So nothing needs to spin: messages are taken by polling, of all topics alike. What every node has
-anyway is left out, and so are hidden nodes (``_…``).
+Messages that were lost on the way count, by their sequence numbers: images are often published as
+best effort. So nothing needs to spin: messages are taken by polling, of all topics alike. What
+every node has anyway is left out, and so are hidden nodes (``_…``). Nodes are looked for until the
+end, as they are found one by one.
 """
 
 from __future__ import annotations
@@ -41,11 +45,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import try_shutdown
 
-SETTLE_S = 0.3
-"""The graph counts as found when it has not changed for so long."""
-
 _LEAST_MESSAGES = 3
-_STEP_S = 0.1
+_STEP_S = 0.2
 _POLL_S = 0.02
 _DEPTH = 200  # so up to 10,000 messages a second of one topic
 
@@ -61,24 +62,33 @@ class Endpoints:
 
 @dataclass
 class Seen:
-    """The messages of a topic: how many, and their first and last source timestamp, ns."""
+    """
+    The messages of a topic: how many, and their first and last source timestamp, ns.
+
+    :ivar lost: how many were published between them and did not come.
+    """
 
     count: int = 0
     first: int = 0
     last: int = 0
+    lost: int = 0
+    _number: int | None = None
 
-    def message(self, stamp: int) -> None:
-        """Count a message."""
+    def message(self, stamp: int, number: int | None = None) -> None:
+        """Count a message; its number is its publisher's, and several publishers tell nothing."""
         self.first = min(self.first, stamp) if self.count else stamp
         self.last = max(self.last, stamp)
         self.count += 1
+        if number is not None and self._number is not None and number > self._number:
+            self.lost += number - self._number - 1
+        self._number = number
 
-    @property
-    def interval_ns(self) -> int | None:
+    def interval_ns(self, publishers: int = 1) -> int | None:
         """Return the mean time between two messages; None with too few of them."""
-        if self.count < _LEAST_MESSAGES or self.last <= self.first:
+        count = self.count + (self.lost if publishers == 1 else 0)
+        if self.count < 2 or count < _LEAST_MESSAGES or self.last <= self.first:
             return None
-        return (self.last - self.first) // (self.count - 1)
+        return (self.last - self.first) // (count - 1)
 
 
 @dataclass
@@ -96,6 +106,11 @@ class Probe:
     seen: dict[str, Seen] = field(default_factory=dict)
     publishers: Counter[str] = field(default_factory=Counter)
     warnings: list[str] = field(default_factory=list)
+
+    def warn(self, text: str) -> None:
+        """Add a warning that is not there yet."""
+        if text not in self.warnings:
+            self.warnings.append(text)
 
 
 def probe(seconds: float, tick: Callable[[float], None] | None = None) -> Probe:
@@ -121,22 +136,18 @@ def probe(seconds: float, tick: Callable[[float], None] | None = None) -> Probe:
 
 def _look(node: Node, context: Context, seconds: float, tick: Callable[[float], None]) -> Probe:
     begin = time.monotonic()
-    found, changed = _nodes(node), begin
-    while time.monotonic() - begin < seconds / 2:
-        time.sleep(_STEP_S)
-        now, before = time.monotonic(), found
-        found = _nodes(node)
-        if found != before or not found.nodes:
-            changed = now
-        elif now - changed >= SETTLE_S:
-            break
-        tick(now - begin)
-    subscriptions = _listen(node, found)
-    while (left := begin + seconds - time.monotonic()) > 0:
-        time.sleep(min(left, _POLL_S))
+    found = Probe()
+    subscriptions: list[tuple[Any, Seen]] = []
+    looked = begin - _STEP_S
+    while (now := time.monotonic()) < begin + seconds:
+        if now - looked >= _STEP_S:
+            looked = now
+            _nodes(node, found)
+            subscriptions += _listen(node, found)
         for subscription, seen in subscriptions:
             _take(subscription, seen)
-        tick(time.monotonic() - begin)
+        tick(now - begin)
+        time.sleep(min(_POLL_S, max(0.0, begin + seconds - time.monotonic())))
     return found
 
 
@@ -147,24 +158,25 @@ def _take(subscription: Any, seen: Seen) -> None:
             taken = subscription.handle.take_message(subscription.msg_type, True)
             if taken is None:
                 return
-            seen.message(taken[1]['source_timestamp'] or taken[1]['received_timestamp'])
+            about = taken[1]
+            seen.message(about['source_timestamp'] or about['received_timestamp'],
+                         about['publication_sequence_number'])
 
 
-def _nodes(node: Node) -> Probe:
-    """Return which nodes there are, and what they publish, subscribe and serve."""
-    found = Probe()
+def _nodes(node: Node, found: Probe) -> None:
+    """Add which nodes there are, and what they publish, subscribe and serve."""
     names = [f'{namespace.rstrip("/")}/{name}'
              for name, namespace in node.get_node_names_and_namespaces()
              if not name.startswith('_')]
     for full, count in sorted(Counter(names).items()):
         if check_node(full) is not None:
-            found.warnings.append(f'{full}: left out, this is no valid node name')
+            found.warn(f'{full}: left out, this is no valid node name')
             continue
         if count > 1:
-            found.warnings.append(
+            found.warn(
                 f'{full}: {count} nodes have this name; they are taken for one: rename them')
         namespace, _, name = full.rpartition('/')
-        found.nodes[full] = endpoints = Endpoints()
+        endpoints = found.nodes.setdefault(full, Endpoints())
         for get, target, check in (
             (node.get_publisher_names_and_types_by_node, endpoints.publishes, check_topic),
             (node.get_subscriber_names_and_types_by_node, endpoints.subscribes, check_topic),
@@ -173,30 +185,31 @@ def _nodes(node: Node) -> Probe:
             try:
                 listed = get(name, namespace or '/')
             except Exception as error:  # rclpy raises several kinds where the node has just ended
-                found.warnings.append(f'{full}: {error}')
+                found.warn(f'{full}: {error}')
                 continue
             target.update((each, types[0]) for each, types in listed
-                          if types and not is_background(each) and check(each) is None)
-        for topic in endpoints.publishes:
-            found.publishers[topic] += 1
-    return found
+                          if types and not is_background(each, full) and check(each) is None)
+    found.publishers = Counter(
+        topic for endpoints in found.nodes.values() for topic in endpoints.publishes)
 
 
 def _listen(node: Node, found: Probe) -> list[tuple[Any, Seen]]:
-    """Subscribe every topic, as best effort, which any publisher serves."""
+    """Subscribe every new topic, as best effort, which any publisher serves."""
     qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT,
                      durability=DurabilityPolicy.VOLATILE)
     types = {topic: kind for endpoints in found.nodes.values()
              for topic, kind in endpoints.publishes.items()}
     subscriptions = []
     for topic, kind in sorted(types.items()):
+        if topic in found.seen:
+            continue
         seen = found.seen[topic] = Seen()
         try:
             subscription = node.create_subscription(
                 _message_type(kind), topic, lambda _: None, qos, raw=True,
                 event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
         except Exception as error:  # whatever the package of the type raises when it is imported
-            found.warnings.append(
+            found.warn(
                 f'{topic}: its rate is not known: its type {kind} cannot be used here ({error})')
         else:
             subscriptions.append((subscription, seen))
@@ -213,19 +226,24 @@ def _message_type(kind: str) -> Any:
 
 def sketch_of(found: Probe) -> Sketch:
     """Return what is known of the system, and what is supposed."""
-    intervals = {topic: seen.interval_ns for topic, seen in found.seen.items()}
+    intervals = {topic: seen.interval_ns(found.publishers[topic])
+                 for topic, seen in found.seen.items()}
     nodes = []
-    for name, endpoints in found.nodes.items():
+    for name, endpoints in sorted(found.nodes.items()):
         node = SketchNode(name)
         for topic in endpoints.subscribes:
             _add(node, 'subscription', [topic], intervals.get(topic))
         for service in endpoints.serves:
             _add(node, 'service', [service], None)
+        unknown = [c for c in node.callbacks.values() if c.kind == 'subscription'
+                   and c.interval_ns is None and found.publishers[c.starts[0]]]
         for topic in endpoints.publishes:
             whole = intervals.get(topic)
-            _publisher(node, topic, None if whole is None else whole * found.publishers[topic])
-        if node.callbacks:
-            nodes.append(node)
+            _publisher(node, topic, None if whole is None else whole * found.publishers[topic],
+                       unknown)
+        if not node.callbacks:
+            _timer(node, None)
+        nodes.append(node)
     return Sketch('the nodes that ran', nodes)
 
 
@@ -236,7 +254,9 @@ def _add(node: SketchNode, kind: str, starts: list[str], interval: int | None) -
     return callback
 
 
-def _publisher(node: SketchNode, topic: str, interval: int | None) -> None:
+def _publisher(
+    node: SketchNode, topic: str, interval: int | None, unknown: list[SketchCallback]
+) -> None:
     """Suppose which callbacks of a node publish a topic (rules 2 and 3)."""
     if interval is None:
         real = [c for c in node.callbacks.values() if not c.guessed]
@@ -248,8 +268,8 @@ def _publisher(node: SketchNode, topic: str, interval: int | None) -> None:
     timers = [c for c in fits if c.guessed]
     if timers:
         timers[0].publishes.append(topic)
-    elif fits:
-        for callback in fits:
+    elif fits or unknown:
+        for callback in fits or unknown:
             callback.maybe.append(topic)
     else:
         _timer(node, interval).publishes.append(topic)

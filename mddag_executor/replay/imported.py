@@ -8,8 +8,8 @@ Theory of operation
 Nothing in such a recording says which callback is which of a graph.  A callback of the graph is
 found by its node's name and by what starts it:
 
-* a timer by its period; where a node's periods differ from the declared ones, but there are as
-  many timers, by order, and that is said,
+* a timer by its period (``binding.is_period``); where a node's periods differ from the declared
+  ones, but there are as many timers, by order, and that is said,
 * a subscription, and each leg of a sync callback, by its topic,
 * a service by its name.
 
@@ -36,7 +36,7 @@ from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from msg_graph import Callback as Declared
 from msg_graph import format_duration, TaskSet
-from msg_graph.binding import Entity
+from msg_graph.binding import Entity, is_period
 
 _START = 'ros2:callback_start'
 _OWN = ('mddag:job_release', 'mddag:dispatch')
@@ -187,7 +187,10 @@ class ImportedMapping:
         timers: list[Declared] = []
         for one in declared:
             if one.kind == 'timer':
-                wanted = [('timer', str(one.timer_period_ns))]
+                period = one.timer_period_ns or 0
+                near = [int(what) for (kind, what), some in free.items()
+                        if kind == 'timer' and some and is_period(int(what), period)]
+                wanted = [('timer', str(min(near, key=lambda p: abs(p - period), default='')))]
             elif one.kind == 'service':
                 wanted = [('service', one.service or '')]
             else:

@@ -8,29 +8,33 @@ Theory of operation
 1. ``Census`` tells who there is. What every node has anyway (parameter services and their like) is
    left out, and with it nodes that have nothing else.
 2. A callback that the recorded declaration names keeps its name, and what was declared of it that
-   a trace does not show: deadline, queue edges, period, sync, group, name of the DAG.  Others are
-   called ``callback_0``, ``callback_1``, … by node, in the order in which they were made.
+   a trace does not show: deadline, queue edges, period, sync, group, name of the DAG.  Others have
+   the name of their function where the trace tells it, else ``callback_0``, ``callback_1``, … by
+   node, in the order in which they were made.
 3. A topic of a node is published by the callbacks that were seen to publish it. Where none was,
    each callback of the node may; where the node has no callback, there is supposed to be a timer.
-4. Execution times are the quantiles of ``PERCENT``.
+4. Execution times are the quantiles of ``PERCENT``. Those of a sync callback are of the executions
+   that made it whole: the others only keep a message.
 """
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Iterable
 import os
 
 from mddag_executor.core import quantile
 from mddag_executor.errors import InputError
 from mddag_executor.trace import TraceReader
-from mddag_executor.trace.census import Address, Census, Entity, Event, Runs
+from mddag_executor.trace.census import Address, Census, Entity, Event, KEEP_TIMES
 from msg_graph import Callback, ExecutionTime, GraphError, loads, TaskSet
-from msg_graph.fields import check_node, check_service, check_topic
+from msg_graph.binding import function_of
+from msg_graph.fields import check_callback, check_node, check_service, check_topic
 from msg_graph.sketch import is_background, Sketch, SketchCallback, SketchNode
 
 PERCENT = (0.0, 50.0, 90.0, 99.0, 100.0)
 _STEP = 4096
-_TASK_SET, _DISPATCH = 'mddag:task_set', 'mddag:dispatch'
+_TASK_SET, _DISPATCH, _COMPLETE = 'mddag:task_set', 'mddag:dispatch', 'mddag:complete'
 
 
 class System:
@@ -53,11 +57,14 @@ class System:
         self.task_set: TaskSet | None = None
         self.workers: int | None = None
         self._declared: dict[Address, Callback] = {}
+        self._whole: dict[str, array[int]] = {}     # by sync callback: how long these took
         reader = TraceReader(path)
-        wanted = {*self.census.handlers, _TASK_SET, _DISPATCH}
+        wanted = {*self.census.handlers, _TASK_SET, _DISPATCH, _COMPLETE}
         for count, event in enumerate(reader.events(wanted, sorted=True)):
             if event[0] == _DISPATCH:
                 self._dispatch(event)
+            elif event[0] == _COMPLETE:
+                self._complete(event)
             elif event[0] == _TASK_SET:
                 self._recorded(event)
             else:
@@ -89,6 +96,15 @@ class System:
             callback = self.task_set.dags[dag].vertices[vertex].callback
             self._declared[event[2], event[4]] = callback
 
+    def _complete(self, event: Event) -> None:
+        declared = self._declared.get((event[2], event[4]))
+        took = self.census.took.get((event[2], event[3]))
+        if declared is None or declared.kind != 'sync' or not event[8] or took is None:
+            return
+        times = self._whole.setdefault(declared.key, array('q'))
+        if took[0] == (event[2], event[4]) and len(times) < KEEP_TIMES:
+            times.append(took[1])
+
     def sketch(self) -> Sketch:
         """Return the whole system."""
         nodes: dict[str, SketchNode] = {}
@@ -98,7 +114,7 @@ class System:
             node.callbacks.setdefault(callback.name, callback)
         for name, topics in self.census.publishers.items():
             unseen = [t for t, seen in topics.items()
-                      if not seen and not is_background(t) and check_topic(t) is None]
+                      if not seen and not is_background(t, name) and check_topic(t) is None]
             if unseen and name not in nodes and check_node(name) is None:
                 timer = SketchCallback(name, 'callback_0', 'timer', guessed=True)
                 nodes[name] = SketchNode(name, {timer.name: timer})
@@ -126,16 +142,24 @@ class System:
             known = node.callbacks.get(declared.name)
             callback = known or _from_declared(declared)
         else:
-            number = len(node.callbacks)
-            while f'callback_{number}' in node.callbacks:
-                number += 1
             callback = SketchCallback(
-                entity.node, f'callback_{number}', entity.kind,
+                entity.node, self._free_name(entity, node), entity.kind,
                 [entity.start] if entity.start else [], entity.period_ns)
             if entity.group is not None:
                 callback.group = self._group_name(entity)
         self._measure(callback, [entity])
         return callback
+
+    def _free_name(self, entity: Entity, node: SketchNode) -> str:
+        """Return a name for a callback that nobody has named."""
+        declared = () if self.task_set is None else self.task_set.callbacks
+        taken = {*node.callbacks, *(c.name for c in declared if c.node == entity.node)}
+        name = function_of(entity.symbol)
+        if name is None or check_callback(name) is not None:
+            names = [f'callback_{number}' for number in range(len(taken), 2 * len(taken) + 1)]
+        else:
+            names = [name, *(f'{name}_{number}' for number in range(2, len(taken) + 2))]
+        return next(each for each in names if each not in taken)
 
     def _group_name(self, entity: Entity) -> str | None:
         """Return a name for a group that several callbacks of the node share."""
@@ -154,12 +178,14 @@ class System:
         runs = found[0]
         for each in found:
             callback.publishes.extend(
-                t for t in each.publishes if t not in callback.publishes and not is_background(t)
-                and check_topic(t) is None)
+                t for t in each.publishes if t not in callback.publishes
+                and not is_background(t, callback.node) and check_topic(t) is None)
         callback.maybe = [t for t in callback.maybe if t not in callback.publishes]
-        if callback.kind != 'sync':
+        if callback.kind == 'sync':
+            callback.times = execution_time(self._whole.get(callback.key, ()))
+        else:
             callback.interval_ns = runs.interval_ns
-            callback.times = execution_time(runs)
+            callback.times = execution_time(runs.times)
         return True
 
     def measure(self, sketch: Sketch) -> int:
@@ -182,9 +208,9 @@ class System:
         return count
 
 
-def execution_time(runs: Runs) -> tuple[ExecutionTime, int] | None:
+def execution_time(took: Iterable[int]) -> tuple[ExecutionTime, int] | None:
     """Return the execution time of a callback and of how many executions it is; None of none."""
-    times = sorted(max(1, time) for time in runs.times)
+    times = sorted(max(1, time) for time in took)
     if not times:
         return None
     quantiles = tuple(quantile(times, share / 100) for share in PERCENT)
@@ -197,7 +223,7 @@ def _is_shown(entity: Entity) -> bool:
     if entity.kind == 'timer':
         return entity.period_ns is not None and entity.period_ns >= 1_000
     check = check_topic if entity.kind == 'subscription' else check_service
-    return not is_background(entity.start) and check(entity.start) is None
+    return not is_background(entity.start, entity.node) and check(entity.start) is None
 
 
 def _from_declared(declared: Callback) -> SketchCallback:

@@ -81,6 +81,8 @@ class Census:
 
     def __init__(self) -> None:
         self.runs: dict[Address, Runs] = {}
+        #: By process and thread: the callback that ended there last, and how long it ran.
+        self.took: dict[tuple[int, int], tuple[Address, int]] = {}
         #: By node its publishers' topics; by topic whether some callback was seen to publish it.
         self.publishers: dict[str, dict[str, bool]] = {}
         self._nodes: dict[Address, str] = {}
@@ -180,6 +182,7 @@ class Census:
         while stack:
             callback, start = stack.pop()
             if callback == (event[2], event[4]):
+                self.took[event[2], event[3]] = callback, event[1] - start
                 times = self.runs[callback].times
                 if len(times) < KEEP_TIMES:
                     times.append(event[1] - start)

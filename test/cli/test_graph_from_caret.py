@@ -25,7 +25,7 @@ def test_from_caret(mddag: Mddag, tmp_path: Path) -> None:
     assert done.stdout == "1 blank to fill in, marked 'FILL IN'\n"
     done = mddag('graph', 'check', 'g.yaml', cwd=tmp_path)
     assert done.returncode == 2
-    assert 'it is a sink' in done.stderr
+    assert 'deadline: is a blank to fill in (a sink' in done.stderr
     text = (tmp_path / 'g.yaml').read_text()
     done = mddag('graph', 'check', '-', input=text.replace('# deadline: 5ms', 'deadline: 5ms'))
     assert (done.returncode, done.stderr) == (0, '')

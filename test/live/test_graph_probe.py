@@ -28,12 +28,16 @@ def seen(interval_ms: float) -> Seen:
 
 def test_intervals() -> None:
     topic = Seen()
-    assert topic.interval_ns is None
+    assert topic.interval_ns() is None
     for stamp in (50, 30, 40):
         topic.message(stamp)
-    assert (topic.count, topic.interval_ns) == (3, 10)
-    assert Seen(3, 7, 7).interval_ns is None
-    assert Seen(2, 1, 9).interval_ns is None
+    assert (topic.count, topic.interval_ns()) == (3, 10)
+    assert Seen(3, 7, 7).interval_ns() is None
+    assert Seen(2, 1, 9).interval_ns() is None
+    image = Seen()
+    for number in (3, 7, 9):     # of seven that were published three came
+        image.message(number * 10, number)
+    assert (image.lost, image.interval_ns(), image.interval_ns(2)) == (4, 10, 30)
 
 
 def test_what_is_supposed() -> None:
@@ -51,9 +55,12 @@ def test_what_is_supposed() -> None:
         publishers=Counter({'/in': 1, '/info': 1, '/slow': 1, '/mute': 1, '/out': 2, '/fast': 1,
                             '/dead': 1}))
     sketch = sketch_of(found)
-    assert [node.name for node in sketch.nodes] == ['/source', '/work', '/other']
-    source, work, other = ([(c.kind, c.starts, c.guessed, c.publishes, c.maybe, c.interval_ns)
-                            for c in node.callbacks.values()] for node in sketch.nodes)
+    assert [node.name for node in sketch.nodes] == ['/empty', '/other', '/source', '/work']
+    empty, other, source, work = (
+        [(c.kind, c.starts, c.guessed, c.publishes, c.maybe, c.interval_ns)
+         for c in node.callbacks.values()] for node in sketch.nodes)
+    # What is seen of it is its name: it may have timers.
+    assert empty == [('timer', [], True, [], [], None)]
     assert source == [
         ('timer', [], True, ['/in', '/info'], [], 10 * MS),
         ('timer', [], True, ['/slow'], [], 100 * MS),
@@ -68,6 +75,19 @@ def test_what_is_supposed() -> None:
     text = declaration_with_blanks(sketch)
     assert f'timer: 10ms  # {MARK}: is this a timer?' in text
     assert f'# timer: 100ms  # {MARK}: what starts it?' in text
+
+
+def test_a_callback_of_an_unknown_rate_is_supposed_before_a_timer() -> None:
+    """As where the images of a camera are too large to come through."""
+    sketch = sketch_of(Probe(
+        nodes={'/camera': Endpoints(publishes={'/image': 'a/b'}),
+               '/detect': Endpoints(subscribes={'/image': 'a/b', '/nobody': 'a/b'},
+                                    publishes={'/boxes': 'a/b'})},
+        seen={'/image': Seen(), '/boxes': seen(33)},
+        publishers=Counter({'/image': 1, '/boxes': 1})))
+    detect = sketch.nodes[1].callbacks.values()
+    assert [(c.kind, c.starts, c.maybe) for c in detect] == [
+        ('subscription', ['/image'], ['/boxes']), ('subscription', ['/nobody'], [])]
 
 
 @pytest.fixture
@@ -100,7 +120,7 @@ def test_a_real_system(system: None) -> None:
     assert set(found.nodes) >= {'/camera', '/deep/worker'}
     assert not [warning for warning in found.warnings if 'rate' in warning]
     assert found.nodes['/camera'].publishes == {'/image': 'std_msgs/msg/String'}
-    interval = found.seen['/image'].interval_ns
+    interval = found.seen['/image'].interval_ns()
     assert interval is not None and interval > 15 * MS  # a busy machine may only be slower
     assert ticks and ticks == sorted(ticks)
     sketch = sketch_of(found)

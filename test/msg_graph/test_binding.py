@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from msg_graph.binding import Binder, Entity, entity_name, meant
+from msg_graph.binding import Binder, Entity, entity_name, is_period, meant
 import pytest
 
 from .helpers import graph
@@ -62,6 +62,8 @@ def test_a_sync_is_bound_by_each_leg() -> None:
 def test_periods_may_be_rounded() -> None:
     binder = Binder(TASKS)
     assert key(binder.bind_timer('/b', 33_333_333)) == '/b:t'
+    assert is_period(33_333_333, 33_300_000) and is_period(16_666_666, 16_700_000)
+    assert not is_period(33_333_333, 33_000_000)
     binder = Binder(TASKS)
     assert binder.bind_timer('/b', 33_400_000) is None
     assert key(binder.bind_timer('/a', 9_999_999)) == '/a:t0'

@@ -65,13 +65,20 @@ def test_a_chain() -> None:
     text = declaration_from_caret(CHAIN, 'arch.yaml')
     with pytest.raises(GraphError) as caught:
         loads(text)
-    assert "nobody publishes '/outside'" in caught.value.problem
+    # All blanks at once, with their lines, instead of the errors that come of them.
+    lines = text.splitlines()
+    blanks = [n for n, line in enumerate(lines, 1) if f'# {MARK}: ' in line]
+    assert [each.line for each in caught.value.errors] == blanks and len(blanks) > 4
+    assert [each.problem.split(':')[0] for each in caught.value.errors] == [
+        lines[n - 1].split('#')[1].split(':')[0].strip()
+        if lines[n - 1].startswith(' ') else 'this is a blank to fill in (path open'
+        for n in blanks]
     task_set = loads(accepted(text))
     assert [c.key for c in task_set.callbacks] == [
         '/a:callback_0', '/b:callback_0', '/b:callback_1', '/b:callback_2']
     assert [dag.name for dag in task_set.dags] == ['/a', '/b/callback_1', '/b/callback_2']
     timer, chained, outside, service = task_set.callbacks
-    assert timer.timer_period_ns == chained.deadline_ns == 33_333_333
+    assert timer.timer_period_ns == chained.deadline_ns == 33_333_000
     assert (chained.topics, chained.group, chained.reads) == (
         ('/x',), 'callback_group_0', ('callback_1',))
     assert (outside.group, outside.period_ns) == ('callback_group_0', 100_000_000)
@@ -177,3 +184,34 @@ def test_what_is_no_architecture_file(text: str, problem: str) -> None:
         declaration_from_caret(text, 'arch.yaml')
     assert str(caught.value).startswith('arch.yaml')
     assert '\n' not in str(caught.value)
+
+
+def test_blanks_and_errors_that_are_not_of_them() -> None:
+    text = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - name: tick
+        # timer: 100ms  # FILL IN: what starts it?
+        publishes: [/x]
+      - {name: wrong, timer: 5, deadline: 1ms}
+  - node: /b
+    callbacks:
+      - name: take
+        subscription: /x
+        # deadline: 100ms  # FILL IN: a sink
+"""
+    with pytest.raises(GraphError) as caught:
+        loads(text, 'g.yaml')
+    assert [str(each) for each in caught.value.errors] == [
+        "g.yaml:6: timer: is a blank to fill in (what starts it?): correct the value and take the "
+        "'# ' away",
+        "g.yaml:13: deadline: is a blank to fill in (a sink): correct the value and take the '# ' "
+        'away',
+        "g.yaml:8: callback '/a:wrong': 'timer': '5' has no unit: add one, as '5ms' (ns, us, ms, "
+        's, min)']
+    # what is filled in is no blank, and one that does no harm is no error
+    filled = text.replace('# timer', 'timer').replace('# deadline', 'deadline').replace(
+        'timer: 5,', 'timer: 5ms, dag: wrong,') + '        # paths: []  # FILL IN: a path\n'
+    assert len(loads(filled).dags) == 2

@@ -13,7 +13,7 @@ from mddag_executor.replay.as_recorded import replay_recording
 from mddag_executor.replay.drift import drift_of_import, WatchedRecording
 from mddag_executor.replay.sketching import System
 from mddag_executor.trace import TraceFile
-from msg_graph import loads
+from msg_graph import load, loads
 from msg_graph.blanks import declaration_with_blanks, MARK
 from msg_graph.from_caret import declaration_from_caret
 import pytest
@@ -117,6 +117,33 @@ def test_from_a_trace(recorded: Path) -> None:
     assert 'get_parameters' not in text and 'parameter_events' not in text
 
 
+def test_names_periods_and_what_no_one_declares(tmp_path: Path) -> None:
+    """Functions give names, periods are as people write them, lifecycle services are left out."""
+    symbols = {1: 'robot.Cam.grab', 2: 'robot.make.<locals>.<lambda>', 3: 'robot.Cam.grab',
+               4: 'std::_Bind<void (Node::*(Node*))()>'}
+    lifecycle = ('change_state', 'get_state', 'get_available_states',
+                 'get_available_transitions', 'get_transition_graph')
+    events: list[tuple[object, ...]] = [
+        ('rcl_node_init', 0, 1, 100, 0, 'cam', '/'),
+        ('rcl_publisher_init', 0, 1, 110, 100, 0, '/cam/transition_event', 10)]
+    for n, period in ((1, 33_333_333), (2, 33_299_999), (3, 1_500), (4, 20 * MS)):
+        events += [
+            ('rcl_timer_init', 0, 1, 120 + n, period),
+            ('rclcpp_timer_callback_added', 0, 1, 120 + n, n),
+            ('rclcpp_timer_link_node', 0, 1, 120 + n, 100),
+            ('rclcpp_callback_register', 0, 1, n, symbols[n])]
+    for n, name in enumerate((*lifecycle, 'ask/get_state')):
+        events += [('rcl_service_init', 0, 1, 200 + n, 100, 0, f'/cam/{name}'),
+                   ('rclcpp_service_callback_added', 0, 1, 200 + n, 300 + n)]
+    events += run(1, 1, 1_000 * MS, MS, 110)
+    text = declaration_with_blanks(System(trace(tmp_path / 'n.mcap', events)).sketch())
+    assert re.findall(r'name: (.*)', text) == [
+        'grab', 'callback_1', 'grab_2', 'callback_3', 'callback_4']
+    assert re.findall(r'timer: (.*)', text)[:4] == ['33.333ms', '33.3ms', '1.5us', '20ms']
+    assert re.findall(r'service: (.*)', text) == ['/cam/ask/get_state']
+    assert 'transition_event' not in text
+
+
 def test_measures_for_an_architecture_file(recorded: Path) -> None:
     system, counts = System(recorded), []
     text = declaration_from_caret(
@@ -148,6 +175,17 @@ def test_a_recorded_declaration_gives_names_and_deadlines() -> None:
         (d.name, d.period_ns, d.edges, [v.name for v in d.vertices]) for d in before.dags]
     assert [v.deadline_ns for v in again.vertices] == [v.deadline_ns for v in before.vertices]
     assert MARK not in text.split('mddag: 1')[1]
+
+
+def test_a_recorded_sync_callback_has_its_times() -> None:
+    """So that what comes of it can be simulated."""
+    task_set = loads(declaration_with_blanks(System(BAGS / 'demo_short.mcap').sketch()))
+    assert all(callback.execution_time for callback in task_set.callbacks)
+    sync = next(callback for callback in task_set.callbacks if callback.kind == 'sync')
+    declared = load(BAGS.parent / 'config' / 'autoware.yaml').callback(sync.key)
+    assert sync.execution_time is not None and declared.execution_time is not None
+    # the executions that made it whole, and not those that only kept a message
+    assert sync.execution_time.quantiles_ns[0] > declared.execution_time.quantiles_ns[0] / 2
 
 
 def test_a_recorded_run_as_declared_has_no_drift() -> None:
