@@ -260,8 +260,26 @@
 
   // --- putting it together -----------------------------------------------------------------------
 
+  const NARROW = 700;                   // pixels, as in html.css
+  const brief = (labels) => window.innerWidth > NARROW ? labels : new Map(
+    [...(labels.entries ? labels.entries() : Object.entries(labels))].map(([y, text]) => {
+      const name = text.split(', every ')[0];
+      return [Number(y), name.length > 18 ? '…' + name.slice(-17) : name];
+    }));
+
+  function fit(model) {                 // leave most of a narrow screen to the pictures
+    if (window.innerWidth > NARROW) return;
+    for (const name of ['workers', 'callbacks', 'flow']) {
+      const axis = model(`${name}_axis`);
+      axis.major_label_text_font_size = '9px';
+      axis.major_label_overrides = brief(axis.major_label_overrides);
+    }
+    for (const name of ['overview', 'workers', 'callbacks', 'flow']) model(name).min_border_left = 110;
+  }
+
   function start(doc) {
     const model = (name) => doc.get_model_by_name(name);
+    fit(model);
     const later = (work) => {           // once for each frame, however often it is asked for
       let asked = false;
       return () => {
@@ -321,7 +339,7 @@
       choice.value = String(at);
       const labels = new Map(path.labels.map((text, i) => [path.labels.length - 1 - i, text]));
       model('flow_ticks').ticks = [...labels.keys()];
-      model('flow_axis').major_label_overrides = labels;
+      model('flow_axis').major_label_overrides = brief(labels);
       model('flow').height = 110 + 34 * path.labels.length;
       model('flow_lines_range').setv({start: -0.7, end: path.labels.length - 0.3});
       const margin = (Math.max(end, deadline) - release) * 0.1 + 1;

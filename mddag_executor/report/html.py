@@ -209,8 +209,9 @@ def _page(
     yield ('<h2 id="mddag-timeline">Timeline</h2>\n<p class="legend">' + ''.join(
         f'<span><i style="background:{colour}"></i>{text}</span>' for colour, text in _LEGEND)
         + '<span><b class="miss">&#9660;</b>where a deadline was missed</span></p>\n')
-    yield ('<p class="note">Drag to move, Ctrl and the wheel (or the tools above a picture) to '
-           'zoom, point at a bar for its facts.</p>\n')
+    yield ('<p class="note">Times count from the beginning of the run. Drag the window of the '
+           'first picture, or its edges. In the others drag to move, zoom with Ctrl and the wheel '
+           '(or the tools above a picture), and point at a bar for its facts.</p>\n')
     yield ('<p class="buttons"><button id="mddag-previous">&#9664; previous miss</button> '
            '<button id="mddag-next">next miss &#9654;</button> '
            '<button id="mddag-whole">whole run</button> <span id="mddag-status"></span></p>\n')

@@ -135,7 +135,7 @@ def prepare(data: ReportData) -> Prepared:
     packer.add('verdict_slack', np.where(
         verdicts[3] >= 0, (verdicts[2] - verdicts[3]) // UNIT_NS, 0))
     packer.add('verdict_kind', verdicts[4])
-    misses = _misses(verdicts, origin)
+    misses = _misses(verdicts, origin, [data.tables.sink_deadline[v] for v in data.tables.sinks])
     names = [vertex.name for vertex in data.task_set.vertices]
     short = short_names(names)
     paths = list(_paths(data, place, short, origin))
@@ -272,14 +272,19 @@ def _rows(
                    'sinks': leads_to[vertex.index]}
 
 
-def _misses(verdicts: Ints, origin: int) -> list[Miss]:
-    """Return the worst misses: first those never completed, then by how late they were."""
+def _misses(verdicts: Ints, origin: int, relative: list[int]) -> list[Miss]:
+    """
+    Return the worst misses, in the order in which their jobs were released.
+
+    Worst are those that never completed, then those that completed latest.
+    """
     late = (verdicts[3] < 0) | (verdicts[3] > verdicts[2])
     found = verdicts[:, late]
     order = np.lexsort((found[2], found[2] - found[3], found[3] >= 0))[:MOST_MISSES]
-    return [
+    misses = [
         Miss(sink, job, deadline - origin, None if completed < 0 else completed - origin, kind)
         for sink, job, deadline, completed, kind in found[:, order].T.tolist()]
+    return sorted(misses, key=lambda miss: (miss.deadline - relative[miss.sink], miss.sink))
 
 
 def _paths(

@@ -96,7 +96,7 @@ def _overview(data: ReportData, prepared: Prepared, time: Range1d) -> Any:
         plot.quad(left=edges[:-1][late], right=edges[1:][late], bottom=data.workers * 1.02,
                   top=data.workers * 1.08, fill_color=_RED, line_color=_RED, line_width=1.5)
     plot.yaxis.axis_label = 'busy workers'
-    _seconds(plot, 'time since the beginning (s): drag the window or its edges')
+    _seconds(plot, 'time (s)')
     tool = RangeTool(x_range=time)
     tool.overlay.fill_color = '#000000'
     tool.overlay.fill_alpha = 0.08
@@ -146,7 +146,7 @@ def _timeline(name: str, lines: list[Line], time: Range1d, gaps: list[list[int]]
                           fill_color=_RED, line_color='#ffffff')
     plot.add_tools(HoverTool(renderers=[marked], tooltips=_TOOLTIP))
     _lines(plot, lines)
-    _seconds(plot, 'time since the beginning (s)')
+    _seconds(plot, 'time (s)')
     _style(plot, grid=False)
     return plot
 
@@ -170,6 +170,7 @@ def _lines(plot: Any, lines: list[Line]) -> None:
     plot.yaxis.ticker = FixedTicker(ticks=[line.y for line in lines])
     plot.yaxis.major_label_overrides = {line.y: line.label for line in lines}
     plot.yaxis.major_tick_line_color = None
+    plot.yaxis.name = f'{plot.name}_axis'
 
 
 def _flow() -> Any:
@@ -190,8 +191,7 @@ def _flow() -> Any:
         visible=False, name='flow_due'))
     _lines(plot, [])
     plot.yaxis[0].ticker.name = 'flow_ticks'
-    plot.yaxis[0].name = 'flow_axis'
-    _seconds(plot, 'time since the beginning (s); the red line is the deadline')
+    _seconds(plot, 'time (s); the red line is the deadline')
     _style(plot)
     return plot
 

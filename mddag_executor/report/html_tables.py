@@ -59,7 +59,7 @@ def html_table(
             shown = cell if isinstance(cell, Html) else escape(
                 '-' if cell is None else printable(str(cell)))
             mark = ' class="bad"' if i == bad and cell else _text(i < texts)
-            lines.append(f'<td{mark}>{shown}</td>')
+            lines.append(f'<td{mark} data-title="{escape(header[i])}">{shown}</td>')
         lines.append('</tr>\n')
     return ''.join([*lines, '</tbody></table>'])
 
@@ -87,7 +87,7 @@ def sinks_html(data: ReportData) -> str:
 
 
 def misses_html(data: ReportData, prepared: Prepared) -> str:
-    """Return the table of the worst misses."""
+    """Return the table of the worst misses, by time."""
     if not data.timeline.n_missed:
         return '<p class="note">No deadline was missed.</p>\n'
     short = short_names(vertex.name for vertex in data.task_set.vertices)
@@ -104,6 +104,7 @@ def misses_html(data: ReportData, prepared: Prepared) -> str:
     shown = len(prepared.misses)
     what = f'The {shown} worst of {data.timeline.n_missed}' if shown < data.timeline.n_missed \
         else 'All'
+    what += ' in the order of time'
     attributes = (f'data-miss="{i}"' for i in range(shown))
     return (f'<h2>Missed deadlines</h2>\n<p class="note">{what}; click on one to see it in the '
             f'timeline.</p>\n<div class="scroll">'
@@ -114,6 +115,9 @@ def worst_html(data: ReportData) -> str:
     """Return a table with a bar for each sink: where the time of its worst job went."""
     short = short_names(vertex.name for vertex in data.task_set.vertices)
     rows = []
+    longest = max((
+        (times.worst.completed - times.worst.release) / data.tables.sink_deadline[vertex]
+        for vertex, times in data.chains.sinks.items() if times.worst is not None), default=0.0)
     used = [any(times.worst is not None and times.worst.breakdown[i]
                 for times in data.chains.sinks.values()) for i in range(len(_PARTS))]
     for vertex, times in data.chains.sinks.items():
@@ -125,20 +129,22 @@ def worst_html(data: ReportData) -> str:
         deadline = data.tables.sink_deadline[vertex]
         rows.append((
             data.task_set.dags[one.dag].name, short[one.name],
-            _stack(worst.breakdown, response, deadline), worst.job, format_ns(response),
+            _stack(worst.breakdown, deadline, max(1.0, longest)), worst.job, format_ns(response),
             *(format_ns(part, 3) for part, shown in zip(worst.breakdown, used) if shown),
             format_ns(deadline)))
     parts = [part for part, shown in zip(_PARTS, used) if shown]
     legend = ''.join(f'<span><i style="background:{colour}"></i>{name}</span>'
                      for name, colour in parts)
-    header = ('DAG', 'sink', 'worst job (the red line is the deadline)', 'job', 'response',
-              *(name for name, _ in parts), 'deadline')
-    return (f'<p class="legend">{legend}</p>\n'
+    header = ('DAG', 'sink', 'worst job', 'job', 'response', *(name for name, _ in parts),
+              'deadline')
+    return (f'<p class="legend">{legend}</p>\n<p class="note">The bars have one scale: parts of '
+            'the deadline, which is the red line.</p>\n'
             f'<div class="wide">{html_table(header, rows, 3)}</div>')
 
 
-def _stack(parts: Breakdown, response: int, deadline: int) -> Html:
-    whole = max(response, deadline, 1)
+def _stack(parts: Breakdown, deadline: int, longest: float) -> Html:
+    """Return a bar on a scale from 0 to ``longest``, in parts of the deadline."""
+    whole = max(1, deadline) * longest
     bars = ''.join(
         f'<i style="width:{100 * max(0, part) / whole:.3f}%;background:{colour}"></i>'
         for part, (_, colour) in zip(parts, _PARTS))

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from mddag_executor.replay import replay
 from mddag_executor.report import html
 from mddag_executor.report.html_data import json_for_html, label, Packer, prepare
-from mddag_executor.report.html_tables import Html, html_table
+from mddag_executor.report.html_tables import Html, html_table, misses_html, worst_html
 import numpy as np
 import pytest
 
@@ -127,7 +127,28 @@ def test_the_tables_have_the_figures_of_the_replay(tmp_path: Path) -> None:
     bars = [attributes['style'] or '' for tag, attributes in page.elements
             if tag == 'i' and 'width' in (attributes.get('style') or '')]
     assert sum(float(bar.split('%')[0].removeprefix('width:')) for bar in bars) \
-        == pytest.approx(100)
+        == pytest.approx(100)       # the worst of all fills the scale
+
+
+def test_misses_stand_by_time_and_worst_jobs_on_one_scale() -> None:
+    task_set = runs.autoware()
+    load, run = runs.simulated(task_set, ms=1500, utilisation=1.2, preemptive=True)
+    data = html.of_run(task_set, load, run)
+    text = misses_html(data, prepare(data))
+    times = [float(found) for found in re.findall(r'>([0-9.]+) s<', text)]
+    assert len(times) > 20 and times == sorted(times)
+    page = worst_html(data)
+    assert len(set(re.findall(r'<u style="left:([0-9.]+)%"', page))) == 1
+    for stack, response, deadline in re.findall(
+            r'<div class="stack">(.*?)</div>.*?"response">([^<]*)<.*?"deadline">([^<]*)<', page):
+        parts = sum(float(part) for part in re.findall(r'width:([0-9.]+)%', stack))
+        line = float(re.search(r'left:([0-9.]+)%', stack)[1])
+        assert parts / line == pytest.approx(ms(response) / ms(deadline), rel=0.01)
+
+
+def ms(text: str) -> float:
+    number, unit = text.split()
+    return float(number) * {'us': 1e-3, 'ms': 1.0, 's': 1e3}[unit]
 
 
 def test_a_page_needs_nothing_but_itself(tmp_path: Path) -> None:
@@ -164,7 +185,7 @@ def test_json_and_cells_hold_any_text(text: str) -> None:
 
 
 def test_markup_is_only_what_says_so() -> None:
-    assert '<td><i></i></td>' in html_table(('a',), [(Html('<i></i>'),)], 0)
+    assert '><i></i></td>' in html_table(('a',), [(Html('<i></i>'),)], 0)
     assert '<td>&lt;i&gt;</td>' in html_table(('a',), [('<i>',)], 0)
 
 
