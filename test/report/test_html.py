@@ -186,7 +186,7 @@ def test_json_and_cells_hold_any_text(text: str) -> None:
 
 def test_markup_is_only_what_says_so() -> None:
     assert '><i></i></td>' in html_table(('a',), [(Html('<i></i>'),)], 0)
-    assert '<td>&lt;i&gt;</td>' in html_table(('a',), [('<i>',)], 0)
+    assert '>&lt;i&gt;</td>' in html_table(('a',), [('<i>',)], 0)
 
 
 def test_end_to_end_times_of_declared_paths(tmp_path: Path) -> None:
