@@ -14,8 +14,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from mddag_executor.core.tally import counts, total
-from mddag_executor.report.tables import percent, short_names
+from mddag_executor.core.tally import Counts, counts, total
+from mddag_executor.report.tables import percent, short_names, verdicts_text
 from mddag_executor.report.text import Cell, format_ns, printable, table
 from mddag_executor.text import counted
 
@@ -173,9 +173,8 @@ def summary(difference: Mapping[str, Any]) -> Iterator[str]:
         pool = f'imported, {counted(run["workers"], "thread")}' if run['imported'] else (
             f'policy {printable(run["policy"])}, ' + counted(run['workers'], 'worker'))
         yield (f'{"first" if mark == "a" else "then"}: {printable(run["trace"])}: '
-               f'{counted(run["due"], "sink job")} due, {run["in_time"]} in time '
-               f'({percent(run["in_time"], run["due"])}), {run["late"]} late, '
-               f'{run["expired"]} expired; ' + ('rescheduled, ' if run['rescheduled'] else '')
+               + verdicts_text(Counts(*(run[name] for name in Counts._fields))) + '; '
+               + ('rescheduled, ' if run['rescheduled'] else '')
                + f'{pool}, {format_ns(run["duration_ns"])}')
     if difference['a']['skip_ns']:
         yield ('left out in both: jobs released in the first '

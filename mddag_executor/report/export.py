@@ -13,8 +13,8 @@ Executions (``ExecutionRow``): a row is one run of a callback on a worker; a cor
 suspended has several, ``first`` tells the first.  What no DAG declares has neither DAG nor job.
 
 Jobs (``JobRow``): a row is the verdict about one job at one sink: ``in_time``, ``late``,
-``overdue`` (not completed when the run ended past its deadline), ``expired`` or ``aborted``; the
-last three have no completion.
+``overdue`` (not completed when the run ended past its deadline), ``expired``, ``failed`` or
+``aborted``; the last four have no completion.
 
 Columns that end in ``_ns`` are whole nanoseconds: times on the trace's clock, or durations.
 ``start_s`` and ``release_s`` are seconds since the run's first release (or execution, where one

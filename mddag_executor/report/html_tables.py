@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from mddag_executor.core.tally import counts
+from mddag_executor.core.tally import counts, total
 from mddag_executor.replay.chains import Breakdown
 from mddag_executor.report.html_data import Prepared, ReportData
 from mddag_executor.report.replays import (
@@ -18,7 +18,7 @@ from mddag_executor.report.replays import (
     RECORDED_HEADER,
     recorded_rows,
 )
-from mddag_executor.report.tables import response_cells, short_names
+from mddag_executor.report.tables import rare_ends, response_cells, short_names
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import ABORTED, DONE, EXPIRED, FAILED, OVERDUE
 
@@ -72,8 +72,9 @@ def sinks_html(data: ReportData) -> str:
     """Return the table of sinks: verdicts, and response times by the deadline."""
     result = data.tally.result()['dags']
     short = short_names(name for dag in result.values() for name in dag['sinks'])
-    header = ('DAG', 'sink', 'due', 'in time', 'missed', 'late', 'expired', 'failed', 'aborted',
-              'median', 'p99', 'max', 'deadline')
+    rare = rare_ends(total(result))
+    header = ('DAG', 'sink', 'due', 'in time', 'missed', 'late', 'expired', *rare, 'median',
+              'p99', 'max', 'deadline')
     rows = []
     for dag_name, dag in result.items():
         for name, sink in dag['sinks'].items():
@@ -81,7 +82,7 @@ def sinks_html(data: ReportData) -> str:
             rows.append((
                 dag_name, short[name], verdicts.due, verdicts.in_time,
                 verdicts.missed, verdicts.late, verdicts.expired,
-                verdicts.failed, verdicts.aborted, *response_cells(sink['response_ns']),
+                *(getattr(verdicts, name) for name in rare), *response_cells(sink['response_ns']),
                 format_ns(sink['relative_deadline_ns'])))
     return f'<div class="wide">{html_table(header, rows, 2, bad=4)}</div>'
 

@@ -26,7 +26,7 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
     raised = {name: counts['failed'] for name, counts in result['callbacks'].items()
               if counts['failed']}
     if raised:
-        yield f'{sum(raised.values())} runs of callbacks that raised' + _details(raised)
+        yield f'{counted(sum(raised.values()), "run")} of callbacks that raised' + _details(raised)
     skipped = {name: counts['skipped'] for name, counts in result['callbacks'].items()
                if counts['skipped']}
     if skipped:

@@ -14,13 +14,12 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from mddag_executor.core.tally import counts, never_due, total
+from mddag_executor.core.tally import Counts, counts, never_due, total
 from mddag_executor.report.text import Cell, format_ns, listed, table
 from mddag_executor.text import counted
 
 HEADER = ('DAG', 'sink', 'due', 'in time', 'share', 'late', 'expired', 'median', 'p99', 'max',
           'deadline')
-_RARE = ('failed', 'aborted')        # shown where there are any
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
@@ -62,8 +61,7 @@ def each_sink(dags: Mapping[str, Any]) -> Iterator[Sink]:
 
 def sink_table(dags: Mapping[str, Any]) -> str:
     """Return a table with a row for each sink: counts, and response times by its deadline."""
-    every = total(dags)
-    rare = [name for name in _RARE if getattr(every, name)]
+    rare = rare_ends(total(dags))
     header = [*HEADER[:7], *rare, *HEADER[7:]]
     rows: list[list[Cell]] = []
     for sink in each_sink(dags):
@@ -75,6 +73,11 @@ def sink_table(dags: Mapping[str, Any]) -> str:
             *response_cells(sink.result['response_ns']),
             format_ns(sink.result['relative_deadline_ns'])])
     return table(header, rows)
+
+
+def rare_ends(every: Counts) -> list[str]:
+    """Return which counts are shown only because there are any."""
+    return [name for name in ('failed', 'aborted') if getattr(every, name)]
 
 
 def response_cells(response: Mapping[str, int] | None) -> list[Cell]:
@@ -96,11 +99,14 @@ def percent(part: int, whole: int) -> str:
 
 def verdicts_line(dags: Mapping[str, Any]) -> str:
     """Return the line that stands below a table of sinks: the verdicts about all of them."""
-    every = total(dags)
+    return verdicts_text(total(dags))
+
+
+def verdicts_text(every: Counts) -> str:
+    """Return verdicts as a text."""
     return (f'{counted(every.due, "sink job")} due, {every.in_time} in time '
             f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
-            + ''.join(f', {getattr(every, name)} {name}' for name in _RARE
-                      if getattr(every, name)))
+            + ''.join(f', {getattr(every, name)} {name}' for name in rare_ends(every)))
 
 
 def never_due_lines(dags: Mapping[str, Any]) -> Iterator[str]:

@@ -25,7 +25,7 @@ from mddag_executor.core.tally import counts
 from mddag_executor.replay import tolerances
 from mddag_executor.replay.tolerances import MissTally, Runs, Tolerance
 from mddag_executor.report.junit import junit
-from mddag_executor.trace import TraceFile
+from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
@@ -154,6 +154,38 @@ def test_the_exit_status(
         assert program.main(arguments) == status
         said = 'not tolerated: /n:a: ' in capsys.readouterr().out
         assert said == bool(options and status)
+
+
+def test_a_failed_job_is_told_wherever_verdicts_are(
+    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first job's callback raised, in a run that was in time but for the third and fourth."""
+    failed, out = tmp_path / 'failed.mcap', tmp_path / 'out.xml'
+    with TraceFile(failed) as file:
+        for name, time, pid, thread, *fields in TraceReader(trace).events():
+            if name == 'mddag:complete' and fields[3] == 0:
+                file.add('fail', time, pid, thread, 0, 0, 0)
+                file.add('deadline', time, pid, thread, 0, 0, 0, 18 * MS, -1)
+            file.add(name, time, pid, thread, *fields)
+    for mode in ([], ['--reschedule']):
+        page = tmp_path / 'page.html'
+        assert program.main(['replay', str(failed), *mode, '--junit', str(out), '--report',
+                             str(page)]) == 0
+        output = capsys.readouterr()
+        assert output.err == '' and '2 late, 0 expired, 1 failed\n' in output.out
+        assert '2 late, 0 expired, 1 failed<' in page.read_text()
+        failure = ElementTree.parse(out).getroot().find('testsuite/testcase/failure')
+        assert failure is not None and failure.attrib['message'] == (
+            '3 of 10 jobs missed the deadline (1 failed: a callback raised)')
+        assert program.main(['replay', str(failed), *mode, '--json', '-']) == 0
+        dag = json.loads(capsys.readouterr().out)['dags']['/n']
+        assert dag['ends'] == {'completed': 7, 'late': 2, 'aborted': 0, 'expired': 0, 'failed': 1}
+        assert dag['sinks']['/n:a']['failed'] == 1
+    assert program.main(['diff', str(trace), str(failed), '--fail-on-worse']) == 1
+    assert '2 late, 0 expired, 1 failed; policy' in capsys.readouterr().out
+    jobs = tmp_path / 'jobs.csv'
+    assert program.main(['export', str(failed), '-o', str(jobs), '--rows', 'jobs']) == 0
+    assert jobs.read_text().count(',failed') == 1
 
 
 def test_junit_on_the_command_line(

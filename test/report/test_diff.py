@@ -32,8 +32,8 @@ def test_a_run_is_no_worse_than_itself(result: dict[str, Any]) -> None:
     sink = difference['dags']['/driver']['sinks']['/filter:run']
     assert sink['a'] == sink['b'] == {
         'relative_deadline_ns': 8 * MS, 'due': 3, 'in_time': 2, 'late': 1, 'expired': 0,
-        'aborted': 0, 'response_ns': {'min': 5 * MS, 'median': 6 * MS, 'p99': 10 * MS,
-                                      'max': 10 * MS}}
+        'failed': 0, 'aborted': 0,
+        'response_ns': {'min': 5 * MS, 'median': 6 * MS, 'p99': 10 * MS, 'max': 10 * MS}}
     assert set(sink['change_ns'].values()) == {0} and set(sink['change'].values()) == {0.0}
     assert difference['worse'] is sink['worse'] is False
     assert difference['callbacks']['/driver:tick']['a'] == {
