@@ -13,19 +13,23 @@ Theory of operation
   apart, and the stamp at the beginning of its content, where its type begins with a
   `std_msgs/Header` or a time.  Nothing else is decoded.
 * A topic that was recorded with a relative name (`AAA`) is that below the root (`/AAA`).
+* Messages at a time that cannot be (``trace.times``) are left out; so are stamps, of which the
+  message stays.
 * Damage costs what comes after it in that file, and is said.
 """
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import closing, contextmanager
 import io
+from itertools import compress
 import os
 from pathlib import Path
 import re
 import shutil
+import sqlite3
 import struct
 import tempfile
 from typing import Any
@@ -34,6 +38,7 @@ from mddag_executor.errors import InputError
 from mddag_executor.text import counted
 from mddag_executor.trace import MessageReader, TraceError, TraceReader
 from mddag_executor.trace.messages import Topic
+from mddag_executor.trace.times import joined, NEVER, stretches, Times
 import zstandard
 
 _METADATA_LIMIT = 4 * 1024 * 1024
@@ -65,6 +70,12 @@ class Stamps:
         self.header = array('q')
         self.type = ''
 
+    def leave_out(self, never: Collection[int]) -> None:
+        """Forget the messages that came at these times."""
+        kept = [time not in never for time in self.arrival]
+        for name in ('arrival', 'published', 'header'):
+            setattr(self, name, array('q', compress(getattr(self, name), kept)))
+
 
 class Bag:
     """
@@ -72,7 +83,7 @@ class Bag:
 
     :ivar topics: every topic in it.
     :ivar stamps: by topic that was asked for and is in it.
-    :ivar start: the first and ``end`` the last arrival of any message, ns; None without any.
+    :ivar stretches: from when to when messages came, of any topic, without a gap (``times``).
     :ivar warnings: what is missing or doubtful, one line each.
     :raises BagError: where there is no bag, or nothing of it can be used.
     :raises mddag_executor.trace.TraceError: where a file of it cannot be read.
@@ -86,14 +97,15 @@ class Bag:
         self.count = 0
         self.topics: set[str] = set()
         self.stamps: dict[str, Stamps] = {}
-        self.start: int | None = None
-        self.end: int | None = None
+        self.stretches: list[tuple[int, int]] = []
+        self._times = Times()
         self.warnings: list[str] = []
         self._stamped: dict[tuple[str, str], bool] = {}
         self._stated: int | None = None     # messages that metadata.yaml counts
         files = self._files()
         for file in files:
             self._read(file, topics, len(files) == 1)
+        self._finish()
         if self._stated is not None and self._stated != self.count and not self.warnings:
             self.warnings.append(
                 f'{self.name}: metadata.yaml counts {counted(self._stated, "message")}, but '
@@ -153,8 +165,7 @@ class Bag:
                           for text in reader.warnings]
         self.topics |= {_absolute(topic) for topic in reader.topics}
         self.count += reader.count
-        if reader.start is not None and reader.end is not None:
-            self._within(reader.start, reader.end)
+        self._look_through(reader.times)
 
     def _read_sqlite(self, unpacked: Path, file: Path, topics: Collection[str]) -> None:
         from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
@@ -166,8 +177,6 @@ class Bag:
                 self.topics |= {_absolute(c.topic) for c in reader.connections}
                 count = reader.metadata.message_count
                 self.count += count
-                if count:
-                    self._within(reader.metadata.start_time, reader.metadata.end_time - 1)
                 known = {c.id: _topic_of(c) for c in reader.connections
                          if _absolute(c.topic) in topics}
                 wanted = [c for c in reader.connections if c.id in known]
@@ -176,6 +185,7 @@ class Bag:
                     used += 1
             finally:
                 reader.close()
+                self._look_through(_sqlite_times(unpacked))
         except Exception as error:      # of SQLite, of rosbags, or of what a damaged file gave
             what = f'its SQLite storage cannot be read ({" ".join(str(error).split())})'
             if not used:
@@ -186,12 +196,41 @@ class Bag:
     def _called(self, file: Path) -> str:
         return self.name if str(file) == self.path else str(file)
 
-    def _within(self, start: int, end: int) -> None:
-        self.start = start if self.start is None else min(self.start, start)
-        self.end = end if self.end is None else max(self.end, end)
+    def _look_through(self, times: Sequence[int]) -> None:
+        """Take in when the messages of a file came, and leave out those that cannot have."""
+        wrong = self._times.impossible(times)
+        if wrong:
+            never = {times[place] for place in wrong}
+            for stamps in self.stamps.values():
+                stamps.leave_out(never)
+            times = [time for time in times if time not in never]
+        self.stretches = joined([*self.stretches, *stretches(times)])
+
+    def _finish(self) -> None:
+        """Say what is odd about times, and forget stamps that cannot be."""
+        self.warnings += [f'{self.name}: {text}' for text in self._times.lines('message')]
+        for topic, stamps in self.stamps.items():
+            for column, noun in ((stamps.header, 'header stamp'),
+                                 (stamps.published, 'publication time')):
+                places = [place for place, stamp in enumerate(column) if stamp > 0]
+                times = Times()
+                for wrong in times.impossible([column[place] for place in places]):
+                    column[places[wrong]] = UNKNOWN
+                self.warnings += [
+                    f'{self.name}: {topic}: {text}' for text in times.lines(noun)]
+
+    @property
+    def start(self) -> int | None:
+        """Return the first arrival of any message, ns; None without any."""
+        return self.stretches[0][0] if self.stretches else None
+
+    @property
+    def end(self) -> int | None:
+        """Return the last arrival of any message, ns; None without any."""
+        return self.stretches[-1][1] if self.stretches else None
 
     def _add(self, topic: Topic, arrival: int, published: int, data: memoryview) -> None:
-        if not 0 <= arrival < 2**62:
+        if not 0 <= arrival < NEVER:
             return
         name = _absolute(topic.name)
         stamps = self.stamps.get(name)
@@ -199,7 +238,7 @@ class Bag:
             stamps = self.stamps[name] = Stamps()
             stamps.type = topic.message_type
         stamps.arrival.append(arrival)
-        different = 0 < published < 2**62 and published != arrival
+        different = 0 < published < NEVER and published != arrival
         stamps.published.append(published if different else UNKNOWN)
         stamps.header.append(self._header(topic, data))
 
@@ -319,6 +358,18 @@ def _beginning(data: bytes) -> bytes:
         return bytes(packed.stream_reader(io.BytesIO(data)).read(_STAMP))
     except zstandard.ZstdError:
         return b''
+
+
+def _sqlite_times(file: Path) -> list[int]:
+    """Return when messages came, in the order in which they were stored, as far as that goes."""
+    times: list[int] = []
+    with closing(sqlite3.connect(f'{file.absolute().as_uri()}?mode=ro', uri=True)) as storage:
+        try:
+            for time, in storage.execute('SELECT timestamp FROM messages ORDER BY id'):
+                times.append(int(time))
+        except (sqlite3.Error, TypeError, ValueError):
+            pass        # whoever reads the messages says why
+    return times
 
 
 def _topic_of(connection: Any) -> Topic:

@@ -9,8 +9,8 @@ Theory of operation
   when the message came.  Its release is what the declaration's `release_from` says: the arrival,
   the stamp in the message's header, or its publication, where the recorder kept that.  Where a
   message has no such stamp, or one later than its arrival, it is released at its arrival.
-* A DAG whose source is a timer has jobs at k * T from the bag's first message on: when the timers
-  really ran is not in a bag.
+* A DAG whose source is a timer has jobs at k * T from the bag's first message on, while messages
+  come (see ``trace.times``): when the timers really ran is not in a bag.
 * Execution times are drawn for each execution from the declared quantiles (seeded), or come from a
   table, fixed for the whole run.
 * What is not in a bag is left out and said: transport, dispatch, what else the machine did.
@@ -90,9 +90,7 @@ class BagReschedule:
             self.notes.append(f'{dag.name}: {source.note}')
             bases.append(len(costs))
             if len(releases) + len(source.jobs) > _MOST_JOBS:
-                raise BagError(
-                    self._bag.name, f'there are more than {_MOST_JOBS} jobs in it',
-                    'give a shorter bag')
+                raise self._too_many()
             for job, (ready, release) in enumerate(source.jobs):
                 releases.append((ready, dag.index, job, release))
                 costs.extend(_costs(dag, times, generator))
@@ -111,12 +109,13 @@ class BagReschedule:
     def _source(self, dag: Dag) -> Source:
         callback = dag.vertices[dag.source].callback
         if callback.kind == 'timer':
-            period = dag.period_ns
-            jobs = [(t, t) for t in range(self.start, self.end, period)] \
-                if (self.end - self.start) // period < _MOST_JOBS else []
+            jobs = self._timer_jobs(dag.period_ns)
+            pauses = len(self._bag.stretches) - 1
             return Source(
                 jobs, f'{counted(len(jobs), "job")} at the nominal period of its timer, from the '
-                'first message on: a bag does not tell when timers ran')
+                'first message on: a bag does not tell when timers ran'
+                + (f'; none in {counted(pauses, "pause")} of over a minute without any message'
+                   if pauses else ''))
         if not callback.topics:
             self.warnings.append(
                 f'{self._bag.name}: {dag.name} starts with a service call, which a bag does not '
@@ -146,6 +145,20 @@ class BagReschedule:
                     f'{self._bag.name}: {count} of {counted(len(jobs), "message")} of {topic} '
                     f'({stamps.type}) {why}: released at the arrival')
         return Source(sorted(jobs), f'{counted(len(jobs), "job")} from the {what} of {topic}')
+
+    def _timer_jobs(self, period: int) -> list[tuple[int, int]]:
+        """Return the jobs of a timer: at its period, while messages came."""
+        found: list[tuple[int, int]] = []
+        for start, end in self._bag.stretches:
+            first = self.start - (self.start - start) // period * period
+            if (end - first) // period + len(found) >= _MOST_JOBS:
+                raise self._too_many()
+            found.extend((t, t) for t in range(first, end + 1, period))
+        return found
+
+    def _too_many(self) -> BagError:
+        return BagError(
+            self._bag.name, f'there are more than {_MOST_JOBS} jobs in it', 'give a shorter bag')
 
     def _run(self, load: Load) -> list[LogEntry]:
         policy = find_policy(self.policy)

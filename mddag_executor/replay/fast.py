@@ -184,7 +184,7 @@ class FastReplay:
 
     def _other(self, event: Event) -> None:
         name = event[0]
-        if None in event or name in fw.KINDS or not 0 <= event[1] < NEVER:
+        if None in event or name in fw.KINDS:
             raise Declined
         if self._watched is not None:
             if name == 'ros2:rcl_publisher_init':

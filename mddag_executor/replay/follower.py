@@ -194,9 +194,6 @@ class Follower:
             if None in event:
                 self._strange[f'{event[0]} without some of its fields'] += 1
                 continue
-            if not 0 <= event[1] < NEVER:
-                self._strange[f'{event[0]} at an impossible time'] += 1
-                continue
             handlers[event[0]](event)
             count += 1
             if progress is not None and count % _PROGRESS_STEP == 0:

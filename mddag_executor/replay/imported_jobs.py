@@ -83,7 +83,6 @@ class ImportedFollower:
         self.dropped: Counter[str] = Counter()
         self.doubts = Doubts(mapping.task_set.dags)
         self.linker = Linker(recording.entities, self)
-        self._strange = 0
         self._workers: dict[tuple[int, int], int] = {}
         self._timers = _Timers()
         self._fallbacks: Counter[str] = Counter()
@@ -129,9 +128,6 @@ class ImportedFollower:
         count = 0
         take = self.linker.take
         for event in self._recording.events(self.linker.events):
-            if not 0 <= event[1] < NEVER:
-                self._strange += 1
-                continue
             take(event)
             count += 1
             if event[1] > self.end:
@@ -322,9 +318,6 @@ class ImportedFollower:
             lines.append(
                 f'{name}: not judged, because what is missing may be theirs: '
                 f'{counted(sum(self.doubts.withdrawn.values()), "job")}: {listed(dags)}')
-        if self._strange:
-            lines.append(
-                f'{name}: left out: {counted(self._strange, "event")} at an impossible time')
         lines.extend(f'{name}: {text}' for text in self._timers.lines())
         if self._fallbacks:
             lines.append(

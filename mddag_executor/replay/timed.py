@@ -107,7 +107,7 @@ class Engine:
                 instant = times[n]
             if messages and messages[0][0] < instant:
                 instant = messages[0][0]
-            if instant > horizon:
+            if instant > horizon or instant >= NEVER:
                 return
             for worker, finish in enumerate(finish_at):
                 if finish == instant:

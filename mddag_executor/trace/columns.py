@@ -27,6 +27,7 @@ from mddag_executor.trace import records
 from mddag_executor.trace.blocks import Block, Damage
 from mddag_executor.trace.channels import Channels, Event
 from mddag_executor.trace.reading import Reading
+from mddag_executor.trace.times import plain
 import numpy as np
 import numpy.typing as npt
 
@@ -75,6 +76,9 @@ class ColumnReading(Reading):
         if len(rows) > self._room(pending):
             raise self._too_unordered()
         times = rows[:, cl.TIME]
+        if len(rows) and not plain(int(times.min()), int(times.max())):
+            rows = np.delete(rows, self._times.impossible(times.tolist()), axis=0)
+            times = rows[:, cl.TIME]
         if len(rows) > 1 and bool((times[1:] < times[:-1]).any()):
             rows = rows[np.argsort(times, kind='stable')]
         if len(rows) and rows[0, cl.TIME] < block.start_time:

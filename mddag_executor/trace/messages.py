@@ -9,6 +9,7 @@ damage. Messages are not decoded; whoever wants a part of one gets its bytes.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Collection, Iterator
 import os
 from typing import NamedTuple
@@ -54,7 +55,7 @@ class MessageReader:
     :ivar warnings: what was found to be missing, one line, once the reading has come to its end.
     :ivar count: messages so far, of all topics.
     :ivar topics: the topics met so far, also those not asked for.
-    :ivar start: the least and `end` the greatest log time of all messages, None before any.
+    :ivar times: the log times of all messages, of any topic, in the order of the file.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -62,8 +63,7 @@ class MessageReader:
         self.warnings: list[str] = []
         self.count = 0
         self.topics: set[str] = set()
-        self.start: int | None = None
-        self.end: int | None = None
+        self.times = array('Q')
         self._schemas: dict[int, tuple[str, str, str]] = {}
         self._channels: dict[int, Topic] = {}
         self._wanted: dict[int, Topic] = {}
@@ -128,12 +128,7 @@ class MessageReader:
         if channel not in self._channels:
             raise Damage('a message is of no channel', block.offset)
         self.count += 1
-        if self.start is None or self.end is None:
-            self.start = self.end = log_time
-        elif log_time > self.end:
-            self.end = log_time
-        elif log_time < self.start:
-            self.start = log_time
+        self.times.append(log_time)
 
     def _define(self, opcode: int, content: bytes, topics: Collection[str]) -> None:
         self._size += len(content)

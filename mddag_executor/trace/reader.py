@@ -184,7 +184,7 @@ class TraceReader:
         return usable(stream, self._start, size, self._summary, twice)
 
     def _warn(self, reading: Reading, size: int, twice: list[int]) -> None:
-        lines = [self._missing(reading, size), reading.undecoded()]
+        lines = [self._missing(reading, size), reading.undecoded(), *reading.odd_times()]
         if reading.restored:
             lines.append(f'{self.path}: the first chunk is damaged: used its copy')
         if twice:

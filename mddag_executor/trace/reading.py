@@ -16,7 +16,8 @@ Theory of operation:
    Events of equal time come in the order of the file.
 4. In both orders a block is used only when everything before it in the file is sound, so what
    damage leaves is always the beginning of the recording. It is kept in `damage`, not raised.
-5. A message in a sound chunk that does not decode is left out and counted.
+5. In the order of time an event at a time that cannot be (`times`) is left out and counted.
+6. A message in a sound chunk that does not decode is left out and counted.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from mddag_executor.trace.blocks import Block, Damage, load
 from mddag_executor.trace.cdr import ENCAPSULATION
 from mddag_executor.trace.channels import Channels, Event
 from mddag_executor.trace.errors import TraceError
+from mddag_executor.trace.times import Times
 
 _SOME = 4096                     # events decoded at a time
 _PENDING_LIMIT = 2_000_000      # events in memory while putting them into the order of time
@@ -57,6 +59,7 @@ class Reading:
         self._path = path
         self._channels = channels
         self._undecoded: Counter[str] = Counter()       # by topic and reason
+        self._times = Times()
 
     def by_file(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Event]:
         """Yield the events in the order of the file."""
@@ -122,6 +125,7 @@ class Reading:
             events += some
             if len(events) > room:
                 raise self._too_unordered()
+        self._leave_out(events)
         events.sort(key=_time_of)
         if events and events[0][1] < block.start_time:
             raise Damage('a chunk holds an event from before the time in its head', block.offset)
@@ -135,6 +139,11 @@ class Reading:
                 raise
         self.restored = True
         return load(stream, block.copy)
+
+    def _leave_out(self, events: list[Event]) -> None:
+        """Take those at an impossible time out of events in the order of the file."""
+        for place in reversed(self._times.impossible([event[1] for event in events])):
+            del events[place]
 
     def _room(self, pending: int) -> int:
         """Return how many events may be loaded beside those that are."""
@@ -206,6 +215,10 @@ class Reading:
                 self._channels.add_channel(content)
         except ValueError as error:
             raise Damage(str(error), block.offset) from None
+
+    def odd_times(self) -> list[str]:
+        """Return the lines about times that cannot be, or that jump."""
+        return [f'{self._path}: {text}' for text in self._times.lines('event')]
 
     def undecoded(self) -> str | None:
         """Return the line about messages that could not be decoded, None where all could."""

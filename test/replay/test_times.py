@@ -1,0 +1,172 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+One bit of one time: nothing gets larger than what was recorded, and what is left out is said.
+
+The bounds are on jobs, decisions and steps of the schedule, never on wall time.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+import random
+import tempfile
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mddag_executor.core import NEVER
+from mddag_executor.errors import MddagError
+from mddag_executor.replay import replay, reschedule
+from mddag_executor.replay.bags_reschedule import BagReschedule, reschedule_bag
+from mddag_executor.trace import times, TraceFile, TraceReader
+from msg_graph import loads
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from .helpers import MS, small, VirtualRun
+from .recorded import four_jobs
+from .test_ordinary_bags import BEGIN, BY_HEADER, GRAPH, header, STORE
+
+S = 1_000 * MS
+N = 40                  # messages, 25 ms apart: 1 s
+TIMER = 30 * MS
+BITS = st.integers(0, 63)
+PLACE = st.integers(0, N - 1)
+STORAGES = (StoragePlugin.MCAP, StoragePlugin.SQLITE3)
+
+
+def scans(path: Path, arrivals: list[int], storage: StoragePlugin = StoragePlugin.MCAP,
+          stamps: list[int] | None = None) -> Path:
+    """Write a bag of scans, in the order given."""
+    writer = Writer(path, version=9, storage_plugin=storage)
+    with writer:
+        points = writer.add_connection('/points', 'std_msgs/msg/Header', typestore=STORE)
+        for arrival, stamp in zip(arrivals, stamps or [BEGIN] * len(arrivals)):
+            writer.write(points, arrival, header(stamp))
+    return path
+
+
+def arrivals() -> list[int]:
+    return [BEGIN + k * 25 * MS for k in range(N)]
+
+
+def rescheduled(path: Path, graph: str = GRAPH) -> BagReschedule:
+    """Reschedule a bag; there may not be more than each message warrants."""
+    outcome = reschedule_bag(path, loads(graph, 'g.yaml'))
+    jobs = [dag['jobs'] for dag in outcome.result()['dags'].values()]
+    assert jobs[0] <= N
+    # a message further away is there alone: one more stretch of time, with one job at most
+    assert jobs[1] <= (1 * S + times.GAP_NS) // TIMER + 2
+    assert len(outcome.decisions) <= 2 * sum(jobs)
+    assert len(outcome.log) <= 2 * (2 * jobs[0] + jobs[1])
+    return outcome
+
+
+def test_the_constants_are_one() -> None:
+    assert times.NEVER == NEVER
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+@pytest.mark.parametrize('odd', [2**62, 2**62 - 1, 2**63 - 1, BEGIN ^ 2**58, 0, BEGIN + 900 * S])
+def test_a_message_at_a_time_that_cannot_be(
+    tmp_path: Path, storage: StoragePlugin, odd: int
+) -> None:
+    whole = arrivals()
+    sound = rescheduled(scans(tmp_path / 'sound', whole[:20] + whole[21:], storage))
+    whole[20] = odd
+    outcome = rescheduled(scans(tmp_path / 'odd', whole, storage))
+    assert [line.split(': ', 1)[1] for line in outcome.warnings] == [
+        f'left out: 1 message at an impossible time, the first at {min(odd, 2**63 - 1)} ns']
+    assert outcome.result()['dags'] == sound.result()['dags']
+
+
+@given(PLACE, BITS, st.sampled_from(STORAGES))
+@settings(max_examples=60, deadline=None)
+def test_any_bit_of_a_bag(place: int, bit: int, storage: StoragePlugin) -> None:
+    flipped = arrivals()
+    flipped[place] = (flipped[place] ^ 1 << bit) & 2**63 - 1
+    with tempfile.TemporaryDirectory() as folder:
+        rescheduled(scans(Path(folder, 'bag'), flipped, storage))
+
+
+@given(PLACE, st.integers(0, 60))
+@settings(max_examples=30, deadline=None)
+def test_any_bit_of_a_header_stamp(place: int, bit: int) -> None:
+    stamps = [time - 2 * MS for time in arrivals()]
+    stamps[place] ^= 1 << bit
+    with tempfile.TemporaryDirectory() as folder:
+        outcome = rescheduled(scans(Path(folder, 'bag'), arrivals(), stamps=stamps), BY_HEADER)
+    response = outcome.result()['dags']['/lidar']['sinks']['/detector:detect']['response_ns']
+    assert response['max'] <= 2 * times.GAP_NS
+
+
+def test_a_pause_has_no_jobs_of_timers(tmp_path: Path) -> None:
+    later = [time + 3600 * S for time in arrivals()]
+    outcome = rescheduled(scans(tmp_path / 'paused', arrivals()[:20] + later[20:]))
+    assert outcome.warnings == []
+    assert 'none in 1 pause of over a minute' in outcome.notes[1]
+    tick = outcome.result()['dags']['/control']['jobs']
+    assert tick <= 2 * (N * 25 * MS // 2 // TIMER + 1)
+
+
+def test_a_clock_that_jumps_is_said(tmp_path: Path) -> None:
+    earlier = [time - 3600 * S for time in arrivals()]
+    outcome = rescheduled(scans(tmp_path / 'jumps', arrivals()[:20] + earlier[20:]))
+    assert [line.split(': ', 1)[1] for line in outcome.warnings] == [
+        'the clock jumps back 1 time in it, by 3599.975s at most']
+    assert outcome.result()['dags']['/lidar']['jobs'] == N
+
+
+def changed(source: Path, target: Path, rng: random.Random) -> None:
+    """Write a trace once more, with one bit of one integer that is as large as a time flipped."""
+    reader = TraceReader(source)
+    events = [list(event) for event in reader.events()]
+    while True:
+        event = rng.choice(events)
+        places = [place for place in (1, *range(4, len(event)))
+                  if isinstance(event[place], int) and event[place] > 10**9]
+        if places and not isinstance(event[4], str):
+            event[place := rng.choice(places)] ^= 1 << rng.randrange(63)
+            if event[place] < 2**63:
+                break
+    with TraceFile(target) as file:
+        for name, time, pid, thread, *fields in events:
+            file.extend(((name, time, thread, *fields),), pid)
+
+
+def sizes(result: dict[str, Any]) -> list[int]:
+    """Return how many jobs there are, and what became of them."""
+    return [dag['jobs'] for dag in result['dags'].values()]
+
+
+@pytest.mark.parametrize('kind', ['own', 'imported'])
+def test_any_bit_of_a_trace(tmp_path: Path, kind: str) -> None:
+    sound, odd = tmp_path / 'sound.mcap', tmp_path / 'odd.mcap'
+    graph = None
+    if kind == 'own':
+        VirtualRun(sound, small(), 1, duration=200 * MS)
+    else:
+        four_jobs(sound)
+        graph = loads(IMPORTED, 'g.yaml')
+    whole = reschedule(sound, graph, policy='rad', workers=2)
+    for seed in range(150):
+        changed(sound, odd, random.Random(seed))
+        try:
+            found = replay(odd, graph, compiled=False).result()
+            outcome = reschedule(odd, graph, policy='rad', workers=2)
+        except MddagError:
+            continue
+        assert all(a <= b for a, b in zip(sizes(found), sizes(whole.result()))), seed
+        assert len(outcome.decisions) <= 2 * len(whole.decisions), seed
+        assert len(outcome.log) <= 2 * len(whole.log), seed
+
+
+IMPORTED = """\
+mddag: 1
+nodes:
+  - node: /camera
+    callbacks: [{name: grab, timer: 100ms, publishes: [/image]}]
+  - node: /detect
+    callbacks: [{name: detect, subscription: /image, deadline: 10ms}]
+"""
