@@ -4,10 +4,10 @@
 
 from mddag_executor.core.policies import POLICIES, Policy, policy, PolicyError
 from mddag_executor.core.scheduler import Scheduler
-from mddag_executor.core.tables import NEVER, rad_offsets, Tables
+from mddag_executor.core.tables import legs_of, NEVER, rad_offsets, Tables
 from mddag_executor.core.tally import quantile, Tally
 
 __all__ = [
-    'NEVER', 'POLICIES', 'Policy', 'PolicyError', 'Scheduler', 'Tables', 'Tally', 'policy',
-    'quantile', 'rad_offsets',
+    'NEVER', 'POLICIES', 'Policy', 'PolicyError', 'Scheduler', 'Tables', 'Tally', 'legs_of',
+    'policy', 'quantile', 'rad_offsets',
 ]

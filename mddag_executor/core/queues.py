@@ -82,8 +82,9 @@ def wait_for_poll(t: Tables, s: State, entry: Entry) -> None:
     x = entry[4]
     vertex = s.x_vertex[x]
     entity = t.entity[vertex]
-    if vertex < t.n_vertices:  # each leg of a sync is a subscription of its own
-        entity += x - s.job_base[s.x_slot[x]] - t.region_offset[vertex]
+    if vertex < t.n_vertices:  # each topic of a sync is a subscription of its own
+        leg = x - s.job_base[s.x_slot[x]] - t.region_offset[vertex]
+        entity += t.leg_topic[t.first_leg[vertex] + leg]
     queue = s.entity_queue[entity]
     if len(queue) == 0:
         s.unpolled.append(entity)

@@ -16,8 +16,8 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
 2.  **Readiness.**  A vertex becomes ready when its join countdown reaches zero: when all its
     predecessors have completed (AND).  Vertices that several publishers trigger are several
     vertices (OR), so the countdown is all there is.  Where sync callbacks run leg by leg (live),
-    each leg is ready when its message is there, and the countdown is taken at its completion:
-    the vertex completes with the leg that made it whole.
+    each leg, the message of one vertex before it, is ready when that is there, and the countdown
+    is taken at its completion: the vertex completes with the leg that made it whole.
 3.  **Order.**  Ready executions wait in a heap by the key of the policy; the smallest goes first.
     Ties that a policy leaves go by the *order*: one running number, given when an execution
     becomes ready and again when it is put back.  At one instant, as in the paper's own program,

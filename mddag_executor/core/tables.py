@@ -13,7 +13,8 @@ callback that no DAG declares runs as a job of it, released when the callback be
 
 What a job needs while it is open lives in a *region* of consecutive execution ids (see
 ``state``): one id for each vertex, or, where sync callbacks run leg by leg as the live executor
-does it, one id for each leg (topic) of a sync vertex.
+does it, one id for each *leg* of a sync vertex.  A leg is one message that the sync waits for: of
+each of its topics one from each vertex before it that publishes the topic (``legs_of``).
 
 The offsets are relative to a job's release:
 
@@ -29,7 +30,7 @@ For policies that know callbacks, not jobs:
 
 * ``entity``: place of the callback in the wait set of an executor of ROS 2: timers, then
   subscriptions, services and clients, each in the order of the declaration.  A sync has one place
-  for each leg, next to one another.  Vertices of one callback are one entity.
+  for each topic, next to one another.  Vertices of one callback are one entity.
 * ``chain_rank``: fixed priority by chains, as PiCAS assigns them; smaller is more urgent.  A chain
   is a path from the source to a sink.  Chains rank by the sink's relative deadline, then by the
   period and order of their DAGs; a callback has the rank of its most urgent chain (so those with
@@ -43,7 +44,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from msg_graph import Callback, Dag, TaskSet
+from msg_graph import Callback, Dag, TaskSet, Vertex
 from msg_graph.analysis import path_lengths
 
 NEVER = 2 ** 62
@@ -86,6 +87,8 @@ class Tables(NamedTuple):
     chain_rank: list[int]
     region_offset: list[int]
     n_legs: list[int]
+    first_leg: list[int]
+    leg_topic: list[int]
     n_predecessors: list[int]
     first_successor: list[int]
     successors: list[int]
@@ -158,9 +161,10 @@ class _Columns:
             for index, (offset, late) in enumerate(zip(offsets, lateness))]
         region = 0
         for vertex, offset, start in zip(dag.vertices, offsets, starts):
-            countdown, legs = len(vertex.predecessors), 1
+            countdown, topics = len(vertex.predecessors), [0]
             if self._legs and countdown > 0:
-                countdown = legs = max(1, len(vertex.callback.topics))
+                topics = [topic for topic, _ in legs_of(vertex, dag.vertices)]
+                countdown = len(topics)
             lists['dag_of'].append(dag.index)
             lists['index_in_dag'].append(vertex.index)
             lists['rad_offset'].append(offset)
@@ -168,12 +172,14 @@ class _Columns:
             lists['sink_deadline'].append(-1 if vertex.deadline_ns is None else vertex.deadline_ns)
             lists['entity'].append(self._entities[vertex.callback.key])
             lists['region_offset'].append(region)
-            lists['n_legs'].append(legs)
+            lists['n_legs'].append(len(topics))
+            lists['first_leg'].append(len(lists['leg_topic']))
+            lists['leg_topic'].extend(topics)
             lists['n_predecessors'].append(countdown)
             lists['successors'].extend(first + s for s in reversed(vertex.successors))
             lists['first_successor'].append(len(lists['successors']))
             lists['group'].append(self._group(vertex.callback.node, vertex.callback.group))
-            region += legs
+            region += len(topics)
         lists['period'].append(dag.period_ns)
         lists['dag_deadline'].append(max(dag.vertices[s].deadline_ns or 0 for s in dag.sinks))
         lists['on_miss'].append(ABORT if dag.on_miss == 'abort' else CONTINUE)
@@ -199,7 +205,8 @@ class _Columns:
             'dag_of': n_dags, 'index_in_dag': 0, 'rad_offset': default_deadline,
             'latest_start': default_deadline, 'sink_deadline': -1,
             'entity': self._n_entities, 'region_offset': 0,
-            'n_legs': 1, 'n_predecessors': 0, 'first_successor': len(lists['successors']),
+            'n_legs': 1, 'first_leg': len(lists['leg_topic']), 'leg_topic': 0,
+            'n_predecessors': 0, 'first_successor': len(lists['successors']),
             'group': -1,
             'period': default_deadline, 'dag_deadline': default_deadline, 'on_miss': CONTINUE,
             'max_active_jobs': NEVER, 'expire_after': NEVER, 'first_vertex': n_vertices,
@@ -221,6 +228,20 @@ class _Columns:
             best[key] = min(chain, best.get(key, chain))
         ranks = {key: rank for rank, key in enumerate(sorted(best, key=lambda key: best[key]))}
         return [ranks[key] for key in keys]
+
+
+def legs_of(vertex: Vertex, vertices: Sequence[Vertex]) -> list[tuple[int, int]]:
+    """
+    Return the messages that start a vertex, its legs: the place of the topic, and who publishes.
+
+    :param vertices: those of its DAG.
+    """
+    topics = vertex.callback.topics
+    if len(topics) <= 1:
+        return [(0, before) for before in vertex.predecessors]
+    return [
+        (place, before) for place, topic in enumerate(topics) for before in vertex.predecessors
+        if topic in vertices[before].callback.publishes]
 
 
 def rad_offsets(dag: Dag) -> list[int]:

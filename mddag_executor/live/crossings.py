@@ -16,9 +16,9 @@ for such DAGs only:
     judged there (rule 10 of ``core.rules``).
 2.  A message whose publication is known here belongs to that publication's job, as always.
 3.  Any other message on a topic *enters* when exactly one vertex that is not here publishes the
-    topic to it (to one leg of one vertex, should there be several), and its header has a stamp
-    that is not zero.  It belongs to the open job of that stamp; if there is none yet, it starts
-    one, whose release is the stamp.
+    topic to it (or several do to one sync, which waits for as many messages), and its header has a
+    stamp that is not zero.  It belongs to the open job of that stamp; if there is none yet, it
+    starts one, whose release is the stamp.
 4.  The job of a stamp is the one that a source's message or an entering message with that stamp
     has started here, or one of whose callbacks here has published a message with that stamp.  So a
     DAG may leave a process and come back.
@@ -123,13 +123,13 @@ class Crossings:
                 vertices = ','.join(str(i) for i, is_here in enumerate(here) if is_here)
                 record('hosted', now, threading.get_native_id(), dag, vertices)
 
-    def _entrance(self, entry: Entry, hosted: set[str]) -> int:
-        """Return the vertex elsewhere from which messages enter at an entity, -1 for none."""
+    def _entrance(self, entry: Entry, hosted: set[str]) -> list[int]:
+        """Return the vertices elsewhere from which messages enter at an entity."""
         remote = [v for v in entry.targets if self._callbacks[v] not in hosted]
-        if not remote or len({entry.targets[v] for v in remote}) > 1:
-            return -1
+        if len({entry.targets[v][0] for v in remote}) > 1:
+            return []
         crossing = all(self._tables.dag_of[v] in self._crossing for v in remote)
-        return remote[0] if crossing else -1
+        return remote if crossing else []
 
     def _published(self, message: Any, origin: Origin) -> None:
         self.note(header_stamp(message), origin)

@@ -218,15 +218,21 @@ class Dispatcher(Dropping):
 
     def _enter(self, entry: Entry, stamp: int, release: int, now: int) -> Origin | None:
         """Find or start the job of a message from another process (see ``crossings``)."""
-        if self.crossings is None or entry.enters < 0:
+        if self.crossings is None or not entry.enters:
             return None
-        dag = self.tables.dag_of[entry.enters]
+        dag = self.tables.dag_of[entry.enters[0]]
         job = self.crossings.find(dag, stamp)
         if job is None:
             slot = self._release(dag, release, now)
-            job = Origin(slot, dag, self.scheduler.state.job_index[slot], entry.enters)
+            job = Origin(slot, dag, self.scheduler.state.job_index[slot], entry.enters[0])
             self.crossings.note(stamp, job)
-        return job._replace(vertex=entry.enters)
+        # Of a sync: the first of its legs that nothing has come for yet.
+        return job._replace(vertex=next(
+            (v for v in entry.enters if self._is_idle(job, *entry.targets[v])), entry.enters[0]))
+
+    def _is_idle(self, job: Origin, vertex: int, leg: int) -> bool:
+        return self.scheduler.state.x_state[
+            self.scheduler.execution(job.slot, vertex, leg)] == IDLE
 
     def _skip_job(self, entry: Entry, release: int, now: int) -> None:
         """Account for a release whose source does not run: the job expires at once."""

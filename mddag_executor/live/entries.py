@@ -9,7 +9,7 @@ import functools
 import types
 from typing import Any
 
-from mddag_executor.core import Tables
+from mddag_executor.core import legs_of, Tables
 from mddag_executor.live.attribution import Origin
 from msg_graph import Callback, TaskSet
 from msg_graph.binding import entity_name
@@ -81,8 +81,8 @@ class Entry:
         self.source = -1
         # publishing vertex -> (vertex that its message starts, leg)
         self.targets: dict[int, tuple[int, int]] = {}
-        # publishing vertex in another process whose messages start jobs here (see ``crossings``)
-        self.enters = -1
+        # publishing vertices in other processes whose messages enter here (see ``crossings``)
+        self.enters: list[int] = []
         self.waiting: dict[int, None] = {}
         self.ready = 0
         self.ran = 0
@@ -158,9 +158,8 @@ def link(entry: Entry, task_set: TaskSet, tables: Tables, topic: str) -> None:
                 continue
             if vertex.index == dag.source:
                 entry.source = first + vertex.index
-            leg = callback.topics.index(topic) if len(callback.topics) > 1 else 0
-            for before in vertex.predecessors:
-                if topic in dag.vertices[before].callback.publishes:
+            for leg, (place, before) in enumerate(legs_of(vertex, dag.vertices)):
+                if callback.topics[place] == topic:
                     entry.targets[first + before] = (first + vertex.index, leg)
 
 

@@ -112,7 +112,7 @@ class Receiver:
         elif entry.targets:
             origin = self._dispatcher.attribution.find(
                 entry.topic, info['source_timestamp'], info.get('publication_sequence_number'))
-            if origin is None and entry.enters >= 0:
+            if origin is None and entry.enters:
                 stamp = header_stamp(message)
                 release = self._steady(stamp)
         if self._recorder is not None:

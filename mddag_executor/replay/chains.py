@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from mddag_executor.core import NEVER, Tables
+from mddag_executor.core import legs_of, NEVER, Tables
 from mddag_executor.replay.follower import Execution
 from msg_graph import TaskSet
 
@@ -104,11 +104,10 @@ class Chains:
 
     def __init__(self, task_set: TaskSet, tables: Tables) -> None:
         self._tables = tables
-        #: By global vertex and leg: the vertices whose message it is.
-        self.before = [before for dag in task_set.dags for before in publishers(dag.vertices)]
-        for vertex, legs in enumerate(self.before):
-            first = tables.first_vertex[tables.dag_of[vertex]]
-            self.before[vertex] = [[first + local for local in leg] for leg in legs]
+        #: By global vertex and leg: the vertex whose message it is.
+        self.before = [
+            [first + before for _, before in legs_of(vertex, dag.vertices)]
+            for dag, first in zip(task_set.dags, tables.first_vertex) for vertex in dag.vertices]
         self._release: dict[int, int] = {}
         self._done: dict[int, dict[int, Step]] = {}
         self.sinks = {vertex: SinkTimes() for vertex in tables.sinks}
@@ -142,12 +141,12 @@ class Chains:
         step = done.get(vertex)
         while step is not None:
             chain.append(step)
-            legs = self.before[step.vertex]
-            if step.leg >= 0 and legs:
-                legs = [legs[step.leg]]
+            publishers = self.before[step.vertex]
+            if step.leg >= 0 and publishers:
+                publishers = [publishers[step.leg]]
             ready = step.execution.ready
-            candidates = [done[v] for leg in legs for v in leg
-                          if v in done and done[v].execution.start <= ready]
+            candidates = [
+                done[v] for v in publishers if v in done and done[v].execution.start <= ready]
             step = max(candidates, key=lambda s: s.execution.end, default=None)
         chain.reverse()
         return chain
@@ -189,23 +188,6 @@ class Chains:
                 'job': worst.job, 'release_ns': worst.release, 'completed_ns': worst.completed,
                 **worst.breakdown._asdict(), 'waiting_group_ns': worst.group,
                 'chain': [_step_result(task_set, step) for step in worst.chain]}}
-
-
-def publishers(vertices: Any) -> list[list[list[int]]]:
-    """Return for each vertex and leg the (local) vertices before it that publish the topic."""
-    result: list[list[list[int]]] = []
-    for vertex in vertices:
-        if not vertex.predecessors:
-            result.append([])
-            continue
-        topics = vertex.callback.topics
-        if len(topics) <= 1:
-            result.append([list(vertex.predecessors)])
-            continue
-        result.append([
-            [p for p in vertex.predecessors if topic in vertices[p].callback.publishes]
-            for topic in topics])
-    return result
 
 
 def _step_result(task_set: TaskSet, step: Step) -> dict[str, Any]:

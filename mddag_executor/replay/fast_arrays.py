@@ -220,9 +220,8 @@ def _mapped(mapping: Mapping) -> dict[str, Any]:
 
 
 def _befores(judge: Judge) -> dict[str, Any]:
-    before_legs = array([0, *accumulate(map(len, judge.chains.before))])
-    before_first, before = _rows([leg for legs in judge.chains.before for leg in legs])
-    return {'before_legs': before_legs, 'before_first': before_first, 'before': before}
+    before_legs, before = _rows(judge.chains.before)
+    return {'before_legs': before_legs, 'before': before}
 
 
 def grown(work: Work, executions: int, copy: Callable[..., None]) -> Work:

@@ -262,7 +262,7 @@ def walk_chain(t: Any, w: Any, base: int, vertex: int) -> int:
         best = -1
         best_end = 0
         if first < last:
-            for k in range(w.before_first[first], w.before_first[last]):
+            for k in range(first, last):
                 v = w.before[k]
                 before = base + t.region_offset[v]
                 if (w.chain[before, fw.K_KNOWN] != 0 and w.chain[before, fw.K_START] <= ready

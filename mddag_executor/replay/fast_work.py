@@ -112,9 +112,8 @@ class Work(NamedTuple):
     workers: Matrix
     group_busy: Matrix
     group_count: Vector
-    # vertices before each leg
+    # by vertex and leg: the vertex whose message it is
     before_legs: Vector
-    before_first: Vector
     before: Vector
     chain: Matrix
     walk: Vector

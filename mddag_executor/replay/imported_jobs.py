@@ -34,7 +34,7 @@ from collections.abc import Callable as Function
 from collections.abc import Sequence
 from typing import Any
 
-from mddag_executor.core import NEVER
+from mddag_executor.core import legs_of, NEVER
 from mddag_executor.replay.doubts import Doubts
 from mddag_executor.replay.entities import Callback
 from mddag_executor.replay.follower import Execution, Observer, Piece
@@ -95,13 +95,17 @@ class ImportedFollower:
         self._source: dict[str, tuple[int, int]] = {}
         self._next: dict[tuple[int, str], int] = {}
         self._sizes: dict[int, int] = {}
+        # by the vertices before and after, and the place of the topic
+        self._leg: dict[tuple[int, int, int], int] = {}
         first = 0
         for dag in self._dags:
             source = dag.vertices[dag.source]
             self._source[source.callback.key] = dag.index, first + dag.source
             for vertex in dag.vertices:
-                self._sizes[first + vertex.index] = max(1, len(vertex.callback.topics)) \
-                    if vertex.predecessors else 1
+                legs = legs_of(vertex, dag.vertices)
+                self._sizes[first + vertex.index] = max(1, len(legs))
+                for leg, (topic, before) in enumerate(legs):
+                    self._leg[(first + before, first + vertex.index, topic)] = leg
                 for after in vertex.successors:
                     key = dag.vertices[after].callback.key
                     self._next[(first + vertex.index, key)] = first + after
@@ -175,7 +179,6 @@ class ImportedFollower:
     def _assign(self, run: Run, target: Target, message: Publication | None) -> None:
         """Find the job that an execution belongs to."""
         key = target.callback.key
-        run.leg = target.leg
         if key in self._source:
             dag, vertex = self._source[key]
             job = self._newest[dag] = self._newest[dag] + 1
@@ -198,6 +201,7 @@ class ImportedFollower:
             after = self._next.get((before, key))
             if after is not None:
                 run.of = dag, after, job
+                run.leg = self._leg.get((before, after, target.leg), 0)
 
     def _release(self, run: Run, dag: Dag, target: Target) -> int:
         """Return the release of a source's execution."""
@@ -232,9 +236,8 @@ class ImportedFollower:
             if whole:
                 self.doubts.done(dag, vertex, job)
             execution = Execution(run.ready, run.start, run.end, run.end - run.start)
-            leg = run.leg if self._sizes[vertex] > 1 else 0
             for observer in self._observers:
-                observer.completed(dag, vertex, job, leg, whole, run.end, execution)
+                observer.completed(dag, vertex, job, run.leg, whole, run.end, execution)
         self.paths.ended(target.callback.key, run.places, run.end)
 
     def _is_whole(self, vertex: int, job: int, leg: int) -> bool:

@@ -35,7 +35,7 @@ from __future__ import annotations
 from array import array
 from typing import NamedTuple
 
-from mddag_executor.core import quantile, Tables
+from mddag_executor.core import legs_of, quantile, Tables
 from mddag_executor.replay.dispatches import Dispatches
 from mddag_executor.replay.follower import Execution, Observer, Piece
 from mddag_executor.replay.groups import RecordedGroups
@@ -117,11 +117,12 @@ class LoadBuilder(Observer):
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
         # when each round of timers ended
         self._rounds = array('q')
-        # by global vertex and leg: the edges (numbers in their DAG) that its message makes true
+        # by global vertex and leg: the edge (number in its DAG) that its message makes true
         numbers = edge_numbers(tables)
         self._edges_into = [
-            legs for dag in task_set.dags
-            for legs in _edges_into(dag, tables.first_vertex[dag.index], numbers)]
+            [numbers[first + before, first + vertex.index]
+             for _, before in legs_of(vertex, dag.vertices)]
+            for dag, first in zip(task_set.dags, tables.first_vertex) for vertex in dag.vertices]
         # (time when ready, what it took, its dispatch or -1): undeclared callbacks, and legs that
         # completed nothing
         self._others: list[tuple[int, int, int]] = []
@@ -181,9 +182,9 @@ class LoadBuilder(Observer):
         if self._leg is not None and not same:
             self._others.append(self._leg[1])
         self._leg = None
-        legs = self._edges_into[vertex]
-        for edge in legs[leg] if leg < len(legs) else ():
-            jobs.arrived[row * jobs.n_edges + edge] = execution.ready
+        edges = self._edges_into[vertex]
+        if leg < len(edges):
+            jobs.arrived[row * jobs.n_edges + edges[leg]] = execution.ready
         if not whole:
             self._leg = execution, (execution.ready, execution.busy, -1)
             return
@@ -192,13 +193,12 @@ class LoadBuilder(Observer):
         jobs.start[place] = execution.start
         jobs.end[place] = execution.end
         if several:
-            self._all_at_once(jobs, row, legs)
-        if not legs and execution.ready >= jobs.release[row]:
+            self._all_at_once(jobs, row, edges)
+        if not edges and execution.ready >= jobs.release[row]:
             jobs.noticed[row] = execution.ready
 
-    def _all_at_once(self, jobs: _Jobs, row: int, legs: list[list[int]]) -> None:
+    def _all_at_once(self, jobs: _Jobs, row: int, edges: list[int]) -> None:
         """Where one execution stands for all legs, only the last message's time is known."""
-        edges = [edge for leg in legs for edge in leg]
         ends = [jobs.end[row * jobs.size + jobs.publishers[edge]] for edge in edges]
         for edge, end in zip(edges, ends):
             if end < max(ends):
@@ -307,20 +307,3 @@ class LoadBuilder(Observer):
         typical.update(
             (key, quantile(sorted(times), 0.5)) for key, times in recorded.items() if times)
         return typical
-
-
-def _edges_into(
-    dag: Dag, first: int, numbers: dict[tuple[int, int], int]
-) -> list[list[list[int]]]:
-    """Return for each vertex and leg the edges, by number in the DAG, that its message is of."""
-    result: list[list[list[int]]] = []
-    for vertex in dag.vertices:
-        edges = {p: numbers[first + p, first + vertex.index] for p in vertex.predecessors}
-        topics = vertex.callback.topics if vertex.predecessors else ()
-        if vertex.predecessors and len(topics) <= 1:
-            result.append([list(edges.values())])
-            continue
-        result.append([
-            [edge for p, edge in edges.items() if topic in dag.vertices[p].callback.publishes]
-            for topic in topics])
-    return result

@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
+from mddag_executor.core import legs_of
 from mddag_executor.replay.recording import Recording, ReplayError
 from mddag_executor.text import counted, listed
 from msg_graph import Callback, Dag, TaskSet, Vertex
@@ -65,7 +66,9 @@ class Mapping:
         legs: list[list[int]] = []
         for vertex in dag.vertices:
             match = None if target is None else _match(vertex, dag, target)
-            map_of_legs = [] if match is None else _legs(vertex, match)
+            map_of_legs = []
+            if target is not None and match is not None:
+                map_of_legs = _legs(vertex, dag, match, target)
             if target is None or match is None or not map_of_legs:
                 vertices.append(-1)
             else:
@@ -133,14 +136,19 @@ def _match(vertex: Vertex, dag: Dag, target: Dag) -> Vertex | None:
     return same[0] if alone and len(same) == 1 else None
 
 
-def _legs(vertex: Vertex, other: Vertex) -> list[int]:
+def _legs(vertex: Vertex, dag: Dag, other: Vertex, target: Dag) -> list[int]:
     """Return for each leg of a vertex the leg of the other with its topic; none: no match."""
-    topics, theirs = vertex.callback.topics, other.callback.topics
+    topics, theirs = (
+        [each.callback.topics[place] for place, _ in legs_of(each, of.vertices)]
+        for each, of in ((vertex, dag), (other, target)))
     if max(len(topics), len(theirs)) <= 1:
         return [0]
     if sorted(topics) != sorted(theirs):
         return []
-    return [theirs.index(topic) for topic in topics]
+    places: dict[str, list[int]] = {}
+    for place, topic in enumerate(theirs):
+        places.setdefault(topic, []).append(place)
+    return [places[topic].pop(0) for topic in topics]
 
 
 def first_meant(absent: Iterable[Callback], others: Sequence[Entity]) -> str | None:

@@ -21,8 +21,8 @@ import os
 import time
 from typing import Any, NamedTuple
 
+from mddag_executor.core import legs_of, Tables
 from mddag_executor.core import policy as find_policy
-from mddag_executor.core import Tables
 from mddag_executor.core.state import new_state
 from mddag_executor.errors import MddagError
 from mddag_executor.memory import peak_memory_mb
@@ -161,7 +161,7 @@ class _Tile:
             yield ('rcl_publish', end, thread, address + 3, address + 4)
         yield ('callback_end', end, thread, address)
         here = dag.vertices[local]
-        last = len(here.callback.topics) - 1 if here.predecessors else 0
+        last = max(1, len(legs_of(here, dag.vertices))) - 1
         for leg in range(last + 1):
             yield ('complete', end, thread, address, dag.index, local, job, leg == last, end, leg)
         for after in dag.vertices[local].successors:

@@ -26,8 +26,7 @@ from __future__ import annotations
 
 from typing import Any, BinaryIO
 
-from mddag_executor.core import Tables
-from mddag_executor.replay.chains import publishers
+from mddag_executor.core import legs_of, Tables
 from mddag_executor.report.export import JobRow, Ran
 from mddag_executor.report.text import format_ns, printable
 from msg_graph import TaskSet
@@ -61,7 +60,7 @@ class PerfettoTarget:
         self._task_set = task_set
         # by global vertex: the edges to its successors, and by leg those of its message
         self._out: list[list[int]] = []
-        self._into: list[list[list[int]]] = []
+        self._into: list[list[int]] = []
         number = 0
         for dag in task_set.dags:
             edges: dict[tuple[int, int], int] = {}
@@ -71,8 +70,8 @@ class PerfettoTarget:
                     number += 1
                 self._out.append([edges[vertex.index, after] for after in vertex.successors])
             self._into.extend(
-                [[edges[before, vertex.index] for before in leg] for leg in legs]
-                for vertex, legs in zip(dag.vertices, publishers(dag.vertices)))
+                [edges[before, vertex.index] for _, before in legs_of(vertex, dag.vertices)]
+                for vertex in dag.vertices)
         self._n_edges = number
         for uuid, name in ((_WORKERS, 'workers'), (_CALLBACKS, 'callbacks'),
                            (_JOBS, 'jobs by sink'), (_MISSED, 'missed deadlines')):
@@ -111,7 +110,7 @@ class PerfettoTarget:
         into = self._into[vertex]
         for leg in ran.legs:
             if leg < len(into):
-                event.terminating_flow_ids.extend(base + edge & _MASK for edge in into[leg])
+                event.terminating_flow_ids.append(base + into[leg] & _MASK)
         if ran.whole:
             event.flow_ids.extend(base + edge & _MASK for edge in self._out[vertex])
 

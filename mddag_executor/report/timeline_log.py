@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence, Set
 from typing import NamedTuple
 
-from mddag_executor.core import NEVER
+from mddag_executor.core import legs_of, NEVER
 from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END
 from mddag_executor.replay import Reschedule
 from mddag_executor.replay.bags_reschedule import BagReschedule
@@ -100,6 +100,9 @@ class _Teller:
         self._schedule = schedule
         self._observers = observers
         self._vertices = task_set.vertices
+        self._last_leg = [
+            max(1, len(legs_of(vertex, task_set.dags[vertex.dag].vertices))) - 1
+            for vertex in self._vertices]
         self._n_dags = len(task_set.dags)
         self._first = [0]
         for dag in task_set.dags:
@@ -185,9 +188,7 @@ class _Teller:
         if kind == END and (v, job) in self._schedule.failed:
             for observer in self._observers:
                 observer.failed(dag, v, number, now)
-        last = 0
-        if kind == END and declared and self._vertices[v].predecessors:
-            last = max(1, len(self._vertices[v].callback.topics)) - 1
+        last = self._last_leg[v] if kind == END and declared else 0
         for leg in range(last):     # they took no time: the execution is the last one's
             for observer in self._observers:
                 observer.completed(dag, v, number, leg, False, now, None)

@@ -22,7 +22,7 @@ from collections.abc import Iterator
 import os
 from typing import Any
 
-from mddag_executor.core import rad_offsets
+from mddag_executor.core import legs_of, rad_offsets
 from mddag_executor.core.state import (
     ABORTED,
     Decision,
@@ -71,6 +71,9 @@ class _Merger:
         self._load = load
         self._run = run
         self._vertices = task_set.vertices
+        self._last_leg = [
+            max(1, len(legs_of(vertex, task_set.dags[vertex.dag].vertices))) - 1
+            for vertex in self._vertices]
         address = {callback.key: i for i, callback in enumerate(task_set.callbacks, 1)}
         self._address = [address[vertex.callback.key] for vertex in self._vertices]
         self._rad = [offset for dag in task_set.dags for offset in rad_offsets(dag)]
@@ -111,7 +114,7 @@ class _Merger:
                    self._ready[dag, v, job], self._release[dag, job] + self._rad[v])
             yield ('callback_start', now, thread, address, False)
             return
-        last = max(1, len(vertex.callback.topics)) - 1 if vertex.predecessors else 0
+        last = self._last_leg[v]
         if kind == END:
             for leg in range(last):  # they took no time: the piece belongs to the last one
                 yield ('complete', now, thread, address, dag, vertex.index, job, False, now, leg)

@@ -22,7 +22,7 @@ from hypothesis.stateful import (
     rule,
     RuleBasedStateMachine,
 )
-from mddag_executor.core import POLICIES, Scheduler, Tables
+from mddag_executor.core import legs_of, POLICIES, Scheduler, Tables
 from mddag_executor.core.state import (
     ABORTED,
     COMPLETED,
@@ -207,11 +207,9 @@ class LiveDriver(RuleBasedStateMachine):
         dag = self.task_set.dags[job.dag]
         me = dag.vertices[vertex - first]
         for after in me.successors:
-            topics = dag.vertices[after].callback.topics
-            legs = range(self.tables.n_legs[first + after])
             self.messages += [
-                (job, first + after, leg) for leg in legs
-                if topics[leg] in me.callback.publishes]
+                (job, first + after, leg) for leg, (_, before)
+                in enumerate(legs_of(dag.vertices[after], dag.vertices)) if before == me.index]
 
     @precondition(methodcaller('with_fate', WAITING))
     @rule(data=st.data())
@@ -322,11 +320,15 @@ class LiveDriver(RuleBasedStateMachine):
         if not self.scheduler.policy.polling:
             return runs
         waiting = [run for run in self.runs if run.fate == WAITING]
-        entity = self.tables.entity
         return [
             run for run in runs if run.vertex == self.tables.n_vertices or not any(
-                (entity[other.vertex], other.leg) == (entity[run.vertex], run.leg)
+                self.subscription(other) == self.subscription(run)
                 for other in waiting[:waiting.index(run)])]
+
+    def subscription(self, run: Run) -> int:
+        """Return the entity of the message that started a run."""
+        tables = self.tables
+        return tables.entity[run.vertex] + tables.leg_topic[tables.first_leg[run.vertex] + run.leg]
 
     def region(self, dag: int, slot: int) -> range:
         base = self.state.job_base[slot]

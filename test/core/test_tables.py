@@ -67,13 +67,14 @@ def test_a_sync_has_a_leg_for_each_topic() -> None:
     assert legs.region_offset == [0, 1, 2, 3, 5, 0, 1, 0]
 
 
-def test_legs_are_topics_however_many_publish_them() -> None:
+def test_a_sync_has_a_leg_for_each_publisher_of_a_topic() -> None:
     tables = Tables.build(declaration([
         {'node': '/n', 'name': 's', 'timer': '10us', 'publishes': ['/s', '/x'], 'dag': 'd'},
         {'node': '/n', 'name': 'x', 'subscription': '/s', 'publishes': ['/x', '/y']},
         {'node': '/n', 'name': 'join', 'sync': ['/x', '/y'], 'deadline': '9us'}]), legs=True)
-    assert tables.n_legs[:3] == [1, 1, 2]
-    assert tables.n_predecessors[:3] == [0, 1, 2]
+    assert tables.n_legs[:3] == [1, 1, 3]
+    assert tables.n_predecessors[:3] == [0, 1, 3]
+    assert tables.leg_topic[tables.first_leg[2]:tables.first_leg[3]] == [0, 0, 1]
 
 
 def test_no_declaration_is_the_undeclared_dag_alone() -> None:

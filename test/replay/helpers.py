@@ -18,7 +18,7 @@ import random
 from typing import Any
 
 from hypothesis import strategies as st
-from mddag_executor.core import Scheduler, Tables, Tally
+from mddag_executor.core import legs_of, Scheduler, Tables, Tally
 from mddag_executor.core.state import (
     ABORTED,
     DROP,
@@ -107,10 +107,9 @@ def legs_to(task_set: TaskSet, tables: Tables) -> dict[int, list[tuple[int, int]
         for vertex in dag.vertices:
             found[first + vertex.index] = targets = []
             for after in vertex.successors:
-                topics = dag.vertices[after].callback.topics
-                for leg, topic in enumerate(topics):
-                    if topic in vertex.callback.publishes:
-                        targets.append((first + after, leg if len(topics) > 1 else 0))
+                for leg, (_, before) in enumerate(legs_of(dag.vertices[after], dag.vertices)):
+                    if before == vertex.index:
+                        targets.append((first + after, leg))
     return found
 
 
