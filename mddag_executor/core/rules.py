@@ -90,7 +90,6 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tables import ABORT, Tables
 
-# --- readiness -----------------------------------------------------------------------------------
 
 def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
     """Put an execution into the ready queue (rule 3)."""
