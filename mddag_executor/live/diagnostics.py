@@ -32,6 +32,7 @@ from typing import NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import quantile
 from mddag_executor.core.tally import SinkTally, Tally
+from mddag_executor.live.endings import is_over, stop_at_exit
 from mddag_executor.live.settings import Thresholds
 from mddag_executor.text import counted
 from rclpy.logging import get_logger
@@ -278,6 +279,7 @@ class Diagnostics:
     def start(self) -> None:
         """Begin to publish; nothing happens when it has begun before."""
         if self._thread is None:
+            stop_at_exit(self)
             self._thread = threading.Thread(
                 target=self._run, name='mddag-diagnostics', daemon=True)
             self._thread.start()
@@ -294,7 +296,7 @@ class Diagnostics:
             try:
                 due = time.monotonic_ns() + self._period_ns
                 while not self._ending.wait(max(0, due - time.monotonic_ns()) / 1e9):
-                    if not self._context.ok():
+                    if is_over(self._context):
                         return
                     publisher.publish(self.statuses())
                     # a period that was missed (the machine slept) is not made up for
@@ -302,7 +304,7 @@ class Diagnostics:
             finally:
                 publisher.destroy()
         except Exception as error:
-            if self._context.ok():
+            if not is_over(self._context):
                 get_logger('mddag_executor').error(f'there will be no diagnostics: {error}')
 
 

@@ -152,14 +152,14 @@ class DirectTakes:
     Not thread-safe: the intake calls it under a lock of its own.
 
     :param on_change: called from any thread when it has to be chosen anew.
-    :param ok: whether the context is still there; without it nothing is looked after.
+    :param over: whether the context has ended; then nothing is looked after.
     """
 
     def __init__(
-        self, receiver: Receiver, on_change: Callable[[], None], ok: Callable[[], bool]
+        self, receiver: Receiver, on_change: Callable[[], None], over: Callable[[], bool]
     ) -> None:
         install()
-        self._ok = ok
+        self._over = over
         self._receiver = receiver
         self._on_change = on_change
         self._known: dict[int, Direct] = {}
@@ -215,7 +215,7 @@ class DirectTakes:
     def _look_after(self, stopping: threading.Event) -> None:
         self._receiver.on_thread()
         looks = 0
-        while not stopping.wait(LOOK_S) and self._ok():
+        while not stopping.wait(LOOK_S) and not self._over():
             looks += 1
             if self._look(looks % TAKE_EVERY == 0):
                 self._on_change()

@@ -11,23 +11,27 @@ aborts after its work was done.  (rclpy's own executors do so when a daemon thre
 from __future__ import annotations
 
 import atexit
-from collections.abc import Callable
 from functools import partial
 import os
+import threading
 import time
-from typing import Protocol
+from typing import Any, Protocol
 import weakref
 
 from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
 FIRST_LOOK_NS = 5_000_000
 LAST_LOOK_NS = 500_000_000
 EXIT_PATIENCE_S = 1.0
 """So long a program that ends waits for callbacks that still run in an executor's threads."""
+RCL_ERRORS = (InvalidHandle, _rclpy.RCLError)
+"""What rclpy raises of anything whose context has ended, among others."""
 _now = time.monotonic_ns
 
 
-class _Intake(Protocol):
+class _Stopped(Protocol):
 
     def stop(self) -> None: ...
 
@@ -39,36 +43,70 @@ class _Executor(Protocol):
     def wait_halted(self, seconds: float) -> None: ...
 
 
-_started: weakref.WeakSet[_Intake] = weakref.WeakSet()
-_executors: weakref.WeakSet[_Executor] = weakref.WeakSet()
-_Methods = set[weakref.WeakMethod[Callable[[], None]]]
-_by_context: weakref.WeakKeyDictionary[Context, _Methods] = weakref.WeakKeyDictionary()
+_Kept = dict[weakref.ref[Any], Any]
+_started: _Kept = {}
+_executors: _Kept = {}
+_by_context: weakref.WeakKeyDictionary[Context, _Kept] = weakref.WeakKeyDictionary()
 
 
-def stop_at_exit(intake: _Intake) -> None:
+def _keep(kept: _Kept, owner: Any, value: Any = None) -> None:
     """
-    Have an intake stopped before the interpreter and the middleware end, if it still runs then.
+    Keep something of an object for as long as that lives.
+
+    What forgets it is no Python code: in there a KeyboardInterrupt would be printed and lost,
+    and intakes die right when a program is interrupted.
+    """
+    kept[weakref.ref(owner, kept.pop)] = value
+
+
+def _living(kept: _Kept) -> list[tuple[Any, Any]]:
+    return [(owner, value) for reference, value in list(kept.items())
+            if (owner := reference()) is not None]
+
+
+def is_over(context: Context) -> bool:
+    """Return whether a context has ended: that it was shut down, or destroyed."""
+    try:
+        return not context.ok()
+    except InvalidHandle:
+        return True
+
+
+def stop_at_exit(thing: _Stopped) -> None:
+    """
+    Have what has threads stopped before the interpreter and the middleware end, if they run then.
 
     A thread that is in the middleware meanwhile can crash the process.
     """
-    _started.add(intake)
+    _keep(_started, thing)
+
+
+def join(thread: threading.Thread) -> None:
+    """Wait for the end of a thread that has been told to end; never for the calling one."""
+    if thread is threading.current_thread():
+        return
+    try:
+        thread.join()
+    except RuntimeError:
+        pass  # a KeyboardInterrupt came while it was started; it finds out by itself
 
 
 def halt_at_exit(executor: _Executor) -> None:
     """Have an executor stopped before the interpreter ends, in whichever thread it spins."""
-    _executors.add(executor)
+    _keep(_executors, executor)
 
 
 @atexit.register
 def _stop_all() -> None:
-    executors = list(_executors)
+    executors: list[_Executor] = [executor for executor, _ in _living(_executors)]
     for executor in executors:
         executor.halt()
     end = _now() + int(EXIT_PATIENCE_S * 1e9)
     for executor in executors:
         executor.wait_halted(max(0.0, (end - _now()) / 1e9))
-    for intake in list(_started):
-        intake.stop()
+    started: list[_Stopped] = [thing for thing, _ in _living(_started)]
+    for thing in started:
+        thing.stop()
 
 
 def _forget() -> None:
@@ -80,27 +118,26 @@ def _forget() -> None:
 os.register_at_fork(after_in_child=_forget)
 
 
-def call_at_shutdown(context: Context, method: Callable[[], None]) -> None:
+def call_at_shutdown(context: Context, method: Any) -> None:
     """
     Have a method called when a context is shut down, as long as its object is alive.
 
     A context never forgets a callback of somebody who is alive, and executors can make an intake
     for each spin; so it gets only one for all.
 
-    :param method: must not wait for a lock: whoever ends the context may hold it.
+    :param method: must not wait for a lock: whoever ends the context may hold it.  Of an object
+        it can be only one.
     """
     methods = _by_context.get(context)
     if methods is None:
-        methods = _by_context[context] = set()
+        methods = _by_context[context] = {}
         context.on_shutdown(partial(_call_all, methods))
-    methods.add(weakref.WeakMethod(method, methods.discard))
+    _keep(methods, method.__self__, method.__func__)
 
 
-def _call_all(methods: _Methods) -> None:
-    for reference in list(methods):
-        method = reference()
-        if method is not None:
-            method()
+def _call_all(methods: _Kept) -> None:
+    for owner, function in _living(methods):
+        function(owner)
 
 
 class SecondLooks:

@@ -20,7 +20,7 @@ import time
 from typing import Any
 
 from mddag_executor.live.direct import DirectTakes
-from mddag_executor.live.endings import call_at_shutdown, SecondLooks, stop_at_exit
+from mddag_executor.live.endings import call_at_shutdown, is_over, join, SecondLooks, stop_at_exit
 from mddag_executor.live.entities import EMPTY, EntitySet, Receiver, snapshot
 from mddag_executor.live.native import NodeStandIn
 from mddag_executor.live.waitset import PATIENCE, WaitSetIntake
@@ -96,6 +96,9 @@ class _NativeThread:
         self._future: Any = None
         self._thread = threading.Thread(
             target=self._run, name=f'mddag-intake-{name}', daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
         self._thread.start()
 
     def update(self, entities: EntitySet) -> None:
@@ -123,10 +126,8 @@ class _NativeThread:
 
     def join(self) -> bool:
         """Wait for the end of the thread; False when this is the thread itself."""
-        if self._thread is threading.current_thread():
-            return False
-        self._thread.join()
-        return True
+        join(self._thread)
+        return self._thread is not threading.current_thread()
 
     def _run(self) -> None:
         self._receiver.on_thread()
@@ -162,7 +163,7 @@ class _NativeThread:
                         self._node.drain()
                     if failures > PATIENCE:
                         time.sleep(min(0.1, 0.001 * failures))
-                ended = not self._context.ok()
+                ended = is_over(self._context)
         finally:
             with self._lock:
                 self._future = None
@@ -204,7 +205,7 @@ class EventsIntake:
         self._lock = threading.RLock()
         self._given = EMPTY
         self._latest = EMPTY
-        self._direct = DirectTakes(receiver, self._choose_again, context.ok)
+        self._direct = DirectTakes(receiver, self._choose_again, partial(is_over, context))
         self._running = False
         self._parts: dict[str, Any] = {}
         self._ending: list[Any] = []
@@ -262,9 +263,10 @@ class EventsIntake:
             if not needed or name in self._parts:
                 continue
             if name in _NATIVE and name not in self._refused:
-                self._parts[name] = _NativeThread(
+                part = self._parts[name] = _NativeThread(
                     name, kinds, self._context, self._receiver, self._latest,
                     partial(self._native_ended, name))
+                part.start()
             else:
                 self._start_wait_set(name, [_SINGULAR[kind] for kind in kinds])
 
@@ -330,8 +332,8 @@ class EventsIntake:
             part.stop()
             if isinstance(part, WaitSetIntake):
                 part.update(EMPTY)
-        if looker is not None and looker is not threading.current_thread():
-            looker.join()
+        if looker is not None:
+            join(looker)
 
 
 class _Probe:

@@ -30,7 +30,7 @@ from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.live import hooks
 from mddag_executor.live.diagnostics import Diagnostics
 from mddag_executor.live.dispatcher import Dispatcher
-from mddag_executor.live.endings import call_at_shutdown, halt_at_exit
+from mddag_executor.live.endings import call_at_shutdown, halt_at_exit, is_over, RCL_ERRORS
 from mddag_executor.live.entities import EMPTY
 from mddag_executor.live.entries import AtOnce, Entry, TASK, Work
 from mddag_executor.live.events import EventsIntake
@@ -283,10 +283,13 @@ class MultiDeadlineExecutor(Stepping):
                 self._attention.wait(left)
                 self._attention.clear()
             self._raise_error()
+        except RCL_ERRORS:
+            self._check_context()
+            raise
         finally:
             self._pool.pause()
             self._stop_intake()
-            if not self._context.ok():
+            if is_over(self._context):
                 self._pool.close(0.5)
                 self._end_run()
             self._spinning.release()
@@ -318,7 +321,7 @@ class MultiDeadlineExecutor(Stepping):
             self._diagnostics.start()
 
     def _check_context(self) -> None:
-        if not self._context.ok():
+        if is_over(self._context):
             raise ExternalShutdownException()
 
     def _start_intake(self) -> None:

@@ -27,6 +27,7 @@ import time
 from types import TracebackType
 from typing import Any
 
+from mddag_executor.live.endings import is_over
 from mddag_executor.live.entities import alive
 from mddag_executor.live.interception import Interception
 from mddag_executor.live.loading import describe, LoadingError, Program
@@ -226,7 +227,7 @@ class Host:
         """Wait for an event, the end of the run, of the context or of a program, or for a time."""
         end = None if timeout_s is None or timeout_s < 0 else time.monotonic() + timeout_s
         waits_for = self._ending if event is None else event
-        while not self._ending.is_set() and self.executor.context.ok():
+        while not self._ending.is_set() and not is_over(self.executor.context):
             left = 0.05 if end is None else min(0.05, end - time.monotonic())
             if left <= 0 or guest is not None and guest.ended.is_set() or waits_for.wait(left):
                 return

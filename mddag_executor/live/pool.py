@@ -154,7 +154,7 @@ class Pool:
             if self._closed:
                 return
             for worker in range(len(self._seats), self.dispatcher.n_workers):
-                self._seats.append(self._new_seat(worker))
+                self._new_seat(worker)
             self.running = True
             self._dispatch(self.dispatcher.tick())
 
@@ -200,12 +200,12 @@ class Pool:
             seat.thread.join(left)
         return True
 
-    def _new_seat(self, worker: int) -> Seat:
+    def _new_seat(self, worker: int) -> None:
         seat = Seat(self, worker)
         seat.thread = threading.Thread(
             target=self._work_in, args=(seat,), daemon=True, name=f'mddag-worker-{worker}')
+        self._seats[worker:worker + 1] = [seat]  # known also when starting it is interrupted
         seat.thread.start()
-        return seat
 
     def _work_in(self, seat: Seat) -> None:
         seat.vtid = threading.get_native_id()
@@ -359,9 +359,11 @@ class Pool:
         if seat.thread is None:  # spin_once: the workers' threads run while it waits
             return
         self._lenders.append(seat)
-        spare = self._spares.pop() if self._spares else self._new_seat(worker)
-        spare.worker = worker
-        self._seats[worker] = spare
+        if self._spares:
+            self._seats[worker] = self._spares.pop()
+            self._seats[worker].worker = worker
+        else:
+            self._new_seat(worker)
 
     @contextmanager
     def lend(self, running: Running) -> Iterator[None]:

@@ -15,6 +15,7 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.live.endings import RCL_ERRORS
 from mddag_executor.live.entries import AtOnce
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.receiver import Receiver
@@ -44,7 +45,6 @@ class Stepping(Upkeep):
     _receiver: Receiver
     _spinning: threading.Lock
     _is_shutdown: bool
-    _left = False
 
     def _check_context(self) -> None:
         raise NotImplementedError
@@ -95,6 +95,9 @@ class Stepping(Upkeep):
                     return
                 if deadline is not None and time.monotonic() >= deadline:
                     return
+        except RCL_ERRORS:
+            self._check_context()
+            raise
         finally:
             self._spinning.release()
 
@@ -124,7 +127,6 @@ class Stepping(Upkeep):
 
     def halt(self) -> None:
         """Start nothing more, since the interpreter ends; see ``wait_halted``."""
-        self._left = self._is_shutdown
         self._is_shutdown = True
         self._pool.pause()
         self.wake()
@@ -132,8 +134,7 @@ class Stepping(Upkeep):
     def wait_halted(self, seconds: float) -> None:
         """Wait until what runs has ended and nobody spins, at most for a time."""
         end = time.monotonic() + seconds
-        if not self._left:  # else a shutdown has waited for what runs, as long as it was to
-            self._pool.close(seconds)
+        self._pool.close(seconds)
         # Not by taking the lock: a thread that steps once more meanwhile would get an exception.
         while self._spinning.locked() and time.monotonic() < end:
             time.sleep(0.001)

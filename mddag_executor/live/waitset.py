@@ -35,7 +35,7 @@ from collections.abc import Callable, Iterable
 import threading
 import time
 
-from mddag_executor.live.endings import call_at_shutdown, SecondLooks, stop_at_exit
+from mddag_executor.live.endings import call_at_shutdown, is_over, join, SecondLooks, stop_at_exit
 from mddag_executor.live.entities import EMPTY, EntitySet, Receiver, snapshot
 from mddag_executor.live.refilled import RefilledSet
 from mddag_executor.live.timers import sharpen_wake_ups, TimerQueue
@@ -248,7 +248,7 @@ class WaitSetIntake:
                 if count or rang or ended or (limit is not None and _now() >= limit):
                     return count
         except _rclpy.RCLError:
-            if self._context.ok():
+            if not is_over(self._context):
                 raise
             return 0
         finally:
@@ -267,7 +267,7 @@ class WaitSetIntake:
             self._looks.begin()
         elif not self._looks.due():
             return False
-        return not self._context.ok()
+        return is_over(self._context)
 
     # --- thread ----------------------------------------------------------------------------------
 
@@ -304,8 +304,8 @@ class WaitSetIntake:
         if thread is None:
             return
         self.wake()
+        join(thread)
         if thread is not threading.current_thread():
-            thread.join()
             self._thread = None
 
     def _run(self) -> None:
@@ -318,7 +318,7 @@ class WaitSetIntake:
                 try:
                     ended = self._context_ended(self._turn())
                 except Exception as error:
-                    ended = not self._context.ok()
+                    ended = is_over(self._context)
                     if not ended:
                         self._failures += 1
                         self._changed = True

@@ -72,8 +72,9 @@ def test_a_callback_that_never_ends_does_not_keep_a_program_from_ending(spin: st
     run(spin=spin, callback='block')
 
 
-def test_a_program_may_shut_the_executor_down_right_before_it_ends() -> None:
-    run(spin=STEPS, end='executor.shutdown(0)')
+@pytest.mark.parametrize('spin', [SPIN, STEPS])
+def test_a_program_may_shut_the_executor_down_right_before_it_ends(spin: str) -> None:
+    run(spin=spin, end='executor.shutdown(0)')
 
 
 def test_a_forked_child_ends_without_what_the_parent_has() -> None:
