@@ -165,6 +165,15 @@ def usable(
         raise damage
 
 
+def has_copy(stream: BinaryIO, start: int, size: int) -> bool:
+    """Tell whether the first chunk, which holds one message then, has a copy (rule 6)."""
+    try:
+        first = next(usable(stream, start, size, None, []), None)
+    except Damage:
+        return False
+    return first is not None and first.copy is not None
+
+
 def _missing(index: list[tuple[int, int]], found: tuple[int, int] | None, offset: int) -> Damage:
     """Return that chunks of the index are missing before the one that was found."""
     count = index.index(found) if found in index else len(index)

