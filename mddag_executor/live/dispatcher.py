@@ -85,6 +85,7 @@ class Dispatcher(Dropping):
         self.fail = fail
         # told, under the lock, that something may be ready to be dispatched
         self.dispatch: Callable[[int], None] = lambda now: None
+        self.context_ended: Callable[[], bool] = lambda: False
         self._key = self.scheduler.policy.key
         self._work: dict[int, Work] = {}
         self._next_job = [0] * (self.tables.n_dags + 1)
@@ -350,6 +351,14 @@ class Dispatcher(Dropping):
                 job, seat.worker, work.ready_ns, deadline, end, now, whole, leg)
         if state.decisions:
             self.decided(now)
+
+    def leave_open(self, work: Work, start: int, end: int, seat: Seat) -> None:
+        """Take an execution off its worker that could not do its work: its context has ended."""
+        if self.record is not None:
+            self._record_run(work, start, end, seat)
+        self.scheduler.lend(work.x)
+        work.x = -1
+        work.entry.ran += 1
 
     def _record_run(self, work: Work, start: int, end: int, seat: Seat) -> None:
         """Record that a callback has run which no DAG declares, or which goes on later."""

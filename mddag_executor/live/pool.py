@@ -288,6 +288,8 @@ class Pool:
             work.entry.busy_ns += end - start
             if not ran:
                 dispatcher.give_up(work, now)
+            elif raised is not None and dispatcher.context_ended():
+                dispatcher.leave_open(work, start, end, seat)
             elif waits_for is None:
                 dispatcher.complete(work, start, end, now, seat, raised is not None)
             else:

@@ -15,7 +15,7 @@ import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
 
-from .conftest import wait_for
+from .conftest import Spinning, wait_for
 from .test_deadlines import CHAIN, Chain, sinks
 
 SYNC = """
@@ -210,3 +210,17 @@ nodes:
     ends = executor.statistics()['dags']['chain']['ends']
     assert ends['failed'] == len(ran) >= len(caught) >= 2
     assert ends['completed'] == ends['late'] == 0
+
+
+def test_what_cannot_work_because_its_context_has_ended_has_not_failed(
+        make_executor, make_node, ros_context: Any) -> None:
+    """Such a callback is one that had not ended when the run ended."""
+    chain = Chain(make_node, {'tick': ros_context.shutdown})
+    executor = make_executor(loads(CHAIN.replace('50ms', '5s').replace('10ms', '5s')))
+    with Spinning(executor) as spinning:
+        chain.start(executor)
+        spinning.join()
+    assert spinning.error is not None
+    ends = executor.statistics()['dags']['chain']['ends']
+    assert (ends['failed'], ends['completed'], ends['late']) == (0, 0, 0)
+    assert executor.statistics()['callbacks']['/source:tick']['failed'] == 0
