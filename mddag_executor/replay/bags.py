@@ -212,12 +212,13 @@ class Bag:
         for topic, stamps in self.stamps.items():
             for column, noun in ((stamps.header, 'header stamp'),
                                  (stamps.published, 'publication time')):
-                places = [place for place, stamp in enumerate(column) if stamp > 0]
-                times = Times()
-                for wrong in times.impossible([column[place] for place in places]):
-                    column[places[wrong]] = UNKNOWN
-                self.warnings += [
-                    f'{self.name}: {topic}: {text}' for text in times.lines(noun)]
+                wrong = _stray_stamps(stamps.arrival, column)
+                for place in wrong:
+                    column[place] = UNKNOWN
+                if wrong:
+                    self.warnings.append(
+                        f'{self.name}: {topic}: left out: {counted(len(wrong), noun)} far from '
+                        'the others, beside the arrival')
 
     @property
     def start(self) -> int | None:
@@ -258,6 +259,17 @@ class Bag:
         if seconds < 0 or nanoseconds >= 1_000_000_000:
             return UNKNOWN
         return int(seconds * 1_000_000_000 + nanoseconds)
+
+
+def _stray_stamps(arrivals: Sequence[int], stamps: Sequence[int]) -> list[int]:
+    """Return the places of stamps that are much earlier or later than others before arrival."""
+    known = [place for place, stamp in enumerate(stamps) if stamp > 0]
+    if not known:
+        return []
+    lags = [NEVER // 2 + stamps[place] - arrivals[place] for place in known]
+    usual = sorted(lags)[len(lags) // 2]
+    # a usual one at both ends: what is odd there is between others, too
+    return [known[odd - 1] for odd in Times().impossible([usual, *lags, usual])]
 
 
 def is_ordinary(path: str) -> bool:

@@ -33,6 +33,7 @@ from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import Load, LogEntry, SimulationError
 from mddag_executor.text import counted, listed
+from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
 
 DEFAULT_WORKERS = 7
@@ -133,12 +134,15 @@ class BagReschedule:
             jobs = [(arrival, arrival) for arrival in arrivals]
             return Source(sorted(jobs), f'{counted(len(jobs), "job")} from the arrival of {topic}')
         column = getattr(stamps, _STAMP_OF[dag.release_from])
-        jobs = [(arrival, stamp if 0 < stamp <= arrival else arrival)
+        jobs = [(arrival, stamp if stamp <= arrival and credible(stamp, arrival) else arrival)
                 for arrival, stamp in zip(arrivals, column)]
         what = _CALLED[dag.release_from]
         without = sum(stamp in (UNKNOWN, 0) for stamp in column)
         later = sum(stamp > arrival for arrival, stamp in zip(arrivals, column))
+        far = sum(0 < stamp and not credible(stamp, arrival)
+                  for arrival, stamp in zip(arrivals, column))
         for count, why in ((without, f'without a {what}'),
+                           (far, f'with a {what} years before the arrival'),
                            (later, f'with a {what} after the arrival')):
             if count:
                 self.warnings.append(

@@ -17,6 +17,7 @@ from mddag_executor.replay.fast_paths import count_row
 from mddag_executor.replay.fast_tables import find, insert, remove
 from mddag_executor.replay.fast_threads import keep_step, mapped
 from mddag_executor.simulate.structures import key_of_policy
+from mddag_executor.trace.times import FAR_NS
 
 
 def on_release(t: Any, s: Any, w: Any, now: int, dag: int, job: int, release: int) -> bool:
@@ -28,7 +29,7 @@ def on_release(t: Any, s: Any, w: Any, now: int, dag: int, job: int, release: in
     w.releases[dag, 0] += 1
     if w.scalars[fw.FIRST] < 0:
         w.scalars[fw.FIRST] = now
-    if not 0 <= release <= now or job <= w.newest[dag]:
+    if not 0 <= release <= now or now - release >= FAR_NS or job <= w.newest[dag]:
         return False
     w.newest[dag] = job
     w.scalars[fw.JOBS] += 1

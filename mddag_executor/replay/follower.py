@@ -31,6 +31,7 @@ from mddag_executor.core import NEVER
 from mddag_executor.replay.mapping import Mapping
 from mddag_executor.replay.recording import Recording, TASK_SET
 from mddag_executor.text import counted
+from mddag_executor.trace.times import credible
 
 _PROGRESS_STEP = 4096
 _KEEP_UNDECLARED = 4096
@@ -327,6 +328,9 @@ class Follower:
             return
         if not 0 <= release <= now:
             self._strange[f'{event[0]} of a release that is still to come'] += 1
+            return
+        if release and not credible(release, now):
+            self._strange[f'{event[0]} of a release years ago'] += 1
             return
         if job <= self._newest[dag]:
             self._strange[f'{event[0]} of a job that is not newer than the last'] += 1

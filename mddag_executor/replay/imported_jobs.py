@@ -43,6 +43,7 @@ from mddag_executor.replay.linked import Publication, Run
 from mddag_executor.replay.links import Linker
 from mddag_executor.replay.paths import PathBook
 from mddag_executor.text import counted, listed
+from mddag_executor.trace.times import credible
 from msg_graph import Dag
 
 EXPIRE_AFTER_NS = 1_000_000_000
@@ -173,7 +174,8 @@ class ImportedFollower:
     def _ready(self, run: Run, message: Publication | None) -> int:
         if run.callback.kind == 'timer':
             return self._timers.release(run.callback, run.start)
-        sent = run.stamp or (message.stamp or message.time if message is not None else 0)
+        stamp = run.stamp if credible(run.stamp, run.start) else 0
+        sent = stamp or (message.stamp or message.time if message is not None else 0)
         return min(sent or run.taken or run.start, run.start)
 
     def _assign(self, run: Run, target: Target, message: Publication | None) -> None:
@@ -208,12 +210,13 @@ class ImportedFollower:
         if run.callback.kind == 'timer':
             return run.ready
         wanted = dag.release_from
-        if wanted == 'header_stamp' and run.stated:
+        if wanted == 'header_stamp' and credible(run.stated, run.start):
             return min(run.stated, run.start)
         if wanted != 'arrival':
-            if not run.stamp or wanted == 'header_stamp':
+            known = credible(run.stamp, run.start)
+            if not known or wanted == 'header_stamp':
                 self._fallbacks[f'{target.callback.key} ({wanted})'] += 1
-            if run.stamp:
+            if known:
                 return min(run.stamp, run.start)
         return min(run.taken or run.start, run.start)
 
@@ -325,7 +328,8 @@ class ImportedFollower:
         if self._fallbacks:
             lines.append(
                 f'{name}: {counted(sum(self._fallbacks.values()), "release")} by the next best '
-                'stamp, because the declared one is not recorded: '
+                'stamp, because the declared one is not recorded or '
+                'years away: '
                 f'{listed(list(self._fallbacks))}')
         if self._dags and self.jobs == 0:
             lines.append(f'{name}: no job was released in it')

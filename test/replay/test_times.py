@@ -13,7 +13,7 @@ import random
 import tempfile
 from typing import Any
 
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.errors import MddagError
@@ -82,6 +82,7 @@ def test_a_message_at_a_time_that_cannot_be(
 
 
 @given(PLACE, BITS, st.sampled_from(STORAGES))
+@example(N - 1, 45, StoragePlugin.MCAP)
 @settings(max_examples=60, deadline=None)
 def test_any_bit_of_a_bag(place: int, bit: int, storage: StoragePlugin) -> None:
     flipped = arrivals()
@@ -91,6 +92,7 @@ def test_any_bit_of_a_bag(place: int, bit: int, storage: StoragePlugin) -> None:
 
 
 @given(PLACE, st.integers(0, 60))
+@example(0, 51)
 @settings(max_examples=30, deadline=None)
 def test_any_bit_of_a_header_stamp(place: int, bit: int) -> None:
     stamps = [time - 2 * MS for time in arrivals()]
@@ -99,6 +101,14 @@ def test_any_bit_of_a_header_stamp(place: int, bit: int) -> None:
         outcome = rescheduled(scans(Path(folder, 'bag'), arrivals(), stamps=stamps), BY_HEADER)
     response = outcome.result()['dags']['/lidar']['sinks']['/detector:detect']['response_ns']
     assert response['max'] <= 2 * times.GAP_NS
+
+
+def test_header_stamps_of_another_clock(tmp_path: Path) -> None:
+    stamps = [12 * S + k * 25 * MS for k in range(N)]
+    outcome = rescheduled(scans(tmp_path / 'bag', arrivals(), stamps=stamps), BY_HEADER)
+    assert [line.split(': ', 1)[1] for line in outcome.warnings] == [
+        f'{N} of {N} messages of /points (std_msgs/msg/Header) with a header stamp years before '
+        'the arrival: released at the arrival']
 
 
 def test_a_pause_has_no_jobs_of_timers(tmp_path: Path) -> None:
