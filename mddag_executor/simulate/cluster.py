@@ -21,6 +21,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from importlib.util import find_spec
 import logging
+import tempfile
 import threading
 import time
 from types import TracebackType
@@ -66,8 +67,13 @@ class Cluster:
         self.address = address
         self._local: Any = None
         self._client: Any = None
+        # Dask never removes what it puts there.
+        self._folder = tempfile.TemporaryDirectory(
+            prefix='mddag-dask-', ignore_cleanup_errors=True)
         try:
-            self._connect(jobs)
+            import dask.config
+            with dask.config.set({'temporary-directory': self._folder.name}):
+                self._connect(jobs)
         except BaseException:
             self.close()
             raise
@@ -118,6 +124,7 @@ class Cluster:
             if each is not None:
                 each.close(timeout=CONNECT_S)
         self._client = self._local = None
+        self._folder.cleanup()
 
     @property
     def jobs(self) -> int:

@@ -20,11 +20,20 @@ from msg_graph import load
 import pytest
 
 distributed = pytest.importorskip('distributed', reason='the extra dask is not there')
+dask = pytest.importorskip('dask', reason='the extra dask is not there')
 pytestmark = pytest.mark.timeout(120)
 
 BASE = Experiment(
     load(Path(__file__).parents[2] / 'config' / 'autoware.yaml'), ('rad', 'fifo'),
     duration_ns=200_000_000, seed=7)
+
+
+@pytest.fixture(scope='module', autouse=True)
+def scratch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep what Dask leaves behind of clusters that these tests make."""
+    folder = str(tmp_path_factory.mktemp('dask'))
+    with dask.config.set({'temporary-directory': folder}):
+        yield
 
 
 @pytest.fixture(scope='module')
