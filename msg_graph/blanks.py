@@ -320,5 +320,5 @@ def _measured(callback: SketchCallback) -> str:
 
 
 def _execution_time(time: ExecutionTime, count: int) -> Iterator[str]:
-    yield f'        # measured in {count} executions'
+    yield f'        # measured in {count} execution{"s" * (count != 1)}'
     yield f'        execution_time: {quantiles_text(time)}'

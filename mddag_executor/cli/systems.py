@@ -28,6 +28,10 @@ def recorded_system(given: str) -> System:
     with Progress('reading the trace') as line:
         if given != '-' and Path(given).is_dir():
             from mddag_executor.trace import import_ctf
+            from mddag_executor.trace.reader import no_trace
+            traces = any(Path(given).glob('*.mcap')) or not any(Path(given).iterdir())
+            if traces and not any(Path(given).rglob('metadata')):
+                raise no_trace(given)
             with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
                 trace = Path(folder, 'session.mcap')
                 warnings = import_ctf(given, trace, progress=line.events).warnings

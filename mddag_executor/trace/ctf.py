@@ -104,7 +104,7 @@ def _check_session(path: str) -> None:
     found = [os.path.join(folder, 'metadata') for folder, _, names in os.walk(path)
              if 'metadata' in names]
     if not found:
-        what = 'holds no CTF recording: there is no file called metadata in it or below'
+        what = 'holds no CTF recording (no file called metadata is in it or below)'
         if os.path.exists(os.path.join(path, _CACHE)):
             what = f'holds only what CARET converted ({_CACHE}), not the recording itself'
         raise TraceError(path, what, remedy)

@@ -42,6 +42,9 @@ def test_from_trace(mddag: Mddag, tmp_path: Path) -> None:
 
 def test_from_trace_of_something_else(mddag: Mddag, tmp_path: Path) -> None:
     (tmp_path / 'x').write_text('no trace')
+    (tmp_path / 'empty').mkdir()
+    done = mddag('graph', 'from-trace', 'empty', '-o', 'g.yaml', cwd=tmp_path)
+    assert done.stderr == 'error: empty: is an empty folder: give a trace, an .mcap file\n'
     for name in ('x', 'none', str(tmp_path)):
         done = mddag('graph', 'from-trace', name, '-o', 'g.yaml', cwd=tmp_path)
         assert (done.returncode, done.stdout) == (2, '')
