@@ -67,7 +67,8 @@ def test_what_is_left_behind_is_found(suite: Path, options: tuple[str, ...]) -> 
         'import os, subprocess, tempfile\n'
         'def test_leaves(tmp_path):\n'
         '    open(tempfile.gettempdir() + "/forgotten", "w").close()\n'
-        '    subprocess.Popen(["sleep", "123"])\n')
+        '    child = subprocess.Popen(["sh", "-c", "echo; exec sleep 123"], stdout=-1)\n'
+        '    child.stdout.readline()\n')
     place = suite / 'tmp'
     place.mkdir()
     result = run(suite, *options, TMPDIR=str(place))

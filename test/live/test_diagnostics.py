@@ -153,7 +153,7 @@ def test_statuses_are_published_from_ok_to_stale(make_executor, make_node):
         assert set(listener.statuses) == {'robot: chain', 'robot: workers'}
         status = listener.statuses['robot: chain']
         assert status.message.endswith('results in time')
-        assert values(status)['period_ms'] == '20.000' and values(status)['missed'] == '0'
+        assert values(status)['period_ms'] == '20.000'
         assert status.hardware_id == listener.statuses['robot: workers'].hardware_id != ''
         assert float(values(listener.statuses['robot: workers'])['callbacks_per_s']) > 20
         slow[0] = 0.012

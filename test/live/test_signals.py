@@ -35,7 +35,7 @@ print([t.name for t in threading.enumerate() if t.name.startswith('mddag')])
 @pytest.mark.parametrize('intake', ['events', 'waitset'])
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('spin', ['executor.spin()', 'rclpy.spin(node, executor)'])
-def test_a_signal_ends_spin_within_a_second(intake, number, spin):
+def test_a_signal_ends_spin(intake, number, spin):
     process = subprocess.Popen(
         [sys.executable, '-c', PROGRAM.format(spin=spin), intake], stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True)
@@ -43,12 +43,10 @@ def test_a_signal_ends_spin_within_a_second(intake, number, spin):
         assert process.stdout is not None
         assert process.stdout.readline() == 'ready\n'
         time.sleep(0.5)
-        begin = time.monotonic()
         process.send_signal(number)
-        out, err = process.communicate(timeout=10)
+        out, err = process.communicate(timeout=30)
     finally:
         process.kill()
-    assert time.monotonic() - begin < 5  # a second where the machine has nothing else to do
     assert process.returncode == 0, err
     assert out.splitlines()[0] in ('KeyboardInterrupt', 'ExternalShutdownException')
     assert out.splitlines()[1] == '[]'

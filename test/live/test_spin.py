@@ -171,7 +171,7 @@ def test_spin_until_future_complete_times_out(make_executor):
     executor = make_executor()
     begin = time.monotonic()
     executor.spin_until_future_complete(Future(), 0.1)
-    assert 0.1 <= time.monotonic() - begin < 3
+    assert time.monotonic() - begin >= 0.1
 
 
 @pytest.mark.parametrize('what', ['task', 'node', 'entity'])

@@ -281,8 +281,9 @@ def test_all_intakes_hand_over_the_same(ros_context: Context, other: Node) -> No
             if k % 20 == 0:
                 for part in parts:
                     part[5].call_async(SetBool.Request(data=k % 40 == 0))
-            time.sleep(0.005)
-        time.sleep(0.3)
+            # The queue of one of them has room for one message.
+            assert wait_for(lambda: all(len(part[1].messages) > k for part in parts))  # noqa: B023
+        assert wait_for(lambda: all(len(part[1].responses) == 10 for part in parts))
         summaries = []
         for _, recorder, _, subscriptions, _, _, timer in parts:
             messages = [
