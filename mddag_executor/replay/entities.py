@@ -325,7 +325,7 @@ class Entities:
         found = self.callbacks.latest(pid, address, time)
         if found is None:
             found = Callback(len(self.every) + 1, None, 'unknown', made=time)
-            found.label = f'unknown callback 0x{address:x} of process {pid}'
+            found.label = f'callback {found.number} of process {pid}, whose start is not recorded'
             self.every.append(found)
             self.callbacks.add(pid, address, time, found)
         return found
