@@ -485,3 +485,31 @@ def test_a_leg_that_two_publishers_feed_waits_for_both(make_executor, make_node,
     executor.shutdown()
     replayed = replay(str(tmp_path / 'run.mcap')).result()
     assert replayed['dags']['joined']['ends'] == statistics['dags']['joined']['ends']
+
+
+def test_a_leg_that_two_publishers_elsewhere_feed_waits_for_both(make_executor, make_node):
+    """Only the sync is here; the stamps say which job a message belongs to."""
+    group = ReentrantCallbackGroup()
+    sink, elsewhere = make_node('sink'), make_node('elsewhere')
+    publishers = {topic: elsewhere.create_publisher(Header, topic, 10) for topic in ('/x', '/y')}
+    for topic in publishers:
+        sink.create_subscription(Header, topic, lambda _: None, 10, callback_group=group)
+    executor = make_executor(loads(TWO_PUBLISHERS.replace(
+        'dag: joined', 'dag: joined, release_from: header_stamp')))
+
+    def counted() -> tuple[int, int]:
+        statistics = executor.statistics()
+        return (statistics['callbacks']['/sink:join']['ran'],
+                statistics['dags']['joined']['sinks']['/sink:join']['completed'])
+
+    with Spinning(executor):
+        executor.add_node(sink)
+        assert wait_for(lambda: all(
+            publisher.get_subscription_count() == 1 for publisher in publishers.values()))
+        assert wait_for(
+            lambda: '/sink:join' in executor.statistics()['dags']['joined']['sinks'])
+        message = Header(stamp=sink.get_clock().now().to_msg())
+        for topic, expected in (('/x', (1, 0)), ('/y', (2, 0)), ('/x', (3, 1))):
+            publishers[topic].publish(message)
+            assert wait_for(lambda e=expected: counted() == e), (topic, counted())
+    assert executor.statistics()['undeclared'] == 0
