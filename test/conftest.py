@@ -45,8 +45,6 @@ DOMAINS = range(40, 102)
 
 CI = bool(os.environ.get('CI'))
 NEEDS = 'needs '
-# in a session's folder: ROS's and Dask's own
-MAY_STAY = ('log', 'dask-scratch-space')
 
 _session = contextlib.ExitStack()
 
@@ -181,7 +179,7 @@ def nothing_left_behind() -> Iterator[None]:
         time.sleep(0.05)
     folder = Path(tempfile.gettempdir())
     files = sorted(str(path.relative_to(folder)) for path in folder.rglob('*')
-                   if path.relative_to(folder).parts[0] not in MAY_STAY)
+                   if path.relative_to(folder).parts[0] != 'log')
     assert (processes, files) == ({}, []), 'the tests left these processes and files behind'
 
 

@@ -21,7 +21,9 @@ import pytest
 
 from .cases_by_hand import slow_cases
 
-CARET = Path(os.environ.get('MDDAG_CARET_SAMPLE', '/work/shared/caret'))
+# not a part of the repository: looked for beside it
+BESIDE = Path(__file__).resolve().parents[3] / 'shared' / 'caret'
+CARET = Path(os.environ.get('MDDAG_CARET_SAMPLE', BESIDE))
 SESSION = CARET / 'end_to_end_sample'
 pytestmark = [
     pytest.mark.skipif(not SESSION.is_dir(), reason='the recording is not there'),

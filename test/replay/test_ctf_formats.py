@@ -10,8 +10,9 @@ from typing import Any
 from mddag_executor.replay import replay
 from mddag_executor.trace import import_ctf
 from msg_graph import loads
+import pytest
 
-from ..trace.ctf_session import CLOCK_OFFSET, needs_babeltrace, session
+from ..trace.ctf_session import CLOCK_OFFSET, session
 
 MS = 1_000_000
 KINDS = [
@@ -83,7 +84,7 @@ def events() -> list[tuple[Any, ...]]:
     return found
 
 
-@needs_babeltrace()
+@pytest.mark.needs('babeltrace2')
 def test_a_session_of_two_processes(tmp_path: Path) -> None:
     session(tmp_path / 'session' / 'ust', KINDS, events())
     trace = tmp_path / 'drive.mcap'

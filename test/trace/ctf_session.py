@@ -9,8 +9,6 @@ from pathlib import Path
 import struct
 from typing import Any
 
-import pytest
-
 CLOCK_OFFSET = 1_732_000_000_000_000_000
 MAGIC = 0xC1FC1FC1
 
@@ -41,11 +39,6 @@ TYPES = {
 CONTEXT = f'{TYPES["i32"][0]} _vpid; {TYPES["i32"][0]} _vtid; string _procname;'
 
 Kind = tuple[str, Sequence[tuple[str, str]]]
-
-
-def needs_babeltrace() -> pytest.MarkDecorator:
-    """Return the mark of tests that read sessions."""
-    return pytest.mark.needs('babeltrace2')
 
 
 def session(

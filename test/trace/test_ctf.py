@@ -15,16 +15,16 @@ from mddag_executor.cli.main import main
 from mddag_executor.trace import ctf, import_ctf, read_events, TraceError, TraceReader
 import pytest
 
-from .ctf_session import CLOCK_OFFSET, needs_babeltrace, session
+from ..replay.test_caret_sample import CARET
+from ..trace.ctf_session import CLOCK_OFFSET, session
 
 START = ('ros2:callback_start', [('callback', 'u64'), ('is_intra_process', 'i32')])
 END = ('ros2:callback_end', [('callback', 'u64')])
 BIND = ('ros2_caret:dds_bind_addr_to_stamp', [('addr', 'u64'), ('source_stamp', 'u64')])
-SAMPLE = Path(__file__).resolve().parents[3] / 'shared' / 'caret'
 
 UNREADABLE = r's: (cannot be read|babeltrace2 gave up) \('
 
-bt2 = needs_babeltrace()
+bt2 = pytest.mark.needs('babeltrace2')
 
 
 def imported(folder: Path, tmp_path: Path) -> Path:
@@ -194,20 +194,20 @@ class Plain(pickle.Unpickler):
 
 
 @bt2
-@pytest.mark.skipif(not SAMPLE.is_dir(), reason='the sample recording is not here')
+@pytest.mark.skipif(not CARET.is_dir(), reason='the sample recording is not here')
 def test_events_of_a_real_recording_equal_what_caret_made_of_them(tmp_path: Path) -> None:
-    path = imported(SAMPLE / 'end_to_end_sample', tmp_path)
-    with open(SAMPLE / 'end_to_end_sample' / 'caret_converted', 'rb') as file:
+    path = imported(CARET / 'end_to_end_sample', tmp_path)
+    with open(CARET / 'end_to_end_sample' / 'caret_converted', 'rb') as file:
         expected = Plain(file).load()
     assert len(expected) == 2880
     assert list(read_events(path)) == expected
 
 
 @bt2
-@pytest.mark.skipif(not SAMPLE.is_dir(), reason='the sample recording is not here')
+@pytest.mark.skipif(not CARET.is_dir(), reason='the sample recording is not here')
 def test_callback_times_of_a_real_recording_equal_those_of_caret(tmp_path: Path) -> None:
-    path = imported(SAMPLE / 'end_to_end_sample', tmp_path)
-    with open(SAMPLE / 'cb_filter_node_callback_0.csv', newline='') as file:
+    path = imported(CARET / 'end_to_end_sample', tmp_path)
+    with open(CARET / 'cb_filter_node_callback_0.csv', newline='') as file:
         expected = [tuple(map(int, row)) for row in list(csv.reader(file))[1:]]
     runs: dict[int, list[tuple[int, int]]] = {}
     started: dict[int, int] = {}
