@@ -60,7 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument(
         '--node', metavar='SPEC', action='append', default=[],
         help='run this node: package/executable (unmodified, as ros2 run does), module:function '
-        'or module:NodeClass; repeat it for more nodes')
+        'or module:NodeClass; arguments for it follow in the same word, as '
+        "'pkg/exe --rate 2'; repeat it for more nodes")
     what.add_argument(
         '--synthetic', choices=('sleep', 'spin'),
         help='make the nodes from the declaration; their callbacks sleep, or take CPU, for the '
@@ -91,6 +92,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='the rest of the command line goes to rclpy.init, as -r from:=to')
 
 
+def _ros_arguments(args: argparse.Namespace) -> list[str]:
+    """Return what programs see of `--ros-args`."""
+    return ['--ros-args', *args.ros_args] if args.ros_args else []
+
+
 def _or_off(text: str) -> int:
     """Return the nanoseconds of a time, 0 for `off`."""
     return 0 if text == 'off' else options.duration(text)
@@ -114,7 +120,7 @@ def main(args: argparse.Namespace) -> int:
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
     else:
         from mddag_executor.live.loading import resolve
-        programs = [resolve(spec) for spec in args.node]
+        programs = [resolve(spec, _ros_arguments(args)) for spec in args.node]
     with told_when_stuck() as ends, _Signals() as signals, _rclpy(args.ros_args or []):
         from mddag_executor.live.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
@@ -233,7 +239,7 @@ def _run(
             _warn(plan, not {'-r', '--remap'}.isdisjoint(args.ros_args or ()))
             measured = _run_synthetic(session, task_set, plan, seconds, progress)
         else:
-            _run_programs(session, programs, args.ros_args or [], seconds, progress)
+            _run_programs(session, programs, _ros_arguments(args), seconds, progress)
     result = {
         'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
         **executor.statistics(), 'measured': measured}
@@ -265,11 +271,10 @@ def _run_programs(
     progress: Progress,
 ) -> None:
     from mddag_executor.live.hosting import Host
-    arguments = ['--ros-args', *ros_args] if ros_args else []
     with Host(session.executor, session.stop) as host:
         try:
             with session:
-                host.start(programs, arguments)
+                host.start(programs, ros_args)
                 session.wait(seconds, progress.update)
                 host.close()
         except MddagError:

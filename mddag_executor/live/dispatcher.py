@@ -142,16 +142,22 @@ class Dispatcher(Dropping):
                     self._skip_job(entry, due, now)
                 return
             if entry.source >= 0:
-                self._start_job(entry, work, min(due, now), now)
+                self._start_job(entry, work, max(entry.since, min(due, now)), now)
             else:
                 self._start_undeclared(entry, work, now)
             self.dispatch(now)
 
     def timer_missed(self, entry: Entry, due: int, period: int, count: int) -> None:
-        """Take in that the ``count`` periods after that of ``due`` were missed: they are late."""
+        """
+        Take in that ``count`` periods after that of ``due`` were missed: they are late.
+
+        But not those before the executor began to look after the timer.
+        """
         with self.lock:
             if entry.removed or self._finished:
                 return
+            early = min(count, max(0, (entry.since - due - 1) // period))
+            due, count = due + early * period, count - early
             entry.skipped += count
             if entry.source >= 0:
                 now = self.tick()
@@ -180,7 +186,7 @@ class Dispatcher(Dropping):
                     return
                 self._drop_oldest(entry, now)
             if entry.source >= 0 and release is not None:
-                self._start_job(entry, work, min(release, now), now)
+                self._start_job(entry, work, max(entry.since, min(release, now)), now)
                 if stamp >= 0 and self.crossings is not None and work.origin is not None:
                     self.crossings.note(stamp, work.origin)
                 self.dispatch(now)

@@ -63,7 +63,7 @@ class Entry:
         'kind', 'entity', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
         'busy_ns', 'unattributed', 'removed', 'address', 'handle', 'enters', 'soon', 'soon_from',
-        'publishes', 'light', 'at_once', '__weakref__')
+        'publishes', 'light', 'at_once', 'since', '__weakref__')
 
     def __init__(
         self, kind: str, entity: Any, node: str, callback: Callback | None, group: int,
@@ -101,6 +101,8 @@ class Entry:
         # the topics that its callback has published on
         self.publishes: set[str] = set()
         self.removed = False
+        # when the executor began to look after it, on the trace's clock: no job is due before
+        self.since = 0
         # whether it runs where it is taken (see ``receiver``)
         self.at_once = False
         self.address = id(self)

@@ -92,7 +92,7 @@ class Host:
 
         A program that takes longer than ``START_TIMEOUT_S`` is left to go on by itself.
 
-        :param arguments: what the programs see as their command line.
+        :param arguments: what the programs see in their command lines after their own.
         :raises LoadingError: when one fails before, or ends without having brought a node.
         """
         arguments = list(arguments)
@@ -104,7 +104,7 @@ class Host:
     def _start(self, program: Program, arguments: list[str]) -> None:
         guest = Guest(program)
         self.guests.append(guest)
-        sys.argv = [program.argv0, *arguments]
+        sys.argv = [program.argv0, *program.arguments, *arguments]
         guest.thread = threading.Thread(
             target=self._run, args=(guest,), daemon=True, name=f'main of {program.spec}')
         guest.thread.start()

@@ -22,12 +22,13 @@ any node starts; ``hosting`` then runs the ``Program`` that it returns.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import difflib
 from importlib import import_module, metadata
 import inspect
 import os
 from pathlib import Path
+import shlex
 import sys
 import traceback
 from types import ModuleType
@@ -60,19 +61,40 @@ class Program:
     :ivar spec: as the user wrote it.
     :ivar argv0: what ``sys.argv[0]`` is while it starts.
     :ivar run: runs it; what it returns may be nodes.
+    :ivar arguments: its own command line arguments.
     """
 
     spec: str
     argv0: str
     run: Callable[[], Any]
+    arguments: tuple[str, ...] = ()
 
 
-def resolve(spec: str) -> Program:
+def resolve(text: str, ros_arguments: Iterable[str] = ()) -> Program:
     """
-    Find what a SPEC names.
+    Find what a SPEC names; arguments of the program may follow it, as in a shell.
+
+    What is imported sees the command line that the program will see.
 
     :raises LoadingError: when it can't be found or imported, or is nothing that brings nodes.
     """
+    try:
+        spec, *arguments = shlex.split(text) or ['']
+    except ValueError as error:
+        raise LoadingError(text, f'its quotes are not right ({error})', 'correct them') from None
+    if '--ros-args' in arguments:
+        raise LoadingError(
+            text, 'all nodes of this process share its ROS arguments',
+            'put --ros-args at the end of the command line')
+    argv = sys.argv
+    sys.argv = [spec.partition(':')[0].rpartition('/')[2], *arguments, *ros_arguments]
+    try:
+        return replace(_find(spec), spec=text, arguments=tuple(arguments))
+    finally:
+        sys.argv = argv
+
+
+def _find(spec: str) -> Program:
     if ':' in spec:
         return _resolve_attribute(spec)
     if spec.count('/') == 1 and all(spec.split('/')):

@@ -100,6 +100,9 @@ class Upkeep(GroupOwner):
                 crossings.host(
                     self._registry.hosted(), self._registry.subscriptions(),
                     self._dispatcher.record, self._dispatcher.tick())
+        since = self._dispatcher.now()
+        for entry in added:
+            entry.since = since
         for entry in gone:
             self._dispatcher.remove(entry)
         if self._recorder is not None:

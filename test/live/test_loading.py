@@ -29,7 +29,22 @@ def test_what_exists_is_found(world: Path, spec: str, argv0: str) -> None:
     assert (program.spec, program.argv0) == (spec, argv0.format(world=world))
 
 
+def test_a_program_has_a_command_line_of_its_own_while_it_is_imported(
+    world: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (world / 'mine_argv.py').write_text(
+        'import sys\nseen = [*sys.argv]\ndef main():\n    return seen\n')
+    monkeypatch.syspath_prepend(world)
+    before = sys.argv
+    program = resolve("mine_argv:main --rate '2 Hz'", ['--ros-args', '-r', 'a:=b'])
+    seen = sys.modules.pop('mine_argv').seen
+    assert seen == ['mine_argv', '--rate', '2 Hz', '--ros-args', '-r', 'a:=b']
+    assert program.arguments == ('--rate', '2 Hz') and sys.argv is before
+
+
 @pytest.mark.parametrize(('spec', 'message'), [
+    ("chat:main 'x", 'its quotes are not right'),
+    ('chat:main --ros-args -r a:=b', 'put --ros-args at the end of the command line'),
     ('talker', 'this names no node: write package/executable, module:function'),
     ('', 'this names no node'),
     ('a/b/c', 'this names no node'),
