@@ -185,7 +185,7 @@ class MultiDeadlineExecutor(Stepping):
         self._intake_kind = intake
         # What is ready still would run before the spin notices.
         call_at_shutdown(self._context, self._pool.start_no_more)
-        self._dispatcher.context_ended = lambda: not self._context.ok()
+        self._dispatcher.context_ended = lambda: is_over(self._context)
         halt_at_exit(self)
 
     # --- tasks -----------------------------------------------------------------------------------
