@@ -163,7 +163,7 @@ def test_the_executor_loads_little_besides_rclpy() -> None:
     # It takes declarations, and calls into rcl; traces, plots and compilers come when asked for.
     assert foreign & (HEAVY | {'json', 'asyncio', 'multiprocessing', 'http'}) <= {'ctypes', 'yaml'}
     parts = {name.split('.')[1] for name in more if name.startswith(f'{NAME}.')}
-    assert parts == {'clocks', 'core', 'defaults', 'errors', 'live', 'trace'}
+    assert parts == {'clocks', 'core', 'defaults', 'errors', 'live', 'text', 'trace'}
     assert {f'{NAME}.trace.writer', f'{NAME}.trace.reader', f'{NAME}.trace.ctf'} & more == set()
 
 
@@ -259,7 +259,7 @@ def test_what_is_installed_works_without_the_checkout(built: Path, tmp_path: Pat
                                                       'bags/demo_short.mcap'))
 
     def mddag(*arguments: str | Path) -> str:
-        # -P and no editable finder: only what was installed, and what it depends on.
+        # -I and no editable finder: only what was installed, and what it depends on.
         code = (f'import sys; sys.path.insert(0, {str(target)!r})\n'
                 'sys.meta_path[:] = [f for f in sys.meta_path'
                 " if 'editable' not in type(f).__module__ + getattr(f, '__name__', '').lower()]\n"
@@ -268,7 +268,7 @@ def test_what_is_installed_works_without_the_checkout(built: Path, tmp_path: Pat
                 f'assert msg_graph.__file__.startswith({str(target)!r})\n'
                 'from mddag_executor.cli.main import main; sys.exit(main())')
         done = subprocess.run(
-            [sys.executable, '-P', '-c', code, *map(str, arguments)], cwd=tmp_path,
+            [sys.executable, '-I', '-c', code, *map(str, arguments)], cwd=tmp_path,
             capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL, check=False)
         assert done.returncode == 0, done.stderr
         return done.stdout
@@ -281,6 +281,6 @@ def test_what_is_installed_works_without_the_checkout(built: Path, tmp_path: Pat
     assert (TOP / NAME / 'report' / 'html.css').read_text(encoding='utf-8')[:40] in report
     code = f'import sys; sys.path.insert(0, {str(target)!r})\nimport {NAME}.resources as r\n' \
            "print(next(p for p in r.roots() if (p / 'config/autoware.yaml').is_file()))"
-    found = subprocess.run([sys.executable, '-P', '-c', code], cwd=tmp_path, text=True,
+    found = subprocess.run([sys.executable, '-I', '-c', code], cwd=tmp_path, text=True,
                            capture_output=True, check=True)
     assert found.stdout.strip() == str(target / SHARE)

@@ -34,6 +34,7 @@ THIRD_PARTY: dict[str, tuple[str | None, str | None]] = {
     'bokeh': (None, 'bokeh'),  # of the extra `report`
     'builtin_interfaces': ('builtin_interfaces', None),
     'diagnostic_msgs': ('diagnostic_msgs', None),
+    'dask': (None, 'distributed'),
     'distributed': (None, 'distributed'),  # Dask has no rosdep key; it is an extra
     'launch': ('launch', None),
     'launch_ros': ('launch_ros', None),

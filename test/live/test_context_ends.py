@@ -89,6 +89,7 @@ def test_what_a_callback_raises_of_a_context_that_is_there_comes_out(make_execut
 def test_no_interrupt_gets_lost_where_something_of_a_context_dies(ros_context, monkeypatch):
     """A KeyboardInterrupt in the Python code of a weak reference is printed and forgotten."""
     class Thing:
+
         def wake(self) -> None:
             pass
 
