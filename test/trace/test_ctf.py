@@ -134,7 +134,7 @@ def test_damage_is_one_error(tmp_path: Path) -> None:
     folder = session(tmp_path / 's', [END], [(0, time, 1, 1, 'p', 3) for time in range(10)])
     stream = folder / 'channel_0'
     whole = stream.read_bytes()
-    for damaged in (whole[:-5], whole[:30], b'\0' * 8 + whole[8:]):
+    for damaged in (whole[:-5], whole[:30], whole[:24] + b'\0\xff' + whole[26:]):
         stream.write_bytes(damaged)
         with pytest.raises(TraceError, match=UNREADABLE):
             import_ctf(folder, tmp_path / 'out.mcap')
