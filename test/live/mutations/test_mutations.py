@@ -127,7 +127,8 @@ def run(folder: Path, runs: list[tuple[str, list[str], list[str]]]) -> dict[str,
     """Run tests with broken executors ('': as it is); each is mutation, tests and options."""
     environment = {
         key: value for key, value in os.environ.items() if not key.startswith('PYTEST_')}
-    environment.update(PYTEST_DISABLE_PLUGIN_AUTOLOAD='1', OPENBLAS_NUM_THREADS='1')
+    environment.update(
+        PYTEST_DISABLE_PLUGIN_AUTOLOAD='1', OPENBLAS_NUM_THREADS='1', TMPDIR=str(folder))
     jobs = [{'name': mutation or 'whole', 'mutation': mutation, 'arguments': [
         '-q', '-p', 'pytest_timeout', '-p', 'no:cacheprovider', f'--timeout={HUNG_S}', *options,
         *(str(LIVE / test) for test in tests)]} for mutation, tests, options in runs]
