@@ -40,7 +40,7 @@ NODE_KEYS = ('node', 'callbacks')
 TRIGGERS = ('timer', 'subscription', 'sync', 'service')
 CALLBACK_KEYS = (
     'name', *TRIGGERS, 'period', 'publishes', 'reads', 'deadline', 'release_from',
-    'execution_time', 'group', 'dag', 'on_miss', 'max_active_jobs')
+    'execution_time', 'holds_interpreter', 'group', 'dag', 'on_miss', 'max_active_jobs')
 PATH_KEYS = ('name', 'callbacks')
 TIME_KEYS = ('quantiles_us', 'percent')
 RELEASE_FROM = ('arrival', 'source_timestamp', 'header_stamp')
@@ -193,6 +193,7 @@ def _callback(fields: Fields, node: str, file: str | None) -> Entry:
         line=fields.line,
         on_miss=cast(OnMiss, fields.choice('on_miss', ON_MISS)),
         max_active_jobs=fields.integer_or_none('max_active_jobs', 1, MOST_ACTIVE_JOBS),
+        holds_interpreter=fields.truth_or_none('holds_interpreter'),
         file=file,
     )
     return Entry(callback, fields)

@@ -20,6 +20,7 @@ WORD = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_.-]*')
 DAG_NAME = re.compile(r'/?[A-Za-z0-9_.-]+(?:/[A-Za-z0-9_.-]+)*')
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
 _INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
+_TRUTHS = {'true': True, 'false': False}
 
 Check = Callable[[str], 'tuple[str, str] | None']
 """Looks at a text; returns what is wrong with it and what to do, or None."""
@@ -222,6 +223,16 @@ class Fields:
                 did_you_mean(text, choices, f'use {", ".join(choices)}'))
 
         return self.text_or_none(key, check) or choices[0]
+
+    def truth_or_none(self, key: str) -> bool | None:
+        """Return true or false."""
+        value = self.tree_or_none(key)
+        if value is None:
+            return None
+        if not (isinstance(value, Scalar) and value.plain and value.text in _TRUTHS):
+            what = shown(value.text) if isinstance(value, Scalar) else _kind_of(value)
+            raise self.error(key, f'{shown(key)} is {what}', 'write true or false')
+        return _TRUTHS[value.text]
 
     def duration_or_none(self, key: str, minimum_ns: int = MICROSECOND) -> int | None:
         """Return a time of at most a day, in ns."""

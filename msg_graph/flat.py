@@ -60,6 +60,8 @@ def _callback(callback: Callback) -> Iterator[str]:
         ('on_miss', callback.on_miss if callback.on_miss != 'continue' else None),
         ('max_active_jobs', callback.max_active_jobs),
         ('execution_time', _execution_time(callback.execution_time)),
+        ('holds_interpreter', None if callback.holds_interpreter is None
+         else str(callback.holds_interpreter).lower()),
     ):
         if value is not None:
             yield f'        {key}: {value}'

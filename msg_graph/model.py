@@ -83,6 +83,8 @@ class Callback:
     :ivar line: line of its declaration, counted from 1.
     :ivar on_miss: what is done with a late job of the DAG that it is the source of.
     :ivar max_active_jobs: bound on the open jobs of the DAG that it is the source of, or None.
+    :ivar holds_interpreter: whether it computes in Python (True), or waits, or computes with the
+        interpreter's lock released (False); None where nobody says.
     :ivar file: name of the file that declares it; None: that of the task set.
     """
 
@@ -104,6 +106,7 @@ class Callback:
     line: int
     on_miss: OnMiss = 'continue'
     max_active_jobs: int | None = None
+    holds_interpreter: bool | None = None
     file: str | None = None
 
 

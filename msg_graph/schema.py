@@ -151,6 +151,10 @@ _CALLBACK: dict[str, _Schema] = {
                      'description': 'Where the release time of a source comes from.'},
     'execution_time': {'allOf': [{'$ref': '#/definitions/execution_time'}],
                        'description': 'Its execution time: constant, or quantiles.'},
+    'holds_interpreter': {
+        'anyOf': [{'type': 'boolean'}, _VALUE],
+        'description': 'Whether it computes in Python (true), or waits, or computes with the lock '
+                       'of the interpreter released (false).'},
     'group': _word(fields.WORD, 'Its mutually exclusive callback group in the node.'),
     'dag': _word(fields.DAG_NAME, 'Name of the DAG that it is the source of.'),
     'on_miss': {'anyOf': [{'enum': list(language.ON_MISS)}, _VALUE],

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The queues in which executions wait: rules 3, 4 and 9 of the scheduling rules (see ``rules``).
+The queues in which executions wait: rules 3, 4, 9 and 11 of the scheduling rules (see ``rules``).
 
 Theory of operation
 -------------------
@@ -9,6 +9,8 @@ A waiting execution stands in exactly one of
 
 * the ready queue (``State.ready``), a heap by the keys of the policy;
 * the heap of its callback group (``State.group_heap``), if the group was busy when its turn came;
+* the heap of those that are held back (``State.held_back``), if the interpreter was held when its
+  turn came by one that is as urgent;
 * under a policy that polls, the queue of its *entity* (``State.entity_queue``): what the wait set
   of rclpy and rclcpp knows, a timer or a subscription with the messages that wait for it.
 
@@ -25,7 +27,7 @@ from __future__ import annotations
 
 from heapq import heapify, heappop, heappush
 
-from mddag_executor.core.state import ABORTED, Entry, N_STALE, State, WAITING
+from mddag_executor.core.state import ABORTED, Entry, N_HOLDING, N_STALE, State, WAITING
 from mddag_executor.core.tables import Tables
 
 SWEEP_AT = 64
@@ -46,7 +48,7 @@ def add_stale(s: State) -> None:
 
 def _sweep(s: State) -> None:
     """Take stale entries out of all queues when they are the larger part: memory is bounded."""
-    length = len(s.ready)
+    length = len(s.ready) + len(s.held_back)
     for group in range(len(s.group_heap)):
         length += len(s.group_heap[group])
     for entity in range(len(s.entity_queue)):
@@ -54,6 +56,7 @@ def _sweep(s: State) -> None:
     if 2 * s.scalars[N_STALE] <= length:
         return
     _keep_valid(s, s.ready)
+    _keep_valid(s, s.held_back)
     for group in range(len(s.group_heap)):
         _keep_valid(s, s.group_heap[group])
     for entity in range(len(s.entity_queue)):
@@ -75,6 +78,37 @@ def _keep_valid(s: State, heap: list[Entry]) -> None:
             kept += 1
     del heap[kept:]
     heapify(heap)
+
+
+def next_queue(s: State) -> list[Entry]:
+    """
+    Return the queue whose first entry goes first; it is empty when nothing is there to go.
+
+    What was held back counts as soon as the interpreter is free for it (rule 11).
+    """
+    _drop_stale(s, s.ready)
+    if len(s.held_back) == 0:
+        return s.ready
+    _drop_stale(s, s.held_back)
+    if len(s.held_back) == 0 or (len(s.ready) > 0 and s.ready[0] < s.held_back[0]):
+        return s.ready
+    return s.held_back if interpreter_is_free(s, s.held_back[0]) else s.ready
+
+
+def _drop_stale(s: State, queue: list[Entry]) -> None:
+    while queue and is_stale(s, queue[0]):
+        heappop(queue)
+        s.scalars[N_STALE] -= 1
+
+
+def interpreter_is_free(s: State, entry: Entry) -> bool:
+    """Tell whether nothing that is as urgent or more holds the interpreter (rule 11)."""
+    if s.scalars[N_HOLDING] > 0:
+        for worker in range(len(s.worker_x)):
+            x = s.worker_x[worker]
+            if x >= 0 and s.x_holds[x] != 0 and s.x_key[x][0] <= entry[0]:
+                return False
+    return True
 
 
 def wait_for_poll(t: Tables, s: State, entry: Entry) -> None:

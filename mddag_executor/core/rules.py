@@ -55,6 +55,11 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
     each of them the vertices that are *expected here*.  The others count as done before it begins:
     they are not judged here and keep no job open.  A job ends when all that ends here has: the
     sinks that are here, and the vertices after which nothing of the DAG runs here.
+11. **The interpreter.**  Python's lock lets one thread compute at a time.  An execution that holds
+    the interpreter (the driver says so, ``State.x_holds``) starts only if none on a worker whose
+    priority is the same or smaller holds it; until then it is held back, and others go past it.
+    One that is more urgent than all that hold it overtakes them.  An execution that lends its
+    worker, is suspended or turns out to wait (``stop_holding``) holds it no more.
 """
 
 from __future__ import annotations
@@ -63,7 +68,14 @@ from heapq import heappop, heappush
 
 from mddag_executor.core.jobs import abort_job, close_job, deactivate, fail_job, judge, overdue
 from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.queues import add_stale, is_stale, poll, wait_for_poll
+from mddag_executor.core.queues import (
+    add_stale,
+    interpreter_is_free,
+    is_stale,
+    next_queue,
+    poll,
+    wait_for_poll,
+)
 from mddag_executor.core.state import (
     ABORTED,
     COMPLETED,
@@ -74,6 +86,7 @@ from mddag_executor.core.state import (
     EXPIRED,
     LAST_HERE,
     LATE,
+    N_HOLDING,
     N_IDLE,
     N_STALE,
     OPEN,
@@ -149,24 +162,30 @@ def peek(t: Tables, s: State, now: int) -> int:
     Return the execution that goes next, or -1 when none may run.
 
     On the way, what cannot go next leaves the queue: dropped and aborted executions for good,
-    those whose group is busy into their group's heap (rule 4) or to the next poll (rule 9).
+    those whose group is busy into their group's heap (rule 4) or to the next poll (rule 9), those
+    for which the interpreter is not free into the heap of what is held back (rule 11).
     """
     again = True
     while True:
-        while s.ready:
-            entry = s.ready[0]
-            if is_stale(s, entry):
-                heappop(s.ready)
-                s.scalars[N_STALE] -= 1
-                continue
+        queue = next_queue(s)
+        while queue:
+            entry = queue[0]
             x = entry[4]
             group = s.x_group[x]
             if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
-                heappop(s.ready)
+                heappop(queue)
                 if s.scalars[POLLING] == 0:
                     heappush(s.group_heap[group], entry)
                 else:
                     wait_for_poll(t, s, entry)
+                queue = next_queue(s)
+                continue
+            if s.x_holds[x] != 0 and not interpreter_is_free(s, entry):
+                heappop(queue)
+                heappush(s.held_back, entry)
+                if group >= 0 and s.group_owner[group] == -1:
+                    _release_group(s, group)  # others of it may go first
+                queue = next_queue(s)
                 continue
             slot = s.x_slot[x]
             if (t.on_miss[s.job_dag[slot]] == ABORT and s.job_state[slot] == OPEN
@@ -175,6 +194,7 @@ def peek(t: Tables, s: State, now: int) -> int:
             if s.job_state[slot] != ABORTED or s.x_started[x] >= 0:
                 return x
             drop(s, x, now)
+            queue = next_queue(s)
             again = True
         if not again or len(s.unpolled) == 0:
             return -1
@@ -183,9 +203,10 @@ def peek(t: Tables, s: State, now: int) -> int:
 
 
 def _start(s: State, x: int, worker: int, now: int) -> None:
-    heappop(s.ready)
+    heappop(s.ready if len(s.ready) > 0 and s.ready[0][4] == x else s.held_back)
     s.x_state[x] = RUNNING
     s.x_worker[x] = worker
+    s.scalars[N_HOLDING] += s.x_holds[x]
     s.x_started[x] = now
     s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]
     s.worker_x[worker] = x
@@ -250,12 +271,20 @@ def _leave_worker(s: State, x: int) -> None:
     if worker >= 0:
         s.worker_x[worker] = -1
         s.x_worker[x] = -1
+        s.scalars[N_HOLDING] -= s.x_holds[x]
         s.scalars[N_IDLE] += 1
 
 
 def lend(s: State, x: int) -> None:
     """Give a running execution's worker free while it waits for something; it keeps its group."""
     _leave_worker(s, x)
+
+
+def stop_holding(s: State, x: int) -> None:
+    """Give the interpreter back for an execution that turns out not to hold it (rule 11)."""
+    if s.x_worker[x] >= 0:
+        s.scalars[N_HOLDING] -= s.x_holds[x]
+    s.x_holds[x] = 0
 
 
 def suspend(s: State, x: int) -> None:

@@ -76,11 +76,12 @@ class Scheduler:
         """Make an execution ready."""
         rules.make_ready(self.tables, self.state, self._key, x, now)
 
-    def undeclared(self, job: int, group: int, now: int) -> int:
+    def undeclared(self, job: int, group: int, now: int, holds: int = 0) -> int:
         """Make a callback that no DAG declares ready; return its execution."""
         slot = self.release(self.tables.n_dags, job, now, now)
         x = self.state.job_base[slot]
         self.state.x_group[x] = group
+        self.state.x_holds[x] = holds
         rules.make_ready(self.tables, self.state, self._key, x, now)
         return x
 
@@ -112,6 +113,10 @@ class Scheduler:
     def lend(self, x: int) -> None:
         """Free the worker of an execution that goes on without one."""
         rules.lend(self.state, x)
+
+    def stop_holding(self, x: int) -> None:
+        """Give the interpreter back for an execution that turns out not to hold it."""
+        rules.stop_holding(self.state, x)
 
     def suspend(self, x: int) -> None:
         """Take a running execution off its worker until ``resume``."""
@@ -176,4 +181,5 @@ class Scheduler:
         """Count the executions that wait, for a worker or for their group."""
         waiting = sum(len(heap) for heap in self.state.group_heap)
         waiting += sum(len(queue) for queue in self.state.entity_queue)
+        waiting += len(self.state.held_back)
         return len(self.state.ready) + waiting - self.state.scalars[N_STALE]

@@ -26,7 +26,7 @@ ELSEWHERE, HERE, LAST_HERE = range(3)
 
 # Columns of ``scalars``.
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
- JUDGE_FROM, SKIP, N_SCALARS) = range(11)
+ JUDGE_FROM, SKIP, N_HOLDING, N_SCALARS) = range(12)
 
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  The deadline is that of the
 # sink; the time that of the decision, for a sink that completed the completion, else -1.  Instead
@@ -44,8 +44,10 @@ class State(NamedTuple):
     """All that changes during a run; made by ``new_state``."""
 
     scalars: list[int]
-    # ready queue (a heap), and one heap for each callback group with those that wait for it
+    # ready queue (a heap), a heap with those that wait for the interpreter, and one heap for each
+    # callback group with those that wait for it
     ready: list[Entry]
+    held_back: list[Entry]
     group_heap: list[list[Entry]]
     group_owner: list[int]
     # under a policy that polls: a heap for each entity, and the entities that have any entry there
@@ -78,6 +80,8 @@ class State(NamedTuple):
     x_state: list[int]
     x_pending: list[int]
     x_group: list[int]
+    # whether it holds the interpreter while it runs
+    x_holds: list[int]
     x_worker: list[int]
     x_key: list[Entry]
     x_ready: list[int]
@@ -169,6 +173,7 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
             s.x_slot.append(slot)
             s.x_vertex.append(vertex)
             s.x_group.append(t.group[vertex])
+            s.x_holds.append(0)
             s.x_key.append((0, 0, 0, 0, 0))
             s.x_state.append(IDLE)
             s.x_pending.append(0)

@@ -280,11 +280,13 @@ class Dispatcher(Dropping):
     def _start_undeclared(self, entry: Entry, work: Work, now: int) -> None:
         self.undeclared += 1
         self._note_ready(
-            entry, work, self.scheduler.undeclared(entry.ready, entry.group, now), now)
+            entry, work, self.scheduler.undeclared(
+                entry.ready, entry.group, now, entry.habit.holds), now)
 
     def _enqueue(self, entry: Entry, work: Work, x: int, origin: Origin, now: int) -> None:
         state = self.scheduler.state
         state.x_group[x] = entry.group
+        state.x_holds[x] = entry.habit.holds
         work.origin = origin
         make_ready(self.tables, state, self._key, x, now)
         self._note_ready(entry, work, x, now)

@@ -11,6 +11,7 @@ from typing import Any
 
 from mddag_executor.core import legs_of, Tables
 from mddag_executor.live.attribution import Origin
+from mddag_executor.live.interpreter import Habit
 from msg_graph import Callback, TaskSet
 from msg_graph.binding import entity_name
 from rclpy.exceptions import InvalidHandle
@@ -63,7 +64,7 @@ class Entry:
         'kind', 'entity', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
         'busy_ns', 'unattributed', 'removed', 'address', 'handle', 'enters', 'soon', 'soon_from',
-        'publishes', 'light', 'at_once', 'since', '__weakref__')
+        'publishes', 'light', 'at_once', 'habit', 'since', '__weakref__')
 
     def __init__(
         self, kind: str, entity: Any, node: str, callback: Callback | None, group: int,
@@ -101,8 +102,7 @@ class Entry:
         # the topics that its callback has published on
         self.publishes: set[str] = set()
         self.removed = False
-        # when the executor began to look after it, on the trace's clock: no job is due before
-        self.since = 0
+        'publishes', 'light', 'at_once', 'habit', 'since', '__weakref__')
         # whether it runs where it is taken (see ``receiver``)
         self.at_once = False
         self.address = id(self)
@@ -142,10 +142,12 @@ class Entry:
             return
         total = counts.setdefault(self.name, {
             'kind': self.kind, 'declared': self.callback is not None, 'waiting': 0,
+            'holds_interpreter': False,
             **dict.fromkeys(COUNTS, 0)})
         for key in COUNTS:
             total[key] += getattr(self, key)
         total['waiting'] += len(self.waiting)
+        total['holds_interpreter'] |= bool(self.habit.holds)
 
 
 def link(entry: Entry, task_set: TaskSet, tables: Tables, topic: str) -> None:

@@ -35,6 +35,7 @@ from mddag_executor.live.entities import EMPTY
 from mddag_executor.live.entries import AtOnce, Entry, TASK, Work
 from mddag_executor.live.events import EventsIntake
 from mddag_executor.live.gathering import Gathering
+from mddag_executor.live.interpreter import short_switch_interval
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.rates import RateWatch
 from mddag_executor.live.receiver import Receiver
@@ -234,7 +235,8 @@ class MultiDeadlineExecutor(Stepping):
         :raises RuntimeError: when the executor spins already.
         :raises Exception: what a callback raised.
         """
-        self._spin(lambda: False, None)
+        with short_switch_interval():
+            self._spin(lambda: False, None)
 
     def spin_until_future_complete(
         self, future: Future, timeout_sec: float | None = None
@@ -242,7 +244,8 @@ class MultiDeadlineExecutor(Stepping):
         """Run callbacks on the pool until a future is done or the time is over."""
         future.add_done_callback(AtOnce(self._attention.set))
         try:
-            self._spin(lambda: future.done() or future.cancelled(), timeout_sec)
+            with short_switch_interval():
+                self._spin(lambda: future.done() or future.cancelled(), timeout_sec)
         except ExternalShutdownException:
             pass
 

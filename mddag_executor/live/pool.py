@@ -38,6 +38,7 @@ from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.entries import AtOnce, Destroyed, Entry, UNKNOWN, Work
 from mddag_executor.live.gathering import Gathering
 from mddag_executor.live.hooks import current
+from mddag_executor.live.interpreter import Overseer, ThreadClock
 from mddag_executor.live.verdicts import NO_ORIGIN
 from mddag_executor.trace.groups import PUBLICATION
 
@@ -53,7 +54,7 @@ SOON_DOUBT = 8
 class Seat:
     """A worker thread's place: the worker it is (-1: spare), and what it is to run."""
 
-    __slots__ = ('worker', 'wake', 'x', 'work', 'thread', 'vtid', 'waits', 'running')
+    __slots__ = ('worker', 'wake', 'x', 'work', 'thread', 'vtid', 'clock', 'waits', 'running')
 
     def __init__(self, pool: Pool, worker: int) -> None:
         self.running = Running(pool, self)
@@ -64,6 +65,7 @@ class Seat:
         self.work: Work | None = None
         self.thread: threading.Thread | None = None
         self.vtid = 0
+        self.clock: ThreadClock | None = None
         self.waits = False
 
 
@@ -144,6 +146,9 @@ class Pool:
         self._spares: list[Seat] = []
         self._lenders: list[Seat] = []
         self._polled: list[Work] = []
+        self._overseer = Overseer(
+            dispatcher.scheduler, dispatcher.lock, self._seat_of,
+            lambda: self._dispatch(dispatcher.tick()))
         # entered while a callback that runs in the calling thread of spin_once waits
         self.pump: Callable[[], AbstractContextManager[None]] = nullcontext
         dispatcher.dispatch = self._dispatch
@@ -181,6 +186,7 @@ class Pool:
                     seat.x = STOP
                     seat.wake.release()
             self._closed = True
+        self._overseer.close()
         deadline = None if timeout is None else monotonic_ns() + int(timeout * 1e9)
         done = True
         for seat in seats:
@@ -209,6 +215,7 @@ class Pool:
 
     def _work_in(self, seat: Seat) -> None:
         seat.vtid = threading.get_native_id()
+        seat.clock = ThreadClock()
         if self._prepare_thread is not None:
             try:
                 self._prepare_thread()
@@ -221,6 +228,7 @@ class Pool:
             while seat.x >= 0:
                 self._execute(seat, True)
             if seat.x == STOP:
+                seat.clock.close()
                 return
 
     def _dispatch(self, now: int) -> None:
@@ -228,15 +236,22 @@ class Pool:
         state = self._scheduler.state
         if self.dispatcher.held:
             return
-        while self.running and (state.ready or state.unpolled) and state.scalars[N_IDLE] > 0:
+        while (self.running and (state.ready or state.unpolled or state.held_back)
+               and state.scalars[N_IDLE] > 0):
             x = schedule(self.dispatcher.tables, state, self._key, now)
             if state.decisions:
                 self.dispatcher.decided(now)
             if x < 0:
-                return
+                break
             seat = self._seats[state.x_worker[x]]
             self._assign(seat, x)
             seat.wake.release()
+        if state.held_back and self.running and not self._overseer.looking:
+            self._overseer.begin()
+
+    def _seat_of(self, worker: int) -> Seat | None:
+        seat = self._seats[worker] if worker < len(self._seats) else None
+        return seat if seat is not None and seat.work is not None else None
 
     def _assign(self, seat: Seat, x: int) -> None:
         seat.work = self.dispatcher.take_work(x)
@@ -270,6 +285,10 @@ class Pool:
         ran = True
         raised: BaseException | None = None
         start = monotonic_ns() + dispatcher.clock_offset
+        clock, habit = seat.clock, work.entry.habit
+        if clock is not None:
+            closely = habit.computes_at_all
+            before = clock.read(closely)
         try:
             if self._gathering is None or not more:
                 waits_for = work.step()
@@ -280,6 +299,8 @@ class Pool:
         except BaseException as error:
             raised = error
         end = monotonic_ns() + dispatcher.clock_offset
+        if clock is not None:
+            habit.ran(end - start, before, clock.read(closely))
         current.running = previous
         if running.published:
             running.ended(work.entry, end - dispatcher.clock_offset)
@@ -319,7 +340,7 @@ class Pool:
                 self.dispatcher.decided(now)
             if x >= 0:
                 self._assign(seat, x)
-            if not state.ready and not state.unpolled:
+            if not state.ready and not state.unpolled and not state.held_back:
                 return
         self._dispatch(now)
 
@@ -335,7 +356,7 @@ class Pool:
     def is_idle(self) -> bool:
         """Return whether nothing runs and nothing is ready."""
         state = self._scheduler.state
-        waiting = state.ready or state.unpolled
+        waiting = state.ready or state.unpolled or state.held_back
         return not waiting and state.scalars[N_IDLE] >= self.dispatcher.n_workers
 
     def resume_polled(self) -> bool:

@@ -21,8 +21,9 @@ def statistics(
 
     ``dags``, ``deadline_missed`` and ``first_miss`` are as in ``replay --json``.  ``callbacks``
     has for each entity what became ready, ran, failed (raised), waits, was dropped (QoS depth,
-    destroyed, aborted) or skipped (timers), and its busy time in ns.  ``unattributed`` counts
-    messages of declared callbacks whose publication was not found; they ran as undeclared ones.
+    destroyed, aborted) or skipped (timers), its busy time in ns, and whether it holds the
+    interpreter while it runs.  ``unattributed`` counts messages of declared callbacks whose
+    publication was not found; they ran as undeclared ones.
     """
     with dispatcher.lock:
         result = dispatcher.verdicts.tally.result()

@@ -23,7 +23,7 @@ nodes:
     callbacks:
       - {name: t, timer: 10ms, publishes: [/a], dag: one, on_miss: abort, max_active_jobs: 3,
          execution_time: 2 ms}
-      - {name: x, subscription: /a, deadline: 1.5s, group: g,
+      - {name: x, subscription: /a, deadline: 1.5s, group: g, holds_interpreter: true,
          execution_time: {quantiles_us: [1, 2.5], percent: [0, 100]}}
       - {name: y, subscription: /o, period: 1min, reads: [x, /a], publishes: [/b],
          release_from: header_stamp}

@@ -1,0 +1,280 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which callbacks hold the interpreter: declared, or learnt from how they run.
+
+Theory of operation
+-------------------
+Python's lock lets one thread compute at a time.  The core therefore starts a callback that holds
+the interpreter only if nothing as urgent holds it (rule 11 of ``core.rules``); here is found out
+which callbacks those are.  A declaration may say it (``holds_interpreter``); else
+
+1.  **After each execution** its CPU time is compared with its duration.  Left out of that is what
+    the other threads of the process computed meanwhile, and what other processes took: if two
+    callbacks fight for the lock, each computes for half of the time, but for all of the time that
+    the other one leaves.  A callback that computed for over four fifths of that time, lately,
+    holds the interpreter; one that computed for less than half of it does not.  Executions of
+    less than ``SHORT_NS`` of CPU are not worth an order.
+2.  **While something is held back** a thread looks every ``LOOK_S`` at the most urgent callback
+    that holds the interpreter.  If its CPU clock stands still, it waits: for a lock, an event, a
+    service.  It gives the interpreter back at once, so that nobody is held back for one that waits
+    for him; where the lock was not free meanwhile it may have waited for that, and is given
+    ``IDLE_LOOKS``.  If it computes and the looking thread gets the lock within half a switch
+    interval, ``FREE_LOOKS`` times in a row, it computes with the lock released (numpy, hashlib):
+    it gives the interpreter back, too, and that is remembered.  One of ``TRY_EVERY`` executions is
+    looked at again.
+
+Between two threads that compute, Python switches every ``sys.getswitchinterval()``, 5 ms by
+default; while an executor spins it is shorter, so that an arrival is seen sooner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+import os
+import sys
+import threading
+from time import (
+    clock_gettime_ns,
+    monotonic_ns,
+    process_time_ns,
+    pthread_getcpuclockid,
+    sleep,
+    thread_time_ns,
+)
+from typing import Any, Protocol
+
+from mddag_executor.core import Scheduler
+from mddag_executor.core.state import N_HOLDING
+
+COMPUTES = 0.8
+WAITS = 0.5
+SHORT_NS = 100_000
+LATELY = 8
+"""The last execution counts for one in so many."""
+
+LOOK_S = 0.002
+REST_LOOKS = 25
+"""After so many looks at which nothing was held back nobody looks any more."""
+FREE_LOOKS = 3
+IDLE_LOOKS = 10
+RELEASED = 0.6
+TRY_EVERY = 64
+
+SWITCH_INTERVAL_S = 0.001
+
+
+Reading = tuple[int, int, int]
+"""CPU time of a thread and of its process, and how long the thread waited for a CPU, ns."""
+
+
+class Habit:
+    """
+    Whether one callback holds the interpreter while it runs.
+
+    :param declared: what the declaration says, or None: it is learnt.
+    :ivar holds: 1 or 0, for its next execution.
+    """
+
+    __slots__ = ('holds', '_declared', '_computed_ns', '_own_ns', '_released', '_passed')
+
+    def __init__(self, declared: bool | None = None) -> None:
+        self.holds = int(declared or False)
+        self._declared = declared is not None
+        self._computed_ns = 0.0
+        self._own_ns = 0.0
+        self._released = 0.0
+        self._passed = 0
+
+    @property
+    def computes_at_all(self) -> bool:
+        """Return whether it may be one that holds the interpreter."""
+        return self._computed_ns >= SHORT_NS / 2
+
+    def ran(self, duration: int, before: Reading, after: Reading) -> None:
+        """
+        Learn from an execution.
+
+        :param duration: how long it took, ns.
+        :param before: what its thread's clock read when it began; ``after``: when it ended.
+        """
+        if self._declared:
+            return
+        computed = after[0] - before[0]
+        others = after[1] - before[1] - computed
+        own = max(computed, duration - others - (after[2] - before[2]))
+        if self._own_ns == 0.0:
+            self._computed_ns, self._own_ns = computed, own
+        else:
+            self._computed_ns += (computed - self._computed_ns) / LATELY
+            self._own_ns += (own - self._own_ns) / LATELY
+        share, least_ns = (WAITS, SHORT_NS / 2) if self.holds else (COMPUTES, SHORT_NS)
+        self.holds = int(self._computed_ns >= max(share * self._own_ns, least_ns))
+        if self._released >= RELEASED:
+            self._passed += 1
+            self.holds &= self._passed % TRY_EVERY == 0
+
+    def was_free(self, free: bool) -> bool:
+        """Learn whether the lock was free while it computed; False where a declaration knows."""
+        if self._declared:
+            return False
+        self._released += (free - self._released) / LATELY
+        if self._released >= RELEASED:
+            self.holds = 0
+        return free
+
+
+class ThreadClock:
+    """
+    How long the thread that makes it has computed, and has waited for a CPU.
+
+    It is to be closed when that thread ends.
+    """
+
+    def __init__(self) -> None:
+        self._clock = pthread_getcpuclockid(threading.get_ident())
+        self._file = -1
+        try:  # proc(5); not everywhere
+            self._file = os.open(
+                f'/proc/self/task/{threading.get_native_id()}/schedstat', os.O_RDONLY)
+        except OSError:
+            pass
+
+    def computed(self) -> int:
+        """Return its CPU time, ns; from any thread."""
+        return clock_gettime_ns(self._clock)
+
+    def read(self, closely: bool) -> Reading:
+        """Return what it reads now, in the thread itself; 0 for waiting, unless ``closely``."""
+        waited = 0
+        if closely and self._file >= 0:
+            waited = int(os.pread(self._file, 64, 0).split()[1])
+        return thread_time_ns(), process_time_ns(), waited
+
+    def close(self) -> None:
+        """Close what it reads."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+
+class Place(Protocol):
+    """A worker's place in the pool: what runs there, and the clock of its thread."""
+
+    clock: ThreadClock | None
+    work: Any
+
+
+class Overseer:
+    """
+    Looks after who holds the interpreter while others are held back for it.
+
+    Its thread is started when something is held back for the first time.
+
+    :param lock: that of the scheduler.
+    :param place_of: returns the place of a worker, None when it is not one of the pool's threads.
+    :param dispatch: called, under the lock, when somebody has given the interpreter back.
+    """
+
+    def __init__(
+        self, scheduler: Scheduler, lock: threading.Lock, place_of: Callable[[int], Place | None],
+        dispatch: Callable[[], None],
+    ) -> None:
+        self.looking = False
+        self._scheduler = scheduler
+        self._lock = lock
+        self._place_of = place_of
+        self._dispatch = dispatch
+        self._wanted = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._closed = False
+        self._seen: tuple[Any, int, int] = (None, 0, 0)
+        self._free = 0
+        self._idle = 0
+
+    def begin(self) -> None:
+        """Begin to look, until nothing is held back any more; the caller holds the lock."""
+        self.looking = True
+        if self._thread is None and not self._closed:
+            self._thread = threading.Thread(
+                target=self._look_on, daemon=True, name='mddag-overseer')
+            self._thread.start()
+        self._wanted.set()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._closed = True
+        self._wanted.set()
+        thread = self._thread
+        if thread is not None and thread is not threading.current_thread():
+            thread.join()
+
+    def _look_on(self) -> None:
+        while not self._closed:
+            self._wanted.wait()
+            self._wanted.clear()
+            left = REST_LOOKS
+            while left > 0 and not self._closed:
+                due = monotonic_ns() + int(LOOK_S * 1e9)
+                sleep(LOOK_S)
+                late = monotonic_ns() - due
+                with self._lock:
+                    if self._scheduler.state.held_back:
+                        left = REST_LOOKS
+                        self._look(due + late, late)
+                    else:
+                        left -= 1
+                        self.looking = left > 0
+
+    def _look(self, now: int, late: int) -> None:
+        """Take the interpreter from the most urgent holder if it does not need it."""
+        state = self._scheduler.state
+        if state.scalars[N_HOLDING] == 0:
+            return
+        holder = min((x for x in state.worker_x if x >= 0 and state.x_holds[x]),
+                     key=lambda x: state.x_key[x])
+        place = self._place_of(state.x_worker[holder])
+        if place is None or place.clock is None:
+            return
+        computed = place.clock.computed()
+        seen, since, before = self._seen
+        self._seen = place.work, now, computed
+        if seen is not place.work:
+            self._free = self._idle = 0
+            return
+        free = late < sys.getswitchinterval() * 0.5e9
+        if computed - before >= WAITS * (now - since):
+            self._idle = 0
+            self._free = self._free + 1 if place.work.entry.habit.was_free(free) else 0
+            needs = self._free < FREE_LOOKS
+        else:
+            # Where the lock was not free it may wait for that alone.
+            self._idle += IDLE_LOOKS if free else 1
+            needs = self._idle < IDLE_LOOKS
+        if not needs:
+            self._scheduler.stop_holding(holder)
+            self._dispatch()
+
+
+_switching = threading.Lock()
+_switchers = 0
+_usual_interval = 0.0
+
+
+@contextmanager
+def short_switch_interval() -> Iterator[None]:
+    """Have Python's threads take turns more often while entered; nested and from any thread."""
+    global _switchers, _usual_interval
+    with _switching:
+        if _switchers == 0:
+            _usual_interval = sys.getswitchinterval()
+            sys.setswitchinterval(min(_usual_interval, SWITCH_INTERVAL_S))
+        _switchers += 1
+    try:
+        yield
+    finally:
+        with _switching:
+            _switchers -= 1
+            if _switchers == 0:
+                sys.setswitchinterval(_usual_interval)
