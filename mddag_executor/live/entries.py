@@ -102,7 +102,10 @@ class Entry:
         # the topics that its callback has published on
         self.publishes: set[str] = set()
         self.removed = False
-        'publishes', 'light', 'at_once', 'habit', 'since', '__weakref__')
+        # whether it holds the interpreter while it runs
+        self.habit = Habit(None if callback is None else callback.holds_interpreter)
+        # when the executor began to look after it, on the trace's clock: no job is due before
+        self.since = 0
         # whether it runs where it is taken (see ``receiver``)
         self.at_once = False
         self.address = id(self)
