@@ -80,9 +80,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'one of {", ".join(POLICIES)} (default: rad)')
     add('--intake', choices=('auto', 'events', 'waitset'), default='auto',
         help='how the executor learns what is ready (default: auto)')
-    add('--one-cpu', action='store_true',
-        help='keep the threads that hold the interpreter lock on one CPU, but for callbacks that '
-        'take much CPU')
     add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
         help="publish the executor's state on /diagnostics so often, for mddag top and other "
         "tools; 'off': not at all (default: 1s)")
@@ -125,7 +122,7 @@ def main(args: argparse.Namespace) -> int:
         from mddag_executor.live.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
-            intake=args.intake, freeze_gc=True, one_cpu=args.one_cpu,
+            intake=args.intake, freeze_gc=True,
             diagnostics_period=args.diagnostics)
         # With `--json -` what nodes print must not get into the JSON.
         output = sys.stdout if common.wants_tables(args) else sys.stderr

@@ -213,7 +213,6 @@ class DirectTakes:
         return self._rest(entities, chosen)
 
     def _look_after(self, stopping: threading.Event) -> None:
-        self._receiver.on_thread()
         looks = 0
         while not stopping.wait(LOOK_S) and not self._over():
             looks += 1

@@ -39,9 +39,6 @@ class Receiver(Protocol):
     raises does no harm to the intake: its exception is passed on to ``on_intake_error``.
     """
 
-    def on_thread(self) -> None:
-        """Take note that the calling thread is going to hand over: it is the intake's own."""
-
     def hold(self) -> None:
         """Take note that several timers are handed over that were due at one wake-up."""
 

@@ -64,7 +64,7 @@ class Entry:
         'kind', 'entity', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
         'busy_ns', 'unattributed', 'removed', 'address', 'handle', 'enters', 'soon', 'soon_from',
-        'publishes', 'light', 'at_once', 'habit', 'since', '__weakref__')
+        'publishes', 'at_once', 'habit', 'since', '__weakref__')
 
     def __init__(
         self, kind: str, entity: Any, node: str, callback: Callback | None, group: int,
@@ -97,8 +97,6 @@ class Entry:
         self.soon = 0
         # from which number on that is expected again; grows each time it turns out wrong
         self.soon_from = SOON_FROM
-        # how many times in a row its callback took little CPU (see ``gathering``)
-        self.light = 0
         # the topics that its callback has published on
         self.publishes: set[str] = set()
         self.removed = False

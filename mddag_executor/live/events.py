@@ -130,7 +130,6 @@ class _NativeThread:
         return self._thread is not threading.current_thread()
 
     def _run(self) -> None:
-        self._receiver.on_thread()
         ended = broken = False
         failures = 0
         looks = SecondLooks()

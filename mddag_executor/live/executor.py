@@ -34,7 +34,6 @@ from mddag_executor.live.endings import call_at_shutdown, halt_at_exit, is_over,
 from mddag_executor.live.entities import EMPTY
 from mddag_executor.live.entries import AtOnce, Entry, TASK, Work
 from mddag_executor.live.events import EventsIntake
-from mddag_executor.live.gathering import Gathering
 from mddag_executor.live.interpreter import short_switch_interval
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.rates import RateWatch
@@ -95,8 +94,6 @@ class MultiDeadlineExecutor(Stepping):
     :param worker_policy: real-time policy of the workers, ``SCHED_FIFO`` or ``SCHED_RR``.
     :param worker_priority: their priority under it.
     :param worker_cpus: the CPUs that they may use.
-    :param one_cpu: keep workers and intake on one of these CPUs, which saves much of what they
-        cost, except while callbacks run that take much CPU (see ``docs/real_time.md``).
     :param freeze_gc: when the first spin begins, collect garbage and have the collector leave
         alone what there is by then (``gc.freeze``): for programs that make their nodes first.
     :param diagnostics_period: how often to publish on ``/diagnostics`` while it spins: ns, or text
@@ -125,7 +122,6 @@ class MultiDeadlineExecutor(Stepping):
         worker_policy: str | None = None,
         worker_priority: int | None = None,
         worker_cpus: set[int] | None = None,
-        one_cpu: bool = False,
         freeze_gc: bool = False,
         diagnostics_period: int | str | None = None,
         thresholds: Thresholds | None = None,
@@ -133,7 +129,6 @@ class MultiDeadlineExecutor(Stepping):
         task_set, num_workers, deadline_ns = resolve(
             graph, num_workers, default_deadline, intake)
         prepare = thread_setting(worker_policy, worker_priority, worker_cpus)
-        self._gathering = Gathering(worker_cpus) if one_cpu else None
         every_ns = diagnostics_period_ns(diagnostics_period)
         max_active_jobs = whole('max_active_jobs', max_active_jobs, MOST_JOBS)
         call_back('on_deadline_miss', on_deadline_miss)
@@ -163,13 +158,13 @@ class MultiDeadlineExecutor(Stepping):
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
             clock_offset=clock_offset, fail=self._fail,
             record=self._recorder.record if self._recorder else None, on_miss=on_deadline_miss)
-        self._pool = Pool(self._dispatcher, prepare, self._gathering)
+        self._pool = Pool(self._dispatcher, prepare)
         self._pool.pump = self._pump
         self._registry = Registry(
             task_set, self._dispatcher.tables, self._dispatcher.scheduler)
         self._receiver = Receiver(
             self._dispatcher, self._registry, task_set, self, self._fail, self._recorder,
-            self._pool, self._gathering)
+            self._pool)
         self._new_tasks: deque[Work] = deque()
         self._task_entry = Entry(TASK, None, '', None, -1, 0, '')
         if self._recorder is not None:
@@ -319,8 +314,6 @@ class MultiDeadlineExecutor(Stepping):
         self._submit_tasks()
         if self._rates.look() and self._registry.is_stale():
             self._changed = True
-        if self._gathering is not None:
-            self._gathering.look()
         if self._diagnostics is not None:
             self._diagnostics.start()
 

@@ -36,7 +36,6 @@ from mddag_executor.core.state import N_IDLE
 from mddag_executor.live.attribution import PublisherState
 from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.entries import AtOnce, Destroyed, Entry, UNKNOWN, Work
-from mddag_executor.live.gathering import Gathering
 from mddag_executor.live.hooks import current
 from mddag_executor.live.interpreter import Overseer, ThreadClock
 from mddag_executor.live.verdicts import NO_ORIGIN
@@ -126,12 +125,10 @@ class Pool:
     The worker threads of a dispatcher.
 
     :param prepare_thread: called first in each worker thread (priority, CPU set).
-    :param gathering: which CPU they share, if any.
     """
 
     def __init__(
         self, dispatcher: Dispatcher, prepare_thread: Callable[[], None] | None = None,
-        gathering: Gathering | None = None,
     ) -> None:
         self.dispatcher = dispatcher
         self.running = False
@@ -140,7 +137,6 @@ class Pool:
         self._scheduler = dispatcher.scheduler
         self._key = dispatcher.scheduler.policy.key
         self._prepare_thread = prepare_thread
-        self._gathering = gathering
         self._closed = False
         self._seats: list[Seat] = []
         self._spares: list[Seat] = []
@@ -221,8 +217,6 @@ class Pool:
                 self._prepare_thread()
             except Exception as error:
                 self.dispatcher.fail(error)
-        if self._gathering is not None:
-            self._gathering.join()
         while True:
             seat.wake.acquire()
             while seat.x >= 0:
@@ -290,10 +284,7 @@ class Pool:
             closely = habit.computes_at_all
             before = clock.read(closely)
         try:
-            if self._gathering is None or not more:
-                waits_for = work.step()
-            else:
-                waits_for = self._gathering.step(work)
+            waits_for = work.step()
         except Destroyed:
             ran = False
         except BaseException as error:

@@ -14,7 +14,6 @@ from mddag_executor.live.attribution import Origin
 from mddag_executor.live.crossings import header_stamp
 from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.entries import Entry, Work
-from mddag_executor.live.gathering import Gathering
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
@@ -41,7 +40,7 @@ class Receiver:
     def __init__(
         self, dispatcher: Dispatcher, registry: Registry, task_set: TaskSet | None,
         executor: Any, fail: Callable[[BaseException], None], recorder: Recorder | None,
-        pool: Pool, gathering: Gathering | None = None,
+        pool: Pool,
     ) -> None:
         self._dispatcher = dispatcher
         self._registry = registry
@@ -50,12 +49,6 @@ class Receiver:
         self._fail = fail
         self._recorder = recorder
         self._pool = pool
-        self._gathering = gathering
-
-    def on_thread(self) -> None:
-        """Take note of a thread of the intake's own: it is to be where the workers are."""
-        if self._gathering is not None:
-            self._gathering.join()
 
     def hold(self) -> None:
         """Take note that several things are handed over that became ready at one instant."""

@@ -309,7 +309,6 @@ class WaitSetIntake:
             self._thread = None
 
     def _run(self) -> None:
-        self._receiver.on_thread()
         sharpen_wake_ups()
         self._timers.watch_clocks(True)
         ended = False

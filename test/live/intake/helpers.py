@@ -53,9 +53,6 @@ class Recorder:
         if reaction is not None:
             reaction(*what)
 
-    def on_thread(self) -> None:
-        """Nothing is to be done."""
-
     def hold(self) -> None:
         self.held += 1
 
