@@ -55,7 +55,8 @@ def test_the_main_job_end_to_end(
         'demo', '--seconds', '3', '--baseline-seconds', '1', '--utilisation', '0.3',
         '--output', tmp_path / 'made', '--json', tmp_path / 'result.json')
     assert process.returncode == 0, process.stderr
-    assert process.stderr == ''
+    # A busy machine skips periods, and that is said.
+    assert all(line.startswith('[WARN] ') for line in process.stderr.splitlines())
     result = json.loads((tmp_path / 'result.json').read_text())
     live = result['live']
     assert len(live['dags']) == 11

@@ -92,15 +92,16 @@ def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executo
         assert wait_for(lambda: len(chain.jobs['last']) >= 20)
         chain.timer.cancel()
         assert wait_for(lambda: len(chain.jobs['last']) == len(chain.jobs['tick']))
-    ran = [j.job for j in chain.jobs['tick']]
+    # They may overlap, so the lists need not be in their order.
+    ran = sorted(j.job for j in chain.jobs['tick'])
     count = len(ran)
     assert chain.wrong == []
     for jobs in chain.jobs.values():
         assert sorted(j.job for j in jobs) == ran
         assert {j.dag for j in jobs} == {'chain'}
-    releases = [(j.release_ns, j.job) for j in chain.jobs['last']]
+    releases = sorted((j.release_ns, j.job) for j in chain.jobs['last'])
     assert all(after - before == (job - job_before) * 20_000_000 for (before, job_before),
-               (after, job) in zip(releases, releases[1:]))
+               (after, job) in zip(releases[1:], releases[2:]))  # the first may have been due before
     statistics = executor.statistics()
     missed = statistics['dags']['chain']['ends']['expired']  # periods, on a busy machine
     assert ran[-1] + 1 == count + missed

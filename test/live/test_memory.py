@@ -137,16 +137,17 @@ def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context)
         assert len(before) > 30
         cycle(CYCLES)
         assert wait_for(nothing_left, 15.0)
-        after = tables(executor)
+
+        def grown() -> dict[str, tuple[int | None, int]]:
+            return {name: (before.get(name), size) for name, size in tables(executor).items()
+                    if size - before.get(name, 0) >= CYCLES // 5}
+        assert wait_for(lambda: not grown()), grown()
 
         def left() -> list[Any]:
             gc.collect()
             return [thing() for thing in made[:-10 * SETTLED] if thing() is not None]
         assert wait_for(lambda: not left()), left()
     assert spinning.error is None
-    grown = {name: (before.get(name), size) for name, size in after.items()
-             if size - before.get(name, 0) >= CYCLES // 5}
-    assert grown == {}
 
 
 @contextmanager
