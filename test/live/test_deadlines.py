@@ -101,7 +101,7 @@ def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executo
         assert {j.dag for j in jobs} == {'chain'}
     releases = sorted((j.release_ns, j.job) for j in chain.jobs['last'])
     assert all(after - before == (job - job_before) * 20_000_000 for (before, job_before),
-               (after, job) in zip(releases[1:], releases[2:]))  # the first may have been due before
+               (after, job) in zip(releases[1:], releases[2:]))  # the first was due earlier
     statistics = executor.statistics()
     missed = statistics['dags']['chain']['ends']['expired']  # periods, on a busy machine
     assert ran[-1] + 1 == count + missed
