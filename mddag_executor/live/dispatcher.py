@@ -409,6 +409,11 @@ class Dispatcher(Dropping):
                 work.x = -1
                 self.verdicts.note_drop(work.entry, work.origin or NO_ORIGIN, 'aborted', now)
 
+    def stopped(self, begin: int, end: int) -> None:
+        """Take in that no thread of the process ran from ``begin`` to ``end`` (monotonic)."""
+        with self.lock:
+            self.verdicts.stops.stopped(begin + self.clock_offset, end + self.clock_offset)
+
     # --- the end ---------------------------------------------------------------------------------
 
     def finish(self) -> int:

@@ -53,6 +53,7 @@ from mddag_executor.live.settings import (
 )
 from mddag_executor.live.statistics import statistics
 from mddag_executor.live.stepping import deadline_of, Stepping
+from mddag_executor.live.stop_watch import StopWatch
 from mddag_executor.live.tasks import make_task, Unclaimed
 from mddag_executor.live.verdicts import DeadlineMiss
 from mddag_executor.live.waitset import WaitSetIntake
@@ -158,6 +159,7 @@ class MultiDeadlineExecutor(Stepping):
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
             clock_offset=clock_offset, fail=self._fail,
             record=self._recorder.record if self._recorder else None, on_miss=on_deadline_miss)
+        self._stop_watch = StopWatch(self._attention, self._dispatcher.stopped)
         self._pool = Pool(self._dispatcher, prepare)
         self._pool.pump = self._pump
         self._registry = Registry(
@@ -279,7 +281,7 @@ class MultiDeadlineExecutor(Stepping):
                     left = min(left, deadline - time.monotonic())
                     if left <= 0:
                         return
-                self._attention.wait(left)
+                self._stop_watch.wait(left)
                 self._attention.clear()
             self._raise_error()
         except RCL_ERRORS:

@@ -23,10 +23,13 @@ def statistics(
     has for each entity what became ready, ran, failed (raised), waits, was dropped (QoS depth,
     destroyed, aborted) or skipped (timers), its busy time in ns, and whether it holds the
     interpreter while it runs.  ``unattributed`` counts messages of declared callbacks whose
-    publication was not found; they ran as undeclared ones.
+    publication was not found; they ran as undeclared ones.  ``stops`` has how often and for how
+    long no thread of the process ran while it spun, how many misses fell into these stops, and
+    the times of the last ones (ns since the epoch).
     """
     with dispatcher.lock:
         result = dispatcher.verdicts.tally.result()
+        stops = dispatcher.verdicts.stops.result()
         waiting = dispatcher.scheduler.queue_length
         idle = dispatcher.scheduler.idle_workers
         undeclared = dispatcher.undeclared
@@ -41,7 +44,7 @@ def statistics(
     result['never_due'] = never_due(result['dags'])
     return {
         'policy': dispatcher.scheduler.policy.name, 'workers': dispatcher.n_workers,
-        **result, 'callbacks': callbacks, 'undeclared': undeclared,
+        **result, 'stops': stops, 'callbacks': callbacks, 'undeclared': undeclared,
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
         'queue': waiting, 'idle_workers': idle, 'lent': pool.lent,
         'unattributed': {

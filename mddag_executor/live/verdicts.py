@@ -23,6 +23,7 @@ from mddag_executor.core.state import (
     SINK_FAILED,
     SINK_MISSED,
 )
+from mddag_executor.core.stops import Stops
 from mddag_executor.live.attribution import Origin
 from mddag_executor.live.entries import Entry
 from msg_graph import TaskSet
@@ -77,6 +78,7 @@ class Verdicts:
         on_miss: Callable[[DeadlineMiss], None] | None, fail: Callable[[BaseException], None],
     ) -> None:
         self.tally = Tally(task_set, tables, KEEP_RESPONSES)
+        self.stops = Stops()
         self.record = record
         self._dags = task_set.dags if task_set is not None else ()
         self._tables = tables
@@ -120,10 +122,12 @@ class Verdicts:
             self.record(
                 'deadline', now, threading.get_native_id(), dag,
                 self._tables.index_in_dag[vertex], job, deadline, time)
+        release = deadline - self._tables.sink_deadline[vertex]
+        if kind != SINK_FAILED:  # that one is its callback's doing
+            self.stops.missed(release, deadline)
         if self._on_miss is not None:
             self.misses.append(DeadlineMiss(
-                self._dags[dag].name, self.tally.vertex_name(vertex), job,
-                deadline - self._tables.sink_deadline[vertex], deadline,
+                self._dags[dag].name, self.tally.vertex_name(vertex), job, release, deadline,
                 time if kind == SINK_DONE else None, _WHY[kind]))
 
     def tell(self) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from mddag_executor.core.tally import total
 from mddag_executor.report.drift import drift_lines
 from mddag_executor.report.tables import never_due_lines, percent, verdicts_line
 from mddag_executor.report.text import listed, printable
@@ -17,6 +18,11 @@ from mddag_executor.text import counted
 def summary(result: dict[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the table of a run."""
     yield verdicts_line(result['dags'])
+    stops = result['stops']
+    if stops['misses']:
+        yield (f'{stops["misses"]} of {counted(total(result["dags"]).missed, "miss", "misses")} '
+               f'fell into {counted(stops["count"], "stop")} ({stops["total_ns"] / 1e9:.2f} s), '
+               'in which no thread of this process ran')
     yield from never_due_lines(result['dags'])
     measured = result['measured']
     if measured is not None:

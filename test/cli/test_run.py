@@ -7,6 +7,7 @@ from collections.abc import Callable
 import json
 import os
 from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
@@ -204,6 +205,41 @@ def test_a_signal_that_comes_twice_is_one(graph: Path) -> None:
     assert process.returncode == 0 and 'Traceback' not in err, err
     assert 'sink jobs due' in out and 'trace: ' in out
     assert [event['_name'] for event in read_events('out.mcap')].count('mddag:task_set') == 1
+
+
+def test_a_stop_of_the_machine_is_told_from_the_executors_own_misses(graph: Path) -> None:
+    trace = Path('out.mcap')
+    with subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'run', graph, '--synthetic', 'sleep',
+         '--workers', '3', '--trace', trace, '--json', 'result.json'],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:
+        try:
+            sizes: set[int] = set()
+            while len(sizes) < 4:  # it runs
+                assert process.poll() is None
+                sizes.add(trace.stat().st_size if trace.exists() else 0)
+                time.sleep(0.01)
+            process.send_signal(signal.SIGSTOP)
+            time.sleep(0.3)
+            process.send_signal(signal.SIGCONT)
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=20)
+        except BaseException:
+            process.kill()
+            raise
+    assert process.returncode == 0, err
+    line = re.search(
+        r'^(\d+) of (\d+) misses fell into (\d+) stops? \((\d+\.\d\d) s\), in which no '
+        r'thread of this process ran$', out, re.MULTILINE)
+    assert line is not None, out
+    result = json.loads(Path('result.json').read_text())
+    stops = result['stops']
+    assert stops['count'] == int(line[3]) >= 1
+    assert f'{stops["total_ns"] / 1e9:.2f}' == line[4]
+    assert max(stop['end_ns'] - stop['begin_ns'] for stop in stops['latest']) >= 270_000_000
+    # Both sinks were due every 20 ms meanwhile; the slow one is late all the time besides.
+    assert 10 <= stops['misses'] == int(line[1]) < int(line[2]) == total(result['dags']).missed
 
 
 def test_a_later_sigint_interrupts_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
