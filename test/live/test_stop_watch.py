@@ -89,5 +89,5 @@ def test_a_callback_that_keeps_the_interpreter_busy_is_no_stop(make_executor, ma
     with Spinning(executor):
         assert wait_for(lambda: len(runs) >= 8, 60.0)
     wall, cpu = time.monotonic_ns() - wall, time.process_time_ns() - cpu
-    # A loaded machine takes the CPU away, and that is a stop.
-    assert executor.statistics()['stops']['total_ns'] <= 1.5 * (wall - cpu)
+    # A loaded machine takes the CPU away, and that is a stop; other threads compute, too.
+    assert executor.statistics()['stops']['total_ns'] <= wall / 4 + 1.5 * max(0, wall - cpu)
