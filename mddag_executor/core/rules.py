@@ -27,6 +27,9 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
 4.  **Callback groups.**  Each group has at most one owner, from its first dispatch to its
     completion (also while preempted or suspended).  What would run next but whose group is busy
     is set aside in the group's own heap; when the owner completes, the group's smallest returns.
+    A group can also be a gate that lets its executions through one by one: the driver finds out
+    whether the owner may begin.  If so, it leaves the group for good (``leave_group``); if not,
+    it waits, owner still, so that none of the group passes it (``refuse``, then ``resume``).
 5.  **Workers.**  A fresh execution takes the idle worker with the lowest number (``schedule``),
     or that of the worker that asks (``take``: live, it is warm).  With no worker idle and
     preemption on, the running execution with the largest priority (on a tie the one with the
@@ -142,6 +145,7 @@ def drop(s: State, x: int, now: int) -> None:
     Its entry stays in a queue, stale, until it gets to the top or stale ones are the larger part.
     An undeclared callback's job has nothing else, so it ends here.
     """
+    in_queue = s.x_state[x] == WAITING  # not what was refused
     s.x_state[x] = DROPPED
     slot = s.x_slot[x]
     dag = s.job_dag[slot]
@@ -152,7 +156,8 @@ def drop(s: State, x: int, now: int) -> None:
     if dag == len(s.oldest) - 1 and s.job_state[slot] == OPEN:
         close_job(s, slot, EXPIRED, now)
     deactivate(s, slot)
-    add_stale(s)
+    if in_queue:
+        add_stale(s)
 
 
 # --- dispatch ------------------------------------------------------------------------------------
@@ -293,8 +298,21 @@ def suspend(s: State, x: int) -> None:
     s.x_state[x] = SUSPENDED
 
 
+def refuse(s: State, x: int) -> None:
+    """Take a running execution that may not begin off its worker until ``resume`` (rule 4)."""
+    suspend(s, x)
+    s.x_started[x] = -1
+
+
+def leave_group(s: State, x: int) -> None:
+    """Let a running execution go on without its group, which is free for the next (rule 4)."""
+    group = s.x_group[x]
+    s.x_group[x] = -1
+    _release_group(s, group)
+
+
 def resume(s: State, x: int) -> None:
-    """Put a suspended execution back into the ready queue, under the key it had."""
+    """Put a suspended or refused execution back into the ready queue, under the key it had."""
     s.x_state[x] = WAITING
     heappush(s.ready, s.x_key[x])
 

@@ -122,8 +122,16 @@ class Scheduler:
         """Take a running execution off its worker until ``resume``."""
         rules.suspend(self.state, x)
 
+    def refuse(self, x: int) -> None:
+        """Take an execution that may not begin off its worker until ``resume``."""
+        rules.refuse(self.state, x)
+
+    def leave_group(self, x: int) -> None:
+        """Let a running execution go on without its callback group."""
+        rules.leave_group(self.state, x)
+
     def resume(self, x: int) -> None:
-        """Make a suspended execution ready to go on."""
+        """Make a suspended or refused execution ready again."""
         rules.resume(self.state, x)
 
     def expire_open(self, slot: int, now: int) -> None:

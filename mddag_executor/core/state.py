@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from mddag_executor.core.tables import NEVER, Tables
 
-# States of an execution.
+# States of an execution; what is refused is suspended, too.
 IDLE, WAITING, RUNNING, SUSPENDED, DONE, DROPPED = range(6)
 
 # States of a job.  Of the last five every ended job is in exactly one.

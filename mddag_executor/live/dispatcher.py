@@ -26,7 +26,7 @@ from mddag_executor.core.state import IDLE, OPEN, SUSPENDED
 from mddag_executor.live.attribution import Attribution, Origin
 from mddag_executor.live.crossings import Crossings
 from mddag_executor.live.dropping import Dropping
-from mddag_executor.live.entries import Entry, Work
+from mddag_executor.live.entries import Entry, TIMER, Work
 from mddag_executor.live.hooks import current
 from mddag_executor.live.verdicts import DeadlineMiss, NO_ORIGIN, Record, Verdicts
 from mddag_executor.trace.groups import EXECUTION
@@ -88,6 +88,9 @@ class Dispatcher(Dropping):
         self.context_ended: Callable[[], bool] = lambda: False
         self._key = self.scheduler.policy.key
         self._work: dict[int, Work] = {}
+        # those of which the first that waits was refused (see ``gates``)
+        self.refused: list[Entry] = []
+        self.refusals = 0
         self._next_job = [0] * (self.tables.n_dags + 1)
         self._last = 0
         self._finished = False
@@ -305,6 +308,12 @@ class Dispatcher(Dropping):
                 self.scheduler.resume(work.x)
                 self.dispatch(self.tick())
 
+    def passed(self, work: Work) -> None:
+        """Take in that an execution may run: its callback group has let it through."""
+        with self.lock:
+            self.scheduler.leave_group(work.x)
+            self.dispatch(self.tick())
+
     def release_of(self, work: Work) -> int:
         """Return the release of the job that a declared execution belongs to; it is not over."""
         assert work.origin is not None
@@ -324,6 +333,28 @@ class Dispatcher(Dropping):
             self._record_run(work, start, end, seat)
         self.scheduler.suspend(work.x)
         self._work[work.x] = work
+
+    def refuse(self, work: Work, now: int) -> None:
+        """Put an execution back that its callback group does not let run now (see ``gates``)."""
+        entry, x = work.entry, work.x
+        if entry.removed:
+            self.give_up(work, now)
+            return
+        self.scheduler.refuse(x)
+        self._work[x] = work
+        entry.waiting = {x: None, **entry.waiting}
+        self.refused.append(entry)
+        self.refusals += 1
+        if 0 < entry.depth < len(entry.waiting) and entry.kind != TIMER:
+            self._drop_oldest(entry, now)  # a newer one has come meanwhile
+
+    def ask_again(self) -> None:
+        """Make ready again what was refused."""
+        refused, self.refused = self.refused, []
+        for entry in refused:
+            x = next(iter(entry.waiting), -1)
+            if x >= 0 and self.scheduler.state.x_state[x] == SUSPENDED:
+                self.scheduler.resume(x)
 
     def complete(
         self, work: Work, start: int, end: int, now: int, seat: Seat, failed: bool = False

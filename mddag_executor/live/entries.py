@@ -11,6 +11,7 @@ from typing import Any
 
 from mddag_executor.core import legs_of, Tables
 from mddag_executor.live.attribution import Origin
+from mddag_executor.live.gates import Gate
 from mddag_executor.live.interpreter import Habit
 from msg_graph import Callback, TaskSet
 from msg_graph.binding import entity_name
@@ -64,7 +65,7 @@ class Entry:
         'kind', 'entity', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
         'busy_ns', 'unattributed', 'removed', 'address', 'handle', 'enters', 'soon', 'soon_from',
-        'publishes', 'at_once', 'habit', 'since', '__weakref__')
+        'publishes', 'at_once', 'habit', 'since', 'gate', '__weakref__')
 
     def __init__(
         self, kind: str, entity: Any, node: str, callback: Callback | None, group: int,
@@ -106,6 +107,8 @@ class Entry:
         self.since = 0
         # whether it runs where it is taken (see ``receiver``)
         self.at_once = False
+        # its callback group, where that is to be asked whether it may run
+        self.gate: Gate | None = None
         self.address = id(self)
         # taken from before a callback runs: it raises once the entity is destroyed
         self.handle = entity.handle if kind in _HANDLED else None

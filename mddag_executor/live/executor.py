@@ -163,7 +163,8 @@ class MultiDeadlineExecutor(Stepping):
         self._pool = Pool(self._dispatcher, prepare)
         self._pool.pump = self._pump
         self._registry = Registry(
-            task_set, self._dispatcher.tables, self._dispatcher.scheduler)
+            task_set, self._dispatcher.tables, self._dispatcher.scheduler,
+            self._dispatcher.passed)
         self._receiver = Receiver(
             self._dispatcher, self._registry, task_set, self, self._fail, self._recorder,
             self._pool)
@@ -275,8 +276,7 @@ class MultiDeadlineExecutor(Stepping):
                 if left == 0.0:
                     self._refresh()
                     left = LOOK_AFTER_S
-                if self._pool.resume_polled():
-                    left = 0.002
+                left = min(left, self._pool.resume_polled())
                 if deadline is not None:
                     left = min(left, deadline - time.monotonic())
                     if left <= 0:

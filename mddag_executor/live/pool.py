@@ -27,6 +27,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
+import math
 import threading
 from time import monotonic_ns
 from typing import Any
@@ -36,6 +37,7 @@ from mddag_executor.core.state import N_IDLE
 from mddag_executor.live.attribution import PublisherState
 from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.entries import AtOnce, Destroyed, Entry, UNKNOWN, Work
+from mddag_executor.live.gates import Refused
 from mddag_executor.live.hooks import current
 from mddag_executor.live.interpreter import Overseer, ThreadClock
 from mddag_executor.live.verdicts import NO_ORIGIN
@@ -43,6 +45,8 @@ from mddag_executor.trace.groups import PUBLICATION
 
 STOP = -2
 LOOK_AGAIN_S = 0.02
+LOOK_POLLED_S = 0.002
+ASK_AGAIN_S = 0.01
 
 SOON_NS = 300_000
 """So much time between publishing and the end of a callback is not worth waking a worker."""
@@ -142,6 +146,7 @@ class Pool:
         self._spares: list[Seat] = []
         self._lenders: list[Seat] = []
         self._polled: list[Work] = []
+        self._refusals = 0
         self._overseer = Overseer(
             dispatcher.scheduler, dispatcher.lock, self._seat_of,
             lambda: self._dispatch(dispatcher.tick()))
@@ -254,51 +259,62 @@ class Pool:
     def run_one(self) -> bool:
         """Run one ready callback in the calling thread; False when none may run."""
         state = self._scheduler.state
-        with self._lock:
-            if state.scalars[N_IDLE] == 0:
-                return False
-            now = self.dispatcher.tick()
-            x = self._scheduler.take(state.worker_x.index(-1), now)
-            self.dispatcher.decided(now)
-            if x < 0:
-                return False
-            seat = Seat(self, state.x_worker[x])
-            self._assign(seat, x)
-        seat.vtid = threading.get_native_id()
-        self._execute(seat, False)
+        ran = False
+        while not ran:
+            with self._lock:
+                if state.scalars[N_IDLE] == 0:
+                    return False
+                now = self.dispatcher.tick()
+                x = self._scheduler.take(state.worker_x.index(-1), now)
+                self.dispatcher.decided(now)
+                if x < 0:
+                    return False
+                seat = Seat(self, state.x_worker[x])
+                self._assign(seat, x)
+            seat.vtid = threading.get_native_id()
+            ran = self._execute(seat, False)
         return True
 
-    def _execute(self, seat: Seat, more: bool) -> None:
-        """Run the seat's execution until it ends or waits; leave the next one in the seat."""
+    def _execute(self, seat: Seat, more: bool) -> bool:
+        """
+        Run the seat's execution until it ends or waits; leave the next one in the seat.
+
+        :return: False when its callback group did not let it run.
+        """
         dispatcher = self.dispatcher
         work = seat.work
         assert work is not None
         previous = current.running
         running = current.running = seat.running
         waits_for: Any = None
-        ran = True
+        ran, refused = True, False
         raised: BaseException | None = None
         start = monotonic_ns() + dispatcher.clock_offset
-        clock, habit = seat.clock, work.entry.habit
+        clock, habit, gate = seat.clock, work.entry.habit, work.entry.gate
         if clock is not None:
             closely = habit.computes_at_all
             before = clock.read(closely)
         try:
-            waits_for = work.step()
+            waits_for = work.step() if gate is None else gate.step(work)
         except Destroyed:
             ran = False
+        except Refused:
+            refused = True
         except BaseException as error:
             raised = error
         end = monotonic_ns() + dispatcher.clock_offset
-        if clock is not None:
+        if clock is not None and not refused:
             habit.ran(end - start, before, clock.read(closely))
         current.running = previous
         if running.published:
             running.ended(work.entry, end - dispatcher.clock_offset)
         with self._lock:
             now = dispatcher.core_time(end)
-            work.entry.busy_ns += end - start
-            if not ran:
+            if not refused:
+                work.entry.busy_ns += end - start
+            if refused:
+                dispatcher.refuse(work, now)
+            elif not ran:
                 dispatcher.give_up(work, now)
             elif raised is not None and dispatcher.context_ended():
                 dispatcher.leave_open(work, start, end, seat)
@@ -306,6 +322,8 @@ class Pool:
                 dispatcher.complete(work, start, end, now, seat, raised is not None)
             else:
                 dispatcher.suspend(work, start, end, seat)
+            if dispatcher.refused and not refused:
+                dispatcher.ask_again()
             self._next(seat, more, now)
         if raised is not None:  # now, when its job has failed for whoever catches it
             dispatcher.fail(raised)
@@ -314,6 +332,7 @@ class Pool:
             self._resume_when_done(work, waits_for)
         if dispatcher.verdicts.misses:
             dispatcher.verdicts.tell()
+        return not refused
 
     def _next(self, seat: Seat, more: bool, now: int) -> None:
         """Leave the next execution in the seat; wake others for the rest."""
@@ -350,22 +369,27 @@ class Pool:
         waiting = state.ready or state.unpolled or state.held_back
         return not waiting and state.scalars[N_IDLE] >= self.dispatcher.n_workers
 
-    def resume_polled(self) -> bool:
+    def resume_polled(self) -> float:
         """
-        Let coroutines look again that wait for something unknown; False: there are none.
+        Let coroutines look again that wait for something unknown; ask again for what was refused.
 
         And wake idle workers for what is still there because a worker was expected to take it.
+
+        :return: after how many seconds to do so again.
         """
-        if self._scheduler.state.ready or self._scheduler.state.unpolled:
+        state = self._scheduler.state
+        refusals, self._refusals = self._refusals, self.dispatcher.refusals
+        if state.ready or state.unpolled or self.dispatcher.refused:
             with self._lock:
+                self.dispatcher.ask_again()
                 self._dispatch(self.dispatcher.tick())
         if not self._polled:
-            return False
+            return math.inf if refusals == self._refusals else ASK_AGAIN_S
         with self._lock:
             polled, self._polled = self._polled, []
         for work in polled:
             self.dispatcher.resume(work)
-        return True
+        return LOOK_POLLED_S
 
     def _give_place(self, seat: Seat) -> None:
         """Have a spare thread take over a worker's place; the caller holds the lock."""

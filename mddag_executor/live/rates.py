@@ -74,7 +74,8 @@ class RateWatch:
         since, self._looked, self._next = self._looked, now, now + LOOK_S
         before = self._known
         self._known = WeakKeyDictionary({
-            entry: before.get(entry) or _Known(since) for entry in self._registry.timers()})
+            entry: before.get(entry) or _Known(since) for entry in self._registry.timers()
+            if entry.gate is None})  # else its callback group may want it slower
         for entry, known in self._known.items():
             if now < known.next:
                 continue

@@ -96,7 +96,8 @@ class Recorder:
         group = getattr(entry.entity, 'callback_group', None)
         if group is not None and group not in self._known:
             self._known.add(group)
-            kind = 'reentrant' if entry.group < 0 else 'mutually_exclusive'
+            exclusive = entry.group >= 0 and entry.gate is None
+            kind = 'mutually_exclusive' if exclusive else 'reentrant'
             self._say('add_callback_group', id(self), id(group), kind)
         if group is not None:
             self._say(f'callback_group_add_{entry.kind}', id(group), entity)

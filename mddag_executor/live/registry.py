@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 import weakref
 
@@ -20,7 +20,9 @@ from mddag_executor.live.entries import (
     SUBSCRIPTION,
     TIMER,
     WAITABLE,
+    Work,
 )
+from mddag_executor.live.gates import decides_itself, Gate
 from msg_graph import Callback, TaskSet
 from msg_graph.binding import Binder, Entity
 from msg_graph.duration import exact_duration
@@ -57,14 +59,21 @@ class Registry:
 
     Not thread-safe: the executor refreshes it under a lock of its own, and other threads only
     look entities up.
+
+    :param passed: told of each execution that a callback group has let through (see ``gates``).
     """
 
-    def __init__(self, task_set: TaskSet | None, tables: Tables, scheduler: Scheduler) -> None:
+    def __init__(
+        self, task_set: TaskSet | None, tables: Tables, scheduler: Scheduler,
+        passed: Callable[[Work], None],
+    ) -> None:
         self._task_set = task_set
         self._tables = tables
         self._scheduler = scheduler
+        self._passed = passed
         self._binder = Binder(task_set) if task_set is not None else None
-        # the core's numbers of callback groups, and all that are not given back yet
+        # the core's numbers of callback groups (where a group decides itself, of its entities),
+        # and all that are not given back yet
         self._groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
         self._numbers: set[int] = set()
         self._entries: dict[int, Entry] = {}
@@ -225,7 +234,12 @@ class Registry:
             if type(error).__name__ == 'InvalidHandle':
                 return None  # destroyed between being listed and looked at
             raise
-        entry = Entry(kind, entity, node, callback, self._group(entity), depth, label)
+        group = getattr(entity, 'callback_group', None)
+        decides = group is not None and decides_itself(group)
+        number = self._number(entity if decides else group)
+        entry = Entry(kind, entity, node, callback, number, depth, label)
+        if decides:
+            entry.gate = Gate(group, entity, self._passed)
         entry.at_once = callback is None and kind == SUBSCRIPTION and keeps_time(entity)
         if callback is None and kind in (TIMER, SUBSCRIPTION, SERVICE):
             if len(self._undeclared) < _MOST_UNDECLARED:
@@ -240,9 +254,8 @@ class Registry:
                     self._tables.period[dag], self._tables.dag_deadline[dag])
         return entry
 
-    def _group(self, entity: Any) -> int:
-        """Return the core's number of an entity's callback group, -1 for a reentrant one."""
-        group = getattr(entity, 'callback_group', None)
+    def _number(self, group: Any) -> int:
+        """Return the core's number of a callback group, -1 for a reentrant one and for none."""
         if group is None or isinstance(group, ReentrantCallbackGroup):
             return -1
         number = self._groups.get(group)

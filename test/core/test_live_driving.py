@@ -42,6 +42,7 @@ from mddag_executor.core.state import (
 from .task_sets import examples, task_sets, TICK
 
 WAITING, RUNNING, SUSPENDED, DONE, DROPPED = 'waiting', 'running', 'suspended', 'done', 'dropped'
+REFUSED = 'refused'
 MAX_ACTIVE = 3
 EXPIRE_AFTER = 20 * TICK
 
@@ -57,6 +58,7 @@ class Run:
     group: int
     key: int
     began: bool = False
+    owns: bool = False
     lent: bool = False
     fate: str = WAITING
 
@@ -179,7 +181,7 @@ class LiveDriver(RuleBasedStateMachine):
         assert run in able
         if not self.scheduler.policy.polling:  # what waits for the next poll may be smaller
             assert run.key == min(other.key for other in able), 'a smaller key waits'
-        run.fate, run.began = RUNNING, True
+        run.fate, run.began, run.owns = RUNNING, True, True
         worker = self.state.x_worker[x]
         assert worker == min(idle) if schedule else worker in idle
         assert self.state.worker_x[worker] == x
@@ -211,10 +213,10 @@ class LiveDriver(RuleBasedStateMachine):
                 (job, first + after, leg) for leg, (_, before)
                 in enumerate(legs_of(dag.vertices[after], dag.vertices)) if before == me.index]
 
-    @precondition(methodcaller('with_fate', WAITING))
     @rule(data=st.data())
     def drop(self, data: st.DataObject) -> None:
-        fresh = [run for run in self.with_fate(WAITING) if not run.began]
+        fresh = [run for run in self.alive()
+                 if run.fate in (WAITING, REFUSED) and not run.began]
         if fresh:
             self.scheduler.drop(data.draw(st.sampled_from(fresh)).x, self.now)
             self.settle()
@@ -233,10 +235,26 @@ class LiveDriver(RuleBasedStateMachine):
         self.scheduler.suspend(run.x)
         run.fate, run.lent = SUSPENDED, False
 
-    @precondition(methodcaller('with_fate', SUSPENDED))
+    @precondition(methodcaller('owners'))
+    @rule(data=st.data(), may=st.booleans())
+    def ask(self, data: st.DataObject, may: bool) -> None:
+        run = data.draw(st.sampled_from(self.owners()))
+        if may:
+            self.scheduler.leave_group(run.x)
+            run.group = -1
+        else:
+            self.scheduler.refuse(run.x)
+            run.fate, run.began, run.lent = REFUSED, False, False
+
+    def owners(self) -> list[Run]:
+        return [run for run in self.with_fate(RUNNING) if run.group >= 0]
+
     @rule(data=st.data())
     def resume(self, data: st.DataObject) -> None:
-        run = data.draw(st.sampled_from(self.with_fate(SUSPENDED)))
+        away = self.with_fate(SUSPENDED) + self.with_fate(REFUSED)
+        if not away:
+            return
+        run = data.draw(st.sampled_from(away))
         self.scheduler.resume(run.x)
         run.fate = WAITING
 
@@ -275,7 +293,7 @@ class LiveDriver(RuleBasedStateMachine):
         _, dag, vertex, job, x, now = decision
         run = self.by_x.pop(x)
         assert (run.job, run.vertex, now) == ((dag, job), vertex, self.now)
-        assert run.fate == WAITING and not run.began
+        assert run.fate in (WAITING, REFUSED) and not run.began
         run.fate = DROPPED
 
     def ended(self, decision: Decision) -> None:
@@ -312,7 +330,7 @@ class LiveDriver(RuleBasedStateMachine):
 
     def blocked(self, run: Run) -> bool:
         return run.group >= 0 and any(
-            other is not run and other.began and other.group == run.group
+            other is not run and other.owns and other.group == run.group
             for other in self.alive())
 
     def polled(self, runs: list[Run]) -> list[Run]:
@@ -344,7 +362,7 @@ class LiveDriver(RuleBasedStateMachine):
     @invariant()
     def groups_are_exclusive(self) -> None:
         for group in self.groups[1:]:
-            holders = [run.x for run in self.alive() if run.began and run.group == group]
+            holders = [run.x for run in self.alive() if run.owns and run.group == group]
             assert len(holders) <= 1
             assert self.state.group_owner[group] == (holders[0] if holders else -1)
 
@@ -381,7 +399,7 @@ class LiveDriver(RuleBasedStateMachine):
         if not hasattr(self, 'scheduler'):
             return
         for _ in range(10 * len(self.runs) + 10):
-            for run in self.with_fate(SUSPENDED):
+            for run in self.with_fate(SUSPENDED) + self.with_fate(REFUSED):
                 self.scheduler.resume(run.x)
                 run.fate = WAITING
             for run in self.with_fate(RUNNING):

@@ -146,6 +146,31 @@ def test_a_suspended_callback_keeps_its_group_and_its_key() -> None:
     assert scheduler.take(0, 8) == blocked
 
 
+def test_what_is_refused_keeps_its_place_and_what_may_run_lets_the_next_be_asked() -> None:
+    scheduler = live(workers=2)
+    group = scheduler.new_group()
+    first, second, other = (
+        scheduler.undeclared(i, place, i) for i, place in enumerate((group, group, -1)))
+    assert scheduler.take(0, 3) == first
+    scheduler.refuse(first)
+    assert scheduler.take(0, 4) == other
+    assert scheduler.take(1, 5) == -1        # the second of the group does not pass the first
+    scheduler.resume(first)
+    assert scheduler.take(1, 6) == first
+    scheduler.complete(other, 7)
+    assert scheduler.take(0, 8) == -1
+    scheduler.leave_group(first)
+    assert scheduler.take(0, 9) == second
+    scheduler.suspend(first)
+    scheduler.resume(first)                  # it has no group to wait for any more
+    scheduler.refuse(second)
+    assert scheduler.take(0, 10) == first
+    scheduler.drop(second, 11)
+    assert scheduler.queue_length == 0
+    third = scheduler.undeclared(3, group, 12)
+    assert scheduler.take(1, 12) == third
+
+
 def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits() -> None:
     scheduler = live(workers=1)
     first, second = scheduler.new_group(), scheduler.new_group()

@@ -21,6 +21,7 @@ class Timer:
         self.node = '/node'
         self.entity = SimpleNamespace(timer_period_ns=10_000_000)
         self.skipped = self.ran = self.busy_ns = 0
+        self.gate: Any = None
 
     def run(self, ran: int, skipped: int) -> None:
         self.ran += ran
@@ -69,6 +70,17 @@ def test_a_timer_that_keeps_its_rate_is_not_warned_of():
         timer.run(ran=50, skipped=0)
         now[0] += LOOK_S
         watch.look()
+    assert warnings == []
+
+
+def test_a_timer_that_its_callback_group_slows_down_is_not_warned_of():
+    timer = Timer()
+    timer.gate = object()
+    watch, warnings, now = make_watch(timer)
+    watch.look()
+    timer.run(ran=10, skipped=15)
+    now[0] += LOOK_S
+    watch.look()
     assert warnings == []
 
 
