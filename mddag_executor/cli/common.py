@@ -173,8 +173,12 @@ def output_file(path: str) -> Iterator[BinaryIO]:
         return
     target = Path(path)
     if _is_special(target):
-        with target.open('wb') as special:
-            yield special
+        try:
+            with target.open('wb') as special:
+                yield special
+        except OSError as error:
+            error.filename = error.filename or path
+            raise
         return
     target = target.resolve()  # a symbolic link stays one
     part = target.with_name(f'.{target.name}.{os.getpid()}.part')
@@ -186,8 +190,10 @@ def output_file(path: str) -> Iterator[BinaryIO]:
         if target.exists():
             shutil.copymode(target, part)
         part.replace(target)
-    except BaseException:
+    except BaseException as error:
         part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = path  # a full disk
         raise
 
 

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+import errno
 from importlib import import_module
 import io
 from itertools import takewhile
@@ -177,6 +178,8 @@ def user_line(error: BaseException) -> str | None:
     """Return the line that tells the user about an error, or None when it is a defect."""
     if isinstance(error, known_errors()):
         return one_line(str(error))
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+        error.filename = 'standard output'
     if isinstance(error, OSError) and error.filename is not None:
         reason = error.strerror or type(error).__name__
         remedy = _REMEDIES.get(type(error), 'check the path and what it lies on')

@@ -90,7 +90,7 @@ class Habit:
     @property
     def computes_at_all(self) -> bool:
         """Return whether it may be one that holds the interpreter."""
-        return self._computed_ns >= SHORT_NS / 2
+        return self._computed_ns >= max(SHORT_NS / 2, self._own_ns / 8)
 
     def ran(self, duration: int, before: Reading, after: Reading) -> None:
         """

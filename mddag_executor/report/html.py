@@ -42,6 +42,7 @@ from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import MOST_EXECUTIONS, Timeline
 from mddag_executor.report.timeline_log import of_rescheduled, Schedule, tell
 from mddag_executor.simulate import Load, Run
+from mddag_executor.text import counted
 from msg_graph import TaskSet
 
 _SCRIPTS = [Path(__file__).with_name(name) for name in ('html_columns.js', 'html.js')]
@@ -251,9 +252,9 @@ def _head(data: ReportData) -> Iterator[str]:
         yield f'<p class="warning">{escape(printable(warning))}</p>\n'
     timeline = data.timeline
     if timeline.kept < timeline.n_executions:
-        yield (f'<p class="warning">The timelines show {timeline.kept} of the '
-               f'{timeline.n_executions} executions: around missed deadlines, and evenly spread '
-               'over the run elsewhere. Tables and histograms are of all.</p>\n')
+        yield (f'<p class="warning">The timelines show {timeline.kept} of '
+               f'{counted(timeline.n_executions, "execution")}: around missed deadlines, '
+               'and evenly spread over the run elsewhere. Tables and histograms are of all.</p>\n')
 
 
 def _flow(prepared: Prepared, plot: str) -> Iterator[str]:

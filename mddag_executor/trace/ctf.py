@@ -38,6 +38,7 @@ import subprocess
 import sys
 from typing import Any, IO
 
+from mddag_executor.text import counted
 from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.ctf_helper import PATIENCE_S
 from mddag_executor.trace.errors import TraceError
@@ -322,21 +323,21 @@ class _Importer:
         if result.discarded:
             about = ' at least' if self._uncounted else ''
             result.warnings.append(
-                f'{path}: the tracer discarded {result.discarded} events{about}: what followed '
-                'from them is missing; record with larger or more sub-buffers')
+                f'{path}: the tracer discarded {counted(result.discarded, "event")}{about}: what '
+                'followed from them is missing; record with larger or more sub-buffers')
         if self._nameless:
             result.warnings.append(
-                f'{path}: {self._nameless} events are of no known process or thread: add the '
-                'contexts vpid and vtid when recording')
+                f'{path}: no process or thread is known of {counted(self._nameless, "event")}: '
+                'add the contexts vpid and vtid when recording')
         if self._file.rejected:
             result.warnings.append(
-                f'{path}: {self._file.rejected} events are left out, the first because of: '
+                f'{path}: left out {counted(self._file.rejected, "event")}, the first because of: '
                 f'{self._file.rejection}')
         if self._changed:
             given, name = next(iter(self._changed.items()))
             result.warnings.append(
-                f'{path}: {len(self._changed)} names are none that ROS can have here and were '
-                f'changed, such as {given!r} to {name!r}')
+                f'{path}: changed {counted(len(self._changed), "name")} that ROS cannot have, '
+                f'such as {given!r} to {name!r}')
 
 
 def _legal(name: str) -> str:

@@ -14,6 +14,7 @@ from collections.abc import Collection, Iterator
 import os
 from typing import NamedTuple
 
+from mddag_executor.text import counted
 from mddag_executor.trace import records
 from mddag_executor.trace.blocks import (
     Block,
@@ -84,7 +85,7 @@ class MessageReader:
                     yield from self._messages(load(stream, block), block, topics)
             except Damage as damage:
                 self.warnings.append(what_was_used(
-                    self.path, damage, f'{self.count} messages', size))
+                    self.path, damage, counted(self.count, 'message'), size))
                 return
         if twice:
             self.warnings.append(used_once(self.path, twice))

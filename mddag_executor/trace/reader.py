@@ -15,6 +15,7 @@ import stat
 from typing import Any, BinaryIO, TYPE_CHECKING
 import warnings
 
+from mddag_executor.text import counted
 from mddag_executor.trace.blocks import (
     Block,
     has_copy,
@@ -202,8 +203,8 @@ class TraceReader:
     def _missing(self, reading: Reading, size: int) -> str | None:
         """Return the line that says what is missing, None where nothing is."""
         damage, summary = reading.damage, self._summary
-        found = f'{reading.chunks} chunks with {reading.messages} messages'
-        stated = (f'{summary.chunks} chunks with {summary.messages} messages are said to be there'
+        found = _contents(reading.chunks, reading.messages)
+        stated = (f'the file says that it holds {_contents(summary.chunks, summary.messages)}'
                   if summary else 'what there should be is not known')
         if damage:
             return f'{what_was_used(self.path, damage, found, size)}; {stated}'
@@ -247,3 +248,7 @@ def read_events(path: str | os.PathLike[str],
                **named.get((vpid, vtid), {}), **values}
     for text in reader.warnings:
         warnings.warn(text, TraceWarning, stacklevel=2)
+
+
+def _contents(chunks: int, messages: int) -> str:
+    return f'{counted(chunks, "chunk")} with {counted(messages, "message")}'

@@ -29,6 +29,7 @@ from operator import itemgetter
 import struct
 from typing import Any, BinaryIO
 
+from mddag_executor.text import counted
 from mddag_executor.trace import records
 from mddag_executor.trace.blocks import Block, Damage, load
 from mddag_executor.trace.cdr import ENCAPSULATION
@@ -226,7 +227,7 @@ class Reading:
             return None
         reason, count = self._undecoded.most_common(1)[0]
         total = sum(self._undecoded.values())
-        return (f'{self._path}: {total} messages could not be decoded and are left out, '
+        return (f'{self._path}: left out {counted(total, "message")} that cannot be decoded, '
                 f'most of them ({count}) of {reason}')
 
 

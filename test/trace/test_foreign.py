@@ -168,10 +168,10 @@ def test_events_that_cannot_be_decoded_are_counted(
         events, warnings = read(path, in_time_order)
         assert not events
         assert len(warnings) == 1
-        assert '5 messages could not be decoded and are left out, most of them (5) of ' \
+        assert 'left out 5 messages that cannot be decoded, most of them (5) of ' \
                '/trace/ros2/callback_end: ' in warnings[0]
         assert reason in warnings[0]
-    with pytest.warns(TraceWarning, match='5 messages could not be decoded'):
+    with pytest.warns(TraceWarning, match='left out 5 messages that cannot'):
         assert list(read_events(path)) == []
 
 
