@@ -95,6 +95,7 @@ class ColumnReading(Reading):
         result = np.zeros(cl.N_RESULTS, dtype=np.int64)
         parts: list[Rows] = []
         others: list[Event] = []
+        self._classify()    # definitions come with other passes, too, which share the channels
         while True:
             result[cl.ROWS] = result[cl.OTHERS] = 0
             self._scan_records(

@@ -40,6 +40,7 @@ def rows_of(path: Path) -> list[tuple[Any, ...]]:
         for row in rows.tolist():
             if row[cl.KIND] == cl.OTHER:
                 found.append(others[row[cl.THREAD]])
+                assert found[-1][0] not in KINDS
                 continue
             name = names[row[cl.KIND]]
             event = [name, row[cl.TIME], row[cl.PROCESS], row[cl.THREAD],
@@ -63,3 +64,13 @@ def test_rows_are_the_events(
                 if i % flush_every == 0:
                     file.flush()
         assert rows_of(path) == list(TraceReader(path).events(WANTED, sorted=True))
+
+
+def test_a_channel_that_is_defined_in_a_later_chunk(tmp_path: Path) -> None:
+    """The chunks of two threads overlap, so that the second one in the file is read last."""
+    path = tmp_path / 'a.mcap'
+    with TraceFile(path) as file:
+        for name, time in (('callback_end', 0), ('job_release', 9), ('job_release', 5)):
+            file.add(name, time, 1, 1, *range(1 if name == 'callback_end' else 3))
+            file.flush()
+    assert [event[1] for event in rows_of(path)] == [0, 5, 9]
