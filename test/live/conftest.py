@@ -37,16 +37,16 @@ class Spinning:
         return self
 
     def __exit__(self, *args: object) -> None:
-        assert self.executor.shutdown(5.0)
+        assert self.executor.shutdown(30.0)
         self.join()
 
     def join(self) -> None:
         """Wait until spin has ended."""
-        self._thread.join(5.0)
+        self._thread.join(30.0)
         assert not self._thread.is_alive(), 'spin did not end'
 
 
-def wait_for(condition: Callable[[], Any], seconds: float = 5.0) -> bool:
+def wait_for(condition: Callable[[], Any], seconds: float = 15.0) -> bool:
     """Wait until something is true; return whether it became so."""
     end = time.monotonic() + seconds
     while not condition():

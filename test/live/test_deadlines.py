@@ -413,21 +413,24 @@ def test_current_job_is_none_elsewhere(make_executor):
 
 def test_what_completes_after_the_end_is_not_counted(make_executor, make_node, ros_context):
     """The run was judged by then, and its trace, which must agree, is closed."""
-    begun = threading.Event()
+    begun, judged, ended = threading.Event(), threading.Event(), threading.Event()
 
     def long() -> None:
         begun.set()
-        time.sleep(1.0)
+        judged.wait(60.0)
+        ended.set()
 
     chain = Chain(make_node, {'early': long})
     executor = make_executor(loads(CHAIN))
     with Spinning(executor) as spinning:
         chain.start(executor)
-        assert begun.wait(5.0)
+        assert begun.wait(30.0)
         ros_context.shutdown()
         spinning.join()
         counts = sinks(executor)
+        judged.set()
         assert counts['/middle:early']['overdue'] > 0
+        assert ended.wait(30.0)
     assert sinks(executor) == counts
 
 
