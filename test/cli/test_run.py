@@ -293,7 +293,7 @@ def sink(completed: int, late: int = 0, **more: Any) -> dict[str, Any]:
 
 
 def test_verdicts_add_up() -> None:
-    # 100 completed, of them 3 late; 2 more were overdue at the end; 4 expired, 1 aborted, 6 failed.
+    # 100 completed, 3 of them late; 2 were overdue at the end; 4 expired, 1 aborted, 6 failed.
     found = counts(sink(100, 5, overdue=2, expired=4, aborted=1, failed=6))
     assert found == (113, 97, 5, 4, 1, 6)
     assert found.missed == found.late + found.expired + found.aborted + found.failed

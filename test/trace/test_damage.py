@@ -197,8 +197,8 @@ def test_a_lost_chunk_is_noticed(tmp_path: Path, sample: Any) -> None:
     padding = struct.pack('<BQ', 0x90, gap) + bytes(gap)
     path.write_bytes(data[:found[place][1]] + padding + data[end:])
     events, warnings = read(path)
-    assert 'events are missing: found and used 3 chunks with 10 messages; the file ' \
-            'says that it holds 4 chunks' in warnings[0]
+    assert ('events are missing: found and used 3 chunks with 10 messages; the file '
+            'says that it holds 4 chunks') in warnings[0]
 
 
 def test_no_length_leads_past_a_chunk(tmp_path: Path, sample: Any) -> None:
