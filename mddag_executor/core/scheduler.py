@@ -15,6 +15,7 @@ from mddag_executor.core.state import (
     N_STALE,
     new_state,
     OPEN,
+    SUSPENDED,
 )
 from mddag_executor.core.tables import Tables
 
@@ -189,5 +190,9 @@ class Scheduler:
         """Count the executions that wait, for a worker or for their group."""
         waiting = sum(len(heap) for heap in self.state.group_heap)
         waiting += sum(len(queue) for queue in self.state.entity_queue)
-        waiting += len(self.state.held_back)
+        waiting += len(self.state.held_back) + sum(map(self._is_refused, self.state.group_owner))
         return len(self.state.ready) + waiting - self.state.scalars[N_STALE]
+
+    def _is_refused(self, x: int) -> bool:
+        state = self.state
+        return x >= 0 and state.x_state[x] == SUSPENDED and state.x_started[x] < 0

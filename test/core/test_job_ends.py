@@ -193,6 +193,23 @@ def test_an_abort_drops_what_waits_and_spares_what_has_started() -> None:
     assert scheduler.state.group_owner[group] == -1
 
 
+def test_an_abort_drops_what_was_refused_when_it_is_asked_about_again() -> None:
+    scheduler = live(aborting(), workers=1)
+    slot = start_job(scheduler)
+    y, group = scheduler.execution(slot, 2), scheduler.new_group()
+    scheduler.state.x_group[y] = group
+    scheduler.ready(y, 1)
+    assert scheduler.take(0, 1) == y
+    scheduler.refuse(y)
+    scheduler.abort(slot, 2)
+    scheduler.decisions()
+    scheduler.resume(y)
+    assert scheduler.take(0, 3) == -1
+    assert scheduler.decisions() == [(DROP, 0, 2, 0, y, 3)]
+    assert scheduler.state.job_state[slot] == FREE
+    assert scheduler.state.group_owner[group] == -1
+
+
 def test_what_comes_too_late_aborts_its_job_at_its_turn() -> None:
     scheduler = live(aborting(), workers=1)
     slot = start_job(scheduler)

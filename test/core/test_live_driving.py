@@ -354,7 +354,8 @@ class LiveDriver(RuleBasedStateMachine):
 
     @invariant()
     def counts_agree(self) -> None:
-        assert self.scheduler.queue_length == len(self.with_fate(WAITING))
+        waiting = self.with_fate(WAITING) + self.with_fate(REFUSED)
+        assert self.scheduler.queue_length == len(waiting)
         placed = [run for run in self.with_fate(RUNNING) if not run.lent]
         assert self.scheduler.idle_workers == self.workers - len(placed)
         assert sorted(x for x in self.state.worker_x if x >= 0) == sorted(r.x for r in placed)

@@ -155,6 +155,7 @@ def test_what_is_refused_keeps_its_place_and_what_may_run_lets_the_next_be_asked
     scheduler.refuse(first)
     assert scheduler.take(0, 4) == other
     assert scheduler.take(1, 5) == -1        # the second of the group does not pass the first
+    assert scheduler.queue_length == 2
     scheduler.resume(first)
     assert scheduler.take(1, 6) == first
     scheduler.complete(other, 7)
