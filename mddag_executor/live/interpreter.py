@@ -9,20 +9,21 @@ Python's lock lets one thread compute at a time.  The core therefore starts a ca
 the interpreter only if nothing as urgent holds it (rule 11 of ``core.rules``); here is found out
 which callbacks those are.  A declaration may say it (``holds_interpreter``); else
 
-1.  **After each execution** its CPU time is compared with its duration.  Left out of that is what
-    the other threads of the process computed meanwhile, and what other processes took: if two
+1.  **After an execution** its CPU time is compared with its duration; after the first executions
+    for a sample of them only, because reading the clocks costs some microseconds.  Left out of the
+    duration is what other executions computed meanwhile, and what other processes took: if two
     callbacks fight for the lock, each computes for half of the time, but for all of the time that
     the other one leaves.  A callback that computed for over four fifths of that time, lately,
-    holds the interpreter; one that computed for less than half of it does not.  Executions of
-    less than ``SHORT_NS`` of CPU are not worth an order.
-2.  **While something is held back** a thread looks every ``LOOK_S`` at the most urgent callback
-    that holds the interpreter.  If its CPU clock stands still, it waits: for a lock, an event, a
-    service.  It gives the interpreter back at once, so that nobody is held back for one that waits
-    for him; where the lock was not free meanwhile it may have waited for that, and is given
-    ``IDLE_LOOKS``.  If it computes and the looking thread gets the lock within half a switch
-    interval, ``FREE_LOOKS`` times in a row, it computes with the lock released (numpy, hashlib):
-    it gives the interpreter back, too, and that is remembered.  One of ``TRY_EVERY`` executions is
-    looked at again.
+    holds the interpreter; one that computed for less than half of it does not.  Executions of less
+    than ``SHORT_NS`` of CPU are not worth an order.
+2.  **While something is held back** for more than a moment, a thread looks every ``LOOK_S`` at the
+    most urgent callback that holds the interpreter.  If its CPU clock stands still, it waits: for
+    a lock, an event, a service.  It gives the interpreter back at once, so that nobody is held
+    back for one that waits for him; where the lock was not free meanwhile it may have waited for
+    that, and is given ``IDLE_LOOKS``.  If it computes and the looking thread gets the lock within
+    half a switch interval, ``FREE_LOOKS`` times in a row, it computes with the lock released
+    (numpy, hashlib): it gives the interpreter back, too, and that is remembered.  One of
+    ``TRY_EVERY`` measured executions is looked at again.
 
 Between two threads that compute, Python switches every ``sys.getswitchinterval()``, 5 ms by
 default; while an executor spins it is shorter, so that an arrival is seen sooner.
@@ -38,7 +39,6 @@ import threading
 from time import (
     clock_gettime_ns,
     monotonic_ns,
-    process_time_ns,
     pthread_getcpuclockid,
     sleep,
     thread_time_ns,
@@ -53,20 +53,26 @@ WAITS = 0.5
 SHORT_NS = 100_000
 LATELY = 8
 """The last execution counts for one in so many."""
+FIRST = 16
+SAMPLE = 8
+"""After the first executions one in so many is measured, and more where it behaves otherwise."""
 
 LOOK_S = 0.002
-REST_LOOKS = 25
-"""After so many looks at which nothing was held back nobody looks any more."""
+QUIET_LOOKS = 3
+GLANCE_S = 0.02
+"""While nothing is held back for longer, it is looked whether anything is only so often."""
+QUIET_GLANCES = 50
+"""After so many glances at which nothing was held back nobody looks any more."""
 FREE_LOOKS = 3
 IDLE_LOOKS = 10
 RELEASED = 0.6
-TRY_EVERY = 64
+TRY_EVERY = 8
 
 SWITCH_INTERVAL_S = 0.001
 
 
-Reading = tuple[int, int, int]
-"""CPU time of a thread and of its process, and how long the thread waited for a CPU, ns."""
+Reading = tuple[int, int]
+"""CPU time of a thread, and how long it waited for a CPU, ns."""
 
 
 class Habit:
@@ -77,7 +83,8 @@ class Habit:
     :ivar holds: 1 or 0, for its next execution.
     """
 
-    __slots__ = ('holds', '_declared', '_computed_ns', '_own_ns', '_released', '_passed')
+    __slots__ = (
+        'holds', '_declared', '_computed_ns', '_own_ns', '_released', '_passed', '_runs', '_close')
 
     def __init__(self, declared: bool | None = None) -> None:
         self.holds = int(declared or False)
@@ -86,30 +93,47 @@ class Habit:
         self._own_ns = 0.0
         self._released = 0.0
         self._passed = 0
+        self._runs = 0
+        self._close = FIRST
+
+    def is_to_be_measured(self) -> bool:
+        """Return whether to measure the execution that begins now."""
+        if self._declared:
+            return False
+        if self._close > 0:
+            self._close -= 1
+            return True
+        self._runs += 1
+        return self._runs % SAMPLE == 0
 
     @property
     def computes_at_all(self) -> bool:
         """Return whether it may be one that holds the interpreter."""
         return self._computed_ns >= max(SHORT_NS / 2, self._own_ns / 8)
 
-    def ran(self, duration: int, before: Reading, after: Reading) -> None:
+    def ran(
+        self, duration: int, before: Reading, after: Reading, beside: Callable[[], int],
+    ) -> None:
         """
         Learn from an execution.
 
         :param duration: how long it took, ns.
         :param before: what its thread's clock read when it began; ``after``: when it ended.
+        :param beside: returns how long other executions computed meanwhile, ns.
         """
-        if self._declared:
-            return
         computed = after[0] - before[0]
-        others = after[1] - before[1] - computed
-        own = max(computed, duration - others - (after[2] - before[2]))
+        own = duration - (after[1] - before[1])
+        if SHORT_NS <= computed < COMPUTES * own:
+            own -= beside()
+        own = max(computed, own)
         if self._own_ns == 0.0:
             self._computed_ns, self._own_ns = computed, own
         else:
             self._computed_ns += (computed - self._computed_ns) / LATELY
             self._own_ns += (own - self._own_ns) / LATELY
         share, least_ns = (WAITS, SHORT_NS / 2) if self.holds else (COMPUTES, SHORT_NS)
+        if (computed >= max(share * own, least_ns)) != self.holds:
+            self._close = LATELY  # it may have changed
         self.holds = int(self._computed_ns >= max(share * self._own_ns, least_ns))
         if self._released >= RELEASED:
             self._passed += 1
@@ -150,7 +174,7 @@ class ThreadClock:
         waited = 0
         if closely and self._file >= 0:
             waited = int(os.pread(self._file, 64, 0).split()[1])
-        return thread_time_ns(), process_time_ns(), waited
+        return thread_time_ns(), waited
 
     def close(self) -> None:
         """Close what it reads."""
@@ -214,18 +238,20 @@ class Overseer:
         while not self._closed:
             self._wanted.wait()
             self._wanted.clear()
-            left = REST_LOOKS
-            while left > 0 and not self._closed:
-                due = monotonic_ns() + int(LOOK_S * 1e9)
-                sleep(LOOK_S)
+            pause, quiet = GLANCE_S, 0
+            while self.looking and not self._closed:
+                due = monotonic_ns() + int(pause * 1e9)
+                sleep(pause)
                 late = monotonic_ns() - due
                 with self._lock:
                     if self._scheduler.state.held_back:
-                        left = REST_LOOKS
-                        self._look(due + late, late)
+                        if pause == LOOK_S:
+                            self._look(due + late, late)
+                        pause, quiet = LOOK_S, 0
                     else:
-                        left -= 1
-                        self.looking = left > 0
+                        quiet += 1
+                        pause = LOOK_S if quiet < QUIET_LOOKS and pause == LOOK_S else GLANCE_S
+                        self.looking = quiet < QUIET_GLANCES
 
     def _look(self, now: int, late: int) -> None:
         """Take the interpreter from the most urgent holder if it does not need it."""

@@ -57,7 +57,9 @@ SOON_DOUBT = 8
 class Seat:
     """A worker thread's place: the worker it is (-1: spare), and what it is to run."""
 
-    __slots__ = ('worker', 'wake', 'x', 'work', 'thread', 'vtid', 'clock', 'waits', 'running')
+    __slots__ = (
+        'worker', 'wake', 'x', 'work', 'thread', 'vtid', 'clock', 'measured', 'began_ns', 'waits',
+        'running')
 
     def __init__(self, pool: Pool, worker: int) -> None:
         self.running = Running(pool, self)
@@ -69,6 +71,9 @@ class Seat:
         self.thread: threading.Thread | None = None
         self.vtid = 0
         self.clock: ThreadClock | None = None
+        # when what runs began: by that clock where it is measured, else by the trace's
+        self.measured = False
+        self.began_ns = 0
         self.waits = False
 
 
@@ -147,6 +152,8 @@ class Pool:
         self._lenders: list[Seat] = []
         self._polled: list[Work] = []
         self._refusals = 0
+        # what all that have ended computed, about
+        self._computed_ns = 0
         self._overseer = Overseer(
             dispatcher.scheduler, dispatcher.lock, self._seat_of,
             lambda: self._dispatch(dispatcher.tick()))
@@ -248,6 +255,19 @@ class Pool:
         if state.held_back and self.running and not self._overseer.looking:
             self._overseer.begin()
 
+    def _computed_beside(self, seat: Seat, now: int, before: int) -> int:
+        """Return how long others computed since all had computed for ``before`` ns; about."""
+        computed = self._computed_ns - before
+        for other in self._seats:
+            work, clock = other.work, other.clock
+            if other is seat or work is None or clock is None:
+                continue
+            if other.measured:
+                computed += clock.computed() - other.began_ns
+            elif work.entry.habit.holds:
+                computed += now - other.began_ns
+        return computed
+
     def _seat_of(self, worker: int) -> Seat | None:
         seat = self._seats[worker] if worker < len(self._seats) else None
         return seat if seat is not None and seat.work is not None else None
@@ -291,9 +311,13 @@ class Pool:
         raised: BaseException | None = None
         start = monotonic_ns() + dispatcher.clock_offset
         clock, habit, gate = seat.clock, work.entry.habit, work.entry.gate
-        if clock is not None:
+        before = None
+        if clock is not None and habit.is_to_be_measured():
             closely = habit.computes_at_all
             before = clock.read(closely)
+        seat.began_ns = start if before is None else before[0]
+        seat.measured = before is not None
+        others = self._computed_ns
         try:
             waits_for = work.step() if gate is None else gate.step(work)
         except Destroyed:
@@ -303,8 +327,13 @@ class Pool:
         except BaseException as error:
             raised = error
         end = monotonic_ns() + dispatcher.clock_offset
-        if clock is not None and not refused:
-            habit.ran(end - start, before, clock.read(closely))
+        if clock is not None and before is not None and not refused:
+            after = clock.read(closely)
+            habit.ran(end - start, before, after, partial(
+                self._computed_beside, seat, end, others))
+            self._computed_ns += after[0] - before[0]
+        elif habit.holds:
+            self._computed_ns += end - start
         current.running = previous
         if running.published:
             running.ended(work.entry, end - dispatcher.clock_offset)

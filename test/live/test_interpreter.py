@@ -184,8 +184,11 @@ def learnt(
     """
     habit = habit or Habit()
     for execution in executions:
+        if not habit.is_to_be_measured():
+            continue
         duration, computed, process_computed = (int(ms * MS) for ms in execution)
-        habit.ran(duration, (0, 0, 0), (computed, process_computed, waited * MS))
+        beside = process_computed - computed
+        habit.ran(duration, (0, 0), (computed, waited * MS), lambda beside=beside: beside)
     return habit.holds
 
 
