@@ -17,13 +17,13 @@ which callbacks those are.  A declaration may say it (``holds_interpreter``); el
     holds the interpreter; one that computed for less than half of it does not.  Executions of less
     than ``SHORT_NS`` of CPU are not worth an order.
 2.  **While something is held back** for more than a moment, a thread looks every ``LOOK_S`` at the
-    most urgent callback that holds the interpreter.  If its CPU clock stands still, it waits: for
-    a lock, an event, a service.  It gives the interpreter back at once, so that nobody is held
-    back for one that waits for him; where the lock was not free meanwhile it may have waited for
-    that, and is given ``IDLE_LOOKS``.  If it computes and the looking thread gets the lock within
-    half a switch interval, ``FREE_LOOKS`` times in a row, it computes with the lock released
-    (numpy, hashlib): it gives the interpreter back, too, and that is remembered.  One of
-    ``TRY_EVERY`` measured executions is looked at again.
+    most urgent callback that holds the interpreter.  If its CPU clock stands still though no other
+    process has its CPU, it waits: for a lock, an event, a service.  It gives the interpreter back
+    at once, so that nobody is held back for one that waits for him; where the lock was not free
+    meanwhile it may have waited for that, and is given ``IDLE_LOOKS``.  If it computes and the
+    looking thread gets the lock within half a switch interval, ``FREE_LOOKS`` times in a row, it
+    computes with the lock released (numpy, hashlib): it gives the interpreter back, too, and that
+    is remembered.  One of ``TRY_EVERY`` measured executions is looked at again.
 
 Between two threads that compute, Python switches every ``sys.getswitchinterval()``, 5 ms by
 default; while an executor spins it is shorter, so that an arrival is seen sooner.
@@ -34,6 +34,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import os
+from pathlib import Path
 import sys
 import threading
 from time import (
@@ -158,10 +159,10 @@ class ThreadClock:
 
     def __init__(self) -> None:
         self._clock = pthread_getcpuclockid(threading.get_ident())
+        self._folder = Path(f'/proc/self/task/{threading.get_native_id()}')  # proc(5)
         self._file = -1
-        try:  # proc(5); not everywhere
-            self._file = os.open(
-                f'/proc/self/task/{threading.get_native_id()}/schedstat', os.O_RDONLY)
+        try:  # not everywhere
+            self._file = os.open(self._folder / 'schedstat', os.O_RDONLY)
         except OSError:
             pass
 
@@ -175,6 +176,13 @@ class ThreadClock:
         if closely and self._file >= 0:
             waited = int(os.pread(self._file, 64, 0).split()[1])
         return thread_time_ns(), waited
+
+    def is_runnable(self) -> bool:
+        """Return whether it runs or waits for a CPU, and for nothing else; from any thread."""
+        try:
+            return (self._folder / 'stat').read_bytes().rpartition(b')')[2].split()[0] == b'R'
+        except (OSError, IndexError):
+            return False
 
     def close(self) -> None:
         """Close what it reads."""
@@ -274,6 +282,8 @@ class Overseer:
             self._idle = 0
             self._free = self._free + 1 if place.work.entry.habit.was_free(free) else 0
             needs = self._free < FREE_LOOKS
+        elif place.clock.is_runnable():  # other processes have the CPUs
+            needs = True
         else:
             # Where the lock was not free it may wait for that alone.
             self._idle += IDLE_LOOKS if free else 1

@@ -96,7 +96,7 @@ def test_what_is_held_back_runs_in_the_order_of_deadlines(make_executor, make_no
                 pass
 
     bodies = Bodies(node, body)
-    executor = make_executor(graph('true', (50, 80, 60, 70)))
+    executor = make_executor(graph('true', (5_000, 60_000, 20_000, 40_000)))
     executor.add_node(node)
     with Spinning(executor):
         bodies.publish('a')
