@@ -51,7 +51,7 @@ from mddag_executor.core.state import N_HOLDING
 
 COMPUTES = 0.8
 WAITS = 0.5
-SHORT_NS = 100_000
+SHORT_NS = 20_000
 LATELY = 8
 """The last execution counts for one in so many."""
 FIRST = 16

@@ -198,7 +198,7 @@ def test_the_share_of_cpu_in_the_duration_decides():
     assert learnt((10, 0.2, 0.3)) == 0
     assert learnt(*[(10, 9.5, 9.6)] * 3, *[(10, 0.2, 0.3)] * 20) == 0
     assert learnt(*[(10, 0.2, 0.3)] * 3, *[(10, 9.5, 9.6)] * 30) == 1
-    assert learnt(*[(0.05, 0.05, 0.05)] * 20) == 0  # too short to matter
+    assert learnt(*[(0.01, 0.01, 0.01)] * 20) == 0  # too short to matter
 
 
 def test_two_that_fight_for_the_lock_are_both_found_out():
