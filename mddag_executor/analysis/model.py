@@ -51,11 +51,6 @@ class Task:
         """Return the share of one worker that the task needs."""
         return self.volume / self.period
 
-    @property
-    def one_deadline(self) -> bool:
-        """Whether all sinks have the same deadline."""
-        return len({deadline for _, deadline, _ in self.sinks}) == 1
-
 
 def tasks_of(task_set: TaskSet, budget: str = 'max') -> list[Task]:
     """

@@ -10,35 +10,31 @@ sufficient test *holds*, for the scheduler that it is about, or *says nothing*: 
 is too large, or because one of its assumptions is not met. No sufficient test ever fails.
 
 All sufficient tests here share the assumptions of ``SHARED``; where the declaration shows that one
-is not met, they say nothing. Sinks of a DAG with different deadlines need a priority for each
-vertex, for which only the response-time tests are proven. The live executor does not preempt: of
-the tests only those whose ``scheduler`` says so speak of it (``LIVE``).
+is not met, they say nothing. They are proven for sinks with different deadlines, and without
+preemption: of the schedulers they are about, the live executor's is one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from mddag_executor.analysis import necessary, sufficient
-from mddag_executor.analysis.federated import federation
-from mddag_executor.analysis.forced_forward import forced_forward
 from mddag_executor.analysis.model import AnalysisError, Task, tasks_of
-from mddag_executor.analysis.non_preemptive import rad_non_preemptive
 from mddag_executor.analysis.sag import Answer, JobSet
-from mddag_executor.analysis.sufficient import Bound, Slowdown
+from mddag_executor.analysis.sufficient import Bound
 from mddag_executor.text import counted
 from msg_graph import format_duration, TaskSet
 
 SHARED = (
     'no execution takes longer than its budget; releases of a DAG are at least its period apart, '
-    'and known when its source becomes ready; no callback group keeps ready work waiting; no '
-    'bound on open jobs ends one that is not late; nothing undeclared runs; dispatching and '
-    'transport take no time')
+    'and known when its source becomes ready; no callback group keeps ready work waiting, nor '
+    "does Python's lock; no bound on open jobs ends one that is not late; nothing undeclared "
+    'runs; dispatching and transport take no time')
 WORK_CONSERVING = 'any work-conserving, preemptive or not'
 RAD_LIVE = 'rad, not preemptive (the live executor)'
-LIVE = (WORK_CONSERVING, RAD_LIVE)
 
 HOLDS = 'holds'
 FAILS = 'fails'
@@ -188,20 +184,15 @@ def _obstacle(tasks: Sequence[Task]) -> str | None:
         for vertex in dag.vertices:
             if vertex.callback.group is not None:
                 return f'{vertex.callback.key} is in a callback group, which can keep it waiting'
+            if vertex.callback.holds_interpreter:
+                return (f'{vertex.callback.key} computes in Python, which can keep others waiting '
+                        'beside a free worker')
         if dag.release_from != 'arrival':
             return (f'DAG {dag.name} is released from {dag.release_from}, so its messages come an '
                     'unknown time later')
         if dag.max_active_jobs is not None and dag.max_active_jobs <= task.deadline // task.period:
             return f'max_active_jobs of DAG {dag.name} can end a job before its deadline'
     return None
-
-
-def _several_deadlines(tasks: Sequence[Task]) -> str | None:
-    task = next((task for task in tasks if not task.one_deadline), None)
-    if task is None:
-        return None
-    return (f'sinks of DAG {task.dag.name} have different deadlines, which need a priority for '
-            'each vertex; the test is proven for one deadline for each DAG')
 
 
 def _graham(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
@@ -212,9 +203,10 @@ def _graham(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdic
     verdict, reason = NOTHING, obstacle
     if obstacle is None and len(tasks) > 1:
         reason = 'the bound is for a DAG that has all workers for itself, and there are several'
+    elif obstacle is None and good:
+        verdict, reason = HOLDS, 'the bound of each sink is within deadline and period'
     elif obstacle is None:
-        verdict, reason = _by(good == 1, 'the bound of each sink is within deadline and period',
-                              'a bound is beyond the deadline or the period')
+        reason = 'a bound is beyond the deadline or the period'
     return Verdict(
         "Graham's bound", 'sufficient', 'Graham 1969', WORK_CONSERVING,
         'one DAG alone, done within its period', verdict,
@@ -222,129 +214,41 @@ def _graham(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdic
         {name: {'alone': HOLDS if ok else NOTHING} for name, ok in within.items()})
 
 
-def _by(holds: bool, why: str, why_not: str) -> tuple[str, str]:
-    return (HOLDS, why) if holds else (NOTHING, why_not)
-
-
 _Bounds = Callable[[Sequence[Task], int], list[Bound]]
 
 
 def _response_times(
-    tasks: Sequence[Task], workers: int, obstacle: str | None, bounds_of: _Bounds
-) -> tuple[str, str, str, dict[str, Any]]:
-    """Return verdict, figure, reason and details of a response-time test."""
+    name: str, source: str, scheduler: str, bounds_of: _Bounds,
+    tasks: Sequence[Task], workers: int, obstacle: str | None,
+) -> Verdict:
+    """Return the verdict of a response-time test, whose bounds ``bounds_of`` returns."""
+    def verdict(verdict: str, figure: str, reason: str, details: dict[str, Any]) -> Verdict:
+        return Verdict(name, 'sufficient', source, scheduler, 'several and any deadlines', verdict,
+                       figure, reason, details)
+
     if obstacle is not None:
-        return NOTHING, '-', obstacle, {}
+        return verdict(NOTHING, '-', obstacle, {})
     for task in tasks:
         if task.volume > workers * min(task.period, task.deadline):
-            return NOTHING, '-', f'DAG {task.dag.name} alone is too much for the workers', {}
+            reason = f'DAG {task.dag.name} alone is too much for the workers'
+            return verdict(NOTHING, '-', reason, {})
     bounds = bounds_of(tasks, workers)
     details = {_sink(b.task, b.sink): {'deadline_ns': b.deadline, 'response_bound_ns': b.response}
                for b in bounds}
     last = bounds[-1]
     if last.response is None:
-        return (NOTHING, f'no bound for {_sink(last.task, last.sink)}',
-                f'its bound is beyond its deadline of {format_duration(last.deadline)}', details)
+        return verdict(NOTHING, f'no bound for {_sink(last.task, last.sink)}',
+                       f'its bound is beyond its deadline of {format_duration(last.deadline)}',
+                       details)
     tight = max(bounds, key=lambda b: (b.response or 0) / b.deadline)
-    return (HOLDS, f'{format_duration(tight.response or 0)} of {format_duration(tight.deadline)} '
-            f'at {_sink(tight.task, tight.sink)}', 'each bound is within its deadline', details)
-
-
-def _work_conserving(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
-    verdict, figure, reason, details = _response_times(
-        tasks, workers, obstacle, sufficient.work_conserving)
-    return Verdict(
-        'response time, any policy', 'sufficient', 'after Melani et al. 2015',
-        WORK_CONSERVING, 'several and any deadlines', verdict, figure,
-        reason, details)
-
-
-def _rad(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
-    verdict, figure, reason, details = _response_times(
-        tasks, workers, obstacle, sufficient.rad_preemptive)
-    return Verdict(
-        'response time, RAD', 'sufficient',
-        'after Bertogna and Cirinei 2007, Melani et al. 2015', 'rad, preemptive',
-        'several and any deadlines', verdict, figure, reason, details)
-
-
-def _rad_live(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
-    verdict, figure, reason, details = _response_times(
-        tasks, workers, obstacle, rad_non_preemptive)
-    return Verdict(
-        'response time, RAD without preemption', 'sufficient',
-        'after Melani et al. 2015, Serrano et al. 2016', RAD_LIVE, 'several and any deadlines',
-        verdict, figure, reason, details)
-
-
-def _gedf_demand(
-    name: str, source: str, test: Callable[[Sequence[Task], int], Slowdown | None],
-    tasks: Sequence[Task], workers: int, obstacle: str | None,
-) -> Verdict:
-    obstacle = obstacle or _several_deadlines(tasks)
-    verdict, figure, reason = NOTHING, '-', obstacle
-    if obstacle is None:
-        slowdown = test(tasks, workers)
-        if slowdown is None:
-            reason = 'too much work in some interval, at each speed that was tried'
-        else:
-            verdict = HOLDS
-            figure = f'speed 1/{slowdown.factor:.3f}, {counted(slowdown.points, "instant")}'
-            reason = 'in no interval the work that EDF would have to be behind with'
-    return Verdict(
-        name, 'sufficient', source, 'gedf or rad, preemptive',
-        'one deadline for each DAG, of any length', verdict, figure, reason or '')
-
-
-def _bonifaci(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
-    return _gedf_demand(
-        'GEDF demand', 'Bonifaci et al. 2013', sufficient.bonifaci, tasks, workers, obstacle)
-
-
-def _baruah(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
-    return _gedf_demand(
-        'GEDF forced-forward demand', 'after Baruah 2014', forced_forward, tasks, workers,
-        obstacle)
-
-
-def _federated(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
-    verdict, figure, reason, details = NOTHING, '-', obstacle, dict[str, Any]()
-    if obstacle is None:
-        found = federation(tasks)
-        if isinstance(found, str):
-            reason = f'DAG {found} takes longer than its period or a deadline on any number'
-        else:
-            figure = f'{found.workers} of {counted(workers, "worker")}'
-            verdict, reason = _by(
-                found.workers <= workers, 'heavy DAGs have enough workers for themselves, and the '
-                'light ones fit on the others', 'the DAGs need more workers than there are')
-            details = {'own_workers': found.own, 'shared': found.shared}
-    return Verdict(
-        'federated scheduling', 'sufficient', 'Li et al. 2014',
-        'federated: an executor for each heavy DAG, preemptive rad on a worker for light ones',
-        'a job is done before the next of its DAG', verdict, figure, reason or '', details)
-
-
-def _li(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
-    obstacle = obstacle or _several_deadlines(tasks)
-    if obstacle is None:
-        other = next((task for task in tasks if task.deadline != task.period), None)
-        if other is not None:
-            obstacle = f'the deadline of DAG {other.dag.name} is not its period'
-    bound = sufficient.capacity_bound(workers)
-    total = sum(task.utilisation for task in tasks)
-    path = max(task.length / task.deadline for task in tasks)
-    verdict, reason = NOTHING, obstacle
-    if obstacle is None:
-        verdict, reason = _by(
-            sufficient.li(tasks, workers), 'load <= m / b, and each longest path <= D / b',
-            'load > m / b, or a longest path > D / b')
-    return Verdict(
-        'GEDF capacity bound', 'sufficient', 'Li et al. 2013 and 2014', 'gedf or rad, preemptive',
-        'one deadline for each DAG, equal to its period', verdict,
-        f'b = {bound:.3f}, m / load = {workers / total if total else float("inf"):.3f}, '
-        f'D / len = {1 / path if path else float("inf"):.3f}', reason or '')
+    return verdict(HOLDS, f'{format_duration(tight.response or 0)} of '
+                   f'{format_duration(tight.deadline)} at {_sink(tight.task, tight.sink)}',
+                   'each bound is within its deadline', details)
 
 
 _SUFFICIENT: tuple[Callable[[Sequence[Task], int, str | None], Verdict], ...] = (
-    _graham, _work_conserving, _rad_live, _rad, _bonifaci, _baruah, _li, _federated)
+    _graham,
+    partial(_response_times, 'response time, any policy', 'after Melani et al. 2015',
+            WORK_CONSERVING, sufficient.work_conserving),
+    partial(_response_times, 'response time, RAD without preemption',
+            'after Melani et al. 2015, Serrano et al. 2016', RAD_LIVE, sufficient.rad))

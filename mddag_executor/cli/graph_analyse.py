@@ -31,8 +31,7 @@ DESCRIPTION = """\
 Test whether the deadlines of a declaration can hold. Where a necessary test fails, no scheduler
 can keep them; where a sufficient test holds, its scheduler does, as long as no execution takes
 longer than its budget. A sufficient test that does not hold says nothing. Overheads of dispatching
-are not part of any test. The live executor does not preempt callbacks: of it speak only the tests
-whose scheduler says so."""
+are not part of any test, nor are callback groups and Python's lock."""
 
 _HEADER = ('test', 'kind', 'verdict', 'figure', 'why')
 _ABOUT = ('test', 'source', 'scheduler', 'assumption')
@@ -118,7 +117,7 @@ def _rows(analysis: Analysis) -> Iterator[list[Cell]]:
 
 def _summary(analysis: Analysis) -> str:
     from mddag_executor.analysis import FAILS, HOLDS
-    from mddag_executor.analysis.verdicts import LIVE, SHARED
+    from mddag_executor.analysis.verdicts import SHARED
     assumed = f'All sufficient tests assume: {SHARED}.\n'
     begin = f'{assumed}{counted(analysis.workers, "worker")}, budget {analysis.budget}: '
     if any(each.verdict == FAILS for each in analysis.verdicts):
@@ -126,8 +125,5 @@ def _summary(analysis: Analysis) -> str:
     proven = {each.scheduler: None for each in analysis.verdicts
               if each.kind == 'sufficient' and each.verdict == HOLDS}
     if proven:
-        text = begin + 'the deadlines hold under ' + '; '.join(proven)
-        if not any(scheduler in LIVE for scheduler in proven):
-            text += '. For the live executor, which does not preempt, nothing is proven'
-        return text
+        return begin + 'the deadlines hold under ' + '; '.join(proven)
     return begin + 'nothing is proven either way: simulate it'

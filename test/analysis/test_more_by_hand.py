@@ -5,17 +5,7 @@
 from __future__ import annotations
 
 from mddag_executor.analysis import analyse, FAILS, HOLDS, NOTHING, tasks_of
-from mddag_executor.analysis.federated import federation
-from mddag_executor.analysis.forced_forward import _demand, _profile, forced_forward
-from mddag_executor.analysis.non_preemptive import rad_non_preemptive
-from mddag_executor.analysis.sufficient import (
-    bonifaci,
-    GRID,
-    own_jobs,
-    own_urgent,
-    rad_preemptive,
-    urgent,
-)
+from mddag_executor.analysis.sufficient import own_jobs, own_urgent, rad, urgent
 from msg_graph import loads
 import pytest
 
@@ -36,13 +26,12 @@ nodes:
 def test_a_long_callback_that_has_begun_is_part_of_the_bound() -> None:
     # 2 ms of its own, 4 ms of a job of the other with an earlier RAD, 4 ms of one with a later.
     tasks = tasks_of(loads(timers('100ms 50ms 2ms', '1s 1s 4ms')))
-    assert [bound.response for bound in rad_non_preemptive(tasks, 1)] == [10 * MS, 6 * MS]
-    assert [bound.response for bound in rad_preemptive(tasks, 1)] == [6 * MS, 6 * MS]
+    assert [bound.response for bound in rad(tasks, 1)] == [10 * MS, 6 * MS]
     # On two workers both of these go on beside each other, and each callback of a chain waits.
     wide = tasks_of(loads(WIDE.replace('10ms, publishes', '100ms, publishes').replace(
         'deadline: 10ms', 'deadline: 50ms')
         + timers('1s 1s 4ms', '1s 1s 2ms').partition('nodes:\n')[2].replace('/n', '/m')))
-    first = rad_non_preemptive(wide, 2)[0]
+    first = rad(wide, 2)[0]
     # To x: 4 + (5 + urgent 4 + 2 + the lesser of 2 * (4 + 2) and what there is, 6 more) / 2.
     assert first.response == (4 + (5 + 6 + 6) / 2) * MS
 
@@ -72,42 +61,6 @@ def test_urgent_work() -> None:
     assert own_urgent(task, 25 * MS) == 12 * MS
     assert own_urgent(task, 35 * MS) == 16 * MS
     assert own_urgent(task, 24 * MS) == 8 * MS
-
-
-def test_forced_forward_demand() -> None:
-    task, = tasks_of(loads(WIDE))
-    profile = _profile(task)
-    assert (profile.at, profile.done) == ((0, MS, 4 * MS, 6 * MS), (0, MS, 7 * MS, 9 * MS))
-    assert [profile.left(z * MS) for z in (-1, 0, 1, 2, 4, 5, 6, 7)] == [
-        each * MS for each in (9, 9, 8, 6, 2, 1, 0, 0)]
-    demand = {t: _demand(profile, t * MS * GRID, GRID) // MS for t in (3, 5, 8, 10, 13, 15, 20)}
-    # At 15: a whole job, and of the one that ends at 20 what is left 5 ms after its release.
-    assert demand == {3: 0, 5: 1, 8: 6, 10: 9, 13: 9, 15: 10, 20: 18}
-    assert _demand(profile, 8 * MS * GRID, 2 * GRID) == 8 * MS  # at half the speed: left after 1
-
-
-def test_forced_forward_sees_more_than_whole_jobs() -> None:
-    tasks = tasks_of(loads(timers('10ms 10ms 6ms', '10ms 10ms 6ms', '10ms 10ms 2ms')))
-    found = [workers for workers in range(1, 6) if forced_forward(tasks, workers)]
-    simple = [workers for workers in range(1, 6) if bonifaci(tasks, workers)]
-    assert set(simple) < set(found)
-    assert found[0] >= 2  # U = 1.4
-
-
-def test_federation() -> None:
-    tasks = tasks_of(loads(timers('10ms 10ms 6ms', '10ms 10ms 3ms', '10ms 5ms 1ms')))
-    found = federation(tasks)
-    assert found == ({}, (('/n0', '/n1'), ('/n2',)))
-    wide = tasks_of(loads(WIDE.replace('deadline: 10ms', 'deadline: 7ms')))
-    # len 6 ms to y, 4 ms to x: ceil(3 / 1) and ceil(5 / 3) workers.
-    assert federation(wide) == ({'/n': 3}, ())
-    assert federation(tasks_of(loads(WIDE.replace('deadline: 10ms', 'deadline: 6ms')))) == '/n'
-    late = tasks_of(loads(timers('10ms 30ms 6ms')))
-    assert federation(late) == ({}, (('/n0',),))
-    assert verdicts(WIDE.replace('deadline: 10ms', 'deadline: 7ms'), 2)[
-        'federated scheduling'].verdict == NOTHING
-    assert verdicts(WIDE.replace('deadline: 10ms', 'deadline: 7ms'), 3)[
-        'federated scheduling'].verdict == HOLDS
 
 
 @pytest.mark.parametrize('budget', ['max', 'mean'])
