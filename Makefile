@@ -2,6 +2,7 @@
 # index. Both make their own environment in .venv/ the first time; PYTHON=... picks the interpreter.
 
 VENV := .venv
+KILTED := .venv-kilted
 # Tests that run ROS go one after the other, the others beside them.
 PYTEST_ARGS ?= -n 2 --dist loadgroup
 BIN := $(VENV)/bin
@@ -14,12 +15,13 @@ ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: help env demo test check-fresh soak fuzz lint docs clean distclean
+.PHONY: help env demo test test-kilted check-fresh soak fuzz lint docs clean distclean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo       run the Autoware workload under the executor, record and replay it'
 	@echo 'make test       run all tests (PYTEST_ARGS=... for some of them)'
+	@echo 'make test-kilted  the tests of what runs ROS, with ROS 2 Kilted, in $(KILTED)/'
 	@echo 'make check-fresh  make demo and make test in new installations of Debian (CHECK_FRESH=...)'
 	@echo 'make soak       the Autoware workload with random faults for SOAK_SECONDS (600)'
 	@echo 'make fuzz       read damaged traces and bags for FUZZ_SECONDS (600) each'
@@ -38,6 +40,15 @@ demo: env
 test: env
 	@sh .ci/tools install
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+# The tests that run ROS, in an environment with ROS 2 Kilted instead of Jazzy.
+LIVE_TESTS := test/live test/examples test/hardening/test_misuse.py \
+	test/replay/test_live_replay.py \
+	$(addprefix test/cli/test_,$(addsuffix .py,demo graph_systems run top))
+
+test-kilted:
+	@PYTHON='$(PYTHON)' sh .ci/environment $(KILTED) ros-kilted,test-kilted
+	@$(KILTED)/bin/python -m pytest $(PYTEST_ARGS) $(LIVE_TESTS)
 
 # Needs root, or sudo; debootstrap; a connection.
 CHECK_FRESH ?= bookworm trixie
@@ -65,7 +76,7 @@ docs: env
 
 clean:
 	rm -rf build install log dist *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
-	find . -name $(VENV) -prune -o -name __pycache__ -type d -exec rm -rf {} +
+	find . -name '.venv*' -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
 distclean: clean
-	rm -rf $(VENV) $(VENV).lock
+	rm -rf $(VENV) $(VENV).lock $(KILTED) $(KILTED).lock

