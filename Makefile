@@ -64,8 +64,8 @@ fuzz: env
 SOAK_SECONDS ?= 600
 
 soak: env
-	@ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m mddag_executor.live.bench.soak \
-		config/autoware.yaml --seconds $(SOAK_SECONDS) $(SOAK_ARGS)
+	@ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python test/endurance/soak.py config/autoware.yaml \
+		--seconds $(SOAK_SECONDS) $(SOAK_ARGS)
 
 lint: env
 	@$(BIN)/python -m pytest -q -m linter test/test_linters.py test/test_layers.py

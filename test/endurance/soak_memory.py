@@ -25,11 +25,11 @@ import subprocess
 import sys
 import time
 
-from mddag_executor.live.bench.soak_nodes import SoakNodes
 from mddag_executor.live.execution import ExecutionPlan
 from msg_graph import load
 import rclpy
 from rclpy.utilities import try_shutdown
+from soak_nodes import SoakNodes
 
 WARM_UP_REMADE = 100
 TIMEOUT_S = 120.0
@@ -59,7 +59,7 @@ def kept_by_middleware(graph: str, remade: int) -> float:
     :param remade: how many nodes to make again.
     """
     done = subprocess.run(
-        [sys.executable, '-m', 'mddag_executor.live.bench.soak_memory', graph, str(remade)],
+        [sys.executable, __file__, graph, str(remade)],
         capture_output=True, text=True, timeout=TIMEOUT_S + remade, check=True)
     return float(done.stdout)
 

@@ -3,7 +3,7 @@
 """
 Endurance: a declared workload under one executor for as long as it takes, with random faults.
 
-    python -m mddag_executor.live.bench.soak config/autoware.yaml --seconds 600
+    python test/endurance/soak.py config/autoware.yaml --seconds 600
 
 Theory of operation
 -------------------
@@ -45,14 +45,14 @@ from typing import Any
 
 from mddag_executor.defaults import LIVE_SEED
 from mddag_executor.live import DeadlineMiss
-from mddag_executor.live.bench.soak_memory import in_use, kept_by_middleware, resident
-from mddag_executor.live.bench.soak_nodes import SimulatedTime, SoakFault, SoakNodes
 from mddag_executor.live.execution import ExecutionPlan
 from mddag_executor.live.executor import MultiDeadlineExecutor
 from msg_graph import load, TaskSet
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.utilities import try_shutdown
+from soak_memory import in_use, kept_by_middleware, resident
+from soak_nodes import SimulatedTime, SoakFault, SoakNodes
 
 FAULTS = ('destroy', 'raise', 'stop', 'burst', 'clock')
 FAULT_S, RECOVERY_S, CLEAN_S = 1.0, 1.0, 1.5

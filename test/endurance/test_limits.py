@@ -5,13 +5,16 @@ from __future__ import annotations
 
 import gc
 import json
+from pathlib import Path
 import subprocess
 import sys
 import time
 from typing import Any
 
-from mddag_executor.live.bench.limits import BODIES, BODY_S, GcWatch
+from limits import BODIES, BODY_S, GcWatch
 import pytest
+
+LIMITS = Path(__file__).with_name('limits.py')
 
 
 @pytest.mark.parametrize('name', BODIES)
@@ -34,7 +37,7 @@ def test_collections_are_noticed():
 
 def limits(*arguments: str) -> Any:
     done = subprocess.run(
-        [sys.executable, '-m', 'mddag_executor.live.bench.limits', *arguments, '--json'],
+        [sys.executable, str(LIMITS), *arguments, '--json'],
         capture_output=True, text=True, timeout=60, check=False, stdin=subprocess.DEVNULL)
     assert 'Traceback' not in done.stderr, done.stderr
     return done

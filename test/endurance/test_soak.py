@@ -1,0 +1,60 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+from threading import Thread
+from typing import Any
+import weakref
+
+import pytest
+from soak import FAULTS, MEMORY_RATIO
+from soak_memory import in_use, resident
+
+TOP = Path(__file__).resolve().parents[2]
+
+
+def soak(*arguments: str, timeout: float = 150.0) -> dict[str, Any]:
+    done = subprocess.run(
+        [sys.executable, 'test/endurance/soak.py', *arguments], cwd=TOP, text=True,
+        capture_output=True, timeout=timeout, check=False, stdin=subprocess.DEVNULL)
+    result: dict[str, Any] = json.loads(done.stdout)
+    assert done.returncode == (1 if result['failed'] else 0)
+    assert 'Traceback' not in done.stderr, done.stderr
+    return result
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('intake', ['events', 'waitset'])
+def test_a_short_soak_loses_nothing_and_keeps_nothing(intake: str):
+    """Deadlines are left to `make soak`: they depend on what else the machine does."""
+    result = soak(
+        'config/autoware.yaml', '--seconds', '25', '--utilisation', '0.5', '--seed', '3',
+        '--intake', intake)
+    failed = [line for line in result['failed'] if 'deadlines missed' not in line]
+    assert failed == []
+    assert sum(result['faults'][fault] for fault in FAULTS) == result['clean_windows'] >= 2
+    assert result['faults']['raised'] == result['faults']['raise'] + 1
+    assert result['ran'] > 10_000 and result['jobs'] > 2_000
+    # one that was made ready by the last tick of the simulated time may still wait
+    assert 0 <= result['executions'] - result['ran'] - result['dropped'] <= 2
+    assert -20_000 < result['middleware_keeps'] < 50_000, 'bytes for each node made again'
+    assert -0.5 < result['memory_growth'] <= MEMORY_RATIO
+
+
+def test_memory_that_was_freed_is_not_in_use():
+    before = in_use()
+    blocks = [bytes(10_000) for _ in range(8_000)]
+    assert resident() - before > 60_000_000
+    kept = blocks[::100]  # so that the C library can't give it all back by itself
+    del blocks
+    cycle: list[Any] = [Thread()]
+    cycle.append(cycle)
+    gone = weakref.ref(cycle[0])
+    del cycle
+    assert in_use() - before < 20_000_000
+    assert gone() is None and len(kept) == 80
