@@ -98,7 +98,8 @@ from mddag_executor.core.state import (
     PREEMPTIVE,
     PROPAGATE,
     RUNNING,
-    SINK_DONE,
+    SINK_IN_TIME,
+    SINK_LATE,
     State,
     SUSPENDED,
     SWITCH_OVERHEAD,
@@ -372,13 +373,14 @@ def _complete_vertex(
         return
     if t.sink_deadline[vertex] >= 0:
         deadline = s.job_release[slot] + t.sink_deadline[vertex]
-        judge(s, slot, SINK_DONE, vertex, deadline, now)
+        late = now > deadline
+        judge(s, slot, SINK_LATE if late else SINK_IN_TIME, vertex, deadline, now)
         s.job_sinks_left[slot] -= 1
-        if now > deadline:
+        if late:
             s.job_late[slot] += 1
         if s.job_sinks_left[slot] == 0:
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
-        elif now > deadline and t.on_miss[dag] == ABORT:
+        elif late and t.on_miss[dag] == ABORT:
             abort_job(t, s, slot, now)
     elif s.expected[vertex] == LAST_HERE:
         s.job_sinks_left[slot] -= 1

@@ -28,10 +28,14 @@ ELSEWHERE, HERE, LAST_HERE = range(3)
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
  JUDGE_FROM, SKIP, N_HOLDING, N_SCALARS) = range(12)
 
-# Decisions: (kind, DAG, global vertex, job index, deadline, time).  The deadline is that of the
-# sink; the time that of the decision, for a sink that completed the completion, else -1.  Instead
-# of a vertex the end of a job has -1, or NOT_JUDGED.
-SINK_DONE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, JOB_END, DROP, SINK_FAILED = range(7)
+# Decisions: (kind, DAG, global vertex, job index, deadline, time).  Each sink of a job is in time,
+# or late: it completed; or missed: it had not completed when the run ended past its deadline; or
+# its job was aborted, expired or failed.  The deadline is that of the sink; the time that of the
+# decision, for a sink that completed the completion, else -1.  Instead of a vertex the end of a
+# job has -1, or NOT_JUDGED.
+(SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, JOB_END,
+ DROP) = range(8)
+SINK_COMPLETED = (SINK_IN_TIME, SINK_LATE)
 NOT_JUDGED = -2
 
 Entry = tuple[int, int, int, int, int]

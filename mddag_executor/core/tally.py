@@ -24,9 +24,11 @@ from mddag_executor.core.state import (
     LATE,
     NOT_JUDGED,
     SINK_ABORTED,
-    SINK_DONE,
+    SINK_COMPLETED,
     SINK_EXPIRED,
     SINK_FAILED,
+    SINK_IN_TIME,
+    SINK_LATE,
     SINK_MISSED,
 )
 from mddag_executor.core.tables import Tables
@@ -207,10 +209,8 @@ class Tally:
         self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
     ) -> None:
         sink = self.sinks[vertex]
-        missed = True
-        if kind == SINK_DONE:
-            missed = time > deadline
-            sink.done(time - deadline + sink.relative_deadline_ns, missed)
+        if kind in SINK_COMPLETED:
+            sink.done(time - deadline + sink.relative_deadline_ns, kind == SINK_LATE)
         elif kind == SINK_MISSED:
             sink.late += 1
             sink.overdue += 1
@@ -220,13 +220,13 @@ class Tally:
             sink.failed += 1
         elif kind == SINK_ABORTED:
             sink.aborted += 1
-        if missed and (self.first_miss is None or (
+        if kind != SINK_IN_TIME and (self.first_miss is None or (
                 kind == self._first_kind == SINK_MISSED
                 and deadline < self.first_miss['deadline_ns'])):
             self._first_kind = kind
             self.first_miss = {
                 'dag': self._dags[dag].name, 'vertex': self.vertex_name(vertex), 'job': job,
-                'deadline_ns': deadline, 'completed_ns': time if kind == SINK_DONE else None}
+                'deadline_ns': deadline, 'completed_ns': time if kind == SINK_LATE else None}
 
     def vertex_name(self, vertex: int) -> str:
         """Return the name of a global vertex."""

@@ -18,9 +18,10 @@ from mddag_executor.core.state import (
     EXPIRED,
     JOB_END,
     SINK_ABORTED,
-    SINK_DONE,
     SINK_EXPIRED,
     SINK_FAILED,
+    SINK_IN_TIME,
+    SINK_LATE,
     SINK_MISSED,
 )
 from mddag_executor.core.stops import Stops
@@ -32,7 +33,7 @@ KEEP_RESPONSES = 2_000
 KEEP_ABORTED = 4096
 NO_ORIGIN = Origin(-1, -1, -1, -1)
 
-_WHY = {SINK_DONE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
+_WHY = {SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
         SINK_ABORTED: 'aborted', SINK_FAILED: 'failed'}
 
 
@@ -98,7 +99,7 @@ class Verdicts:
                 dropped.append(deadline)
             elif kind == JOB_END:
                 self._ended(dag, job, deadline, now)
-            elif kind != SINK_DONE or time > deadline:
+            elif kind != SINK_IN_TIME:
                 self._missed(kind, dag, vertex, job, deadline, time, now)
         return dropped
 
@@ -128,7 +129,7 @@ class Verdicts:
         if self._on_miss is not None:
             self.misses.append(DeadlineMiss(
                 self._dags[dag].name, self.tally.vertex_name(vertex), job, release, deadline,
-                time if kind == SINK_DONE else None, _WHY[kind]))
+                time if kind == SINK_LATE else None, _WHY[kind]))
 
     def tell(self) -> None:
         """Tell the user of the misses since the last call."""

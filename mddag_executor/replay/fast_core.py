@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 from mddag_executor.core import jobs, rules
-from mddag_executor.core.state import add_slot, IDLE, JOB_END, SINK_DONE
+from mddag_executor.core.state import add_slot, IDLE, JOB_END, SINK_IN_TIME, SINK_LATE
 from mddag_executor.replay import fast_work as fw
 from mddag_executor.replay.fast_paths import count_row
 from mddag_executor.replay.fast_tables import find, insert, remove
@@ -179,9 +179,9 @@ def take_decisions(t: Any, s: Any, w: Any, slot: int, seen: int) -> bool:
             remove(w.slots, find(w.slots, dag, job, 0, 0))
             w.counts[fw.SLOTS] -= 1
             continue
-        if kind == SINK_DONE and not sink_done(t, s, w, slot, vertex, job, time):
+        if kind <= SINK_LATE and not sink_done(t, s, w, slot, vertex, job, time):
             return False
-        if w.scalars[fw.COMPARE] != 0 and (kind != SINK_DONE or time > deadline):
+        if w.scalars[fw.COMPARE] != 0 and kind != SINK_IN_TIME:
             note_miss(w, 1, dag, vertex, job, deadline, time)
     return True
 

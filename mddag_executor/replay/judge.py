@@ -30,9 +30,10 @@ from mddag_executor.core.state import (
     JOB_END,
     JUDGE_FROM,
     SINK_ABORTED,
-    SINK_DONE,
+    SINK_COMPLETED,
     SINK_EXPIRED,
     SINK_FAILED,
+    SINK_LATE,
     SINK_MISSED,
     SKIP,
 )
@@ -210,9 +211,9 @@ class Judge(Observer):
         for kind, dag, vertex, job, deadline, time in decisions:
             if kind == JOB_END:
                 del self._slots[(dag, job)]
-            elif kind == SINK_DONE:
+            elif kind in SINK_COMPLETED:
                 self.chains.sink(slot, vertex, job, time)
-                if time > deadline and self.compare:
+                if kind == SINK_LATE and self.compare:
                     self.differ(Miss(dag, vertex, job, deadline, time), 1)
             elif kind in _MISSES and self.compare:
                 self.differ(Miss(dag, vertex, job, deadline, time), 1)

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mddag_executor.core import Tables, Tally
-from mddag_executor.core.state import SINK_DONE
+from mddag_executor.core.state import SINK_IN_TIME
 from mddag_executor.core.tally import counts, total
 from mddag_executor.text import counted
 from msg_graph import TaskSet
@@ -77,7 +77,7 @@ class MissTally(Tally):
         self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
     ) -> None:
         super()._add_sink(kind, dag, vertex, job, deadline, time)
-        if kind != SINK_DONE or time > deadline:
+        if kind != SINK_IN_TIME:
             self.missed_jobs[vertex].add(job)
 
     def add_bursts(self, dags: Mapping[str, Any]) -> None:

@@ -40,9 +40,11 @@ from mddag_executor.core.state import (
     DROP,
     JOB_END,
     SINK_ABORTED,
-    SINK_DONE,
+    SINK_COMPLETED,
     SINK_EXPIRED,
     SINK_FAILED,
+    SINK_IN_TIME,
+    SINK_LATE,
     SINK_MISSED,
 )
 from mddag_executor.errors import MddagError
@@ -58,8 +60,9 @@ MOST_HELD = 1024
 MOST_ORDERED = 65536
 BATCH = 65536
 
-_VERDICTS = {SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired', SINK_ABORTED: 'aborted',
-             SINK_FAILED: 'failed'}
+_VERDICTS = {
+    SINK_IN_TIME: 'in_time', SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
+    SINK_ABORTED: 'aborted', SINK_FAILED: 'failed'}
 
 
 class ExecutionRow(NamedTuple):
@@ -237,15 +240,11 @@ class Exporter(Observer):
         self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
     ) -> None:
         release = deadline - self._tables.sink_deadline[vertex]
-        completed = time if kind == SINK_DONE else None
-        if completed is None:
-            verdict = _VERDICTS[kind]
-        else:
-            verdict = 'in_time' if completed <= deadline else 'late'
+        completed = time if kind in SINK_COMPLETED else None
         self.target.verdict(JobRow(
             self._dags[dag], job, self._names[vertex], self._seconds(release), release, deadline,
             completed, None if completed is None else completed - release,
-            None if completed is None else deadline - completed, verdict), vertex)
+            None if completed is None else deadline - completed, _VERDICTS[kind]), vertex)
 
 
 def export_schedule(schedule: Schedule, target: Target) -> None:

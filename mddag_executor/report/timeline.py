@@ -30,9 +30,10 @@ from mddag_executor.core.state import (
     DROP,
     JOB_END,
     SINK_ABORTED,
-    SINK_DONE,
     SINK_EXPIRED,
     SINK_FAILED,
+    SINK_IN_TIME,
+    SINK_LATE,
     SINK_MISSED,
 )
 from mddag_executor.replay import batches
@@ -50,8 +51,9 @@ OTHERS = 'other undeclared callbacks'
 
 # What came of a sink's job, as the pictures and exports call it.
 DONE, OVERDUE, EXPIRED, ABORTED, FAILED = range(5)
-_KINDS = {SINK_DONE: DONE, SINK_MISSED: OVERDUE, SINK_EXPIRED: EXPIRED, SINK_ABORTED: ABORTED,
-          SINK_FAILED: FAILED}
+_KINDS = {
+    SINK_IN_TIME: DONE, SINK_LATE: DONE, SINK_MISSED: OVERDUE, SINK_EXPIRED: EXPIRED,
+    SINK_ABORTED: ABORTED, SINK_FAILED: FAILED}
 
 _FIRST_WIDTH = 1 << 16      # of a bin, ns
 _ADDRESS = 2 ** 64 - 1
@@ -218,7 +220,7 @@ class Timeline(Observer):
                 continue
             verdict = _KINDS[kind]
             block.verdicts.extend((vertex, job, deadline, time, verdict))
-            if verdict != DONE or time > deadline:
+            if kind != SINK_IN_TIME:
                 block.missed += 1
                 if 6 * filled < self._block_size and len(self._blocks) > 1:
                     self._blocks[-2].missed += 1    # where much of the job ran
@@ -262,7 +264,7 @@ class Timeline(Observer):
         for (kind, *_, deadline, time), after in zip(
                 batch.decisions, batch.decided_after.tolist()):
             if after == 0 and kind not in (JOB_END, DROP) and (
-                    _KINDS[kind] != DONE or time > deadline):
+                    kind != SINK_IN_TIME):
                 self.bins.place(max(time, deadline))
                 return
         if len(batch.pieces):

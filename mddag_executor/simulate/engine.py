@@ -27,14 +27,7 @@ from typing import NamedTuple
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.state import (
-    add_slot,
-    SINK_ABORTED,
-    SINK_DONE,
-    SINK_EXPIRED,
-    SINK_MISSED,
-    State,
-)
+from mddag_executor.core.state import add_slot, DROP, JOB_END, SINK_IN_TIME, State
 from mddag_executor.core.tables import NEVER, Tables
 
 # Kinds of log entries.
@@ -160,9 +153,7 @@ def _note(
 def any_missed(s: State, first: int) -> bool:
     """Tell whether a miss is among the decisions from number ``first`` on."""
     for i in range(first, len(s.decisions)):
-        kind, deadline, time = s.decisions[i][0], s.decisions[i][4], s.decisions[i][5]
-        if kind == SINK_DONE and time > deadline:
-            return True
-        if kind == SINK_MISSED or kind == SINK_EXPIRED or kind == SINK_ABORTED:
+        kind = s.decisions[i][0]
+        if kind != SINK_IN_TIME and kind != JOB_END and kind != DROP:
             return True
     return False

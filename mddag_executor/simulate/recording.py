@@ -30,9 +30,9 @@ from mddag_executor.core.state import (
     EXPIRED,
     JOB_END,
     SINK_ABORTED,
-    SINK_DONE,
+    SINK_COMPLETED,
     SINK_EXPIRED,
-    SINK_MISSED,
+    SINK_IN_TIME,
 )
 from mddag_executor.simulate.engine import END, Load, LogEntry, START
 from mddag_executor.simulate.run import Run
@@ -129,7 +129,8 @@ class _Merger:
     def _verdict(self, dag: int, v: int, job: int, now: int) -> Iterator[Event]:
         """Yield what the completion of a vertex decided."""
         i = self._next_decision
-        if self._decision(i)[:4] != (SINK_DONE, dag, v, job):
+        kind, *of = self._decision(i)[:4]
+        if kind not in SINK_COMPLETED or of != [dag, v, job]:
             return  # no sink, or its job has ended before
         yield from self._decided(i, now)
         ahead = self._ahead()
@@ -190,5 +191,5 @@ class _Merger:
         vertex = self._vertices[v]
         if kind == DROP:
             yield ('drop', now, 0, self._address[v], dag, vertex.index, job, 'aborted')
-        elif kind in (SINK_MISSED, SINK_EXPIRED, SINK_ABORTED) or time > deadline:
+        elif kind != SINK_IN_TIME:
             yield ('deadline', now, 0, dag, vertex.index, job, deadline, time)

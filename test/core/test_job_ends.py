@@ -15,9 +15,9 @@ from mddag_executor.core.state import (
     JOB_END,
     OPEN,
     SINK_ABORTED,
-    SINK_DONE,
     SINK_EXPIRED,
     SINK_FAILED,
+    SINK_LATE,
     SINK_MISSED,
     WAITING,
 )
@@ -180,7 +180,7 @@ def test_an_abort_drops_what_waits_and_spares_what_has_started() -> None:
     scheduler.suspend(y)
     scheduler.complete(x, 6 * US)            # late by 1 us
     assert scheduler.decisions() == [
-        (SINK_DONE, 0, 1, 0, 5 * US, 6 * US), (SINK_ABORTED, 0, 2, 0, 50 * US, -1),
+        (SINK_LATE, 0, 1, 0, 5 * US, 6 * US), (SINK_ABORTED, 0, 2, 0, 50 * US, -1),
         (SINK_ABORTED, 0, 3, 0, 60 * US, -1), (JOB_END, 0, -1, 0, ABORTED, 6 * US)]
     scheduler.resume(y)
     assert scheduler.take(0, 7 * US) == y, 'it has started, so it runs on'

@@ -35,7 +35,7 @@ from mddag_executor.core.state import (
     LATE,
     OPEN,
     SINK_ABORTED,
-    SINK_DONE,
+    SINK_COMPLETED,
     SINK_EXPIRED,
 )
 
@@ -286,8 +286,8 @@ class LiveDriver(RuleBasedStateMachine):
                 _, dag, vertex, job, _, _ = decision
                 self.sinks[dag, vertex, job] += 1
                 assert self.sinks[dag, vertex, job] == 1, 'two verdicts'
-                self.completed_sinks[dag, job] += kind == SINK_DONE
-                assert kind in (SINK_DONE, SINK_ABORTED, SINK_EXPIRED)
+                self.completed_sinks[dag, job] += kind in SINK_COMPLETED
+                assert kind in (*SINK_COMPLETED, SINK_ABORTED, SINK_EXPIRED)
 
     def dropped(self, decision: Decision) -> None:
         _, dag, vertex, job, x, now = decision

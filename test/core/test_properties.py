@@ -22,8 +22,9 @@ from mddag_executor.core.state import (
     ORDER,
     RUNNING,
     SINK_ABORTED,
-    SINK_DONE,
+    SINK_COMPLETED,
     SINK_EXPIRED,
+    SINK_LATE,
     WAITING,
 )
 from mddag_executor.simulate import END, LogEntry, PREEMPT, Settings
@@ -232,22 +233,21 @@ def test_every_job_ends_in_exactly_one_way(case: Case, last_release: int) -> Non
     released = {(dag.index, job) for dag in dags
                 for job in range(-(-last_release * TICK // dag.period_ns))}
     ends: dict[tuple[int, int], int] = {}
-    sinks: dict[Id, tuple[int, bool]] = {}
+    sinks: dict[Id, int] = {}
     for kind, dag, vertex, job, deadline, time in run.decisions:
         if kind == JOB_END:
             assert (dag, job) not in ends
             ends[dag, job] = deadline
-        elif kind in (SINK_DONE, SINK_ABORTED, SINK_EXPIRED):
+        elif kind in (*SINK_COMPLETED, SINK_ABORTED, SINK_EXPIRED):
             assert (dag, vertex, job) not in sinks
-            sinks[dag, vertex, job] = kind, time > deadline
+            assert (kind == SINK_LATE) == (kind in SINK_COMPLETED and time > deadline)
+            sinks[dag, vertex, job] = kind
     assert set(ends) == released
     assert len(sinks) == sum(len(dags[dag].sinks) for dag, _ in released)
     for (dag, job), end in ends.items():
-        mine = [verdict for each, verdict in sinks.items() if (each[0], each[2]) == (dag, job)]
-        kinds = {kind for kind, _ in mine}
-        late = any(late for kind, late in mine if kind == SINK_DONE)
-        if kinds == {SINK_DONE}:
-            assert end == (LATE if late else COMPLETED)
+        kinds = {kind for each, kind in sinks.items() if (each[0], each[2]) == (dag, job)}
+        if kinds.issubset(SINK_COMPLETED):
+            assert end == (LATE if SINK_LATE in kinds else COMPLETED)
         else:
             assert end == (ABORTED if SINK_ABORTED in kinds else EXPIRED)
             assert not {SINK_ABORTED, SINK_EXPIRED} <= kinds

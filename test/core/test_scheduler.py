@@ -14,8 +14,8 @@ from mddag_executor.core.state import (
     JOB_END,
     LATE,
     OPEN,
-    SINK_DONE,
     SINK_EXPIRED,
+    SINK_IN_TIME,
 )
 import pytest
 
@@ -41,7 +41,7 @@ def test_a_sync_completes_with_the_leg_that_makes_it_whole(order: tuple[int, int
     assert scheduler.decisions() == []
     assert run_one(scheduler, last, 30) is True
     assert scheduler.decisions() == [
-        (SINK_DONE, 0, J, 0, 50 * US, 30), (JOB_END, 0, -1, 0, COMPLETED, 30)]
+        (SINK_IN_TIME, 0, J, 0, 50 * US, 30), (JOB_END, 0, -1, 0, COMPLETED, 30)]
     assert scheduler.state.job_state[slot] == FREE
 
 

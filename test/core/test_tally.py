@@ -21,8 +21,9 @@ from mddag_executor.core.state import (
     JOB_END,
     LATE,
     SINK_ABORTED,
-    SINK_DONE,
     SINK_EXPIRED,
+    SINK_IN_TIME,
+    SINK_LATE,
     SINK_MISSED,
 )
 from mddag_executor.core.tally import Latest
@@ -44,7 +45,8 @@ def tally(keep: int | None = None) -> Tally:
 def done(vertex: int, job: int, response: int) -> Decision:
     """Return the decision on a completion; jobs are released each 100 us."""
     release = 100 * US * job
-    return (SINK_DONE, 0, vertex, job, release + 10 * US * vertex, release + response)
+    deadline, time = release + 10 * US * vertex, release + response
+    return (SINK_LATE if time > deadline else SINK_IN_TIME, 0, vertex, job, deadline, time)
 
 
 def test_a_tally_of_everything() -> None:

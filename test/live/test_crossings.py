@@ -19,8 +19,9 @@ from mddag_executor.core.state import (
     EXPIRED,
     JOB_END,
     LATE,
-    SINK_DONE,
     SINK_EXPIRED,
+    SINK_IN_TIME,
+    SINK_LATE,
     SINK_MISSED,
 )
 from mddag_executor.live import current_job
@@ -94,15 +95,15 @@ def test_a_part_without_sinks_completes_when_all_that_ends_here_has():
 def test_sinks_are_judged_where_they_are_only():
     part = Part(LEFT, ONE)
     assert part.run(LEFT, MS) == []
-    assert part.run(ONE, 11 * MS) == [(SINK_DONE, ONE), (JOB_END, LATE)]
+    assert part.run(ONE, 11 * MS) == [(SINK_LATE, ONE), (JOB_END, LATE)]
     part = Part(TWO)
-    assert part.run(TWO, 11 * MS) == [(SINK_DONE, TWO), (JOB_END, COMPLETED)]
+    assert part.run(TWO, 11 * MS) == [(SINK_IN_TIME, TWO), (JOB_END, COMPLETED)]
 
 
 def test_a_part_that_is_left_and_entered_again_ends_with_its_sink():
     part = Part(SOURCE, ONE)
     assert part.run(SOURCE, MS) == []
-    assert part.run(ONE, 5 * MS) == [(SINK_DONE, ONE), (JOB_END, COMPLETED)]
+    assert part.run(ONE, 5 * MS) == [(SINK_IN_TIME, ONE), (JOB_END, COMPLETED)]
 
 
 def test_what_is_elsewhere_does_not_expire_here():
@@ -118,8 +119,8 @@ def test_a_whole_dag_is_judged_as_ever():
     part = Part(SOURCE, LEFT, RIGHT, ONE, TWO)
     for vertex in (SOURCE, LEFT, RIGHT):
         assert part.run(vertex, MS) == []
-    assert part.run(ONE, 2 * MS) == [(SINK_DONE, ONE)]
-    assert part.run(TWO, 2 * MS) == [(SINK_DONE, TWO), (JOB_END, COMPLETED)]
+    assert part.run(ONE, 2 * MS) == [(SINK_IN_TIME, ONE)]
+    assert part.run(TWO, 2 * MS) == [(SINK_IN_TIME, TWO), (JOB_END, COMPLETED)]
 
 
 # --- stamps --------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from mddag_executor.core import Tables, Tally
-from mddag_executor.core.state import SINK_DONE, SINK_EXPIRED
+from mddag_executor.core.state import SINK_EXPIRED, SINK_IN_TIME, SINK_LATE
 from mddag_executor.errors import UsageError
 from mddag_executor.live.diagnostics import DagWatch, ERROR, OK, STALE, WARN
 from mddag_executor.live.settings import diagnostics_period_ns, Thresholds
@@ -40,7 +40,7 @@ class Watched:
 
     def after(self, in_time: int = 0, late: int = 0, expired: int = 0) -> Any:
         for kind, count, response in (
-            (SINK_DONE, in_time, 20_000_000), (SINK_DONE, late, 60_000_000),
+            (SINK_IN_TIME, in_time, 20_000_000), (SINK_LATE, late, 60_000_000),
             (SINK_EXPIRED, expired, -1),
         ):
             for _ in range(count):

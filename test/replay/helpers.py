@@ -26,7 +26,8 @@ from mddag_executor.core.state import (
     IDLE,
     JOB_END,
     OPEN,
-    SINK_DONE,
+    SINK_COMPLETED,
+    SINK_IN_TIME,
 )
 from mddag_executor.trace import TraceFile
 from msg_graph import loads, TaskSet
@@ -350,8 +351,8 @@ class VirtualRun:
                 if deadline in (ABORTED, EXPIRED):
                     self.record('abort' if deadline == ABORTED else 'expire', now, 2, dag, job)
             else:
-                if kind == SINK_DONE:
+                if kind in SINK_COMPLETED:
                     self.responses.append(time - deadline + self.tables.sink_deadline[vertex])
-                if kind != SINK_DONE or time > deadline:
+                if kind != SINK_IN_TIME:
                     self.record('deadline', now, 2, dag, self.tables.index_in_dag[vertex], job,
                                 deadline, time)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mddag_executor.core import NEVER, Tables
-from mddag_executor.core.state import Decision, SINK_DONE
+from mddag_executor.core.state import Decision, SINK_LATE
 from mddag_executor.simulate.engine import END, Load, LogEntry, START
 from mddag_executor.trace import TraceFile
 from msg_graph import TaskSet
@@ -50,7 +50,7 @@ def write_simulated(
             events.append(('complete', time, 100 + worker, address, *where,
                            leg == legs.n_legs[vertex] - 1, time, leg))
     for kind, dag, vertex, job, deadline, time in decisions:
-        if kind == SINK_DONE and time > deadline:
+        if kind == SINK_LATE:
             events.append(
                 ('deadline', time, 2, dag, legs.index_in_dag[vertex], job, deadline, time))
     with TraceFile(path) as file:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Tables
-from mddag_executor.core.state import new_state, SINK_DONE
+from mddag_executor.core.state import new_state, SINK_COMPLETED
 from mddag_executor.replay import reschedule
 from mddag_executor.replay.timed import busy_times, edge_numbers, edges_of, Engine, Transports
 from mddag_executor.simulate import END, Load, PREEMPT, START
@@ -58,7 +58,7 @@ def engine(
     run.run(horizon)
     starts = [(time // 1000, worker, vertex) for time, kind, worker, _, vertex, _ in run.log
               if kind == START]
-    done = [(d[2], d[5] // 1000) for d in state.decisions if d[0] == SINK_DONE]
+    done = [(d[2], d[5] // 1000) for d in state.decisions if d[0] in SINK_COMPLETED]
     assert edges_of(tables) == [3, 0]
     return starts, done
 

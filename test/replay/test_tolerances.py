@@ -17,8 +17,10 @@ from mddag_executor.core import Tables
 from mddag_executor.core.state import (
     Decision,
     SINK_ABORTED,
-    SINK_DONE,
+    SINK_COMPLETED,
     SINK_EXPIRED,
+    SINK_IN_TIME,
+    SINK_LATE,
     SINK_MISSED,
 )
 from mddag_executor.core.tally import counts
@@ -45,8 +47,10 @@ def sink_of(missed: list[bool]) -> dict[str, Any]:
     decisions: list[Decision] = []
     for job, miss in enumerate(missed):
         deadline = job * 10 * MS + 8 * MS
-        kind = (SINK_DONE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED)[job % 4] if miss else SINK_DONE
-        time = deadline + miss if kind == SINK_DONE else -1
+        kind = SINK_IN_TIME
+        if miss:
+            kind = (SINK_LATE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED)[job % 4]
+        time = deadline + miss if kind in SINK_COMPLETED else -1
         decisions.append((kind, 0, 0, job, deadline, time))
     tally.add(reversed(decisions))      # jobs may complete out of order
     result = tally.result()

@@ -9,7 +9,7 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mddag_executor.core.state import SINK_DONE, SINK_MISSED
+from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE, SINK_MISSED
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.bags_reschedule import reschedule_bag
 from mddag_executor.replay.follower import Observer, Piece
@@ -185,7 +185,8 @@ def test_detail_is_bounded_and_keeps_the_misses() -> None:
         timeline.released(0, i, 100 * i, 100 * i)
         timeline.ran(piece(0, i, 100 * i, 100 * i + 50))
         late = i in (333, 777)
-        timeline.decided([(SINK_DONE, 0, 0, i, 100 * i + 60, 100 * i + (70 if late else 50))])
+        timeline.decided([(SINK_LATE if late else SINK_IN_TIME, 0, 0, i, 100 * i + 60,
+                           100 * i + (70 if late else 50))])
     columns = timeline.columns()
     assert timeline.n_executions == 1000 and timeline.n_missed == 2
     assert timeline.kept == len(columns.executions[0]) <= 100
