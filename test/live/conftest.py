@@ -56,6 +56,12 @@ def wait_for(condition: Callable[[], Any], seconds: float = 15.0) -> bool:
     return True
 
 
+def is_idle(executor: MultiDeadlineExecutor) -> bool:
+    """Tell whether nothing runs or waits."""
+    statistics = executor.statistics()
+    return bool(not statistics['queue'] and statistics['idle_workers'] == statistics['workers'])
+
+
 def interrupted(program: str, *arguments: str) -> tuple[int, str, str]:
     """Run a program that prints ``ready``, then SIGINT it; return exit status, output, errors."""
     process = subprocess.Popen(

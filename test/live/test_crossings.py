@@ -32,7 +32,7 @@ from msg_graph import loads
 import pytest
 from std_msgs.msg import Header
 
-from .conftest import Spinning, wait_for
+from .conftest import is_idle, Spinning, wait_for
 
 CHAIN = """
 mddag: 1
@@ -191,8 +191,8 @@ class Nodes:
             executor.wake()
         assert wait_for(lambda: len(self.jobs.get('last', ())) >= 20)
         self.timer.cancel()
-        assert wait_for(lambda: len(self.jobs['last']) == len(self.stamps))
-        time.sleep(0.02)
+        assert wait_for(lambda: len(self.jobs['last']) == len(self.stamps)
+                        and all(map(is_idle, executors)))
 
 
 def ends(executor: Any) -> dict[str, int]:
@@ -201,7 +201,8 @@ def ends(executor: Any) -> dict[str, int]:
 
 def test_a_job_goes_on_in_another_executor_with_its_stamp_as_release(make_executor, make_node):
     nodes = Nodes(make_node)
-    up, down = make_executor(loads(CHAIN)), make_executor(loads(CHAIN))
+    text = CHAIN.replace('100ms', '60s')
+    up, down = make_executor(loads(text)), make_executor(loads(text))
     for executor, names in ((up, ('sensor', 'first')), (down, ('second', 'last'))):
         for name in names:
             executor.add_node(nodes.nodes[name])
@@ -212,16 +213,18 @@ def test_a_job_goes_on_in_another_executor_with_its_stamp_as_release(make_execut
         assert [job.job for job, _ in nodes.jobs[name]] == list(range(n))
         for job, stamp in nodes.jobs[name]:
             assert abs(job.release_ns - stamp) < 2 * MS
-    assert [job.job for job, _ in nodes.jobs['first']] == list(range(n))
-    for executor in (up, down):
+    assert [job.job for job, _ in nodes.jobs['first']] == [
+        job.job for job, _ in nodes.jobs['sensor']]
+    skipped = up.statistics()['callbacks']['/sensor:tick']['skipped']  # on a busy machine
+    for executor, expired in ((up, skipped), (down, 0)):
         statistics = executor.statistics()
         assert statistics['undeclared'] == 0 and statistics['never_ran'] == []
         assert ends(executor) == {
-            'completed': n, 'late': 0, 'aborted': 0, 'expired': 0, 'failed': 0}
+            'completed': n, 'late': 0, 'aborted': 0, 'expired': expired, 'failed': 0}
     assert up.statistics()['dags']['chain']['sinks'] == {}
     sink = down.statistics()['dags']['chain']['sinks']['/last:sink']
     assert (sink['completed'], sink['late']) == (n, 0)
-    assert not up.statistics()['deadline_missed']
+    assert up.statistics()['deadline_missed'] is (skipped > 0)
 
 
 def test_a_dag_leaves_and_comes_back_to_the_same_job(make_executor, make_node):
@@ -288,9 +291,9 @@ def test_a_message_without_a_stamp_is_undeclared(lone):
 def test_a_second_message_of_a_job_that_has_ended_is_undeclared(lone):
     executor, half, nodes = lone
     stamp = time.time_ns()
-    for _ in range(2):
-        half.publish(stamped(stamp))
-        time.sleep(0.05)
+    half.publish(stamped(stamp))
+    assert wait_for(lambda: sum(ends(executor).values()) == 1)
+    half.publish(stamped(stamp))
     assert wait_for(lambda: len(nodes.jobs.get('last', ())) == 2)
     assert nodes.jobs['second'][0][0] is not None
     assert nodes.jobs['second'][1][0] is None
@@ -379,7 +382,9 @@ def test_two_processes_share_a_graph_and_the_sink_judges(
         up.kill()
         down.kill()
     assert upper['dags']['chain']['sinks'] == {} and not upper['deadline_missed']
-    assert upper['dags']['chain']['ends']['expired'] <= 5
+    # apart from releases that a busy machine skipped
+    skipped = upper['dags']['chain']['jobs'] - upper['callbacks']['/sensor:tick']['ran']
+    assert upper['dags']['chain']['ends']['expired'] <= skipped + 5
     chain = lower['dags']['chain']
     assert 10 < chain['jobs'] <= upper['dags']['chain']['jobs']
     assert lower['unattributed']['doubtful'] == 0 and lower['never_ran'] == []

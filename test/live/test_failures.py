@@ -62,7 +62,8 @@ def agrees(trace: Path, statistics: dict[str, Any]) -> None:
     again = reschedule(trace).result()
     for name, dag in statistics['dags'].items():
         assert result['dags'][name]['ends'] == dag['ends']
-        assert again['dags'][name]['ends']['failed'] == dag['ends']['failed']
+        # Rescheduled, skipped releases run, too, and the last ones may not get to an end.
+        assert 0 < again['dags'][name]['ends']['failed'] <= dag['ends']['failed']
         for sink, counts in dag['sinks'].items():
             found = result['dags'][name]['sinks'][sink]
             assert {key: found[key] for key in counts if key != 'response_ns'} == {

@@ -159,9 +159,9 @@ def test_replay_counts_what_the_executor_counted(
 
     # something happened in each of the ways that there are
     sinks = {name: sink for dag in live['dags'].values() for name, sink in dag['sinks'].items()}
-    assert min(dag['jobs'] for dag in live['dags'].values()) > 50
+    assert min(dag['jobs'] for dag in live['dags'].values()) > 30
     assert sinks['/fuse:join']['late'] > 3
-    assert sinks['/right:watch']['completed'] > 50
+    assert sinks['/right:watch']['completed'] > 20
     assert sinks['/filter:show']['aborted'] + sinks['/filter:show']['late'] > 3
     for breakdown, response in breakdowns:
         worst = breakdown['worst']
