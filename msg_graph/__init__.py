@@ -18,7 +18,6 @@ from msg_graph.declaration import parse_declaration
 from msg_graph.derive import derive_task_set
 from msg_graph.duration import DurationError, format_duration, parse_duration
 from msg_graph.errors import GraphError, GraphErrors
-from msg_graph.flat import flat_text
 from msg_graph.model import (
     Callback,
     Dag,
@@ -69,11 +68,10 @@ def loads(
     text = decode(text, name) if isinstance(text, bytes) else text
     try:
         with _no_collection():
-            declaration = parse_declaration(text, name, None if path is None else fspath(path))
-            return derive_task_set(declaration, flat_text(declaration) if declaration.composed
-                                   else text)
+            return derive_task_set(
+                parse_declaration(text, name, None if path is None else fspath(path)))
     except GraphError as error:
-        from msg_graph.blanks import with_blanks
+        from msg_graph.draft_text import with_blanks
         raise with_blanks(error, text, name) from None
 
 

@@ -25,15 +25,33 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from msg_graph.draft import Draft, DraftCallback, DraftNode, DraftPath
+from msg_graph.draft_text import declaration_of
 from msg_graph.errors import GraphError, shown
-from msg_graph.fields import check_callback, check_group, check_node, check_service, check_topic
-from msg_graph.sketch import Sketch, SketchCallback, SketchNode, SketchPath
+from msg_graph.names import CALLBACK, GROUP, Name, NODE, SERVICE, TOPIC
 from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Sequence, Tree
 
 _REMEDY = "give an architecture file as caret_analyze's Architecture.export writes it"
 
 
-def read_architecture(text: str, file: str) -> Sketch:
+def declaration_from_caret(
+    text: str, file: str, measure: Callable[[Draft], object] | None = None
+) -> str:
+    """
+    Return the text of a declaration with marked blanks.
+
+    :param text: the architecture file's.
+    :param file: its name, for errors and for the first line.
+    :param measure: fills in what was measured, before the declaration is written.
+    :raises GraphError: it is not YAML, or no architecture file.
+    """
+    draft = read_architecture(text, file)
+    if measure is not None:
+        measure(draft)
+    return declaration_of(draft)
+
+
+def read_architecture(text: str, file: str) -> Draft:
     """
     Return what an architecture file says.
 
@@ -45,7 +63,7 @@ def read_architecture(text: str, file: str) -> Sketch:
     reader = _Reader(file)
     nodes = [reader.node(each) for each in reader.mappings(tree, 'nodes')]
     paths = [reader.path(each) for each in reader.mappings(tree, 'named_paths')]
-    return Sketch(
+    return Draft(
         f'the CARET architecture file {file}', [node for node in nodes if node.callbacks], paths)
 
 
@@ -79,16 +97,15 @@ class _Reader:
         items = value.items if isinstance(value, Sequence) else []
         return [item.text for item in items if isinstance(item, Scalar)]
 
-    def name(self, tree: Mapping, key: str,
-             check: Callable[[str], tuple[str, str] | None]) -> str:
-        text = self.text(tree, key)
-        wrong = check(text)
+    def name(self, tree: Mapping, key: str, what: Name, text: str | None = None) -> str:
+        text = self.text(tree, key) if text is None else text
+        wrong = what.check(text)
         if wrong is not None:
             raise GraphError(self._file, tree.line, f"'{key}': {wrong[0]}", wrong[1])
         return text
 
-    def node(self, tree: Mapping) -> SketchNode:
-        node = SketchNode(self.name(tree, 'node_name', check_node))
+    def node(self, tree: Mapping) -> DraftNode:
+        node = DraftNode(self.name(tree, 'node_name', NODE))
         for each in self.mappings(tree, 'callbacks'):
             callback = self.callback(each, node.name)
             full = self.text(each, 'callback_name')
@@ -98,7 +115,7 @@ class _Reader:
         for each in self.mappings(tree, 'callback_groups'):
             self._group(node, each)
         for each in self.mappings(tree, 'subscribes'):
-            topic = self.name(each, 'topic_name', check_topic)
+            topic = self.name(each, 'topic_name', TOPIC)
             if self.text(each, 'callback_name') not in node.callbacks:
                 node.taken.append(topic)
         for each in self.mappings(tree, 'publishes'):
@@ -112,38 +129,36 @@ class _Reader:
             self._context(node, each)
         return node
 
-    def callback(self, tree: Mapping, node: str) -> SketchCallback:
+    def callback(self, tree: Mapping, node: str) -> DraftCallback:
         full = self.text(tree, 'callback_name')
         name = full[len(node) + 1:] if full.startswith(f'{node}/') else full.rpartition('/')[2]
-        wrong = check_callback(name)
-        if wrong is not None:
-            raise GraphError(self._file, tree.line, f"'callback_name': {wrong[0]}", wrong[1])
+        self.name(tree, 'callback_name', CALLBACK, name)
         kind = self.text(tree, 'callback_type').removesuffix('_callback')
         if kind == 'timer':
             period = self.text(tree, 'period_ns')
             if not (period.isascii() and period.isdecimal() and 0 < int(period[:19]) < 2 ** 62):
                 raise self.error(tree, f"'period_ns' is {shown(period)}")
-            return SketchCallback(node, name, kind, period_ns=int(period))
+            return DraftCallback(node, name, kind, period_ns=int(period))
         if kind == 'subscription':
-            return SketchCallback(node, name, kind, [self.name(tree, 'topic_name', check_topic)])
+            return DraftCallback(node, name, kind, [self.name(tree, 'topic_name', TOPIC)])
         if kind == 'service':
-            service = self.name(tree, 'service_name', check_service)
-            return SketchCallback(node, name, kind, [service])
+            service = self.name(tree, 'service_name', SERVICE)
+            return DraftCallback(node, name, kind, [service])
         raise self.error(tree, f"'callback_type' {shown(kind)} is not known")
 
-    def _group(self, node: SketchNode, tree: Mapping) -> None:
+    def _group(self, node: DraftNode, tree: Mapping) -> None:
         members = [node.callbacks[name] for name in self.texts(tree, 'callback_names')
                    if name in node.callbacks]
         name = self.text(tree, 'callback_group_name').rpartition('/')[2]
         if self.text(tree, 'callback_group_type') != 'mutually_exclusive' or len(members) < 2:
             return
-        if check_group(name) is not None:
+        if GROUP.check(name) is not None:
             raise self.error(tree, f"'callback_group_name' {shown(name)} is no name")
         for callback in members:
             callback.group = name
 
-    def _publisher(self, node: SketchNode, tree: Mapping) -> None:
-        topic = self.name(tree, 'topic_name', check_topic)
+    def _publisher(self, node: DraftNode, tree: Mapping) -> None:
+        topic = self.name(tree, 'topic_name', TOPIC)
         names = self.texts(tree, 'callback_names')
         known = [node.callbacks[name] for name in names if name in node.callbacks]
         if not known and len(node.callbacks) == 1:
@@ -155,7 +170,7 @@ class _Reader:
             for callback in node.callbacks.values():
                 callback.maybe.append(topic)
 
-    def _context(self, node: SketchNode, tree: Mapping) -> None:
+    def _context(self, node: DraftNode, tree: Mapping) -> None:
         kind = tree.entries.get('context_type')
         if not isinstance(kind, Scalar) or kind.text != 'use_latest_message':
             return
@@ -169,15 +184,15 @@ class _Reader:
             for read in takers or ([taken] if taken in node.taken else []):
                 _read(callback, read)
 
-    def path(self, tree: Mapping) -> SketchPath:
+    def path(self, tree: Mapping) -> DraftPath:
         steps = []
         for each in self.mappings(tree, 'node_chain'):
             steps.append((self.text(each, 'node_name'),
                           self.text(each, 'subscribe_topic_name'),
                           self.text(each, 'publish_topic_name')))
-        return SketchPath(self.text(tree, 'path_name'), steps)
+        return DraftPath(self.text(tree, 'path_name'), steps)
 
 
-def _read(reader: SketchCallback, what: str) -> None:
+def _read(reader: DraftCallback, what: str) -> None:
     if what != reader.name and what not in reader.reads:
         reader.reads.append(what)

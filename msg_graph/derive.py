@@ -43,7 +43,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from msg_graph.declaration import Declaration
-from msg_graph.errors import Collector, GraphError, shown
+from msg_graph.errors import Collector, shown
 from msg_graph.links import Links
 from msg_graph.model import Dag, Path, QueueEdge, TaskSet, Vertex
 
@@ -51,7 +51,7 @@ MAX_VERTICES = 100_000
 MAX_EDGES = 1_000_000
 
 
-def derive_task_set(declaration: Declaration, text: str) -> TaskSet:
+def derive_task_set(declaration: Declaration) -> TaskSet:
     """
     Return the task set of a declaration.
 
@@ -79,12 +79,12 @@ def derive_task_set(declaration: Declaration, text: str) -> TaskSet:
         expansion.expand(callback)
     return TaskSet(
         dags=_dags(links, expansion),
-        callbacks=tuple(entry.callback for entry in declaration.entries),
+        callbacks=tuple(each.callback for each in declaration.callbacks),
         queue_edges=queue_edges,
         paths=paths,
         workers=declaration.workers,
         file=declaration.file,
-        text=text,
+        text=declaration.text,
     )
 
 
@@ -130,7 +130,7 @@ class _Expansion:
             ('edges', self.edges, MAX_EDGES),
         ):
             if count > most:
-                raise self.links.entries[place].fields.error(
+                raise self.links.declared[place].entry.error(
                     None, f'with it the DAGs have {count} {what}, more than {most}',
                     'a callback runs once for each publisher before it: use fewer publishers for '
                     "one topic, or read some by a queue edge ('reads:')")
@@ -140,16 +140,15 @@ class _Expansion:
         other = next((v for v in vertices if self.source[v] != first), None)
         if other is None:
             return
-        entry = self.links.entries[place]
+        declared = self.links.declared[place]
         published = self.links.callbacks[self.callback[other]].publishes
-        topic = next(topic for topic in entry.callback.topics if topic in published)
+        topic = next(topic for topic in declared.callback.topics if topic in published)
         keys = [self.links.callbacks[source].key for source in (first, self.source[other])]
-        raise GraphError(
-            entry.fields.file, entry.fields.line_of('sync', topic),
-            f'{entry.fields.entry}: it joins two sources, {shown(keys[0])} and {shown(keys[1])}, '
-            'but a DAG has one',
+        raise declared.entry.error(
+            'sync',
+            f'it joins two sources, {shown(keys[0])} and {shown(keys[1])}, but a DAG has one',
             f"read {shown(topic)} by a queue edge: take it out of 'sync:' and list it under "
-            "'reads:'")
+            "'reads:'", item=topic)
 
 
 def _dags(links: Links, expansion: _Expansion) -> tuple[Dag, ...]:
@@ -173,7 +172,7 @@ def _dag_names(links: Links, sources: list[int]) -> dict[int, str]:
         name = callback.dag or callback.node
         if name in taken:
             other = links.callbacks[taken[name]].key
-            raise links.entries[source].fields.error(
+            raise links.declared[source].entry.error(
                 'dag' if callback.dag else None,
                 f'its DAG has the name {shown(name)}, as that of {shown(other)}',
                 "give it another one with 'dag:'")

@@ -34,7 +34,7 @@ from msg_graph.binding import Entity, meant
 from msg_graph.duration import format_duration
 from msg_graph.errors import printable
 from msg_graph.model import Callback, Dag, TaskSet
-from msg_graph.sketch import is_background
+from msg_graph.names import is_background
 
 TOLERANCE = 0.2
 LEAST = 10

@@ -4,9 +4,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 import difflib
 from types import TracebackType
+from typing import TypeVar
+
+T = TypeVar('T')
+R = TypeVar('R')
 
 MOST_ERRORS = 50
 """So many errors of a declaration are collected at most."""
@@ -104,6 +108,21 @@ class Collector:
             raise self.errors[0]
         if self.errors:
             raise GraphErrors(tuple(self.errors))
+
+
+def for_each(items: Iterable[T], work: Callable[[T], R]) -> list[R]:
+    """
+    Return what a function returns of each item.
+
+    :raises GraphError: all that it raised, together.
+    """
+    found = Collector()
+    results: list[R] = []
+    for item in items:
+        with found:
+            results.append(work(item))
+    found.check()
+    return results
 
 
 def printable(text: str) -> str:

@@ -7,10 +7,11 @@ Theory of operation
 -------------------
 1. ``include:`` lists files. Their nodes and paths come before those of the file itself, in that
    order, each time that the file is listed. A ``workers:`` of an included file does not count.
-2. ``arguments:`` names what a file can be told, and ``set:`` of an include tells it (see
-   ``arguments``).
-3. Names in an included file are put below the ``namespace:`` of the include, or become others by
-   its ``remap:`` (see ``renaming``).
+2. ``arguments:`` names what a file can be told, with default values (none: it must be told).
+   ``set:`` of an include tells it, and ``$(name)`` in any value of the file stands for it.
+3. Names in an included file (nodes, topics, services, DAGs and, with dots, paths) are put below
+   the ``namespace:`` of the include. A name that ``remap:`` lists, as it stands in the included
+   file, becomes the other name instead, which the including file knows.
 4. So an included file is worked from the inside out: its own includes, its arguments, then the
    names, as the file that includes it wants them. The result is a tree like that of one file, and
    every part of it knows its file and line.
@@ -21,159 +22,290 @@ Theory of operation
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 import os
+import re
 import stat
 
-from msg_graph.arguments import argument_values, pairs, substituted
-from msg_graph.errors import GraphError, shown
-from msg_graph.fields import Check, Fields
-from msg_graph.renaming import Names
-from msg_graph.yamltext import decode, Mapping, MAX_BYTES, MAX_SIZE, parse_yaml, Scalar, Tree
+from msg_graph.entries import ARGUMENT, Entry
+from msg_graph.errors import did_you_mean, GraphError, listed, shown
+from msg_graph.language import FILE, INCLUDE
+from msg_graph.yamltext import (
+    decode,
+    Mapping,
+    MAX_BYTES,
+    MAX_SIZE,
+    parse_yaml,
+    Scalar,
+    Sequence,
+    Tree,
+)
 
 MOST_FILES = 2_000
 MOST_DEPTH = 16
-
-INCLUDE_KEYS = ('file', 'namespace', 'remap', 'set')
+LONGEST_VALUE = 4_096
+_ARGUMENT_USE = re.compile(r'\$\(([^()]*)\)')
 
 Part = tuple[Tree, str]
-"""A tree and the name of its file."""
+"""An entry of ``nodes:`` or ``paths:``, and the name of its file."""
+
+
+def top_of(text: str, file: str) -> tuple[Mapping, Entry]:
+    """
+    Return the outermost mapping of a file, as a tree and as an entry.
+
+    :raises GraphError: the text is not YAML, or no declaration of this format.
+    """
+    tree = parse_yaml(text, file)
+    if tree is None or (isinstance(tree, Scalar) and tree.is_null):
+        raise GraphError(
+            file, None, 'the file is empty', "write a declaration that starts with 'mddag: 1'")
+    if not isinstance(tree, Mapping):
+        raise GraphError(
+            file, tree.line, 'this is not a declaration', "write one that starts with 'mddag: 1'")
+    entry = _top(tree, file)
+    entry.get('mddag')
+    return tree, entry
+
+
+def _top(tree: Tree, file: str) -> Entry:
+    return Entry(tree, file, 'the declaration', FILE)
+
+
+def is_composed(entry: Entry) -> bool:
+    """Tell whether a declaration is put together, or has arguments."""
+    return entry.has('include') or entry.has('arguments')
 
 
 @dataclass
-class Parts:
-    """The nodes and paths of a declaration, from all of its files."""
-
-    nodes: list[Part] = field(default_factory=list)
-    paths: list[Part] = field(default_factory=list)
-
-
-def is_composed(tree: Mapping) -> bool:
-    """Tell whether a declaration is put together, or has arguments."""
-    return 'include' in tree.entries or 'arguments' in tree.entries
-
-
 class Assembler:
     """
     Puts a declaration together.
 
-    :param top: path of the first file; None where it was read from elsewhere, so that there is
-        nothing to include from.
-    :param known: the keys of a file.
-    :param check_format: looks at the version of the format.
+    :ivar path: of the first file; None where it was read from elsewhere, so that there is nothing
+        to include from.
     """
 
-    def __init__(self, top: str | None, known: tuple[str, ...], check_format: Check) -> None:
-        self._root = None if top is None else os.path.realpath(os.path.dirname(top) or '.')
-        self._top = None if top is None else os.path.realpath(top)
-        self._known = known
-        self._check_format = check_format
-        self._trees: dict[str, Mapping] = {}
-        self._files = 0
-        self._size = 0
+    path: str | None
+    _read_trees: dict[str, Mapping] = field(default_factory=dict)
+    _files: int = 0
+    _size: int = 0
 
-    def assemble(self, tree: Mapping, file: str) -> tuple[Mapping, Parts]:
+    def assemble(self, tree: Mapping, file: str) -> tuple[Entry, list[Part], list[Part]]:
         """
-        Return the first file with its arguments filled in, and all parts.
+        Return the first file with its arguments filled in, and the nodes and paths of all files.
 
         :raises GraphError: a file cannot be included, or an argument is missing.
         """
-        chain = [] if self._top is None else [(self._top, file)]
+        chain = [] if self.path is None else [(os.path.realpath(self.path), file)]
         return self._file(tree, file, {}, chain)
 
     def _file(
         self, tree: Mapping, file: str, given: dict[str, str], chain: list[tuple[str, str]]
-    ) -> tuple[Mapping, Parts]:
-        fields = Fields(tree, file, 'the declaration', self._known)
-        values = argument_values(fields, tree, given)
-        own = substituted(tree, file, values)
-        assert isinstance(own, Mapping)
-        self._size += own.size
-        fields = Fields(own, file, 'the declaration', self._known)
+    ) -> tuple[Entry, list[Part], list[Part]]:
+        values = _argument_values(_top(tree, file), tree, given)
+        entry = _top(_substituted(tree, file, values), file)
+        self._size += tree.size
         if self._size > MAX_SIZE:
-            raise fields.error(
+            raise entry.error(
                 None, f'with all includes there are more than {MAX_SIZE} entries',
                 'include less, or split it into several graphs')
-        parts = Parts()
-        if fields.has('include'):
-            for place, each in enumerate(fields.sequence('include'), 1):
-                more = self._include(each, file, place, chain)
-                parts.nodes += more.nodes
-                parts.paths += more.paths
-        for key, found in (('nodes', parts.nodes), ('paths', parts.paths)):
-            if fields.has(key):
-                found += [(item, file) for item in fields.sequence(key)]
-        return own, parts
+        nodes: list[Part] = []
+        paths: list[Part] = []
+        for place, each in enumerate(entry.get('include') or (), 1):
+            more_nodes, more_paths = self._include(each, file, place, chain)
+            nodes += more_nodes
+            paths += more_paths
+        if entry.has('nodes'):
+            nodes += [(each, file) for each in entry.get('nodes')]
+        paths += [(each, file) for each in entry.get('paths') or ()]
+        return entry, nodes, paths
 
     def _include(
         self, tree: Tree, file: str, place: int, chain: list[tuple[str, str]]
-    ) -> Parts:
+    ) -> tuple[list[Part], list[Part]]:
         if isinstance(tree, Scalar):
-            wrapped = Mapping(tree.line)
-            wrapped.entries['file'] = tree
-            wrapped.key_lines['file'] = tree.line
-            tree = wrapped
-        fields = Fields(tree, file, f'include {place}', INCLUDE_KEYS)
-        path, name = self._locate(fields, file, chain)
-        included = self._read(fields, path, name)
-        values = {key: text for key, text, _ in pairs(fields, 'set')}
-        _, parts = self._file(included, name, values, [*chain, (path, name)])
-        names = Names(fields)
-        parts = Parts([(names.node(tree), source) for tree, source in parts.nodes],
-                      [(names.path(tree), source) for tree, source in parts.paths])
-        names.check()
-        return parts
+            short, tree = tree, Mapping(tree.line)
+            tree.entries['file'] = short
+            tree.key_lines['file'] = short.line
+        entry = Entry(tree, file, f'include {place}', INCLUDE)
+        path, name = self._locate(entry, file, chain)
+        values = {key: text for key, text, _ in entry.get('set')}
+        _, nodes, paths = self._file(
+            self._read(entry, path, name), name, values, [*chain, (path, name)])
+        renaming = _Renaming(entry)
+        nodes = [(renaming.node(each), source) for each, source in nodes]
+        paths = [(renaming.path(each), source) for each, source in paths]
+        renaming.check()
+        return nodes, paths
 
     def _locate(
-        self, fields: Fields, file: str, chain: list[tuple[str, str]]
+        self, entry: Entry, file: str, chain: list[tuple[str, str]]
     ) -> tuple[str, str]:
         """Return the real path of an included file, and what errors call it."""
-        text = fields.text('file', _check_path)
-        if self._root is None:
-            raise fields.error(
+        text = entry.get('file')
+        if self.path is None:
+            raise entry.error(
                 'file', 'a declaration that is not read from a file includes nothing',
                 'give the path of the declaration')
         real = os.path.realpath(os.path.join(os.path.dirname(chain[-1][0]), text))
-        if os.path.commonpath([real, self._root]) != self._root:
-            raise fields.error(
+        root = os.path.realpath(os.path.dirname(self.path) or '.')
+        if os.path.commonpath([real, root]) != root:
+            raise entry.error(
                 'file', f'{shown(text)} lies outside of the folder of the first file',
                 'keep all files of a declaration below one folder')
         if real in [path for path, _ in chain]:
             names = ' -> '.join(name for _, name in chain)
-            raise fields.error(
+            raise entry.error(
                 'file', f'files include each other in a cycle: {names} -> {text}',
                 'remove one of the includes')
         self._files += 1
         if len(chain) > MOST_DEPTH or self._files > MOST_FILES:
-            raise fields.error(
+            raise entry.error(
                 'file', f'more than {MOST_DEPTH} levels or {MOST_FILES} files are included',
                 'include less, or split it into several graphs')
         return real, os.path.normpath(os.path.join(os.path.dirname(file), text))
 
-    def _read(self, fields: Fields, path: str, name: str) -> Mapping:
-        tree = self._trees.get(path)
-        if tree is not None:
+    def _read(self, entry: Entry, path: str, name: str) -> Mapping:
+        if path not in self._read_trees:
+            try:
+                if not stat.S_ISREG(os.stat(path).st_mode):
+                    raise OSError(0, 'it is no regular file')
+                with open(path, 'rb') as stream:
+                    data = stream.read(MAX_BYTES + 1)
+            except (OSError, ValueError) as error:
+                reason = error.strerror if isinstance(error, OSError) else str(error)
+                raise entry.error('file', f'{shown(name)} cannot be read ({reason})',
+                                  'correct the path') from None
+            self._read_trees[path], _ = top_of(decode(data, name), name)
+        return self._read_trees[path]
+
+
+def _argument_values(entry: Entry, tree: Mapping, given: dict[str, str]) -> dict[str, str]:
+    """
+    Return the values of a file's arguments.
+
+    :param given: those that an include tells; the others have their defaults.
+    """
+    declared = tree.entries.get('arguments', Mapping(tree.line))
+    if not isinstance(declared, Mapping):
+        raise entry.error('arguments', "'arguments' is no mapping",
+                          'write arguments: {name: default value}')
+    values: dict[str, str] = {}
+    for name, value in declared.entries.items():
+        line = declared.key_lines[name]
+        if not ARGUMENT.fullmatch(name):
+            raise GraphError(entry.file, line, f'{shown(name)} is no name for an argument',
+                             "use letters, digits and '_', and no digit first")
+        if not isinstance(value, Scalar):
+            raise GraphError(entry.file, value.line,
+                             f'the default value of the argument {shown(name)} is no text',
+                             'write a text, a number or a time')
+        if value.is_null and name not in given:
+            raise GraphError(entry.file, line, f'the argument {shown(name)} has no value',
+                             "tell it with 'set:' of the include, or give it a default here")
+        values[name] = given.get(name, value.text)
+    for name in given:
+        if name not in values:
+            raise entry.error(
+                'arguments', f'an include sets {shown(name)}, which is no argument of this file',
+                did_you_mean(name, values, "add it to 'arguments:'"))
+    return values
+
+
+def _substituted(tree: Tree, file: str, values: dict[str, str]) -> Tree:
+    """Return a tree with arguments replaced by their values."""
+    def change(old: Scalar) -> str:
+        def value(found: re.Match[str]) -> str:
+            if found[1] not in values:
+                raise GraphError(
+                    file, old.line, f'{shown(found[0])} stands for no argument of this file',
+                    did_you_mean(found[1], values, f"add it to 'arguments:' ({listed(values)})"
+                                 if values else "add it to 'arguments:'"))
+            return values[found[1]]
+
+        text = _ARGUMENT_USE.sub(value, old.text)
+        if len(text) > LONGEST_VALUE and text != old.text:
+            raise GraphError(file, old.line, 'with its arguments this value is too long',
+                             f'use at most {LONGEST_VALUE} characters')
+        return text
+
+    return _changed(tree, change)
+
+
+def _changed(tree: Tree, change: Callable[[Scalar], str]) -> Tree:
+    """Return a tree with every text changed; nesting is bounded, so this may recurse."""
+    if isinstance(tree, Scalar):
+        text = change(tree)
+        return tree if text == tree.text else Scalar(tree.line, text, tree.plain)
+    if isinstance(tree, Sequence):
+        return tree.with_items([_changed(item, change) for item in tree.items])
+    return tree.with_entries(
+        {key: _changed(value, change) for key, value in tree.entries.items()})
+
+
+class _Renaming:
+    """
+    Gives names of an included file those that the including one knows (rule 3).
+
+    :param entry: of ``include:``.
+    """
+
+    def __init__(self, entry: Entry) -> None:
+        self._entry = entry
+        self._space: str = entry.get('namespace') or ''
+        self._remap: dict[str, str] = {old: new for old, new, _ in entry.get('remap')}
+        self._lines = {old: line for old, _, line in entry.get('remap')}
+        self._seen: set[str] = set()
+
+    def check(self) -> None:
+        """Raise where a name is remapped that the included file does not have."""
+        for name, line in self._lines.items():
+            if name not in self._seen:
+                raise GraphError(
+                    self._entry.file, line, f'{self._entry.name}: it remaps {shown(name)}, '
+                    'which the included file does not name',
+                    did_you_mean(name, self._seen, "remove it from 'remap:'"))
+
+    def node(self, tree: Tree) -> Tree:
+        """Return an entry of ``nodes`` with its names changed."""
+        tree = _with_changes(tree, ('node',), self._name)
+        callbacks = tree.entries.get('callbacks') if isinstance(tree, Mapping) else None
+        if not isinstance(tree, Mapping) or not isinstance(callbacks, Sequence):
             return tree
-        try:
-            if not stat.S_ISREG(os.stat(path).st_mode):
-                raise OSError(0, 'it is no regular file')
-            with open(path, 'rb') as stream:
-                data = stream.read(MAX_BYTES + 1)
-        except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) else str(error)
-            raise fields.error(
-                'file', f'{shown(name)} cannot be read ({reason})', 'correct the path') from None
-        found = parse_yaml(decode(data, name), name)
-        if not isinstance(found, Mapping):
-            raise GraphError(name, None if found is None else found.line,
-                             'this is not a declaration', "write one that starts with 'mddag: 1'")
-        Fields(found, name, 'the declaration', self._known).text('mddag', self._check_format)
-        self._trees[path] = found
-        return found
+        return tree.with_entries({**tree.entries, 'callbacks': callbacks.with_items(
+            [_with_changes(_with_changes(each, _NAMED, self._name), ('dag',), self._dag)
+             for each in callbacks.items])})
+
+    def path(self, tree: Tree) -> Tree:
+        """Return an entry of ``paths`` with its names changed."""
+        before = self._space.strip('/').replace('/', '.')
+        tree = _with_changes(tree, ('callbacks',), self._key)
+        return _with_changes(tree, ('name',), lambda text: f'{before}.{text}') if before else tree
+
+    def _name(self, text: str) -> str:
+        if not text.startswith('/'):
+            return text
+        self._seen.add(text)
+        return self._remap.get(text, self._space + text)
+
+    def _key(self, text: str) -> str:
+        node, colon, name = text.rpartition(':')
+        return f'{self._name(node)}{colon}{name}'
+
+    def _dag(self, text: str) -> str:
+        return f'{self._space}/{text.lstrip("/")}' if self._space else text
 
 
-def _check_path(text: str) -> tuple[str, str] | None:
-    if os.path.isabs(text) or text.startswith('~') or '\0' in text or not text:
-        return (f'{shown(text)} is no relative path',
-                'write it as seen from the file that includes it')
-    return None
+_NAMED = ('subscription', 'service', 'sync', 'publishes', 'reads')
+
+
+def _with_changes(tree: Tree, keys: tuple[str, ...], change: Callable[[str], str]) -> Tree:
+    """Return an entry with the texts at some keys changed."""
+    if not isinstance(tree, Mapping):
+        return tree
+    return tree.with_entries({
+        key: value if key not in keys else _changed(
+            value, lambda old: old.text if old.is_null else change(old.text))
+        for key, value in tree.entries.items()})

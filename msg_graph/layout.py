@@ -27,12 +27,10 @@ import io
 import re
 import sys
 
-from msg_graph.declaration import FILE_KEYS
 from msg_graph.errors import GraphError
-from msg_graph.fields import Fields
-from msg_graph.include import is_composed
+from msg_graph.include import is_composed, top_of
 from msg_graph.model import Callback, Dag, TaskSet
-from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Sequence, Tree
+from msg_graph.yamltext import Scalar, Sequence, Tree
 import yaml
 
 WIDTH = 87
@@ -67,11 +65,8 @@ def format_text(text: str, name: str = '<string>') -> str:
 def _meaning(text: str, name: str) -> object:
     """Return what must stay the same: the task set, or all that stands in the text (rule 6)."""
     from msg_graph import loads
-    tree = parse_yaml(text, name)
-    if not isinstance(tree, Mapping) or not is_composed(tree):
-        return without_lines(loads(text, name))
-    Fields(tree, name, 'the declaration', FILE_KEYS).text('mddag', lambda _: None)
-    return _plain(tree)
+    tree, top = top_of(text, name)
+    return _plain(tree) if is_composed(top) else without_lines(loads(text, name))
 
 
 def _plain(tree: Tree) -> object:

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections import deque
 
-from msg_graph.declaration import Declaration, Entry, PathEntry
-from msg_graph.errors import Collector, did_you_mean, GraphError, listed, shown
+from msg_graph.declaration import Declaration, DeclaredCallback, DeclaredPath
+from msg_graph.errors import did_you_mean, for_each, GraphError, listed, shown
 from msg_graph.model import Callback, Path, QueueEdge
 
 
@@ -20,9 +20,8 @@ class Links:
     """Who publishes what, and whom it starts; callbacks by their places in the file."""
 
     def __init__(self, declaration: Declaration) -> None:
-        self.file = declaration.file
-        self.entries = declaration.entries
-        self.callbacks = [entry.callback for entry in declaration.entries]
+        self.declared = declaration.callbacks
+        self.callbacks = [each.callback for each in declaration.callbacks]
         self.by_key = {callback.key: callback for callback in self.callbacks}
         self.publishers: dict[str, list[int]] = {}
         self.started: dict[str, list[int]] = {}
@@ -39,60 +38,55 @@ class Links:
 
     def check_triggers(self) -> None:
         """Check sources, and that the topics of all other callbacks are published (rule 2)."""
-        found = Collector()
-        for entry in self.entries:
-            with found:
-                self._check_trigger(entry)
-        found.check()
+        for_each(self.declared, self._check_trigger)
 
-    def _check_trigger(self, entry: Entry) -> None:
-        callback = entry.callback
+    def _check_trigger(self, declared: DeclaredCallback) -> None:
+        callback = declared.callback
         if callback.kind == 'service' and callback.period_ns is None:
-            raise entry.fields.error(
+            raise declared.entry.error(
                 'service', 'a service is a source, and it has no period',
                 "add 'period:' with the time between two requests")
         # header_stamp says of a timer what its messages carry on to other processes
         if callback.kind == 'timer' and callback.release_from == 'source_timestamp':
-            raise entry.fields.error(
+            raise declared.entry.error(
                 'release_from', 'a timer is released when it is due',
                 "remove 'release_from:', or start the callback by a subscription")
         if self.is_source(callback):
-            self._check_source(entry)
+            self._check_source(declared)
         else:
-            self._check_started(entry)
+            self._check_started(declared)
 
-    def _check_source(self, entry: Entry) -> None:
-        callback = entry.callback
+    def _check_source(self, declared: DeclaredCallback) -> None:
+        callback = declared.callback
         if callback.kind == 'sync':
-            raise entry.fields.error(
+            raise declared.entry.error(
                 'period', 'a sync callback joins topics, so it cannot be a source',
                 "remove 'period:' and declare who publishes its topics")
         for topic in callback.topics:
             if topic in self.publishers:
                 publisher = self.callbacks[self.publishers[topic][0]].key
-                raise entry.fields.error(
+                raise declared.entry.error(
                     'period', f'only a source has a period, but {shown(publisher)} publishes '
                     f'{shown(topic)}',
                     "remove 'period:', or take the topic out of that callback's 'publishes:'")
 
-    def _check_started(self, entry: Entry) -> None:
+    def _check_started(self, declared: DeclaredCallback) -> None:
         for key in ('dag', 'max_active_jobs', 'on_miss'):
-            if entry.fields.has(key):
-                raise self._only_source(entry, key)
-        if entry.callback.release_from != 'arrival':
-            raise self._only_source(entry, 'release_from')
-        for topic in entry.callback.topics:
+            if declared.entry.has(key):
+                raise self._only_source(declared, key)
+        if declared.callback.release_from != 'arrival':
+            raise self._only_source(declared, 'release_from')
+        for topic in declared.callback.topics:
             if topic not in self.publishers:
                 remedy = "add it to a 'publishes:'"
-                if entry.callback.kind == 'subscription':
+                if declared.callback.kind == 'subscription':
                     remedy += ", or add 'period:' if it comes from outside of the graph"
-                raise GraphError(
-                    entry.fields.file, entry.fields.line_of(entry.callback.kind, topic),
-                    f'{entry.fields.entry}: nobody publishes {shown(topic)}',
-                    did_you_mean(topic, self.publishers, remedy))
+                raise declared.entry.error(
+                    declared.callback.kind, f'nobody publishes {shown(topic)}',
+                    did_you_mean(topic, self.publishers, remedy), item=topic)
 
-    def _only_source(self, entry: Entry, key: str) -> GraphError:
-        return entry.fields.error(
+    def _only_source(self, declared: DeclaredCallback, key: str) -> GraphError:
+        return declared.entry.error(
             key, f"'{key}:' is for the source of a DAG, and a topic of this graph starts this one",
             'move it to the source callback')
 
@@ -137,8 +131,9 @@ class Links:
         keys = [self.callbacks[place].key for place in cycle[first:] + cycle[:first + 1]]
         if len(keys) > 9:
             keys[8:-1] = [f'… ({len(keys) - 9} more)']
+        entry = self.declared[cut].entry
         return GraphError(
-            self.entries[cut].fields.file, self.entries[cut].fields.line_of(callback.kind, topic),
+            entry.file, entry.line_of(callback.kind, topic),
             f'callbacks start each other in a cycle: {" -> ".join(keys)}',
             f'cut it with a queue edge: in {shown(callback.key)} list {shown(topic)} under '
             f"'reads:' and {how}")
@@ -158,23 +153,19 @@ class Links:
 
     def check_deadlines(self) -> None:
         """Check that sinks, and nothing else, have deadlines (rule 6)."""
-        found = Collector()
-        for entry in self.entries:
-            with found:
-                self._check_deadline(entry)
-        found.check()
+        for_each(self.declared, self._check_deadline)
 
-    def _check_deadline(self, entry: Entry) -> None:
-        callback = entry.callback
+    def _check_deadline(self, declared: DeclaredCallback) -> None:
+        callback = declared.callback
         topic = next((t for t in callback.publishes if t in self.started), None)
         if topic is None:
             if callback.deadline_ns is None:
-                raise entry.fields.error(
+                raise declared.entry.error(
                     None, 'it is a sink (it starts no other callback) and has no deadline',
                     "add 'deadline:'")
         elif callback.deadline_ns is not None:
             after = self.callbacks[self.started[topic][0]].key
-            raise entry.fields.error(
+            raise declared.entry.error(
                 'deadline', f'it has a deadline but is no sink: it starts {shown(after)} by '
                 f'{shown(topic)}',
                 'move the deadline to the sinks after it, or read that topic by a queue edge '
@@ -182,64 +173,48 @@ class Links:
 
     def queue_edges(self) -> tuple[QueueEdge, ...]:
         """Return the queue edges, each with its writers (rule 1)."""
-        found = Collector()
-        edges = []
-        for entry in self.entries:
-            for read in entry.callback.reads:
-                with found:
-                    edges.append(self._queue_edge(entry, read))
-        found.check()
-        return tuple(edges)
+        return tuple(for_each(
+            [(each, read) for each in self.declared for read in each.callback.reads],
+            self._queue_edge))
 
-    def _queue_edge(self, entry: Entry, read: str) -> QueueEdge:
-        callback = entry.callback
-        topic = read if read.startswith('/') else None
-        if topic is not None:
-            writers = tuple(self.callbacks[p].key for p in self.publishers.get(topic, ()))
-        else:
-            writer = f'{callback.node}:{read}'
-            writers = (writer,) if writer in self.by_key else ()
-        if not writers:
-            raise self._read_error(entry, read)
-        return QueueEdge(callback.key, topic, writers)
-
-    def _read_error(self, entry: Entry, read: str) -> GraphError:
-        line = entry.fields.line_of('reads', read)
+    def _queue_edge(self, reading: tuple[DeclaredCallback, str]) -> QueueEdge:
+        declared, read = reading
+        callback = declared.callback
         if read.startswith('/'):
-            return GraphError(
-                entry.fields.file, line,
-                f'{entry.fields.entry}: it reads {shown(read)}, which nobody publishes',
-                did_you_mean(read, self.publishers, "add it to a 'publishes:'"))
-        siblings = [c.name for c in self.callbacks if c.node == entry.callback.node]
-        return GraphError(
-            entry.fields.file, line,
-            f'{entry.fields.entry}: it reads the unknown callback {shown(read)}',
-            did_you_mean(read, siblings, f'name a callback of its node: {listed(siblings)}'))
+            writers = tuple(self.callbacks[p].key for p in self.publishers.get(read, ()))
+            if not writers:
+                raise declared.entry.error(
+                    'reads', f'it reads {shown(read)}, which nobody publishes',
+                    did_you_mean(read, self.publishers, "add it to a 'publishes:'"), item=read)
+            return QueueEdge(callback.key, read, writers)
+        writer = f'{callback.node}:{read}'
+        if writer not in self.by_key:
+            siblings = [c.name for c in self.callbacks if c.node == callback.node]
+            raise declared.entry.error(
+                'reads', f'it reads the unknown callback {shown(read)}',
+                did_you_mean(read, siblings, f'name a callback of its node: {listed(siblings)}'),
+                item=read)
+        return QueueEdge(callback.key, None, (writer,))
 
     def paths(self, declaration: Declaration) -> tuple[Path, ...]:
         """Return the declared paths; each step must be a trigger or queue edge (rule 1)."""
-        found = Collector()
-        for entry in declaration.paths:
-            with found:
-                self._check_path(entry)
-        found.check()
-        return tuple(entry.path for entry in declaration.paths)
+        return tuple(for_each(declaration.paths, self._path))
 
-    def _check_path(self, entry: PathEntry) -> None:
-        keys = entry.path.callbacks
+    def _path(self, declared: DeclaredPath) -> Path:
+        keys = declared.path.callbacks
         for key in keys:
             if key not in self.by_key:
-                raise GraphError(
-                    entry.fields.file, entry.fields.line_of('callbacks', key),
-                    f'{entry.fields.entry}: unknown callback {shown(key)}',
-                    did_you_mean(key, self.by_key, 'name a declared callback'))
+                raise declared.entry.error(
+                    'callbacks', f'unknown callback {shown(key)}',
+                    did_you_mean(key, self.by_key, 'name a declared callback'), item=key)
         for before, after in zip(keys, keys[1:]):
             if not self._linked(self.by_key[before], self.by_key[after]):
-                raise GraphError(
-                    entry.fields.file, entry.fields.line_of('callbacks', after),
-                    f'{entry.fields.entry}: no trigger or queue edge leads from '
+                raise declared.entry.error(
+                    'callbacks', 'no trigger or queue edge leads from '
                     f'{shown(before)} to {shown(after)}',
-                    "name the callbacks between them, or add what is missing to 'reads:'")
+                    "name the callbacks between them, or add what is missing to 'reads:'",
+                    item=after)
+        return declared.path
 
     def _linked(self, before: Callback, after: Callback) -> bool:
         if before.node == after.node and before.name in after.reads:

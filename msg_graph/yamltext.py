@@ -18,6 +18,7 @@ The tree is built from the parser's events, not by PyYAML's composer or construc
 
 from __future__ import annotations
 
+import json
 import re
 from typing import Any
 
@@ -32,6 +33,7 @@ _LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _NOT_YAML = re.compile('[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]')
 _PLAIN_TAGS = (None, '!')
 _PLAIN = re.compile(r'[/A-Za-z_][/A-Za-z0-9_.-]*')
+_SIMPLE = re.compile(r'[+-]?[A-Za-z0-9_/.][A-Za-z0-9_/. +-]*')
 _WORDS = {'true', 'false', 'yes', 'no', 'on', 'off', 'null', 'y', 'n'}
 
 
@@ -114,6 +116,28 @@ def decode(data: bytes, file: str) -> str:
 def plain_scalar(text: str) -> str:
     """Return a name (without quotes in it) that stands for itself, quoted where it would not."""
     return text if _PLAIN.fullmatch(text) and text.lower() not in _WORDS else f"'{text}'"
+
+
+def yaml_lines(tree: Tree) -> list[str]:
+    """Return the lines of a text that gives an equal tree."""
+    if isinstance(tree, Scalar):
+        simple = tree.plain and _SIMPLE.fullmatch(tree.text)
+        return [tree.text if simple else json.dumps(tree.text)]
+    if isinstance(tree, Sequence) and all(isinstance(item, Scalar) for item in tree.items):
+        return [f'[{", ".join(line for item in tree.items for line in yaml_lines(item))}]']
+    lines = []
+    if isinstance(tree, Sequence):
+        for item in tree.items:
+            first, *rest = yaml_lines(item)
+            lines += [f'- {first}', *(f'  {line}' for line in rest)]
+        return lines
+    for key, value in tree.entries.items():
+        first, *rest = yaml_lines(value)
+        if isinstance(value, Mapping) or first.startswith('- '):
+            lines += [f'{key}:', f'  {first}', *(f'  {line}' for line in rest)]
+        else:
+            lines.append(f'{key}: {first}')
+    return lines
 
 
 def parse_yaml(text: str, file: str) -> Tree | None:

@@ -12,7 +12,7 @@ from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
-    from msg_graph.sketch import Sketch
+    from msg_graph.draft import Draft
 
 HELP = 'make a declaration to fill in from a CARET architecture file'
 EXAMPLE = """\
@@ -50,19 +50,19 @@ def main(args: argparse.Namespace) -> int:
     :raises mddag_executor.trace.TraceError: when the recording cannot be used
     """
     from mddag_executor.cli.systems import recorded_system, write_declaration
-    from msg_graph.from_caret import declaration_from_caret
+    from msg_graph.caret import declaration_from_caret
     common.check_output(args.output)
     if args.architecture == '-' and args.trace == '-':
         raise UsageError('-: standard input can be only one of ARCHITECTURE.yaml and TRACE: name '
                          'the other')
     name, text = common.read_text(args.architecture)
 
-    def measure(sketch: Sketch) -> None:
+    def measure(draft: Draft) -> None:
         """Fill in what the recording shows, and tell of how much of the system."""
         if args.trace is None:
             return
         system = recorded_system(args.trace)
-        every, count = len(list(sketch.callbacks())), system.measure(sketch)
+        every, count = len(list(draft.callbacks())), system.measure(draft)
         if count < every:
             warn(f'{system.name}: {every - count} of the {every} callbacks of {name} did not run')
 

@@ -17,11 +17,11 @@ mddag graph from-ros --timeout 10 -o graph.yaml
 """
 DESCRIPTION = """\
 Make a declaration from the nodes that run now in this ROS domain: their subscriptions, services
-and publishers, and the rates of their topics. The ROS graph tells nothing of timers, callback
-groups and execution times, and not which callback publishes what: a topic is supposed to come
-from the callbacks of its node that run as often, else from a timer. All of that is marked
-'FILL IN', like deadlines and periods, with a proposal. A recorded run tells more: see
-'mddag graph from-trace'. What every node has, such as parameter services, is left out."""
+and publishers. The ROS graph tells nothing of timers, callback groups and execution times, and not
+which callback publishes what. A node that subscribes and serves nothing is supposed to have one
+timer, of the rate of its topics; elsewhere each callback of the node may publish a topic. All of
+that is marked 'FILL IN', like deadlines and periods, with a proposal. A recorded run tells more:
+see 'mddag graph from-trace'. What every node has, such as parameter services, is left out."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,16 +41,16 @@ def main(args: argparse.Namespace) -> int:
     """
     common.check_output(args.output)
     from mddag_executor.cli.systems import write_declaration
-    from mddag_executor.live.graph_probe import probe, sketch_of
-    from msg_graph.blanks import declaration_with_blanks
+    from mddag_executor.live.graph_probe import draft_of, probe
+    from msg_graph.draft_text import declaration_of
     with Progress('looking at the nodes', args.timeout) as line:
         found = probe(args.timeout, line.update)
     for warning in found.warnings:
         warn(warning)
-    sketch = sketch_of(found)
-    if not sketch.nodes:
+    draft = draft_of(found)
+    if not draft.nodes:
         raise InputError(
             'ROS graph', 'no node was found',
             'start the nodes, check ROS_DOMAIN_ID, or give a longer --timeout')
-    write_declaration(args.output, declaration_with_blanks(sketch))
+    write_declaration(args.output, declaration_of(draft))
     return 0

@@ -41,8 +41,8 @@ def main(args: argparse.Namespace) -> int:
     :raises mddag_executor.errors.InputError: when no system is recorded in it
     """
     from mddag_executor.cli.systems import recorded_system, write_declaration
-    from msg_graph.blanks import declaration_with_blanks
+    from msg_graph.draft_text import declaration_of
     common.check_output(args.output)
-    sketch = recorded_system(args.trace).sketch()
-    write_declaration(args.output, declaration_with_blanks(sketch))
+    draft = recorded_system(args.trace).draft()
+    write_declaration(args.output, declaration_of(draft))
     return 0

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print the schema."""
-    from msg_graph.schema import schema
+    from msg_graph.language import schema
     common.check_output(args.output)
     common.write_json(args.output, schema())
     return 0

@@ -106,7 +106,7 @@ def _replay(
     if isinstance(recording, WatchedRecording):
         drift.extend(recording.drift(outcome.task_set))
     elif task_set is not None:
-        from mddag_executor.replay.sketching import System
+        from mddag_executor.replay.drafting import System
         drift.extend(drift_of_import(System(path, name).census, task_set))
     return outcome
 

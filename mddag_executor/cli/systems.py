@@ -13,7 +13,7 @@ from mddag_executor.cli.text import Progress, warn
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
-    from mddag_executor.replay.sketching import System
+    from mddag_executor.replay.drafting import System
 
 
 def recorded_system(given: str) -> System:
@@ -24,7 +24,7 @@ def recorded_system(given: str) -> System:
     :raises mddag_executor.trace.TraceError: when it is neither.
     :raises mddag_executor.errors.InputError: when no system is recorded in it.
     """
-    from mddag_executor.replay.sketching import System
+    from mddag_executor.replay.drafting import System
     with Progress('reading the trace') as line:
         if given != '-' and Path(given).is_dir():
             from mddag_executor.trace import import_ctf
@@ -48,7 +48,7 @@ def recorded_system(given: str) -> System:
 
 def write_declaration(output: str, text: str) -> None:
     """Write a declaration with blanks, and tell how many there are."""
-    from msg_graph.blanks import MARK
+    from msg_graph.draft_text import MARK
     common.write_text(output, text)
     if output == '-':
         return

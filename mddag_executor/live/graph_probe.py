@@ -1,22 +1,18 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A sketch of the system that runs now, from the ROS graph and from the rates of its topics.
+A draft of the system that runs now, from the ROS graph and from the rates of its topics.
 
 Theory of operation
 -------------------
 The ROS graph tells which node publishes, subscribes and serves what. It does not tell of timers,
-of callback groups, nor which callback publishes a topic. So the probe listens to every topic for
-a while, without looking into the messages, and supposes:
+of callback groups, nor which callback publishes a topic. So:
 
-1. A node that subscribes a topic has a callback for it, and so for a service.
-2. A topic comes from the callbacks of its node that run as often (``TOLERANCE``), from each of
-   them perhaps; where none does, from those of which it is not known how often they run; from a
-   timer of its node where there is none of these. Topics of one node that come as often share the
-   timer.
-3. A topic of which no message came may come from any callback of its node; where there is none,
-   from a timer of unknown period. So it is with a node of which nothing is seen: it may have
-   timers.
+1. A node that subscribes a topic has a callback for it, and so for a service. Each of a node's
+   callbacks may publish what the node publishes.
+2. A node that subscribes and serves nothing is supposed to have one timer, which publishes all
+   that the node does, as often as the most frequent of its topics comes. So the probe listens to
+   these topics for a while, without looking into the messages.
 
 A topic's rate is that of its messages' source timestamps, divided by the number of its publishers.
 Messages that were lost on the way count, by their sequence numbers: images are often published as
@@ -34,9 +30,8 @@ from importlib import import_module
 import time
 from typing import Any
 
-from msg_graph.drift import TOLERANCE
-from msg_graph.fields import check_node, check_service, check_topic
-from msg_graph.sketch import is_background, Sketch, SketchCallback, SketchNode
+from msg_graph.draft import Draft, DraftCallback, DraftNode
+from msg_graph.names import is_background, NODE, SERVICE, TOPIC
 import rclpy
 from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -169,7 +164,7 @@ def _nodes(node: Node, found: Probe) -> None:
              for name, namespace in node.get_node_names_and_namespaces()
              if not name.startswith('_')]
     for full, count in sorted(Counter(names).items()):
-        if check_node(full) is not None:
+        if NODE.check(full) is not None:
             found.warn(f'{full}: left out, this is no valid node name')
             continue
         if count > 1:
@@ -177,10 +172,10 @@ def _nodes(node: Node, found: Probe) -> None:
                 f'{full}: {count} nodes have this name; they are taken for one: rename them')
         namespace, _, name = full.rpartition('/')
         endpoints = found.nodes.setdefault(full, Endpoints())
-        for get, target, check in (
-            (node.get_publisher_names_and_types_by_node, endpoints.publishes, check_topic),
-            (node.get_subscriber_names_and_types_by_node, endpoints.subscribes, check_topic),
-            (node.get_service_names_and_types_by_node, endpoints.serves, check_service),
+        for get, target, kind in (
+            (node.get_publisher_names_and_types_by_node, endpoints.publishes, TOPIC),
+            (node.get_subscriber_names_and_types_by_node, endpoints.subscribes, TOPIC),
+            (node.get_service_names_and_types_by_node, endpoints.serves, SERVICE),
         ):
             try:
                 listed = get(name, namespace or '/')
@@ -188,16 +183,17 @@ def _nodes(node: Node, found: Probe) -> None:
                 found.warn(f'{full}: {error}')
                 continue
             target.update((each, types[0]) for each, types in listed
-                          if types and not is_background(each, full) and check(each) is None)
+                          if types and not is_background(each, full) and kind.check(each) is None)
     found.publishers = Counter(
         topic for endpoints in found.nodes.values() for topic in endpoints.publishes)
 
 
 def _listen(node: Node, found: Probe) -> list[tuple[Any, Seen]]:
-    """Subscribe every new topic, as best effort, which any publisher serves."""
+    """Subscribe every new topic whose rate tells something, as best effort."""
     qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT,
                      durability=DurabilityPolicy.VOLATILE)
     types = {topic: kind for endpoints in found.nodes.values()
+             if not (endpoints.subscribes or endpoints.serves)
              for topic, kind in endpoints.publishes.items()}
     subscriptions = []
     for topic, kind in sorted(types.items()):
@@ -224,62 +220,21 @@ def _message_type(kind: str) -> Any:
     raise ValueError('this is no name of a message type')
 
 
-def sketch_of(found: Probe) -> Sketch:
-    """Return what is known of the system, and what is supposed."""
-    intervals = {topic: seen.interval_ns(found.publishers[topic])
-                 for topic, seen in found.seen.items()}
+def draft_of(found: Probe) -> Draft:
+    """Return what is known of the system, and what is supposed (rules 1 and 2)."""
     nodes = []
     for name, endpoints in sorted(found.nodes.items()):
-        node = SketchNode(name)
-        for topic in endpoints.subscribes:
-            _add(node, 'subscription', [topic], intervals.get(topic))
-        for service in endpoints.serves:
-            _add(node, 'service', [service], None)
-        unknown = [c for c in node.callbacks.values() if c.kind == 'subscription'
-                   and c.interval_ns is None and found.publishers[c.starts[0]]]
-        for topic in endpoints.publishes:
-            whole = intervals.get(topic)
-            _publisher(node, topic, None if whole is None else whole * found.publishers[topic],
-                       unknown)
-        if not node.callbacks:
-            _timer(node, None)
-        nodes.append(node)
-    return Sketch('the nodes that ran', nodes)
-
-
-def _add(node: SketchNode, kind: str, starts: list[str], interval: int | None) -> SketchCallback:
-    name = f'callback_{len(node.callbacks)}'
-    callback = SketchCallback(node.name, name, kind, starts, interval_ns=interval)
-    node.callbacks[name] = callback
-    return callback
-
-
-def _publisher(
-    node: SketchNode, topic: str, interval: int | None, unknown: list[SketchCallback]
-) -> None:
-    """Suppose which callbacks of a node publish a topic (rules 2 and 3)."""
-    if interval is None:
-        real = [c for c in node.callbacks.values() if not c.guessed]
-        for callback in real or [_timer(node, None)]:
-            callback.maybe.append(topic)
-        return
-    fits = [c for c in node.callbacks.values()
-            if c.interval_ns is not None and abs(c.interval_ns - interval) <= TOLERANCE * interval]
-    timers = [c for c in fits if c.guessed]
-    if timers:
-        timers[0].publishes.append(topic)
-    elif fits or unknown:
-        for callback in fits or unknown:
-            callback.maybe.append(topic)
-    else:
-        _timer(node, interval).publishes.append(topic)
-
-
-def _timer(node: SketchNode, interval: int | None) -> SketchCallback:
-    """Return the timer of a node that is supposed to have this period, a new one if need be."""
-    for callback in node.callbacks.values():
-        if callback.guessed and callback.interval_ns is None and interval is None:
-            return callback
-    timer = _add(node, 'timer', [], interval)
-    timer.guessed = True
-    return timer
+        starts = [*(('subscription', topic) for topic in endpoints.subscribes),
+                  *(('service', service) for service in endpoints.serves)]
+        published = list(endpoints.publishes)
+        callbacks = [DraftCallback(name, f'callback_{i}', kind, [start], maybe=list(published))
+                     for i, (kind, start) in enumerate(starts)]
+        if not callbacks:
+            intervals = [interval * found.publishers[topic] for topic in published
+                         if topic in found.seen and (interval := found.seen[topic].interval_ns(
+                             found.publishers[topic])) is not None]
+            callbacks = [DraftCallback(
+                name, 'callback_0', 'timer', publishes=published, guessed=True,
+                interval_ns=min(intervals, default=None))]
+        nodes.append(DraftNode(name, {callback.name: callback for callback in callbacks}))
+    return Draft('the nodes that ran', nodes)

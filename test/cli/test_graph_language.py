@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 import subprocess
 
-from msg_graph.schema import schema
+from msg_graph.language import schema
 
 Mddag = Callable[..., subprocess.CompletedProcess[str]]
 

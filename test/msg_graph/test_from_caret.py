@@ -7,7 +7,8 @@ from __future__ import annotations
 import re
 
 from msg_graph import GraphError, loads
-from msg_graph.from_caret import declaration_from_caret, MARK
+from msg_graph.caret import declaration_from_caret
+from msg_graph.draft_text import MARK
 import pytest
 
 HEAD = 'executors: []\nnamed_paths: []\nnodes:\n'

@@ -10,12 +10,12 @@ import re
 
 from mddag_executor.errors import InputError
 from mddag_executor.replay.as_recorded import replay_recording
+from mddag_executor.replay.drafting import System
 from mddag_executor.replay.drift import drift_of_import, WatchedRecording
-from mddag_executor.replay.sketching import System
 from mddag_executor.trace import TraceFile
 from msg_graph import load, loads
-from msg_graph.blanks import declaration_with_blanks, MARK
-from msg_graph.from_caret import declaration_from_caret
+from msg_graph.caret import declaration_from_caret
+from msg_graph.draft_text import declaration_of, MARK
 import pytest
 
 MS = 1_000_000
@@ -94,7 +94,7 @@ def recorded(tmp_path: Path) -> Path:
 
 
 def test_from_a_trace(recorded: Path) -> None:
-    text = declaration_with_blanks(System(recorded).sketch())
+    text = declaration_of(System(recorded).draft())
     assert f'# From the trace {recorded}.' in text
     accepted = re.sub(rf'^( +)# (\w+: .*# {MARK})', r'\1\2', text, flags=re.MULTILINE)
     # That quiet node's publisher has no callback: a timer of unknown period is supposed.
@@ -136,7 +136,7 @@ def test_names_periods_and_what_no_one_declares(tmp_path: Path) -> None:
         events += [('rcl_service_init', 0, 1, 200 + n, 100, 0, f'/cam/{name}'),
                    ('rclcpp_service_callback_added', 0, 1, 200 + n, 300 + n)]
     events += run(1, 1, 1_000 * MS, MS, 110)
-    text = declaration_with_blanks(System(trace(tmp_path / 'n.mcap', events)).sketch())
+    text = declaration_of(System(trace(tmp_path / 'n.mcap', events)).draft())
     assert re.findall(r'name: (.*)', text) == [
         'grab', 'callback_1', 'grab_2', 'callback_3', 'callback_4']
     assert re.findall(r'timer: (.*)', text)[:4] == ['33.333ms', '33.3ms', '1.5us', '20ms']
@@ -147,7 +147,7 @@ def test_names_periods_and_what_no_one_declares(tmp_path: Path) -> None:
 def test_measures_for_an_architecture_file(recorded: Path) -> None:
     system, counts = System(recorded), []
     text = declaration_from_caret(
-        ARCHITECTURE, 'arch.yaml', lambda sketch: counts.append(system.measure(sketch)))
+        ARCHITECTURE, 'arch.yaml', lambda draft: counts.append(system.measure(draft)))
     assert counts == [4]
     plain = declaration_from_caret(ARCHITECTURE, 'arch.yaml')
     assert plain.count('which callback publishes /x?') == 2
@@ -167,7 +167,7 @@ def test_a_recorded_declaration_gives_names_and_deadlines() -> None:
     bag = BAGS / 'demo_short.mcap'
     system = System(bag, 'bag')
     assert system.task_set is not None
-    text = declaration_with_blanks(system.sketch())
+    text = declaration_of(system.draft())
     again = loads(text)
     before = system.task_set
     assert [c.key for c in again.callbacks] == [c.key for c in before.callbacks]
@@ -179,7 +179,7 @@ def test_a_recorded_declaration_gives_names_and_deadlines() -> None:
 
 def test_a_recorded_sync_callback_has_its_times() -> None:
     """So that what comes of it can be simulated."""
-    task_set = loads(declaration_with_blanks(System(BAGS / 'demo_short.mcap').sketch()))
+    task_set = loads(declaration_of(System(BAGS / 'demo_short.mcap').draft()))
     assert all(callback.execution_time for callback in task_set.callbacks)
     sync = next(callback for callback in task_set.callbacks if callback.kind == 'sync')
     declared = load(BAGS.parent / 'config' / 'autoware.yaml').callback(sync.key)

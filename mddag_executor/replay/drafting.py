@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Sketches of systems from traces: nodes, callbacks, what each publishes, rates, execution times.
+Drafts of systems from traces: nodes, callbacks, what each publishes, rates, execution times.
 
 Theory of operation
 -------------------
@@ -29,8 +29,8 @@ from mddag_executor.trace import TraceReader
 from mddag_executor.trace.census import Address, Census, Entity, Event, KEEP_TIMES
 from msg_graph import Callback, ExecutionTime, GraphError, loads, TaskSet
 from msg_graph.binding import function_of
-from msg_graph.fields import check_callback, check_node, check_service, check_topic
-from msg_graph.sketch import is_background, Sketch, SketchCallback, SketchNode
+from msg_graph.draft import Draft, DraftCallback, DraftNode
+from msg_graph.names import CALLBACK, is_background, NODE, SERVICE, TOPIC
 
 PERCENT = (0.0, 50.0, 90.0, 99.0, 100.0)
 _STEP = 4096
@@ -105,44 +105,44 @@ class System:
         if took[0] == (event[2], event[4]) and len(times) < KEEP_TIMES:
             times.append(took[1])
 
-    def sketch(self) -> Sketch:
+    def draft(self) -> Draft:
         """Return the whole system."""
-        nodes: dict[str, SketchNode] = {}
+        nodes: dict[str, DraftNode] = {}
         for entity in self._entities:
-            node = nodes.setdefault(entity.node, SketchNode(entity.node))
+            node = nodes.setdefault(entity.node, DraftNode(entity.node))
             callback = self._callback(entity, node)
             node.callbacks.setdefault(callback.name, callback)
         for name, topics in self.census.publishers.items():
             unseen = [t for t, seen in topics.items()
-                      if not seen and not is_background(t, name) and check_topic(t) is None]
-            if unseen and name not in nodes and check_node(name) is None:
-                timer = SketchCallback(name, 'callback_0', 'timer', guessed=True)
-                nodes[name] = SketchNode(name, {timer.name: timer})
+                      if not seen and not is_background(t, name) and TOPIC.check(t) is None]
+            if unseen and name not in nodes and NODE.check(name) is None:
+                timer = DraftCallback(name, 'callback_0', 'timer', guessed=True)
+                nodes[name] = DraftNode(name, {timer.name: timer})
             if unseen:
                 for callback in nodes[name].callbacks.values() if name in nodes else ():
                     callback.maybe.extend(t for t in unseen if t not in callback.publishes)
-        return Sketch(f'the trace {self.name}', self._ordered(nodes), workers=self.workers)
+        return Draft(f'the trace {self.name}', self._ordered(nodes), workers=self.workers)
 
-    def _ordered(self, nodes: dict[str, SketchNode]) -> list[SketchNode]:
+    def _ordered(self, nodes: dict[str, DraftNode]) -> list[DraftNode]:
         """Return the nodes in the order of the recorded declaration, which counts for ties."""
         if self.task_set is None:
             return list(nodes.values())
         place = {c.key: i for i, c in enumerate(self.task_set.callbacks)}
         every = [callback for node in nodes.values() for callback in node.callbacks.values()]
-        found: list[SketchNode] = []
+        found: list[DraftNode] = []
         for callback in sorted(every, key=lambda c: place.get(c.key, len(place))):
             if not found or found[-1].name != callback.node:
-                found.append(SketchNode(callback.node))  # a node may have several entries
+                found.append(DraftNode(callback.node))  # a node may have several entries
             found[-1].callbacks[callback.name] = callback
         return found
 
-    def _callback(self, entity: Entity, node: SketchNode) -> SketchCallback:
+    def _callback(self, entity: Entity, node: DraftNode) -> DraftCallback:
         declared = None if entity.callback is None else self._declared.get(entity.callback)
         if declared is not None and declared.node == entity.node:
             known = node.callbacks.get(declared.name)
             callback = known or _from_declared(declared)
         else:
-            callback = SketchCallback(
+            callback = DraftCallback(
                 entity.node, self._free_name(entity, node), entity.kind,
                 [entity.start] if entity.start else [], entity.period_ns)
             if entity.group is not None:
@@ -150,12 +150,12 @@ class System:
         self._measure(callback, [entity])
         return callback
 
-    def _free_name(self, entity: Entity, node: SketchNode) -> str:
+    def _free_name(self, entity: Entity, node: DraftNode) -> str:
         """Return a name for a callback that nobody has named."""
         declared = () if self.task_set is None else self.task_set.callbacks
         taken = {*node.callbacks, *(c.name for c in declared if c.node == entity.node)}
         name = function_of(entity.symbol)
-        if name is None or check_callback(name) is not None:
+        if name is None or CALLBACK.check(name) is not None:
             names = [f'callback_{number}' for number in range(len(taken), 2 * len(taken) + 1)]
         else:
             names = [name, *(f'{name}_{number}' for number in range(2, len(taken) + 2))]
@@ -169,7 +169,7 @@ class System:
         known = [group for group in dict.fromkeys(groups) if group is not None]
         return f'callback_group_{known.index(entity.group)}' if entity.group in known else None
 
-    def _measure(self, callback: SketchCallback, entities: Iterable[Entity]) -> bool:
+    def _measure(self, callback: DraftCallback, entities: Iterable[Entity]) -> bool:
         """Fill in what was measured of a callback; return whether anything was."""
         found = [self.census.runs[e.callback] for e in entities
                  if e.callback is not None and e.callback in self.census.runs]
@@ -179,7 +179,7 @@ class System:
         for each in found:
             callback.publishes.extend(
                 t for t in each.publishes if t not in callback.publishes
-                and not is_background(t, callback.node) and check_topic(t) is None)
+                and not is_background(t, callback.node) and TOPIC.check(t) is None)
         callback.maybe = [t for t in callback.maybe if t not in callback.publishes]
         if callback.kind == 'sync':
             callback.times = execution_time(self._whole.get(callback.key, ()))
@@ -188,9 +188,9 @@ class System:
             callback.times = execution_time(runs.times)
         return True
 
-    def measure(self, sketch: Sketch) -> int:
+    def measure(self, draft: Draft) -> int:
         """
-        Fill what was measured into a sketch of the same system; return of how many callbacks.
+        Fill what was measured into a draft of the same system; return of how many callbacks.
 
         Callbacks are the same if node and what starts them are; of several that are started
         alike the first is the one that was made first.
@@ -200,7 +200,7 @@ class System:
             start = str(entity.period_ns) if entity.kind == 'timer' else entity.start
             waiting.setdefault((entity.node, entity.kind, start), []).append(entity)
         count = 0
-        for callback in sketch.callbacks():
+        for callback in draft.callbacks():
             start = callback.starts[0] if callback.starts else str(callback.period_ns)
             fits = waiting.get((callback.node, callback.kind, start))
             if fits:
@@ -218,17 +218,17 @@ def execution_time(took: Iterable[int]) -> tuple[ExecutionTime, int] | None:
 
 
 def _is_shown(entity: Entity) -> bool:
-    if check_node(entity.node) is not None:
+    if NODE.check(entity.node) is not None:
         return False
     if entity.kind == 'timer':
         return entity.period_ns is not None and entity.period_ns >= 1_000
-    check = check_topic if entity.kind == 'subscription' else check_service
-    return not is_background(entity.start, entity.node) and check(entity.start) is None
+    name = TOPIC if entity.kind == 'subscription' else SERVICE
+    return not is_background(entity.start, entity.node) and name.check(entity.start) is None
 
 
-def _from_declared(declared: Callback) -> SketchCallback:
+def _from_declared(declared: Callback) -> DraftCallback:
     starts = [declared.service] if declared.service else list(declared.topics)
-    return SketchCallback(
+    return DraftCallback(
         declared.node, declared.name, declared.kind, starts, declared.period_ns, [], [],
         list(declared.reads), declared.group, declared.dag, declared.deadline_ns,
         declared.release_from)

@@ -1,11 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A sketch of a system: its nodes and callbacks as far as a file, a trace or a running system knows.
+Drafts of declarations: a system as far as a file, a trace or the system itself tells of it.
 
-Sketches come from CARET architecture files (``caret``), from traces and from running systems;
-``blanks`` writes them as declarations to fill in. Names in a sketch are valid: whoever makes one
-checks them.
+Drafts come from CARET architecture files (``caret``), from traces and from running systems;
+``draft_text`` writes them as declarations to fill in. Names in a draft are valid: whoever makes
+one checks them.
 """
 
 from __future__ import annotations
@@ -18,18 +18,9 @@ from msg_graph.model import ExecutionTime, ReleaseFrom
 UNDEFINED = 'UNDEFINED'
 """Stands for a topic at the end of a path (CARET's word)."""
 
-_BACKGROUND_TOPICS = {'/rosout', '/parameter_events', '/clock', '/diagnostics'}
-_BACKGROUND_SERVICES = {
-    'describe_parameters', 'get_parameter_types', 'get_parameters', 'list_parameters',
-    'set_parameters', 'set_parameters_atomically', 'get_type_description',
-    'get_logger_levels', 'set_logger_levels'}
-_LIFECYCLE = {
-    'change_state', 'get_state', 'get_available_states', 'get_available_transitions',
-    'get_transition_graph', 'transition_event'}
-
 
 @dataclass
-class SketchCallback:
+class DraftCallback:
     """
     A callback.
 
@@ -72,16 +63,16 @@ class SketchCallback:
 
 
 @dataclass
-class SketchNode:
+class DraftNode:
     """A node with its callbacks by name, and topics that it subscribes without a callback."""
 
     name: str
-    callbacks: dict[str, SketchCallback] = field(default_factory=dict)
+    callbacks: dict[str, DraftCallback] = field(default_factory=dict)
     taken: list[str] = field(default_factory=list)
 
 
 @dataclass
-class SketchPath:
+class DraftPath:
     """A named path: node, subscribed and published topic of each step."""
 
     name: str
@@ -89,7 +80,7 @@ class SketchPath:
 
 
 @dataclass
-class Sketch:
+class Draft:
     """
     A system.
 
@@ -97,23 +88,11 @@ class Sketch:
     """
 
     origin: str
-    nodes: list[SketchNode]
-    paths: list[SketchPath] = field(default_factory=list)
+    nodes: list[DraftNode]
+    paths: list[DraftPath] = field(default_factory=list)
     workers: int | None = None
 
-    def callbacks(self) -> Iterator[SketchCallback]:
+    def callbacks(self) -> Iterator[DraftCallback]:
         """Yield the callbacks of all nodes."""
         for node in self.nodes:
             yield from node.callbacks.values()
-
-
-def is_background(name: str, node: str) -> bool:
-    """
-    Tell whether a node has a topic or service as every node has, or is an action's inner one.
-
-    So it is with what every lifecycle node has. A declaration is about what a system is there for,
-    not about what the client library adds.
-    """
-    before, _, word = name.rpartition('/')
-    return (name in _BACKGROUND_TOPICS or '/_action/' in name or word in _BACKGROUND_SERVICES
-            or (word in _LIFECYCLE and before == node))

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Declarations to fill in: what a sketch knows, and marked blanks for what it cannot know.
+Declarations to fill in: what a draft knows, and marked blanks for what it cannot know.
 
 Theory of operation
 -------------------
@@ -24,15 +24,14 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 import re
 
+from msg_graph.draft import Draft, DraftCallback, DraftPath, UNDEFINED
 from msg_graph.duration import DAY, exact_duration, format_duration, MICROSECOND
 from msg_graph.errors import GraphError, GraphErrors, printable
-from msg_graph.fields import check_path
-from msg_graph.flat import quantiles_text
 from msg_graph.model import ExecutionTime
-from msg_graph.sketch import Sketch, SketchCallback, SketchPath, UNDEFINED
+from msg_graph.names import PATH
 from msg_graph.yamltext import plain_scalar
 
 MARK = 'FILL IN'
@@ -42,9 +41,9 @@ _MOST_EDGES = 60
 _LITTLE = 1e-4      # of a period
 
 
-def declaration_with_blanks(sketch: Sketch) -> str:
+def declaration_of(draft: Draft) -> str:
     """Return the text of a declaration with marked blanks."""
-    return '\n'.join(_Writer(sketch).lines()) + '\n'
+    return '\n'.join(_Writer(draft).lines()) + '\n'
 
 
 def open_blanks(text: str, file: str) -> list[GraphError]:
@@ -72,11 +71,11 @@ def with_blanks(error: GraphError, text: str, file: str) -> GraphError:
 
 class _Writer:
 
-    def __init__(self, sketch: Sketch) -> None:
-        self._sketch = sketch
-        self._callbacks = list(sketch.callbacks())
-        self._publishers: dict[str, list[SketchCallback]] = {}
-        self._started: dict[str, list[SketchCallback]] = {}
+    def __init__(self, draft: Draft) -> None:
+        self._draft = draft
+        self._callbacks = list(draft.callbacks())
+        self._publishers: dict[str, list[DraftCallback]] = {}
+        self._started: dict[str, list[DraftCallback]] = {}
         for callback in self._callbacks:
             for topic in callback.publishes:
                 self._publishers.setdefault(topic, []).append(callback)
@@ -88,19 +87,19 @@ class _Writer:
         self._next = {callback.key: self._successors(callback) for callback in self._callbacks}
         self._period = self._shortest_periods()
 
-    def _is_source(self, callback: SketchCallback) -> bool:
+    def _is_source(self, callback: DraftCallback) -> bool:
         if callback.kind == 'sync':
             return False
         return callback.kind != 'subscription' or not (
             callback.starts[0] in self._publishers or callback.starts[0] in self._maybe)
 
-    def _successors(self, callback: SketchCallback) -> list[tuple[str, SketchCallback]]:
+    def _successors(self, callback: DraftCallback) -> list[tuple[str, DraftCallback]]:
         return [(topic, after) for topic in callback.publishes
                 for after in self._started.get(topic, ())]
 
-    def _shortest_periods(self) -> dict[str, SketchCallback]:
+    def _shortest_periods(self) -> dict[str, DraftCallback]:
         """Return by callback the source with the shortest period that leads to it, perhaps."""
-        found: dict[str, SketchCallback] = {}
+        found: dict[str, DraftCallback] = {}
         sources = [c for c in self._callbacks if self._is_source(c) and c.source_period_ns]
         for source in sorted(sources, key=lambda c: c.source_period_ns or 0):
             stack = [source]
@@ -113,22 +112,22 @@ class _Writer:
         return found
 
     def lines(self) -> Iterator[str]:
-        yield f'# From {printable(self._sketch.origin)}.'
+        yield f'# From {printable(self._draft.origin)}.'
         yield f"# Lines with '{MARK}' are blanks: correct the value, then take the '# ' away."
         yield "# 'mddag graph check' tells what is still open."
         yield from self._cycles()
         yield 'mddag: 1'
-        if self._sketch.workers is not None:
-            yield f'workers: {self._sketch.workers}'
+        if self._draft.workers is not None:
+            yield f'workers: {self._draft.workers}'
         yield 'nodes:'
-        for node in self._sketch.nodes:
+        for node in self._draft.nodes:
             yield f'  - node: {plain_scalar(node.name)}'
             yield '    callbacks:'
             for callback in node.callbacks.values():
                 yield from self._callback(callback)
         yield from self._paths()
 
-    def _callback(self, callback: SketchCallback) -> Iterator[str]:
+    def _callback(self, callback: DraftCallback) -> Iterator[str]:
         yield f'      - name: {plain_scalar(callback.name)}'
         yield self._trigger(callback)
         yield from self._source(callback)
@@ -142,7 +141,7 @@ class _Writer:
         if callback.times is not None:
             yield from _execution_time(*callback.times)
 
-    def _trigger(self, callback: SketchCallback) -> str:
+    def _trigger(self, callback: DraftCallback) -> str:
         if callback.kind == 'timer':
             if callback.guessed and not (callback.publishes or callback.maybe):
                 return (f'        # timer: 100ms  # {MARK}: what starts it? Nothing is seen of '
@@ -162,7 +161,7 @@ class _Writer:
             return f'        sync: [{", ".join(callback.starts)}]'
         return f'        {callback.kind}: {callback.starts[0]}'
 
-    def _source(self, callback: SketchCallback) -> Iterator[str]:
+    def _source(self, callback: DraftCallback) -> Iterator[str]:
         """Yield what concerns a source: the name of its DAG, and its period if it is no timer."""
         source = self._is_source(callback)
         known = callback.kind == 'timer' or callback.period_ns is not None
@@ -181,7 +180,7 @@ class _Writer:
         elif callback.starts[0] not in self._publishers:
             yield f'        # {callback.starts[0]} has no known publisher yet: see its blanks'
 
-    def _period_blank(self, callback: SketchCallback) -> str:
+    def _period_blank(self, callback: DraftCallback) -> str:
         what = ('the time between two requests' if callback.kind == 'service' else
                 'nobody here publishes the topic; the time between two messages')
         if callback.interval_ns is not None:
@@ -189,7 +188,7 @@ class _Writer:
                     f'{_measured(callback)}')
         return f'{"1s" if callback.kind == "service" else "100ms"}  # {MARK}: {what}'
 
-    def _publishes(self, callback: SketchCallback) -> Iterator[str]:
+    def _publishes(self, callback: DraftCallback) -> Iterator[str]:
         every = ', '.join(callback.publishes + callback.maybe)
         if callback.maybe:
             names = ', '.join(callback.maybe)
@@ -199,7 +198,7 @@ class _Writer:
         if callback.publishes:
             yield f'        publishes: [{", ".join(callback.publishes)}]'
 
-    def _deadline(self, callback: SketchCallback) -> str:
+    def _deadline(self, callback: DraftCallback) -> str:
         if callback.deadline_ns is not None and not callback.maybe:
             return f'        deadline: {exact_duration(callback.deadline_ns)}'
         what = 'if it is a sink' if callback.maybe else 'a sink'
@@ -212,7 +211,7 @@ class _Writer:
                 f'of the {leads} that leads here')
 
     def _paths(self) -> Iterator[str]:
-        found = [(path, self._path_keys(path)) for path in self._sketch.paths]
+        found = [(path, self._path_keys(path)) for path in self._draft.paths]
         if any(keys for _, keys in found):
             yield 'paths:'
         for path, keys in found:
@@ -224,7 +223,7 @@ class _Writer:
                 chain = ' -> '.join(node for node, _, _ in path.steps)
                 yield printable(f'# {MARK}: path {path.name}: which callbacks? {chain}')
 
-    def _path_keys(self, path: SketchPath) -> list[str]:
+    def _path_keys(self, path: DraftPath) -> list[str]:
         keys = []
         for node, taken, published in path.steps:
             fits = [c for c in self._callbacks if c.node == node
@@ -233,70 +232,62 @@ class _Writer:
             if len(fits) != 1:
                 return []
             keys.append(fits[0].key)
-        return keys if len(keys) > 1 and check_path(path.name) is None else []
+        return keys if len(keys) > 1 and PATH.check(path.name) is None else []
 
     def _cycles(self) -> Iterator[str]:
-        for members in _components(self._next):
+        for members in _cycles(self._next):
             edges = [(before, topic, after) for before in members
                      for topic, after in self._next[before] if after.key in members]
             names = ', '.join(members)
             yield f'# {MARK}: these callbacks start each other in a cycle: {names}.'
             cuts = [edge for edge in edges[:_MOST_EDGES]
-                    if _is_cut(members, self._next, (edge[0], edge[2].key))]
+                    if not _cyclic(self._next, members, (edge[0], edge[2].key))]
             how = 'Each of these queue edges cuts it' if cuts else 'Several of these cut it'
             yield f"# {how} (write it under 'reads:', start the callback by something else):"
             for before, topic, after in cuts or edges[:_MOST_EDGES]:
                 yield f'#   {after.key} reads {topic} (published by {before})'
 
 
-_Next = dict[str, list[tuple[str, SketchCallback]]]
+_Next = dict[str, list[tuple[str, DraftCallback]]]
 
 
-def _components(successors: _Next) -> list[list[str]]:
-    """Return the sets of callbacks that lead back to themselves (Tarjan), in file order."""
-    order = {key: place for place, key in enumerate(successors)}
-    index: dict[str, int] = {}
-    low: dict[str, int] = {}
-    open_keys: list[str] = []
-    is_open: set[str] = set()
-    found: list[list[str]] = []
-    for root in successors:
-        stack = [] if root in index else [(root, iter(successors[root]))]
-        while stack:
-            key, rest = stack[-1]
-            if key not in index:
-                index[key] = low[key] = len(index)
-                open_keys.append(key)
-                is_open.add(key)
-            for _, after in rest:
-                if after.key not in index:
-                    stack.append((after.key, iter(successors[after.key])))
-                    break
-                if after.key in is_open:
-                    low[key] = min(low[key], low[after.key])
-            else:
-                stack.pop()
-                if stack:
-                    low[stack[-1][0]] = min(low[stack[-1][0]], low[key])
-                if low[key] == index[key]:
-                    members: list[str] = []
-                    while not members or members[-1] != key:
-                        members.append(open_keys.pop())
-                        is_open.discard(members[-1])
-                    if len(members) > 1 or any(a.key == key for _, a in successors[key]):
-                        found.append(sorted(members, key=order.__getitem__))
-    return sorted(found, key=lambda members: order[members[0]])
+def _cyclic(successors: _Next, keys: Iterable[str], without: tuple[str, str] | None = None
+            ) -> set[str]:
+    """Return those of some callbacks that are on a cycle of these, or on a way between two."""
+    left = set(keys)
+    edges = {(key, after.key) for key in left for _, after in successors[key]
+             if after.key in left} - {without}
+    while True:
+        inner = {key for key, _ in edges} & {key for _, key in edges}
+        if inner == left:
+            return left
+        left = inner
+        edges = {(key, after) for key, after in edges if key in left and after in left}
 
 
-def _is_cut(members: list[str], successors: _Next, edge: tuple[str, str]) -> bool:
-    """Whether no cycle is left among the members without an edge."""
-    inside = set(members)
-    rest = {key: [(topic, after) for topic, after in successors[key]
-                  if after.key in inside and (key, after.key) != edge] for key in members}
-    return not _components(rest)
+def _cycles(successors: _Next) -> list[list[str]]:
+    """Return the sets of callbacks that lead back to each other, in file order."""
+    left = _cyclic(successors, successors)
+    reached = {key: _reached(successors, key, left) for key in left}
+    found: dict[frozenset[str], None] = {}
+    for key in successors:
+        if key in left and key in reached[key]:
+            found[frozenset(other for other in reached[key] if key in reached[other])] = None
+    return [[key for key in successors if key in members] for members in found]
 
 
-def _period(source: SketchCallback) -> str:
+def _reached(successors: _Next, start: str, inside: set[str]) -> set[str]:
+    reached: set[str] = set()
+    stack = [start]
+    while stack:
+        for _, after in successors[stack.pop()]:
+            if after.key in inside and after.key not in reached:
+                reached.add(after.key)
+                stack.append(after.key)
+    return reached
+
+
+def _period(source: DraftCallback) -> str:
     if source.period_ns is not None:
         return _whole(source.period_ns)
     return _rounded(source.interval_ns or 0)
@@ -315,10 +306,12 @@ def _rounded(nanoseconds: int) -> str:
     return exact_duration(max(1_000, round(nanoseconds / digits) * digits))
 
 
-def _measured(callback: SketchCallback) -> str:
+def _measured(callback: DraftCallback) -> str:
     return f'time between two of its executions, {format_duration(callback.interval_ns or 0)}'
 
 
 def _execution_time(time: ExecutionTime, count: int) -> Iterator[str]:
+    quantiles = ', '.join(f'{ns / 1000:.3f}'.rstrip('0').rstrip('.') for ns in time.quantiles_ns)
+    percent = ', '.join(repr(share).removesuffix('.0') for share in time.percent)
     yield f'        # measured in {count} execution{"s" * (count != 1)}'
-    yield f'        execution_time: {quantiles_text(time)}'
+    yield f'        execution_time: {{quantiles_us: [{quantiles}], percent: [{percent}]}}'
