@@ -236,7 +236,7 @@ def _run(
             _warn(plan, not {'-r', '--remap'}.isdisjoint(args.ros_args or ()))
             measured = _run_synthetic(session, task_set, plan, seconds, progress)
         else:
-            _run_programs(session, programs, _ros_arguments(args), seconds, progress)
+            _run_programs(session, executor, programs, _ros_arguments(args), seconds, progress)
     result = {
         'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
         **executor.statistics(), 'measured': measured}
@@ -264,14 +264,16 @@ def _run_synthetic(
 
 
 def _run_programs(
-    session: Session, programs: list[Program], ros_args: list[str], seconds: float | None,
-    progress: Progress,
+    session: Session, executor: MultiDeadlineExecutor, programs: list[Program],
+    ros_args: list[str], seconds: float | None, progress: Progress,
 ) -> None:
     from mddag_executor.live.hosting import Host
-    with Host(session.executor, session.stop) as host:
+    with Host(executor, session.stop) as host:
+        executor.set_judging(False)
         try:
             with session:
                 host.start(programs, ros_args)
+                executor.set_judging(True)
                 session.wait(seconds, progress.update)
                 host.close()
         except MddagError:

@@ -117,6 +117,11 @@ def _link_newest(s: State, dag: int, slot: int) -> None:
     s.n_open[dag] += 1
 
 
+def judge_from(s: State, release: int) -> None:
+    """Give verdicts about jobs released from a time on only (rule 6); NEVER: for now, none."""
+    s.scalars[JUDGE_FROM] = release + s.scalars[SKIP]
+
+
 def is_judged(s: State, slot: int) -> bool:
     """Tell whether a job was released when there are verdicts already (rule 6)."""
     return s.job_release[slot] >= s.scalars[JUDGE_FROM]

@@ -39,6 +39,7 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
     deadline) is late; at the deadline is in time.  ``finish`` judges what is open when the run
     ends: an absolute deadline at or before the end has been missed.  Jobs that are released less
     than ``SKIP`` after the first one, or before ``JUDGE_FROM``, get no verdicts: a warm-up.
+    ``judge_from`` says that the run begins in earnest later: live, when all programs have started.
 7.  **Misses.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops what is left of it, as soon
     as the miss is known: at a late completion, or when something of it comes first in the ready
     queue after the deadline of a sink that is not done.  What has started runs on.

@@ -20,7 +20,8 @@ import threading
 from time import monotonic_ns
 from typing import Protocol
 
-from mddag_executor.core import Scheduler, Tables
+from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.rules import complete, fail, make_ready
 from mddag_executor.core.state import IDLE, OPEN, SUSPENDED
 from mddag_executor.live.attribution import Attribution, Origin
@@ -257,7 +258,8 @@ class Dispatcher(Dropping):
         if self.scheduler.state.decisions:
             self.decided(now)
         if not self._finished:
-            self.verdicts.released(dag, job, release, now)
+            judged = is_judged(self.scheduler.state, slot)
+            self.verdicts.released(dag, job, release, now, judged)
         return slot
 
     def _start_successor(self, entry: Entry, work: Work, origin: Origin, now: int) -> bool:
@@ -439,6 +441,15 @@ class Dispatcher(Dropping):
                 work.entry.waiting.pop(x, None)
                 work.x = -1
                 self.verdicts.note_drop(work.entry, work.origin or NO_ORIGIN, 'aborted', now)
+
+    def set_judging(self, judging: bool) -> None:
+        """Give verdicts about jobs that are released from now on, or about none for now."""
+        with self.lock:
+            now = self.tick()
+            release = now if judging else NEVER
+            judge_from(self.scheduler.state, release)
+            if self.record is not None:
+                self.record('judge_from', now, threading.get_native_id(), release)
 
     def stopped(self, begin: int, end: int) -> None:
         """Take in that no thread of the process ran from ``begin`` to ``end`` (monotonic)."""

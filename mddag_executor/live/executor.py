@@ -400,6 +400,10 @@ class MultiDeadlineExecutor(Stepping):
         if self._recorder is not None:
             self._recorder.close(end)
 
+    def set_judging(self, judging: bool) -> None:
+        """Give verdicts about jobs that are released from now on, or about none until told so."""
+        self._dispatcher.set_judging(judging)
+
     def statistics(self) -> dict[str, Any]:
         """Return a snapshot of what has happened so far (see the module ``statistics``)."""
         return statistics(self._dispatcher, self._pool, self._registry, self._recorder)

@@ -141,9 +141,10 @@ class Verdicts:
             except Exception as error:
                 self._fail(error)
 
-    def released(self, dag: int, job: int, release: int, now: int) -> None:
+    def released(self, dag: int, job: int, release: int, now: int, judged: bool) -> None:
         """Take in that a job was released."""
-        self.tally.released(dag)
+        if judged:
+            self.tally.released(dag)
         if self.on_release is not None:
             self.on_release(dag, release)
         if self.record is not None:

@@ -24,7 +24,7 @@ from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.core.policies import POLICIES
-from mddag_executor.core.state import State
+from mddag_executor.core.state import JUDGE_FROM, State
 from mddag_executor.replay import fast_work as fw
 from mddag_executor.replay.batches import Batch, BatchWatcher
 from mddag_executor.replay.chains import Breakdown, Step, Worst
@@ -45,6 +45,7 @@ import numpy as np
 _MASK = 2 ** 64 - 1
 _MDDAG = 'mddag:'         # events that name no entities
 _HOSTED = 'mddag:hosted'
+_JUDGE_FROM = 'mddag:judge_from'
 
 
 class FastReplay:
@@ -205,6 +206,11 @@ class FastReplay:
         if name == _HOSTED:
             for column, values in self._judge.expected.items():
                 self._state.write(State._fields.index(column), values)
+        elif name == _JUDGE_FROM:
+            scalars_field = State._fields.index('scalars')
+            numbers = [number for number, in self._state.rows(scalars_field, 1)]
+            numbers[JUDGE_FROM] = self._judge.judge_from
+            self._state.write(scalars_field, numbers)
         if follower.shut_down and not self._finished:
             self._finish(follower.end)
         self._stale = self._stale or not name.startswith(_MDDAG)

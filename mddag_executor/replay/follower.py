@@ -69,6 +69,9 @@ class Observer:
     def hosted(self, dag: int, vertices: set[int]) -> None:
         """Take in which (global) vertices of a DAG the process has from here on."""
 
+    def judging(self, release: int) -> None:
+        """Take in that from here on only jobs released at a time or later are judged."""
+
     def released(self, dag: int, job: int, release: int, now: int) -> None:
         """Take in the release of a job; `now` is when the executor noticed it."""
 
@@ -152,6 +155,7 @@ class Follower:
             'ros2:callback_end': self._end,
             TASK_SET: self._task_set,
             'mddag:hosted': self._hosted,
+            'mddag:judge_from': self._judge_from,
             'mddag:job_release': self._release,
             'mddag:dispatch': self._dispatch,
             'mddag:complete': self._complete,
@@ -319,6 +323,15 @@ class Follower:
         if dag >= 0:
             for observer in self._observers:
                 observer.hosted(dag, vertices)
+
+    def _judge_from(self, event: Event) -> None:
+        _, now, _, _, release = event
+        self._advance(now)
+        if not 0 <= release <= NEVER:
+            self._strange[f'{event[0]} an impossible time'] += 1
+            return
+        for observer in self._observers:
+            observer.judging(release)
 
     def _release(self, event: Event) -> None:
         _, now, _, _, dag, job, release = event

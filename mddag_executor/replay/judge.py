@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from mddag_executor.core import NEVER, Scheduler, Tables
-from mddag_executor.core.jobs import is_judged
+from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.state import (
     Decision,
     DROP,
@@ -106,6 +106,10 @@ class Judge(Observer):
         """Expect nothing of a DAG that other processes run."""
         first, last = self.tables.first_vertex[dag:dag + 2]
         self._scheduler.expect(dag, [int(v in vertices) for v in range(first, last)])
+
+    def judging(self, release: int) -> None:
+        """Judge only jobs that are released then or later."""
+        judge_from(self._scheduler.state, release)
 
     @property
     def judge_from(self) -> int:

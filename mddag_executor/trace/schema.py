@@ -121,6 +121,7 @@ _ALL = (
     _event('mddag', 'task_set', yaml=_STR, file=_STR, policy=_STR, workers=_I32,
            default_deadline=_I64, max_active_jobs=_I32, preemptive=_BOOL),
     _event('mddag', 'hosted', dag=_I32, vertices=_STR),
+    _event('mddag', 'judge_from', release=_I64),
     _event('mddag', 'job_release', dag=_I32, job=_I64, release=_I64),
     _event('mddag', 'dispatch', callback=_U64, dag=_I32, vertex=_I32, job=_I64, worker=_I32,
            ready=_I64, reference_deadline=_I64),

@@ -9,6 +9,7 @@ from contextlib import suppress
 import gc
 import json
 from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
@@ -19,7 +20,8 @@ import weakref
 
 from mddag_executor.live.hosting import Guest, Host
 from mddag_executor.live.loading import Program
-from mddag_executor.trace import TraceError, TraceReader
+from mddag_executor.replay import replay, reschedule
+from mddag_executor.trace import read_events, TraceError, TraceReader
 import pytest
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
@@ -93,6 +95,25 @@ def test_a_program_that_leaves_early_leaves_the_others_alone(world: Path, mddag:
     result, output = run(mddag, 'chat_nodes/talker', 'chat:main', 'chat:leaves_early')
     assert 'left early' in output
     assert heard(result) >= 5  # of 30: a busy machine skips some
+
+
+def test_what_is_due_while_other_programs_start_is_no_miss(world: Path, mddag: Mddag) -> None:
+    process = mddag(
+        'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', 'chat:starts_slowly',
+        '--duration', '1s', '--json', '-', '--trace', 'out.mcap')
+    assert process.returncode == 0, process.stderr
+    talker = json.loads(process.stdout)['dags']['/talker']
+    started = int(re.findall(r'^started at (\d+)$', process.stderr, re.MULTILINE)[0])
+    events = list(read_events('out.mcap', {'mddag:job_release', 'mddag:deadline'}))
+    released = [e['release'] for e in events if e['_name'] == 'mddag:job_release']
+    missed = [e['deadline'] for e in events if e['_name'] == 'mddag:deadline']
+    assert sum(release < started for release in released) >= 20
+    assert all(deadline - 50_000_000 >= started for deadline in missed)
+    assert 0 < talker['jobs'] <= sum(release >= started for release in released)
+    assert talker['sinks']['/listener:heard']['completed'] > 0
+    for found in (replay('out.mcap').result(), reschedule('out.mcap').result()['recorded']):
+        assert found['dags']['/talker']['jobs'] == talker['jobs']
+        assert found['dags']['/talker']['ends'] == talker['ends']
 
 
 def test_the_run_ends_when_a_callback_shuts_rclpy_down(world: Path, mddag: Mddag) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mddag_executor.core import NEVER
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import fast_compile, replay
 from mddag_executor.replay.as_recorded import replay_compiled, replay_recording
@@ -118,6 +119,24 @@ def test_a_process_that_has_a_part_of_a_dag(tmp_path: Path) -> None:
                 if i == len(events) // 4:
                     file.add('mddag:hosted', time, pid, thread, 0, vertices)
         assert compare(path)
+
+
+@pytest.mark.parametrize('skip', [0, 100 * MS])
+def test_verdicts_begin_when_all_programs_have_started(tmp_path: Path, skip: int) -> None:
+    path = tmp_path / 'a.mcap'
+    VirtualRun(path, loads(SMALL, 'g.yaml'), 4, duration=400 * MS)
+    events = list(TraceReader(path).events(sorted=True))
+    start = events[len(events) // 3][1]
+    jobs = sum(name == 'mddag:job_release' and release >= start + skip
+               for name, *_, release in events)
+    with TraceFile(path) as file:
+        for i, (name, time, pid, thread, *fields) in enumerate(events):
+            file.add(name, time, pid, thread, *fields)
+            if i in (0, len(events) // 3):
+                file.add('mddag:judge_from', time, pid, thread, start if i else NEVER)
+    assert compare(path, skip=skip)
+    found = replay(path, skip=skip).result()['dags'].values()
+    assert sum(dag['jobs'] for dag in found) == jobs > 0
 
 
 @given(st.integers(0, 2**32), st.sampled_from([0.5, 0.9, 1.3]),

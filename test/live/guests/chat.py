@@ -134,6 +134,14 @@ def catches_signals():
     rclpy.spin(Listener())
 
 
+def starts_slowly():
+    import time
+    rclpy.init()
+    time.sleep(1.5)
+    print('started at', time.time_ns())
+    rclpy.spin(Listener())
+
+
 def leaves_a_thread():
     import threading
     import time
