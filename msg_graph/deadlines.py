@@ -18,35 +18,26 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from msg_graph.duration import SECOND, short_duration
+from msg_graph.duration import exact_duration, SECOND
 from msg_graph.errors import GraphError
 from msg_graph.layout import refused, without_lines
+from msg_graph.loading import loads
 from msg_graph.model import TaskSet
 import yaml
 
 _LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-_PLACEHOLDER_NS = SECOND
 
 
-def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, str]:
+def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, list[str]]:
     """
     Return the task set of a declaration whose sinks may lack deadlines.
 
-    :return: the task set and the text that it was read from, where deadlines that were missing
-        are a placeholder.
+    :return: the task set, and the keys of the callbacks that lack theirs; it is a second there.
     :raises GraphError: anything else is wrong.
     """
-    from msg_graph import loads
-    try:
-        return loads(text, name), text
-    except GraphError as error:
-        first = error
-    try:
-        filled = _changed(text, dict.fromkeys(_without_deadline(text), _PLACEHOLDER_NS))
-        return loads(filled, name), filled
-    except (GraphError, yaml.YAMLError, RecursionError, KeyError, TypeError, ValueError,
-            AttributeError, IndexError):  # it is wrong in other ways, which the first error tells
-        raise first from None
+    missing: list[str] = []
+    task_set = loads(text, name, without_deadline=missing)
+    return with_deadlines(task_set, dict.fromkeys(missing, SECOND)), missing
 
 
 def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Mapping[str, int]) -> str:
@@ -57,11 +48,10 @@ def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Mapping[str, int]
     :param deadlines: by the callback's key, ns.
     :raises GraphError: the text cannot be written anew without another change of its meaning.
     """
-    from msg_graph import loads
-    result = _changed(text, deadlines)
     try:
+        result = _changed(text, deadlines)
         after = loads(result, task_set.file)
-    except GraphError:
+    except (GraphError, KeyError):  # of a declaration of several files
         raise refused(task_set.file) from None
     if without_lines(after) != without_lines(with_deadlines(task_set, deadlines)):
         raise refused(task_set.file)
@@ -81,23 +71,6 @@ def _entries(node: Any) -> dict[str, Any]:
     return {key.value: value for key, value in node.value}
 
 
-def _without_deadline(text: str) -> list[str]:
-    """Return the keys of the callbacks that start no other and have no deadline."""
-    every = list(_callbacks(text))
-    starting = {
-        topic for _, _, entries in every for trigger in ('subscription', 'sync')
-        for topic in _texts(entries.get(trigger))}
-    return [key for key, _, entries in every
-            if 'deadline' not in entries
-            and not starting.intersection(_texts(entries.get('publishes')))]
-
-
-def _texts(node: Any) -> list[str]:
-    if node is None:
-        return []
-    return [node.value] if isinstance(node.value, str) else [each.value for each in node.value]
-
-
 def _changed(text: str, deadlines: Mapping[str, int]) -> str:
     """Return a text with other or additional deadlines."""
     lines = text.splitlines(keepends=True)
@@ -105,7 +78,7 @@ def _changed(text: str, deadlines: Mapping[str, int]) -> str:
     for key, callback, entries in _callbacks(text):
         if key not in deadlines:
             continue
-        value = short_duration(deadlines[key])
+        value = exact_duration(deadlines[key])
         if 'deadline' in entries:
             begin, end = entries['deadline'].start_mark, entries['deadline'].end_mark
             edits.append((begin.line, begin.column, end.column, value))

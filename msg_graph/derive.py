@@ -51,10 +51,14 @@ MAX_VERTICES = 100_000
 MAX_EDGES = 1_000_000
 
 
-def derive_task_set(declaration: Declaration) -> TaskSet:
+def derive_task_set(
+    declaration: Declaration, without_deadline: list[str] | None = None
+) -> TaskSet:
     """
     Return the task set of a declaration.
 
+    :param without_deadline: takes the keys of the sinks that have no deadline; None: they are
+        errors.
     :raises GraphError: the graph breaks a rule of the model.
     """
     links = Links(declaration)
@@ -70,7 +74,7 @@ def derive_task_set(declaration: Declaration) -> TaskSet:
     with found:
         order = links.order()
     with found:
-        links.check_deadlines()
+        links.check_deadlines(without_deadline)
     with found:
         paths = links.paths(declaration)
     found.check()

@@ -98,22 +98,14 @@ def whole_us(ns: float) -> int:
     return max(1, -int(-min(DAY, ns) // 1000)) * 1000
 
 
-def short_duration(ns: int) -> str:
+def exact_duration(ns: int) -> str:
     """
-    Return just this time in the largest of ms, us and ns that needs three decimals at most.
+    Return just this time in the largest of s, ms, us and ns that needs three decimals at most.
 
-    What the program writes into declarations; no seconds, so that columns of deadlines compare.
+    ``parse_duration`` reads it back, if it is a time at all.
     """
-    for unit, factor in (('ms', MILLISECOND), ('us', MICROSECOND)):
-        if ns >= factor and ns % (factor // 1000) == 0:
+    for unit, factor in (('s', SECOND), ('ms', MILLISECOND), ('us', MICROSECOND)):
+        if factor <= ns <= DAY and ns % (factor // 1000) == 0:
             whole, part = divmod(ns // (factor // 1000), 1000)
             return f'{whole}.{part:03d}'.rstrip('0').rstrip('.') + unit
-    return f'{ns}ns'
-
-
-def exact_duration(ns: int) -> str:
-    """Return a time that ``parse_duration`` reads back as just this one, if it is one at all."""
-    text = format_duration(ns)
-    if 0 <= ns <= DAY and parse_duration(text, minimum_ns=0) == ns:
-        return text
     return f'{ns}ns'

@@ -29,6 +29,7 @@ import sys
 
 from msg_graph.errors import GraphError
 from msg_graph.include import is_composed, top_of
+from msg_graph.loading import loads
 from msg_graph.model import Callback, Dag, TaskSet
 from msg_graph.yamltext import Scalar, Sequence, Tree
 import yaml
@@ -64,7 +65,6 @@ def format_text(text: str, name: str = '<string>') -> str:
 
 def _meaning(text: str, name: str) -> object:
     """Return what must stay the same: the task set, or all that stands in the text (rule 6)."""
-    from msg_graph import loads
     tree, top = top_of(text, name)
     return _plain(tree) if is_composed(top) else without_lines(loads(text, name))
 

@@ -151,15 +151,17 @@ class Links:
                 for publisher in self.publishers[topic] if publisher in stuck)
         return walk[seen[place]:][::-1]
 
-    def check_deadlines(self) -> None:
-        """Check that sinks, and nothing else, have deadlines (rule 6)."""
-        for_each(self.declared, self._check_deadline)
+    def check_deadlines(self, without: list[str] | None) -> None:
+        """Check that sinks, and nothing else, have deadlines (rule 6); or collect who has none."""
+        for_each(self.declared, lambda each: self._check_deadline(each, without))
 
-    def _check_deadline(self, declared: DeclaredCallback) -> None:
+    def _check_deadline(self, declared: DeclaredCallback, without: list[str] | None) -> None:
         callback = declared.callback
         topic = next((t for t in callback.publishes if t in self.started), None)
         if topic is None:
-            if callback.deadline_ns is None:
+            if callback.deadline_ns is None and without is not None:
+                without.append(callback.key)
+            elif callback.deadline_ns is None:
                 raise declared.entry.error(
                     None, 'it is a sink (it starts no other callback) and has no deadline',
                     "add 'deadline:'")

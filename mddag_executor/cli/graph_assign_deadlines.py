@@ -86,12 +86,12 @@ def main(args: argparse.Namespace) -> int:
     for path in (args.output, args.json):
         common.check_output(path)
     name, text = common.read_text(args.graph)
-    task_set, whole = load_with_or_without_deadlines(text, name)
-    if args.base == 'deadline' and whole != text:
+    task_set, missing = load_with_or_without_deadlines(text, name)
+    if args.base == 'deadline' and missing:
         raise InputError(name, 'a sink has no deadline, on which --base deadline depends',
                          "add it, or use '--base period'")
     deadlines, measured, found = _assign(args, task_set)
-    common.write_text(args.output, deadlines_in_text(task_set, whole, deadlines))
+    common.write_text(args.output, deadlines_in_text(task_set, text, deadlines))
     if args.json is not None:
         common.write_json(args.json, _result(args, deadlines, measured, found))
     if common.wants_tables(args):

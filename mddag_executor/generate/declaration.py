@@ -23,7 +23,7 @@ from typing import NamedTuple
 from mddag_executor.generate.options import GenerateError, LEAST_NS, Options
 from mddag_executor.generate.shapes import draw_shape, Shape
 from mddag_executor.generate.shares import deal, Dice
-from msg_graph.duration import short_duration, whole_us
+from msg_graph.duration import exact_duration, whole_us
 
 
 class _Dag(NamedTuple):
@@ -126,7 +126,7 @@ def _callback(dag: _Dag, place: int, spread: float) -> Iterator[str]:
     before = shape.predecessors[place]
     yield f'      - name: v{place}'
     if place == 0:
-        yield f'        timer: {short_duration(dag.period_ns)}'
+        yield f'        timer: {exact_duration(dag.period_ns)}'
         yield f'        dag: {dag.name}'
     elif len(before) == 1 or shape.is_or[place]:
         topic = f'to_v{place}' if shape.is_or[place] else f'v{before[0]}'
@@ -139,7 +139,7 @@ def _callback(dag: _Dag, place: int, spread: float) -> Iterator[str]:
         yield '        publishes:'
         yield from (f'          - {topic}' for topic in topics)
     if place >= shape.first_sink:
-        yield f'        deadline: {short_duration(dag.deadlines[place - shape.first_sink])}'
+        yield f'        deadline: {exact_duration(dag.deadlines[place - shape.first_sink])}'
     yield f'        execution_time: {_execution_time(dag.costs[place], spread)}'
 
 
@@ -154,5 +154,5 @@ def _published(dag: _Dag, place: int) -> list[str]:
 def _execution_time(cost: int, spread: float) -> str:
     half = int(cost * spread)
     if half == 0:
-        return short_duration(cost)
+        return exact_duration(cost)
     return f'{{quantiles_us: [{(cost - half) / 1000:.3f}, {(cost + half) / 1000:.3f}]}}'

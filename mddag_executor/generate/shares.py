@@ -108,7 +108,9 @@ def _stretched(dice: Dice, total: float, most: Sequence[float]) -> list[float]:
         for _ in range(_MOST_STRETCHES):
             over = [share > limit for share, limit in zip(shares, most)]
             if not any(over):
-                return shares
+                if abs(sum(shares) - total) <= total * 1e-9:
+                    return shares
+                break  # stretching often has made the rounding large
             rest = total - sum(limit for limit, is_over in zip(most, over) if is_over)
             if rest <= total * 1e-9:
                 break  # nothing but rounding is left to stretch

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 import hypothesis.strategies as st
 from mddag_executor.generate import GenerateError
 from mddag_executor.generate.shares import deal, Dice, dirichlet_rescale, uunifast
@@ -14,6 +14,7 @@ LIMITS = st.lists(st.floats(0.01, 2.0), min_size=1, max_size=30)
 
 
 @given(limits=LIMITS, part=st.floats(0.0, 1.0), seed=st.integers(0, 10 ** 6))
+@example(limits=[0.375, 0.390625, 0.5, 0.5, 0.5, 0.015625], part=0.5, seed=42)
 def test_dirichlet_rescale_keeps_sum_and_bounds(
     limits: list[float], part: float, seed: int
 ) -> None:

@@ -38,7 +38,7 @@ def test_only_the_values_change() -> None:
     task_set = loads(TEXT)
     new = {'/n:x': 1_234_000, '/n:y': 2_000_000_000, '/n:z': 3_141}
     result = deadlines_in_text(task_set, TEXT, new)
-    assert result == TEXT.replace('5 ms', '1.234ms').replace('"50ms"', '2000ms').replace(
+    assert result == TEXT.replace('5 ms', '1.234ms').replace('"50ms"', '2s').replace(
         '7ms', '3.141us')
     after = loads(result)
     assert {c.key: c.deadline_ns for c in after.callbacks if c.deadline_ns} == new
@@ -55,10 +55,10 @@ def test_missing_deadlines() -> None:
     text = text.replace('      deadline: 7ms\n', '')
     with pytest.raises(GraphError, match='no deadline'):
         loads(text)
-    task_set, filled = load_with_or_without_deadlines(text, 'g.yaml')
-    assert task_set.file == 'g.yaml'
+    task_set, missing = load_with_or_without_deadlines(text, 'g.yaml')
+    assert (task_set.file, missing) == ('g.yaml', ['/n:x', '/n:y', '/n:z'])
     result = deadlines_in_text(
-        task_set, filled, {'/n:x': 5_000_000, '/n:y': 50_000_000, '/n:z': 7_000_000})
+        task_set, text, {'/n:x': 5_000_000, '/n:y': 50_000_000, '/n:z': 7_000_000})
     assert without_lines(loads(result)) == without_lines(loads(TEXT))
     # What was there stays as it was.
     left = iter(result.splitlines())
@@ -66,8 +66,8 @@ def test_missing_deadlines() -> None:
                for line in text.splitlines())
 
 
-def test_with_all_deadlines_nothing_is_filled() -> None:
-    assert load_with_or_without_deadlines(TEXT, 'g.yaml') == (loads(TEXT, 'g.yaml'), TEXT)
+def test_with_all_deadlines_none_is_missing() -> None:
+    assert load_with_or_without_deadlines(TEXT, 'g.yaml') == (loads(TEXT, 'g.yaml'), [])
 
 
 @pytest.mark.parametrize('text', [
