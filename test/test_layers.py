@@ -6,13 +6,16 @@ The parts of the program know one another in one direction only.
     cli -> report -> (live | replay | assign | simulate | analysis) -> trace, core, generate
         -> msg_graph
 
-Imports are read from the sources, those inside functions and for type checkers included.
+Imports are read from the sources, those inside functions and for type checkers included. So are
+the names that only ``live.compat`` may use of rclpy.
 """
 
 from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -158,3 +161,117 @@ def test_a_wrong_import_is_found(module: str, text: str) -> None:
 ])
 def test_a_right_import_is_none(module: str, text: str) -> None:
     assert violations(module, text) == []
+
+
+# --- rclpy's private names -----------------------------------------------------------------------
+
+COMPAT = 'mddag_executor.live.compat'
+BASES = frozenset(('BareExecutor', 'BareTask', 'Executor', 'Task', 'Future', 'Waitable'))
+
+
+@cache
+def rclpys_private_names() -> frozenset[str]:
+    """Return the private names in rclpy, and those of its handles that no documented class has."""
+    spec = find_spec('rclpy')
+    assert spec is not None and spec.origin is not None
+    private, public = {'_rclpy'}, set()
+    for path in Path(spec.origin).parent.rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, (ast.Attribute, ast.FunctionDef)):
+                name = node.attr if isinstance(node, ast.Attribute) else node.name
+                if name.startswith('_') and not name.startswith('__'):
+                    private.add(name)
+                elif isinstance(node, ast.FunctionDef):
+                    public.add(name)
+    from rclpy.impl.implementation_singleton import rclpy_implementation
+    handles = {name for kind in vars(rclpy_implementation).values()
+               if hasattr(kind, 'destroy_when_not_in_use')
+               for name in vars(kind) if not name.startswith('_')}
+    return frozenset(private | handles - public - {'name', 'qos'})
+
+
+def derived(texts: list[str]) -> frozenset[str]:
+    """Return the names of all classes that are, or derive from, one of rclpy's."""
+    found: set[str] = set(BASES)
+    kinds = [node for text in texts for node in ast.walk(ast.parse(text))
+             if isinstance(node, ast.ClassDef)]
+    for _ in kinds:
+        found |= {kind.name for kind in kinds
+                  if any(isinstance(base, ast.Name) and base.id in found for base in kind.bases)}
+    return frozenset(found)
+
+
+def private_uses(
+    text: str, private: frozenset[str], bases: frozenset[str] = BASES
+) -> Iterator[tuple[int, str]]:
+    """
+    Yield line and name of what a module uses of rclpy and must not.
+
+    :param bases: the classes in whose methods ``self`` has rclpy's attributes.
+    """
+    tree = ast.parse(text)
+    own = {name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)
+           for name in _attributes_of_its_own(node)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef):
+            if any(isinstance(base, ast.Name) and base.id in bases for base in node.bases):
+                mine = _attributes_of_its_own(node)
+                yield from ((each.lineno, each.attr) for each in ast.walk(node)
+                            if isinstance(each, ast.Attribute) and each.attr in private
+                            and each.attr not in mine)
+        elif isinstance(node, ast.Attribute):
+            if node.attr in ('_getframe', '__code__') or (
+                    node.attr in private and node.attr not in own
+                    and not (isinstance(node.value, ast.Name) and node.value.id == 'self')):
+                yield node.lineno, node.attr
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            if node.value in private and node.value not in own:
+                yield node.lineno, node.value
+        elif isinstance(node, ast.ImportFrom) and (node.module or '').startswith('rclpy.impl'):
+            yield node.lineno, str(node.module)
+
+
+def _attributes_of_its_own(kind: ast.ClassDef) -> set[str]:
+    """Return the names that a class defines, in its body, its slots or by setting them."""
+    names = set()
+    for node in ast.walk(kind):
+        if isinstance(node, ast.FunctionDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            names.add(node.attr)
+        elif isinstance(node, (ast.AnnAssign, ast.Assign)):
+            targets = [node.target] if isinstance(node, ast.AnnAssign) else node.targets
+            names |= {target.id for target in targets if isinstance(target, ast.Name)}
+            if '__slots__' in names:
+                names |= {each.value for each in ast.walk(node) if isinstance(each, ast.Constant)}
+    return names
+
+
+@pytest.mark.linter
+def test_only_compat_uses_what_is_private_in_rclpy() -> None:
+    private = rclpys_private_names()
+    assert {'_guard', '_callback_type', 'take_message', 'call_timer', '_rclpy'} <= private
+    texts = {module: path.read_text(encoding='utf-8') for module, path in modules()
+             if module.startswith('mddag_executor.live') and not module.startswith(COMPAT)}
+    bases = derived(list(texts.values()))
+    assert 'MultiDeadlineExecutor' in bases
+    assert not [
+        f'{module}:{line} uses {name} of rclpy: only {COMPAT} does'
+        for module, text in texts.items() for line, name in private_uses(text, private, bases)]
+
+
+@pytest.mark.parametrize('text', [
+    'subscription.handle.take_message(kind, False)',
+    'future._set_executor(None)',
+    'class Own(BareExecutor):\n    def f(self):\n        return self._guard',
+    'getattr(client, "_feedback_callbacks")',
+    'from rclpy.impl.implementation_singleton import rclpy_implementation',
+    'import sys\nsys._getframe(1)',
+])
+def test_a_private_name_of_rclpy_is_found(text: str) -> None:
+    assert list(private_uses(text, rclpys_private_names()))
+
+
+def test_a_private_name_of_ones_own_is_none() -> None:
+    text = 'class Own:\n    def __init__(self):\n        self._lock = self._guard = 1'
+    assert not list(private_uses(text, rclpys_private_names()))

@@ -41,19 +41,20 @@ what waits for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 import threading
 from typing import Any
 
 from mddag_executor.live.attribution import PublisherState
-from mddag_executor.live.entities import EntitySet, keeps_time, Receiver
+from mddag_executor.live.compat import keeps_time
 from mddag_executor.live.hooks import install, publisher_state
+from mddag_executor.live.intake.arrivals import Arrival, Receiver
+from mddag_executor.live.intake.entities import EntitySet
+from mddag_executor.live.intake.sources import MOST_AT_ONCE, SubscriptionSource
 from rclpy.exceptions import InvalidHandle
 from rclpy.qos import DurabilityPolicy, qos_check_compatible, QoSCompatibility
 from rclpy.subscription import Subscription
-
-MOST_AT_ONCE = 64
 
 LOOK_S = 0.2
 """How often to count publishers anew."""
@@ -64,29 +65,19 @@ _several_executors = threading.Lock()
 
 
 class Direct:
-    """
-    A subscription that publishers of the process may take from.
+    """A subscription that publishers of the process may take from."""
 
-    :param on_miss: called when a message is not there that was published.
-    """
+    __slots__ = ('subscription', 'publishers', 'refused', 'lock', '_newest', '_source')
 
-    __slots__ = (
-        'owner', 'subscription', 'publishers', 'refused', '_lock', '_newest', '_receiver',
-        '_on_miss')
-
-    def __init__(
-        self, owner: DirectTakes, subscription: Subscription, receiver: Receiver,
-        on_miss: Callable[[], None],
-    ) -> None:
-        self.owner = owner
+    def __init__(self, subscription: Subscription, receiver: Receiver) -> None:
         self.subscription = subscription
         # how many there are, all of these nodes
         self.publishers = 0
+        # whether a message was not there that was published
         self.refused = False
-        self._lock = threading.Lock()
+        self.lock = threading.Lock()
         self._newest = 0
-        self._receiver = receiver
-        self._on_miss = on_miss
+        self._source = SubscriptionSource(subscription, receiver)
 
     def changed(self) -> bool:
         """Return whether there are more or fewer publishers than when they were counted."""
@@ -95,54 +86,70 @@ class Direct:
         except InvalidHandle:
             return False  # destroyed: its node tells the executor
 
-    def take(self, begin: int) -> None:
+    def take(self, begin: int, arrivals: list[Arrival]) -> bool:
         """
-        Hand over what is there, at least up to a message that was just published.
+        Take what is there, at least up to a message that was just published.
 
         :param begin: system time (ns) before that was published; 0: take what there is.
+        :param arrivals: gets what was taken.
+        :return: False when that message was not there, for the first time.
         """
-        subscription, receiver = self.subscription, self._receiver
-        handle = subscription.handle
-        missed = False
+        take_next = self._source.take_next
         try:
-            with self._lock, handle:
+            with self._source.handle:
                 for _ in range(MOST_AT_ONCE):
-                    taken = handle.take_message(subscription.msg_type, subscription.raw)
+                    taken = take_next()
                     if taken is None:
                         break
                     stamp: int = taken[1]['source_timestamp']
                     self._newest = max(stamp, self._newest)
-                    receiver.on_message(subscription, taken[0], taken[1])
+                    arrivals.append(self._source.arrival(taken))
                     if stamp >= begin > 0:
                         break
-                if self._newest < begin and not self.refused:
-                    missed = self.refused = True
         except InvalidHandle:
-            pass  # destroyed
-        except Exception as error:
-            receiver.on_intake_error(error)
-        if missed:
-            self._on_miss()
+            return True  # destroyed
+        if self._newest >= begin or self.refused:
+            return True
+        self.refused = True
+        return False
 
 
-class Several:
-    """All that one publisher takes from; RAD is to choose among all that a message starts."""
+class PublisherTakes:
+    """
+    All subscriptions that one publisher takes from.
 
-    __slots__ = ('owner', '_directs', '_receiver')
+    :param on_miss: called when a message is not there that was published.
+    """
 
-    def __init__(self, owner: DirectTakes, directs: list[Direct], receiver: Receiver) -> None:
+    __slots__ = ('owner', '_directs', '_receiver', '_on_miss')
+
+    def __init__(
+        self, owner: DirectTakes, directs: Iterable[Direct], receiver: Receiver,
+        on_miss: Callable[[], None],
+    ) -> None:
         self.owner = owner
-        self._directs = directs
+        self._directs = sorted(directs, key=id)  # so no two threads wait for each other's locks
         self._receiver = receiver
+        self._on_miss = on_miss
 
     def take(self, begin: int) -> None:
-        """Hand over what is there of each (see ``Direct.take``)."""
-        self._receiver.hold()
+        """Take what is there (see ``Direct.take``), and hand it over in one piece."""
+        arrivals: list[Arrival] = []
+        missed = False
+        for direct in self._directs:
+            direct.lock.acquire()
         try:
             for direct in self._directs:
-                direct.take(begin)
+                missed |= not direct.take(begin, arrivals)
+            if arrivals:
+                self._receiver.take_in(arrivals)
+        except Exception as error:
+            self._receiver.on_intake_error(error)
         finally:
-            self._receiver.let_go()
+            for direct in self._directs:
+                direct.lock.release()
+        if missed:
+            self._on_miss()
 
 
 class DirectTakes:
@@ -224,7 +231,7 @@ class DirectTakes:
         changed = False
         for key, direct in list(self._known.items()):
             if take and key in self._chosen:
-                direct.take(0)
+                self._takes_of([direct]).take(0)
             changed = changed or direct.changed()
         return changed
 
@@ -233,7 +240,10 @@ class DirectTakes:
         for key in self._chosen:
             direct = self._known.get(key)
             if direct is not None:
-                direct.take(0)
+                self._takes_of([direct]).take(0)
+
+    def _takes_of(self, directs: list[Direct]) -> PublisherTakes:
+        return PublisherTakes(self, directs, self._receiver, self._on_change)
 
     def stop(self) -> threading.Thread | None:
         """
@@ -262,8 +272,7 @@ class DirectTakes:
                 return None
             if keeps_time(subscription):
                 return None
-            direct = self._known[key] = Direct(
-                self, subscription, self._receiver, self._on_change)
+            direct = self._known[key] = Direct(subscription, self._receiver)
         return direct
 
     def _set_takes(
@@ -273,10 +282,7 @@ class DirectTakes:
             for key, state in (*self._states.items(), *states.items()):
                 others = tuple(t for t in state.takes if t.owner is not self)
                 mine = takes.get(key, []) if states.get(key) is state else []
-                if len(mine) > 1:
-                    state.takes = (*others, Several(self, mine, self._receiver))
-                else:
-                    state.takes = (*others, *mine)
+                state.takes = (*others, self._takes_of(mine)) if mine else others
         self._states = states
 
     def _forget(self, entities: EntitySet) -> None:

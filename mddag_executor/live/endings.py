@@ -20,14 +20,11 @@ import weakref
 
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
 FIRST_LOOK_NS = 5_000_000
 LAST_LOOK_NS = 500_000_000
 EXIT_PATIENCE_S = 1.0
 """So long a program that ends waits for callbacks that still run in an executor's threads."""
-RCL_ERRORS = (InvalidHandle, _rclpy.RCLError)
-"""What rclpy raises of anything whose context has ended, among others."""
 _now = time.monotonic_ns
 
 

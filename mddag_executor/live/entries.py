@@ -11,6 +11,7 @@ from typing import Any
 
 from mddag_executor.core import legs_of, Tables
 from mddag_executor.live.attribution import Origin
+from mddag_executor.live.compat import awaited
 from mddag_executor.live.gates import Gate
 from mddag_executor.live.interpreter import Habit
 from msg_graph import Callback, TaskSet
@@ -206,7 +207,7 @@ class Work:
                 try:
                     with handle:
                         # One more may have become due before it was cancelled in its callback.
-                        if self.entry.kind == TIMER and handle.is_timer_canceled():
+                        if self.entry.kind == TIMER and self.entry.entity.is_canceled():
                             raise Destroyed
                 except InvalidHandle:
                     raise Destroyed from None
@@ -251,29 +252,3 @@ class TaskWork(Work):
             del task
             return None
         return awaited(self.coroutine) if task.waits_for is None else task.waits_for
-
-
-UNKNOWN = object()
-"""Stands for something awaited that cannot be found out: it is asked again now and then."""
-
-
-def awaited(coroutine: Any) -> Any:
-    """
-    Return the rclpy future that a suspended coroutine waits for, or UNKNOWN.
-
-    In rclpy before 7.1.9 ``Future.__await__`` is a generator that yields nothing, so the future is
-    looked up where the chain of awaits ends.
-    """
-    inner = coroutine
-    while True:
-        if type(inner) is types.CoroutineType:
-            inner = inner.cr_await
-        elif type(inner) is types.GeneratorType:
-            if inner.gi_yieldfrom is None:
-                break
-            inner = inner.gi_yieldfrom
-        else:
-            break
-    if type(inner) is types.GeneratorType and inner.gi_frame is not None:
-        inner = inner.gi_frame.f_locals.get('self')
-    return inner if hasattr(inner, 'add_done_callback') else UNKNOWN

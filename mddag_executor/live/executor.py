@@ -28,12 +28,14 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.live import hooks
+from mddag_executor.live.compat import RCL_ERRORS
 from mddag_executor.live.diagnostics import Diagnostics
 from mddag_executor.live.dispatcher import Dispatcher
-from mddag_executor.live.endings import call_at_shutdown, halt_at_exit, is_over, RCL_ERRORS
-from mddag_executor.live.entities import EMPTY
+from mddag_executor.live.endings import call_at_shutdown, halt_at_exit, is_over
 from mddag_executor.live.entries import AtOnce, Entry, TASK, Work
-from mddag_executor.live.events import EventsIntake
+from mddag_executor.live.intake.entities import EMPTY
+from mddag_executor.live.intake.events import EventsIntake
+from mddag_executor.live.intake.waitset import WaitSetIntake
 from mddag_executor.live.interpreter import short_switch_interval
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.rates import RateWatch
@@ -56,7 +58,6 @@ from mddag_executor.live.stepping import deadline_of, Stepping
 from mddag_executor.live.stop_watch import StopWatch
 from mddag_executor.live.tasks import make_task, Unclaimed
 from mddag_executor.live.verdicts import DeadlineMiss
-from mddag_executor.live.waitset import WaitSetIntake
 from msg_graph import TaskSet
 from rclpy.executors import ExternalShutdownException
 from rclpy.task import Future, Task
@@ -105,8 +106,6 @@ class MultiDeadlineExecutor(Stepping):
         value of the wrong kind, and when the trace cannot be written.
     :raises rclpy.exceptions.NotInitializedException: when ``rclpy.init`` was not called before.
     """
-
-    _sigint_gc: Any = None  # for the base class' finalizer, where construction fails
 
     def __init__(
         self,
@@ -179,12 +178,12 @@ class MultiDeadlineExecutor(Stepping):
         self._diagnostics: Diagnostics | None = None
         if every_ns is not None:
             self._diagnostics = Diagnostics(
-                self._context, task_set, self._dispatcher, self._pool, self._registry,
+                self.context, task_set, self._dispatcher, self._pool, self._registry,
                 self._recorder, every_ns, thresholds)
         self._intake_kind = intake
         # What is ready still would run before the spin notices.
-        call_at_shutdown(self._context, self._pool.start_no_more)
-        self._dispatcher.context_ended = lambda: is_over(self._context)
+        call_at_shutdown(self.context, self._pool.start_no_more)
+        self._dispatcher.context_ended = lambda: is_over(self.context)
         halt_at_exit(self)
 
     # --- tasks -----------------------------------------------------------------------------------
@@ -209,9 +208,6 @@ class MultiDeadlineExecutor(Stepping):
     def create_future(self) -> Future:
         """Return a future whose callbacks run in this executor (rclpy from 7.1.6 on)."""
         return Future(executor=self)
-
-    def _call_task_in_next_spin(self, task: Task) -> None:
-        """Leave a task (rclpy 7.1.9) to the pool, which asks it again by itself."""
 
     def _submit_tasks(self) -> None:
         """Have the tasks run that were created while nobody spun: the newest first (rclpy)."""
@@ -252,7 +248,7 @@ class MultiDeadlineExecutor(Stepping):
         if not self._spinning.acquire(blocking=False):
             raise RuntimeError('Executor is already spinning')
         try:
-            if self._is_shutdown:
+            if self.is_ending():
                 return
             self._check_context()
             if self._freeze_gc:
@@ -262,7 +258,7 @@ class MultiDeadlineExecutor(Stepping):
             self._start_intake()
             self._submit_tasks()
             self._pool.start()
-            while not self._is_shutdown:
+            while not self.is_ending():
                 self._raise_error()
                 if done():
                     self._settle()
@@ -290,7 +286,7 @@ class MultiDeadlineExecutor(Stepping):
         finally:
             self._pool.pause()
             self._stop_intake()
-            if is_over(self._context):
+            if is_over(self.context):
                 self._pool.close(0.5)
                 self._end_run()
             self._spinning.release()
@@ -320,7 +316,7 @@ class MultiDeadlineExecutor(Stepping):
             self._diagnostics.start()
 
     def _check_context(self) -> None:
-        if is_over(self._context):
+        if is_over(self.context):
             raise ExternalShutdownException()
 
     def _start_intake(self) -> None:
@@ -329,13 +325,10 @@ class MultiDeadlineExecutor(Stepping):
             kind = 'events' if EventsIntake.available() else 'waitset'
         intake_type = EventsIntake if kind == 'events' else WaitSetIntake
         self._intake = intake_type(
-            self._context, self._receiver, self._guards(), on_shutdown=self._attention.set)
+            self.context, self._receiver, self.guards(), on_shutdown=self._attention.set)
         self._changed = True
         self._refresh()
         self._intake.start()
-
-    def _guards(self) -> tuple[Any, ...]:
-        return self._guard, self._sigint_gc
 
     def _stop_intake(self) -> None:
         intake, self._intake = self._intake, None
@@ -375,7 +368,7 @@ class MultiDeadlineExecutor(Stepping):
         """
         if timeout_sec is not None and timeout_sec < 0:
             timeout_sec = None
-        self._is_shutdown = True
+        self.begin_end()
         self.wake()
         self._pool.pause()
         if self._inline is not None and self._spinning.acquire(blocking=False):

@@ -30,6 +30,7 @@ from importlib import import_module
 import time
 from typing import Any
 
+from mddag_executor.live.compat import message_taker
 from msg_graph.draft import Draft, DraftCallback, DraftNode
 from msg_graph.names import is_background, NODE, SERVICE, TOPIC
 import rclpy
@@ -148,9 +149,10 @@ def _look(node: Node, context: Context, seconds: float, tick: Callable[[float], 
 
 def _take(subscription: Any, seen: Seen) -> None:
     """Count what has come; nothing is deserialised."""
+    take = message_taker(subscription)
     with subscription.handle:
         for _ in range(_DEPTH):
-            taken = subscription.handle.take_message(subscription.msg_type, True)
+            taken = take()
             if taken is None:
                 return
             about = taken[1]

@@ -13,7 +13,7 @@ one executor.  What an executor sees of a node that is shared is a ``NodeShare``
 only those entities that the executor is to run.
 
 A node tells its one executor when entities come and go.  So that the owners of its groups hear of
-it too, ``Node._wake_executor`` is wrapped, once and only where somebody adds a group.
+it too, they are told beside it, from when somebody first adds a group.
 
 The middleware calls one listener for each entity, so an entity changes hands in this order: the
 executor that had it lets go (its intake has taken back its listener), then the other one takes
@@ -31,7 +31,7 @@ import time
 from typing import Any, TYPE_CHECKING
 import weakref
 
-from rclpy.executors import Executor
+from mddag_executor.live.compat import BareExecutor, tell_of_changes
 from rclpy.node import Node
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ class NodeShare:
         return [e for e in list(value) if self._has(getattr(e, 'callback_group', None))]
 
 
-class GroupOwner(Executor):
+class GroupOwner(BareExecutor):
     """The part of the executor that has callback groups."""
 
     _intake: Any
@@ -219,14 +219,9 @@ def _hook_nodes() -> None:
         if _hooked:
             return
         _hooked = True
-    wake: Any = Node._wake_executor
+    tell_of_changes(_wake_sharers)
 
-    def wake_all(self: Any) -> None:
-        wake(self)
-        sharers = _sharers.get(self)
-        if sharers is not None:
-            for executor in list(sharers):
-                executor.wake()
 
-    wake_all.__doc__ = wake.__doc__
-    Node._wake_executor = wake_all  # type: ignore[method-assign]
+def _wake_sharers(node: Node) -> None:
+    for executor in list(_sharers.get(node, ())):
+        executor.wake()

@@ -28,7 +28,7 @@ from types import TracebackType
 from typing import Any
 
 from mddag_executor.live.endings import is_over
-from mddag_executor.live.entities import alive
+from mddag_executor.live.intake.entities import alive
 from mddag_executor.live.interception import Interception
 from mddag_executor.live.loading import describe, LoadingError, Program
 from rclpy.executors import Executor

@@ -35,8 +35,9 @@ from typing import Any
 from mddag_executor.core.rules import schedule, take
 from mddag_executor.core.state import N_IDLE
 from mddag_executor.live.attribution import PublisherState
+from mddag_executor.live.compat import UNKNOWN
 from mddag_executor.live.dispatcher import Dispatcher
-from mddag_executor.live.entries import AtOnce, Destroyed, Entry, UNKNOWN, Work
+from mddag_executor.live.entries import AtOnce, Destroyed, Entry, Work
 from mddag_executor.live.gates import Refused
 from mddag_executor.live.hooks import current
 from mddag_executor.live.interpreter import Overseer, ThreadClock

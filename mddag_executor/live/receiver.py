@@ -4,27 +4,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-import threading
+from collections.abc import Callable, Sequence
 import time
-from types import MethodType
 from typing import Any
 
 from mddag_executor.live.attribution import Origin
+from mddag_executor.live.compat import ends_sleep
 from mddag_executor.live.crossings import header_stamp
 from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.entries import Entry, Work
+from mddag_executor.live.intake.arrivals import Arrival
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
-from rclpy.subscription import Subscription
-
-_END_OF_SLEEP = threading.Event.set
-MOST_FEEDBACK = 64
-"""More of it is taken in its turn."""
-WITH_INFO = Subscription.CallbackType.WithMessageInfo
 
 
 class Receiver:
@@ -33,8 +27,8 @@ class Receiver:
 
     What callbacks may wait for comes through though they hold all workers.  So some of rclpy's
     own parts, which only take note of something, run at once, here: a client's response, which
-    completes a future; while workers run, what sets a node's simulated time, and the timer of a
-    ``Rate``, which ends a sleep.
+    completes a future (``intake.sources``); while workers run, what sets a node's simulated time,
+    and the timer of a ``Rate``, which ends a sleep.
     """
 
     def __init__(
@@ -45,58 +39,60 @@ class Receiver:
         self._dispatcher = dispatcher
         self._registry = registry
         self._release_from = [d.release_from for d in task_set.dags] if task_set else []
-        self._executor = executor
+        self.executor = executor
         self._fail = fail
         self._recorder = recorder
         self._pool = pool
 
-    def hold(self) -> None:
-        """Take note that several things are handed over that became ready at one instant."""
+    def take_in(self, arrivals: Sequence[Arrival]) -> None:
+        """Take in what became ready at one instant."""
+        if len(arrivals) == 1:
+            self._take_in(*arrivals[0])
+            return
         self._dispatcher.hold()
-
-    def let_go(self) -> None:
-        """Take note that all of them have been."""
-        self._dispatcher.let_go()
-
-    def on_timer(self, timer: Any, due_ns: int) -> None:
-        """Take in a timer; ``due_ns`` is its nominal due time on the monotonic clock."""
-        entry = self._registry[timer]
-        if entry is None:
-            return
-        callback = timer.callback
-        if type(callback) is MethodType and callback.__func__ is _END_OF_SLEEP:
-            if entry.callback is None and self._pool.running:
-                self._run(entry, callback)
-                return
-        self._dispatcher.timer_due(
-            entry, Work(entry, callback, ()), due_ns + self._dispatcher.clock_offset)
-
-    def _run(self, entry: Entry, callback: Callable[..., Any], *args: Any) -> None:
-        callback(*args)
-        self._dispatcher.ran_at_once(entry)
-
-    def on_missed(self, timer: Any, due_ns: int, count: int) -> None:
-        """Take in that periods were skipped since nobody was there to look at the timer."""
-        entry = self._registry[timer]
-        if entry is None:
-            return
         try:
-            period = timer.timer_period_ns
+            for arrival in arrivals:
+                self._take_in(*arrival)
+        finally:
+            self._dispatcher.let_go()
+
+    def _take_in(
+        self, entity: Any, function: Callable[..., Any], args: tuple[Any, ...],
+        then: Callable[[Any], Any] | None, info: dict[str, Any] | None, due: int | None,
+        missed: int,
+    ) -> None:
+        entry = self._registry[entity]
+        if entry is None:
+            return
+        dispatcher = self._dispatcher
+        if self._pool.running and (
+                entry.at_once or entry.callback is None and due is not None
+                and ends_sleep(function)):
+            function(*args)
+            dispatcher.ran_at_once(entry)
+            return
+        work = Work(entry, function, args, then)
+        if due is not None:
+            due += dispatcher.clock_offset
+            dispatcher.timer_due(entry, work, due)
+            if missed:
+                self._missed(entry, due, missed)
+        elif info is not None:
+            self._message(entry, work, args[0], info)
+        elif entry.source >= 0:
+            dispatcher.message(entry, work, None, dispatcher.now())
+        else:
+            dispatcher.undeclared_ready(entry, work)
+
+    def _missed(self, entry: Entry, due_ns: int, count: int) -> None:
+        """Take in that periods were skipped since nobody was there to look at the timer."""
+        try:
+            period = entry.entity.timer_period_ns
         except InvalidHandle:
             return  # destroyed meanwhile
-        self._dispatcher.timer_missed(
-            entry, due_ns + self._dispatcher.clock_offset, period, count)
+        self._dispatcher.timer_missed(entry, due_ns, period, count)
 
-    def on_message(self, subscription: Any, message: Any, info: dict[str, Any]) -> None:
-        """Take in a message with its info."""
-        entry = self._registry[subscription]
-        if entry is None:
-            return
-        if entry.at_once and self._pool.running:
-            self._run(entry, subscription.callback, message)
-            return
-        args = (message, info) if subscription._callback_type is WITH_INFO else (message,)
-        work = Work(entry, subscription.callback, args)
+    def _message(self, entry: Entry, work: Work, message: Any, info: dict[str, Any]) -> None:
         origin: Origin | None = None
         release: int | None = None
         stamp = -1
@@ -131,68 +127,6 @@ class Receiver:
     def _steady(self, stamp: int) -> int:
         """Return a system time on the trace's clock."""
         return self._dispatcher.now() - time.time_ns() + stamp
-
-    def on_request(self, service: Any, request: Any, header: Any) -> None:
-        """Take in a service request."""
-        entry = self._registry[service]
-        if entry is None:
-            return
-        work = Work(
-            entry, service.callback, (request, service.srv_type.Response()),
-            lambda response: service.send_response(response, header))
-        if entry.source >= 0:
-            self._dispatcher.message(entry, work, None, self._dispatcher.now())
-        else:
-            self._dispatcher.undeclared_ready(entry, work)
-
-    def on_response(self, client: Any, sequence: int, header: Any, response: Any) -> None:
-        """Pass a service's response on to the future that waits for it."""
-        try:
-            future = client.get_pending_request(sequence)
-        except KeyError:
-            return  # the request was cancelled
-        future._set_executor(self._executor)
-        future.set_result(response)
-
-    def on_guard(self, guard: Any) -> None:
-        """Take in a guard condition that was triggered."""
-        entry = self._registry[guard]
-        if entry is not None and guard.callback is not None:
-            self._dispatcher.undeclared_ready(entry, Work(entry, guard.callback, ()))
-
-    def on_waitable(self, waitable: Any, data: Any) -> None:
-        """Take in what a waitable has taken."""
-        entry = self._registry[waitable]
-        if entry is None:
-            return
-        for future in waitable._futures:
-            future._set_executor(self._executor)
-        if hasattr(waitable, '_feedback_callbacks'):  # an action client; rclpy.action loads much
-            self._feedback(entry, waitable, data)
-        if data:
-            self._dispatcher.undeclared_ready(entry, Work(entry, waitable.execute, (data,)))
-
-    def _feedback(self, entry: Entry, client: Any, data: dict[str, Any]) -> None:
-        """
-        Hand over the feedback that an action client has taken, each with the callback it is for.
-
-        A client forgets the callback when the goal's result has come.  It takes one feedback at a
-        time, so with a result all that is there is taken, too; and another worker may have the
-        result in its hands soon, so the callback is looked up now.
-        """
-        callbacks = client._feedback_callbacks
-        messages = [data['feedback']] if 'feedback' in data else []
-        if 'result' in data and callbacks:
-            kind = client._action_type.Impl.FeedbackMessage
-            for message in iter(lambda: client._client_handle.take_feedback(kind), None):
-                messages.append(message)
-                if len(messages) >= MOST_FEEDBACK:
-                    break
-        for message in messages:
-            callback = callbacks.get(bytes(message.goal_id.uuid))
-            if callback is not None:
-                data.pop('feedback', None)  # the first one
-                self._dispatcher.undeclared_ready(entry, Work(entry, callback, (message,)))
 
     def on_intake_error(self, error: BaseException) -> None:
         """Take an error of the intake: it comes out of spin."""

@@ -9,7 +9,7 @@ from typing import Any
 import weakref
 
 from mddag_executor.core import Scheduler, Tables
-from mddag_executor.live.entities import keeps_time
+from mddag_executor.live.compat import keeps_time, service_name
 from mddag_executor.live.entries import (
     CLIENT,
     COUNTS,
@@ -40,17 +40,6 @@ KINDS = (
 def source_depth(period_ns: int, deadline_ns: int) -> int:
     """Return how many releases of a timer source may wait: as many as can still be in time."""
     return max(1, -(-deadline_ns // period_ns))
-
-
-def looked_after(entity: Any) -> bool:
-    """
-    Tell whether the executor is to take from an entity.
-
-    Not from the subscriptions that ``rclpy.wait_for_message`` makes for a moment: it takes from
-    them itself, and would wait in vain for what the executor has taken before.
-    """
-    callback = getattr(entity, 'callback', None)
-    return getattr(callback, '__module__', None) != 'rclpy.wait_for_message'
 
 
 class Registry:
@@ -225,7 +214,7 @@ class Registry:
                 depth = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else 0
                 callback = self._binder.bind_subscription(node, topic) if self._binder else None
             elif kind in (SERVICE, CLIENT):
-                label = entity.service_name if hasattr(entity, 'service_name') else entity.srv_name
+                label = service_name(entity)
                 if kind == SERVICE and self._binder is not None:
                     callback = self._binder.bind_service(node, label)
             elif kind == GUARD:

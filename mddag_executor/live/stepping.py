@@ -10,18 +10,15 @@ thread runs the one callback that the core puts first.
 from __future__ import annotations
 
 from collections.abc import Callable
-import sys
 import threading
 import time
-from typing import Any
 
-from mddag_executor.live.endings import RCL_ERRORS
+from mddag_executor.live.compat import is_called_by_spin, RCL_ERRORS
 from mddag_executor.live.entries import AtOnce
+from mddag_executor.live.intake.waitset import ALL_KINDS, WaitSetIntake
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.receiver import Receiver
 from mddag_executor.live.upkeep import Upkeep
-from mddag_executor.live.waitset import ALL_KINDS, WaitSetIntake
-import rclpy
 from rclpy.executors import TimeoutObject
 from rclpy.task import Future
 
@@ -44,7 +41,6 @@ class Stepping(Upkeep):
     _pool: Pool
     _receiver: Receiver
     _spinning: threading.Lock
-    _is_shutdown: bool
 
     def _check_context(self) -> None:
         raise NotImplementedError
@@ -58,9 +54,6 @@ class Stepping(Upkeep):
     def _submit_tasks(self) -> None:
         raise NotImplementedError
 
-    def _guards(self) -> tuple[Any, ...]:
-        raise NotImplementedError
-
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """
         Wait for one callback and run it in the calling thread.
@@ -70,7 +63,7 @@ class Stepping(Upkeep):
 
         :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
         """
-        if timeout_sec is None and sys._getframe(1).f_code is rclpy.spin.__code__:
+        if timeout_sec is None and is_called_by_spin():
             self.spin()
             return
         self._spin_once(timeout_sec, lambda: False)
@@ -88,7 +81,7 @@ class Stepping(Upkeep):
         if not self._spinning.acquire(blocking=False):
             raise RuntimeError('Executor is already spinning')
         try:
-            while not self._is_shutdown:
+            while not self.is_ending():
                 self._check_context()
                 self._look_after()
                 if self._one_step(deadline, done) or done():
@@ -106,7 +99,7 @@ class Stepping(Upkeep):
         self._raise_error()
         if self._inline is None:
             self._inline = WaitSetIntake(
-                self._context, self._receiver, self._guards(), ALL_KINDS)
+                self.context, self._receiver, self.guards(), ALL_KINDS)
             self._changed = True
         self._refresh()
         self._pool.resume_polled()
@@ -127,7 +120,7 @@ class Stepping(Upkeep):
 
     def halt(self) -> None:
         """Start nothing more, since the interpreter ends; see ``wait_halted``."""
-        self._is_shutdown = True
+        self.begin_end()
         self._pool.pause()
         self.wake()
 

@@ -22,29 +22,26 @@ import inspect
 from typing import Any
 import weakref
 
+from mddag_executor.live.compat import BareTask, forget_task_frames
 from mddag_executor.live.entries import AtOnce, Entry, TaskWork, Work
 from mddag_executor.live.hooks import current
-from rclpy.task import Future, Task
-
-_RCLPY = Task.__call__.__code__.co_filename
+from rclpy.task import Future
 
 
-class ObservedTask(Task):
+class ObservedTask(BareTask):
     """
     A task that knows whether somebody waits for it, and so takes care of its exception.
 
-    :ivar waits_for: the future that its coroutine waits for, where rclpy says so (7.1.9).
     :ivar maker: the execution whose callback has created it, or None.
     :ivar put_by: told its exception where nobody took care of that, once it was put by.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.observed = False
-        self.waits_for: Future | None = None
         running: Any = current.running
         self.maker: Work | None = None if running is None else running.work
         self.put_by: Callable[[BaseException], None] | None = None
-        super().__init__(*args, **kwargs)  # type: ignore[no-untyped-call]
+        super().__init__(*args, **kwargs)
 
     def __del__(self) -> None:
         """Tell an exception that was put by: nobody can take care of it any more."""
@@ -54,27 +51,20 @@ class ObservedTask(Task):
 
     def unclaimed(self) -> BaseException | None:
         """Return its exception if nobody takes care of that."""
-        if self.observed or self._exception_fetched:
-            return None
-        error: BaseException | None = self._exception
-        return error
+        return None if self.observed else self.unfetched()
 
     def give_out(self) -> None:
         """Tell an exception that was put by, unless somebody has taken care of it."""
         tell, self.put_by = self.put_by, None
         error = self.unclaimed()
         if error is not None and tell is not None:
-            self._exception_fetched = True
+            self.mark_fetched()
             tell(error)
 
     def add_done_callback(self, callback: Callable[[Future], None]) -> None:
         """Add a callback for when the task is done."""
         self.observed = True
         super().add_done_callback(callback)  # type: ignore[no-untyped-call]
-
-    def _add_resume_callback(self, future: Future, executor: Any) -> None:
-        """Leave it to the pool to go on: rclpy's own way (7.1.9) would be a second one."""
-        self.waits_for = future
 
 
 class Unclaimed:
@@ -100,14 +90,9 @@ class Unclaimed:
             task.maker = None
             return
         if task.maker is None or task.maker.x < 0:
-            task._exception_fetched = True
+            task.mark_fetched()
             raise error
-        # The task must not hold on to itself by the frames in which it caught the exception.
-        trace = error.__traceback__
-        while trace is not None and trace.tb_frame.f_code.co_filename == _RCLPY:
-            trace.tb_frame.clear()
-            trace = trace.tb_next
-        error.__traceback__ = trace
+        forget_task_frames(error)  # else the task holds on to itself
         task.put_by = self._fail
         self._tasks.append(weakref.ref(task))
 

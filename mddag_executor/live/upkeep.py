@@ -16,12 +16,11 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.live.dispatcher import Dispatcher
-from mddag_executor.live.entities import EntitySet, snapshot
 from mddag_executor.live.groups import GroupOwner
+from mddag_executor.live.intake.entities import EntitySet, snapshot
+from mddag_executor.live.intake.waitset import WaitSetIntake
 from mddag_executor.live.recorder import Recorder
-from mddag_executor.live.registry import looked_after, Registry
-from mddag_executor.live.waitset import WaitSetIntake
-from rclpy.exceptions import InvalidHandle
+from mddag_executor.live.registry import Registry
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -52,7 +51,7 @@ class Upkeep(GroupOwner):
         """
         if not hasattr(node, 'executor'):
             raise TypeError(f'{node!r} is no node: add an rclpy.node.Node')
-        if self._guard is None:
+        if self.is_gone():
             raise RuntimeError('The executor was shut down: add the node to a new one')
         added: bool = super().add_node(node)
         if added:
@@ -72,12 +71,7 @@ class Upkeep(GroupOwner):
     def _ring(self) -> None:
         """End the wait of whoever spins."""
         self._attention.set()
-        guard = self._guard
-        if guard is not None:
-            try:
-                guard.trigger()
-            except InvalidHandle:
-                pass
+        self.ring()
 
     def _refresh(self) -> None:
         """Bring registry, intake and trace up to date with the nodes' entities."""
@@ -109,7 +103,7 @@ class Upkeep(GroupOwner):
             self._recorder.entities(nodes, added)
 
     def _inform_intakes(self, nodes: list[Any]) -> None:
-        self._entities = snapshot(nodes, self._entities, looked_after)
+        self._entities = snapshot(nodes, self._entities)
         for intake in (self._intake, self._inline):
             if intake is not None:
                 intake.update(self._entities)

@@ -12,6 +12,7 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from mddag_executor import DeadlineMiss
 from mddag_executor.live import current_job
+from mddag_executor.live.intake.arrivals import Arrival
 from mddag_executor.replay import replay
 from msg_graph import loads, TaskSet
 import pytest
@@ -290,7 +291,7 @@ def test_ready_callbacks_run_in_the_policys_order(make_executor, make_node, poli
 
 def tick_as_timer(executor: Any, timer: Any, tick: Any) -> None:
     """Have the intake's receiver told that the timer is due, instead of waiting ten seconds."""
-    executor._receiver.on_timer(timer, time.monotonic_ns())
+    executor._receiver.take_in((Arrival(timer, timer.callback, due=time.monotonic_ns()),))
 
 
 SAME_INSTANT = """

@@ -107,7 +107,7 @@ def tables(executor: Any) -> dict[str, int]:
     return used(dispatcher.scheduler) | sizes(
         executor, dispatcher, dispatcher.attribution, dispatcher.verdicts, executor._registry,
         executor._pool, executor._rates, *(part for part in parts if part is not None),
-        *(part._node for part in parts if hasattr(part, '_node')),
+        *(part._native._node for part in parts if hasattr(part, '_native')),
         *(part._timers for part in parts if hasattr(part, '_timers')))
 
 

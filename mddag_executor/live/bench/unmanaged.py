@@ -20,6 +20,7 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.live.compat import message_taker, timer_functions
 from rclpy.executors import Executor
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
@@ -35,37 +36,38 @@ class NoExecutor(Executor):
         take_where_published([s for node in nodes for s in node.subscriptions])
         for timer in [timer for node in nodes for timer in node.timers]:
             threading.Thread(target=self._run, args=(timer,), daemon=True).start()
-        while self._context.ok():
+        while self.context.ok():
             time.sleep(0.1)
 
     def _run(self, timer: Timer) -> None:
-        while self._context.ok():
+        _, call, _ = timer_functions(timer)
+        while self.context.ok():
             left = timer.time_until_next_call()
             if left > 0:
                 time.sleep(left / 1e9)
                 continue
             with timer.handle:
-                timer.handle.call_timer()
+                call()
             timer.callback()
 
 
 def take_where_published(subscriptions: list[Subscription]) -> None:
     """Let every publisher of this process take from these, and run their callbacks."""
-    by_topic: dict[str, list[Subscription]] = {}
+    by_topic: dict[str, list[tuple[Subscription, Any]]] = {}
     for subscription in subscriptions:
-        by_topic.setdefault(subscription.topic_name, []).append(subscription)
+        by_topic.setdefault(subscription.topic_name, []).append(
+            (subscription, message_taker(subscription)))
     send = Publisher.publish
-    takers: dict[int, list[Subscription]] = {}
+    takers: dict[int, list[tuple[Subscription, Any]]] = {}
 
     def publish(self: Any, msg: Any) -> None:
         send(self, msg)
         found = takers.get(id(self))
         if found is None:
             found = takers[id(self)] = by_topic.get(self.topic_name, [])
-        for subscription in found:
+        for subscription, take in found:
             with subscription.handle:
-                taken = subscription.handle.take_message(
-                    subscription.msg_type, subscription.raw)
+                taken = take()
             if taken is not None:
                 subscription.callback(*taken)
 

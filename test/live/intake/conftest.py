@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from mddag_executor.live.waitset import WaitSetIntake
+from mddag_executor.live.intake.waitset import WaitSetIntake
 import pytest
 from rclpy.context import Context
 from rclpy.node import Node
@@ -54,7 +54,7 @@ def bare_node(ros_context: Context) -> Iterator[Node]:
 @pytest.fixture
 def timer_intake(ros_context: Context, recorder: Recorder) -> Iterator[WaitSetIntake]:
     """Give an intake of timers only, which is what EventsIntake has for them."""
-    made = WaitSetIntake(ros_context, recorder, kinds={'timer'})
+    made = WaitSetIntake(ros_context, recorder, kinds={'timers'})
     yield made
     made.stop()
     assert not recorder.errors

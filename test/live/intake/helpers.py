@@ -4,14 +4,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 import itertools
 import threading
 import time
 from typing import Any
 
-from mddag_executor.live.events import EventsIntake
-from mddag_executor.live.waitset import WaitSetIntake
+from mddag_executor.live.intake.arrivals import Arrival
+from mddag_executor.live.intake.events import EventsIntake
+from mddag_executor.live.intake.waitset import WaitSetIntake
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.waitable import NumberOfEntities, Waitable
@@ -37,12 +38,12 @@ class Recorder:
     """A receiver that keeps what it gets; ``react`` holds functions to call with it as well."""
 
     def __init__(self) -> None:
-        self.held = 0
+        self.executor = None
+        self.rounds: list[int] = []
         self.timers: list[tuple[Any, int]] = []
         self.missed: list[tuple[Any, int, int]] = []
         self.messages: list[tuple[Any, Any, dict[str, Any]]] = []
-        self.requests: list[tuple[Any, Any, Any]] = []
-        self.responses: list[tuple[Any, int, Any, Any]] = []
+        self.requests: list[tuple[Any, Any]] = []
         self.guards: list[Any] = []
         self.waitables: list[tuple[Any, Any]] = []
         self.errors: list[BaseException] = []
@@ -53,38 +54,30 @@ class Recorder:
         if reaction is not None:
             reaction(*what)
 
-    def hold(self) -> None:
-        self.held += 1
+    def take_in(self, arrivals: Sequence[Arrival]) -> None:
+        self.rounds.append(len(arrivals))
+        for arrival in arrivals:
+            self._arrived(arrival)
 
-    def let_go(self) -> None:
-        self.held -= 1
-
-    def on_timer(self, timer: Any, due_ns: int) -> None:
-        self.timers.append((timer, due_ns))
-        self._reaction('timer', timer, due_ns)
-
-    def on_missed(self, timer: Any, due_ns: int, count: int) -> None:
-        self.missed.append((timer, due_ns, count))
-
-    def on_message(self, subscription: Any, message: Any, info: dict[str, Any]) -> None:
-        self.messages.append((subscription, message, info))
-        self._reaction('message', subscription, message, info)
-
-    def on_request(self, service: Any, request: Any, header: Any) -> None:
-        self.requests.append((service, request, header))
-        self._reaction('request', service, request, header)
-
-    def on_response(self, client: Any, sequence: int, header: Any, response: Any) -> None:
-        self.responses.append((client, sequence, header, response))
-        self._reaction('response', client, sequence, header, response)
-
-    def on_guard(self, guard_condition: Any) -> None:
-        self.guards.append(guard_condition)
-        self._reaction('guard', guard_condition)
-
-    def on_waitable(self, waitable: Any, data: Any) -> None:
-        self.waitables.append((waitable, data))
-        self._reaction('waitable', waitable, data)
+    def _arrived(self, arrival: Arrival) -> None:
+        entity, function, args, then, info, due, missed = arrival
+        if due is not None:
+            self.timers.append((entity, due))
+            if missed:
+                self.missed.append((entity, due, missed))
+            self._reaction('timer', entity, due)
+        elif info is not None:
+            self.messages.append((entity, args[0], info))
+            self._reaction('message', entity, args[0], info)
+        elif then is not None:
+            self.requests.append((entity, args[0]))
+            self._reaction('request', entity, args[0], then)
+        elif args:
+            self.waitables.append((entity, args[0]))
+            self._reaction('waitable', entity, function, args[0])
+        else:
+            self.guards.append(entity)
+            self._reaction('guard', entity)
 
     def on_intake_error(self, error: BaseException) -> None:
         self.errors.append(error)

@@ -9,9 +9,9 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.live.entities import snapshot
-from mddag_executor.live.events import EventsIntake
-from mddag_executor.live.waitset import WaitSetIntake
+from mddag_executor.live.intake.entities import snapshot
+from mddag_executor.live.intake.events import EventsIntake
+from mddag_executor.live.intake.waitset import WaitSetIntake
 import pytest
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
@@ -127,18 +127,19 @@ def test_a_storm_of_destruction(intake: Any, ros_context: Context, recorder: Rec
     publishers = [source.create_publisher(String, name, 10) for name in names]
     clients = [source.create_client(SetBool, name) for name in names]
     stop = threading.Event()
+    responses: list[Any] = []
 
     def pour() -> None:
         while not stop.is_set():
             for publisher in publishers:
                 publisher.publish(text('x'))
             for client in clients:
-                client.call_async(SetBool.Request())
+                client.call_async(SetBool.Request()).add_done_callback(responses.append)
             time.sleep(0.0005)
 
-    def answer(service: Any, request: Any, header: Any) -> None:
+    def answer(_: Any, request: Any, respond: Any) -> None:
         try:
-            service.send_response(SetBool.Response(), header)
+            respond(SetBool.Response())
         except InvalidHandle:
             pass
 
@@ -192,7 +193,7 @@ def test_a_storm_of_destruction(intake: Any, ros_context: Context, recorder: Rec
         for node in (source, *nodes):
             node.destroy_node()
     assert made > 100
-    assert recorder.messages and recorder.requests and recorder.responses
+    assert recorder.messages and recorder.requests and responses
     assert recorder.timers and recorder.guards
     # A destroyed entity is no error; a response may come for a request of a former client.
     assert not recorder.errors

@@ -7,9 +7,9 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from mddag_executor.live import standins
-from mddag_executor.live.events import EventsIntake
-from mddag_executor.live.waitset import WaitSetIntake
+from mddag_executor.live.intake import sources
+from mddag_executor.live.intake.events import EventsIntake
+from mddag_executor.live.intake.waitset import WaitSetIntake
 import pytest
 from rclpy.context import Context
 from rclpy.node import Node
@@ -118,15 +118,16 @@ def test_what_is_destroyed_while_it_is_added_does_no_harm(
     kept, doomed = subscriptions[0], [subscriptions[2]]
     publisher = other.create_publisher(String, name, 10)
 
-    class Unlucky(standins.SubscriptionStandIn):
+    class Unlucky(sources.SubscriptionSource):
         """Lose the entity after its handle was entered, and before it is added."""
 
-        def drain(self) -> None:
-            super().drain()
-            if doomed and self.handle is doomed[0].handle:
+        def take(self) -> int:
+            count = super().take()
+            if doomed and self.entity is doomed[0]:
                 node.destroy_subscription(doomed.pop())
+            return count
 
-    monkeypatch.setitem(standins.STAND_INS, 'subscriptions', Unlucky)
+    monkeypatch.setitem(sources.SOURCES, 'subscriptions', Unlucky)
     intake = EventsIntake(ros_context, recorder)
     start(intake, node)
     try:
@@ -157,16 +158,15 @@ def test_a_wait_set_takes_over_from_a_native_executor_that_fails(
     subscription = node.create_subscription(String, name, nothing, 10)
     publisher = other.create_publisher(String, name, 10)
 
-    class Bad(standins.SubscriptionStandIn):
+    class Bad(sources.SubscriptionSource):
         """What makes the native executor fail in the middle of adding."""
 
         def __init__(self, *args: Any) -> None:
             super().__init__(*args)
-            self.let_go()
             self.handle = ros_context.handle
-            self.handle.__enter__()
+            sources.SOURCES['subscriptions'] = sources.SubscriptionSource
 
-    monkeypatch.setitem(standins.STAND_INS, 'subscriptions', Bad)
+    monkeypatch.setitem(sources.SOURCES, 'subscriptions', Bad)
     intake = EventsIntake(ros_context, recorder)
     start(intake, node)
     try:

@@ -9,7 +9,7 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.live.events import EventsIntake
+from mddag_executor.live.intake.events import EventsIntake
 import pytest
 from rclpy.action.client import ActionClient
 from rclpy.action.server import ActionServer, CancelResponse
@@ -110,19 +110,13 @@ def test_services_and_clients(intake: Any, node: Node, recorder: Recorder) -> No
     start(intake, node)
     assert client.wait_for_service(5.0)
 
-    def answer(service: Any, request: Any, header: Any) -> None:
-        service.send_response(SetBool.Response(success=not request.data), header)
-
-    def complete(client: Any, sequence: int, header: Any, response: Any) -> None:
-        assert header is None or header.request_id.sequence_number == sequence
-        client.get_pending_request(sequence).set_result(response)
-
-    recorder.react.update(request=answer, response=complete)
+    recorder.react['request'] = lambda _, request, respond: respond(
+        SetBool.Response(success=not request.data))
     for _ in range(5):  # five at once: a service keeps no more than ten
         futures = [client.call_async(SetBool.Request(data=bool(k % 2))) for k in range(5)]
         assert wait_for(lambda futures=futures: all(future.done() for future in futures))
         assert [f.result().success for f in futures] == [True, False, True, False, True]
-    assert {id(s) for s, _, _ in recorder.requests} == {id(service)}
+    assert {id(s) for s, _ in recorder.requests} == {id(service)}
     assert not recorder.errors
 
 
@@ -149,10 +143,8 @@ def test_timers_of_both_kinds_of_threads(intake: Any, node: Node, recorder: Reco
 def test_parameter_services(intake: Any, node: Node, other: Node, recorder: Recorder) -> None:
     node.declare_parameter('size', 3)
     client = AsyncParameterClient(other, node.get_name())
-    recorder.react['request'] = lambda service, request, header: service.send_response(
-        service.callback(request, service.srv_type.Response()), header)
-    recorder.react['response'] = lambda client, sequence, header, response: (
-        client.get_pending_request(sequence).set_result(response))
+    recorder.react['request'] = lambda service, request, respond: respond(
+        service.callback(request, service.srv_type.Response()))
     start(intake, node, other)
     assert client.wait_for_services(5.0)
     future = client.get_parameters(['size'])
@@ -185,9 +177,9 @@ def _run_waitables_in_order(executor: FakeExecutor, recorder: Recorder) -> None:
     """Execute what waitables have taken, each one's in order, and answer nothing else."""
     locks: dict[int, threading.Lock] = {}
 
-    def execute(waitable: Any, data: Any) -> None:
+    def execute(waitable: Any, function: Any, data: Any) -> None:
         with locks.setdefault(id(waitable), threading.Lock()):
-            executor.run(waitable.execute, data)
+            executor.run(function, data)
 
     recorder.react['waitable'] = execute
 
@@ -255,10 +247,11 @@ def test_all_intakes_hand_over_the_same(ros_context: Context, other: Node) -> No
     """Send one load to a node of each intake, and compare what comes out."""
     names = [topic() for _ in range(4)]
     parts = []
+    futures: list[list[Any]] = [[] for _ in INTAKES]
     for kind in INTAKES:
         node, recorder = make_node(ros_context), Recorder()
-        recorder.react['request'] = lambda service, request, header: service.send_response(
-            SetBool.Response(success=request.data), header)
+        recorder.react['request'] = lambda _, request, respond: respond(
+            SetBool.Response(success=request.data))
         subscriptions = [
             node.create_subscription(String, name, nothing, depth, raw=depth == 5)
             for name, depth in zip(names, (100, 50, 5, 1))]
@@ -279,13 +272,13 @@ def test_all_intakes_hand_over_the_same(ros_context: Context, other: Node) -> No
         for k in range(200):
             draw.choice(publishers).publish(text(str(k)))
             if k % 20 == 0:
-                for part in parts:
-                    part[5].call_async(SetBool.Request(data=k % 40 == 0))
+                for part, asked in zip(parts, futures):
+                    asked.append(part[5].call_async(SetBool.Request(data=k % 40 == 0)))
             # The queue of one of them has room for one message.
             assert wait_for(lambda: all(len(part[1].messages) > k for part in parts))  # noqa: B023
-        assert wait_for(lambda: all(len(part[1].responses) == 10 for part in parts))
+        assert wait_for(lambda: all(future.done() for asked in futures for future in asked))
         summaries = []
-        for _, recorder, _, subscriptions, _, _, timer in parts:
+        for (_, recorder, _, subscriptions, _, _, timer), asked in zip(parts, futures):
             messages = [
                 [(m if isinstance(m, bytes) else m.data, info['source_timestamp'])
                  for s, m, info in recorder.messages if s is subscription]
@@ -294,8 +287,8 @@ def test_all_intakes_hand_over_the_same(ros_context: Context, other: Node) -> No
             assert all((b - a) % (20 * MS) == 0 for a, b in zip(dues, dues[1:]))
             assert not recorder.errors
             summaries.append((
-                messages, [r.data for _, r, _ in recorder.requests],
-                [(sequence, r.success) for _, sequence, _, r in recorder.responses]))
+                messages, [r.data for _, r in recorder.requests],
+                [future.result().success for future in asked]))
         assert sum(map(len, summaries[0][0])) == 200 and len(summaries[0][2]) == 10
         assert summaries[0] == summaries[1] == summaries[2]
     finally:

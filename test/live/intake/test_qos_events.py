@@ -7,9 +7,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from mddag_executor.live import standins
-from mddag_executor.live.events import EventsIntake
-import pytest
+from mddag_executor.live.intake.events import EventsIntake
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -24,7 +22,6 @@ from std_msgs.msg import String
 from .helpers import (
     cpu_ns,
     intake_threads,
-    make_node,
     matched,
     MS,
     nothing,
@@ -100,7 +97,7 @@ def test_messages_do_not_wake_whoever_waits_for_qos_events(
     start(intake, node)
     try:
         assert matched(publisher)
-        threads = [t for t in intake_threads() if t.name.endswith('qos')]
+        threads = [t for t in intake_threads() if t.name.endswith('waitables')]
         assert threads
         before = cpu_ns(threads)
         for _ in range(200):
@@ -110,40 +107,3 @@ def test_messages_do_not_wake_whoever_waits_for_qos_events(
         assert cpu_ns(threads) - before < 5 * MS
     finally:
         intake.stop()
-
-
-def test_events_while_their_callback_is_registered_are_not_lost(
-    ros_context: Context, node: Node, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    name = topic()
-    drain = standins.EventStandIn.drain
-    turns: dict[int, int] = {}
-
-    def then_an_event(self: standins.EventStandIn) -> None:
-        """Have the event come right after everything was taken, before the callback is there."""
-        drain(self)
-        turns[id(self)] = turns.get(id(self), 0) + 1
-        if sum(turns.values()) == count:
-            other = make_node(ros_context)
-            other.create_publisher(
-                String, name, QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-            others.append(other)
-            time.sleep(0.2)
-
-    monkeypatch.setattr(standins.EventStandIn, 'drain', then_an_event)
-    others: list[Node] = []
-    node.create_subscription(String, name, nothing, QoSProfile(
-        depth=1, reliability=ReliabilityPolicy.RELIABLE))
-    count = len(list(node.waitables))
-    intake = EventsIntake(ros_context, recorder)
-    start(intake, node)
-    try:
-        assert wait_for(lambda: _events(recorder) == ['SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS'])
-        assert recorder.waitables[0][1].total_count == 1
-        intake.stop()
-        intake.start()
-        time.sleep(0.2)
-        assert len(recorder.waitables) == 1
-    finally:
-        intake.stop()
-        others[0].destroy_node()

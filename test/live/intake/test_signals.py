@@ -23,8 +23,8 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerGuardCondition
-from mddag_executor.live.events import EventsIntake
-from mddag_executor.live.waitset import WaitSetIntake
+from mddag_executor.live.intake.events import EventsIntake
+from mddag_executor.live.intake.waitset import WaitSetIntake
 
 class Receiver:
     def __getattr__(self, name):

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import time
 
 from builtin_interfaces.msg import Time as TimeMessage
-from mddag_executor.live.waitset import WaitSetIntake
+from mddag_executor.live.intake.waitset import WaitSetIntake
 import pytest
 from rclpy.context import Context
 from rclpy.parameter import Parameter

@@ -8,8 +8,8 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.live.entities import snapshot
-from mddag_executor.live.waitset import WaitSetIntake
+from mddag_executor.live.intake.entities import snapshot
+from mddag_executor.live.intake.waitset import WaitSetIntake
 import pytest
 from rclpy.context import Context
 from rclpy.guard_condition import GuardCondition
@@ -40,12 +40,9 @@ def test_a_snapshot_has_every_entity_and_its_node(ros_context: Context) -> None:
     seen = snapshot([a, b])
     assert seen.timers == [timer] and seen.guards == [guard]
     assert subscription in seen.subscriptions
-    assert seen.node_of(timer) is a and seen.node_of(guard) is b
     assert set(seen.services) == {*a.services, *b.services}
     assert set(seen.events) == {*a.waitables, *b.waitables} and seen.events
     assert not seen.waitables and seen.nodes == [a, b]
-    with pytest.raises(KeyError):
-        seen.node_of(object())
 
 
 def test_a_snapshot_is_the_same_while_nothing_changes(ros_context: Context) -> None:
@@ -64,18 +61,13 @@ def test_a_snapshot_is_the_same_while_nothing_changes(ros_context: Context) -> N
     assert snapshot([], first).timers == []
 
 
-def test_a_snapshot_takes_what_is_accepted(node: Node) -> None:
-    timer, other = node.create_timer(1.0, nothing), node.create_timer(2.0, nothing)
-    assert snapshot([node], accept=lambda entity: entity is not other).timers == [timer]
-
-
 def test_comparing_a_thousand_entities_is_cheap(ros_context: Context) -> None:
     nodes = [make_node(ros_context) for _ in range(8)]
     for made in nodes:
         for _ in range(125):
             made.create_guard_condition(nothing)
     first = snapshot(nodes)
-    assert len(first) > 1000
+    assert len(first.guards) >= 1000
     best = min(_seconds(lambda: snapshot(nodes, first)) for _ in range(5))
     assert best < 0.002  # about 0.1 ms
 
@@ -166,11 +158,6 @@ def test_poll_and_start_exclude_each_other(inline: WaitSetIntake, node: Node) ->
         inline.start()
     inline.stop()
     assert inline.poll(0.0) == 0
-
-
-def test_unknown_kinds_are_refused(ros_context: Context, recorder: Recorder) -> None:
-    with pytest.raises(ValueError, match='timers'):
-        WaitSetIntake(ros_context, recorder, kinds={'timers'})
 
 
 # --- cost ----------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ its call.  So a test that never ended shows as well: it has only begun.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import json
 from pathlib import Path
 import threading
@@ -22,13 +22,15 @@ from mddag_executor.core import policies, tally
 from mddag_executor.core.state import COMPLETED, IDLE, JOB_END, LATE, OPEN
 from mddag_executor.live import executor, upkeep
 from mddag_executor.live.attribution import Attribution, Origin
+from mddag_executor.live.compat import BareTask
 from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.entries import Entry, TASK, TaskWork, Work
-from mddag_executor.live.events import EventsIntake
+from mddag_executor.live.intake.arrivals import Arrival
+from mddag_executor.live.intake.events import EventsIntake
+from mddag_executor.live.intake.sources import ClientSource
+from mddag_executor.live.intake.waitset import WaitSetIntake
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.receiver import Receiver
-from mddag_executor.live.tasks import ObservedTask
-from mddag_executor.live.waitset import WaitSetIntake
 import pytest
 
 MUTATIONS: dict[str, Callable[[], None]] = {}
@@ -99,14 +101,14 @@ def every_twentieth_lost() -> None:
 def every_twentieth_response_lost() -> None:
     count = 0
 
-    def make(on_response: Any) -> Any:
+    def make(arrived: Any) -> Any:
         def broken(*args: Any) -> None:
             nonlocal count
             count += 1
             if count % 20:
-                on_response(*args)
+                arrived(*args)
         return broken
-    replace(Receiver, 'on_response', make)
+    replace(ClientSource, 'arrived', make)
 
 
 # --- coroutines, exceptions, waking, the end -----------------------------------------------------
@@ -129,7 +131,7 @@ def unknown_waits_not_resumed() -> None:
 
 @mutation('A task of rclpy 7.1.9 goes on by itself as well, so it does so twice.')
 def tasks_go_on_by_themselves() -> None:
-    del ObservedTask._add_resume_callback
+    del BareTask._add_resume_callback
 
 
 @mutation('What a callback raises does not come out of spin.')
@@ -202,11 +204,12 @@ def shutdown_leaves_intake() -> None:
 
 @mutation("A job's release is when its timer was looked at, and not when it was due.")
 def release_is_when_noticed() -> None:
-    def make(on_timer: Any) -> Any:
-        def broken(self: Receiver, timer: Any, due_ns: int) -> None:
-            on_timer(self, timer, time.monotonic_ns())
+    def make(take_in: Any) -> Any:
+        def broken(self: Receiver, arrivals: Sequence[Arrival]) -> None:
+            take_in(self, [a if a.due is None else a._replace(due=time.monotonic_ns())
+                           for a in arrivals])
         return broken
-    replace(Receiver, 'on_timer', make)
+    replace(Receiver, 'take_in', make)
 
 
 @mutation('A message belongs to the oldest open job that still waits for one like it.')

@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import time
 from typing import Any
 
+from mddag_executor.live.compat import timer_functions, with_timer_info
+from mddag_executor.live.intake.arrivals import Arrival
 from rclpy.clock_type import ClockType
 from rclpy.timer import Timer
 
@@ -20,24 +21,20 @@ WIDE_NS = 50_000
 _now = time.monotonic_ns
 
 
-class Slot:
+class PhasedTimer:
     """A timer with its phase grid; ``entry`` is the number of its one valid heap entry, or 0."""
 
     __slots__ = (
-        'timer', 'handle', 'until', 'call', 'get_period', 'overridden',
+        'timer', 'handle', 'until', 'get_period', 'may_be_overridden', '_call', '_info', '_clock',
         'period', 'anchor', 'due', 'entry', 'cancelled', 'simulated', 'missed')
 
     def __init__(self, timer: Timer) -> None:
-        handle = timer.handle
         self.timer = timer
-        self.handle: Any = handle
-        self.until: Callable[[], int | None] = handle.time_until_next_call
-        self.call: Callable[[], None] = handle.call_timer
-        self.get_period: Callable[[], int] = handle.get_timer_period
-        clock = timer.clock
-        self.overridden: Callable[[], bool] | None = None
-        if clock.clock_type == ClockType.ROS_TIME:
-            self.overridden = clock.handle.get_ros_time_override_is_enabled
+        self.handle: Any = timer.handle
+        self.until, self._call, self.get_period = timer_functions(timer)
+        self._info: dict[str, int] | None = None
+        self._clock: Any = timer.clock
+        self.may_be_overridden = timer.clock.clock_type == ClockType.ROS_TIME
         self.period = self.get_period()
         self.anchor = 0
         self.due = 0
@@ -45,6 +42,24 @@ class Slot:
         self.cancelled = False
         self.simulated = False
         self.missed = 0
+
+    def overridden(self) -> bool:
+        """Return whether the time of its clock is simulated now."""
+        return self.may_be_overridden and bool(self._clock.ros_time_is_active)
+
+    def call(self) -> None:
+        """Move its next call time on; rcl skips what it has missed."""
+        self._info = self._call()
+
+    def arrival(self, due: int) -> Arrival | None:
+        """Return what it is handed over as, now that it was called; None without a callback."""
+        timer = self.timer
+        callback = timer.callback
+        missed, self.missed = self.missed, 0
+        if callback is None:
+            return None
+        return Arrival(
+            timer, with_timer_info(timer, callback, self._info), due=due, missed=missed)
 
     def measure(self) -> tuple[int, int] | None:
         """Return an interval that holds the next call time, or None when cancelled."""

@@ -9,9 +9,9 @@ One wait: fill the wait set with the handles of all entities (rcl empties it at 
 without the GIL, and ask it for what is ready; each of that is taken and handed over at once.
 
 What is built once for a set of entities is the wait set itself, the lists of handles and, for
-each entity, the function that takes from it, found by the address that the wait set gives. What
-makes rclpy's own executors slow with many entities, is what is not done here: asking every node
-for its entities, a callback group for each, and a new wait set, at every wait.
+each entity, its source, found by the address that the wait set gives (``compat.wait_set``). What
+makes rclpy's own executors slow with many entities is not done here: asking every node for its
+entities, a callback group for each, and a new wait set, at every wait.
 
 Entities are held (``with handle``) while they are waited for, so a destroyed one goes when the
 wait ends. Taking from it enters its handle once more, which fails after ``destroy``: nothing is
@@ -20,9 +20,6 @@ handed over for it.
 From a ready subscription messages are taken until there are none, at most its depth: that is as
 many as were there when it became ready. One message a wait would cost a wait for each message
 under load; more than the depth could keep the others waiting.
-
-A waitable keeps in itself what ``is_ready`` has found, for ``take_data``: the two are called one
-after the other, in the thread of the wait.
 
 Timers are not in the wait set (see ``timers``): their next due time is the wait's time-out. An
 intake of timers only, or one that has nothing else yet, sleeps on a lock instead, which is
@@ -35,19 +32,20 @@ from collections.abc import Callable, Iterable
 import threading
 import time
 
+from mddag_executor.live.compat import RCLError
+from mddag_executor.live.compat.wait_set import RefilledSet
 from mddag_executor.live.endings import call_at_shutdown, is_over, join, SecondLooks, stop_at_exit
-from mddag_executor.live.entities import EMPTY, EntitySet, Receiver, snapshot
-from mddag_executor.live.refilled import RefilledSet
-from mddag_executor.live.timers import sharpen_wake_ups, TimerQueue
+from mddag_executor.live.intake.arrivals import Receiver
+from mddag_executor.live.intake.entities import EMPTY, EntitySet, snapshot
+from mddag_executor.live.intake.sources import SOURCES, sources
+from mddag_executor.live.intake.timers import sharpen_wake_ups, TimerQueue
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 
-ALL_KINDS = frozenset(
-    ('subscription', 'timer', 'client', 'service', 'guard', 'waitable', 'event'))
-"""The kinds of entities; ``event`` are the waitables of QoS events."""
+ALL_KINDS = frozenset(('timers', *SOURCES))
+"""The kinds of entities: lists of ``EntitySet``."""
 
 REBUILD_SHARE = 10
 """A wait set is built anew at the earliest after so many times what building it took last."""
@@ -99,8 +97,6 @@ class WaitSetIntake:
         self._receiver = receiver
         self._guards = tuple(guards)
         self._kinds = frozenset(kinds)
-        if not self._kinds <= ALL_KINDS:
-            raise ValueError(f'{sorted(self._kinds - ALL_KINDS)}: no kinds of entities')
         self._name = f'mddag-intake-{name}'
         self._on_shutdown = on_shutdown
         self._timers = TimerQueue(receiver, self.wake)
@@ -113,7 +109,7 @@ class WaitSetIntake:
         self._bell = threading.Lock()
         self._bell.acquire()
         self._guard: GuardCondition | None = None
-        if self._guards or self._kinds != {'timer'}:
+        if self._guards or self._kinds != {'timers'}:
             self._guard = GuardCondition(None, None, context)
         self._thread: threading.Thread | None = None
         self._stopping = False
@@ -168,18 +164,24 @@ class WaitSetIntake:
         latest = self._latest
         self._drop()
         if self._guard is not None:
-            bells = (*self._guards, self._guard)
-            kinds = self._kinds - {'event'} if self._threaded else self._kinds
-            self._filled = RefilledSet(self._context, latest, kinds, bells, self._receiver)
-            if 'event' in self._kinds and latest.events and self._threaded:
-                events = RefilledSet(
-                    self._context, latest, frozenset({'event'}), (), self._receiver)
+            apart = {'events'} & self._kinds if self._threaded else set[str]()
+            self._filled = self._set_for(
+                latest, self._kinds - apart, (*self._guards, self._guard))
+            if apart and latest.events:
+                events = self._set_for(latest, apart)
                 self._events = events if events.size else None  # all may be destroyed by now
                 self._events_at = 0
-        if 'timer' in self._kinds:
+        if 'timers' in self._kinds:
             self._timers.update(latest.timers)
         end = _now()
         self._rebuild_at = end + min((end - start) * REBUILD_SHARE, REBUILD_LATEST_NS)
+
+    def _set_for(
+        self, entities: EntitySet, kinds: Iterable[str], bells: Iterable[GuardCondition] = ()
+    ) -> RefilledSet:
+        receiver = self._receiver
+        return RefilledSet(
+            self._context, sources(entities, kinds, receiver), bells, receiver.on_intake_error)
 
     def _drop(self) -> None:
         for some in self._filled, self._events:
@@ -211,7 +213,7 @@ class WaitSetIntake:
             self._apply()
             return 0, False
         rang = filled.rung()
-        count, failed = filled.hand_over()
+        count, failed = filled.take_ready()
         self._failures = self._failures + 1 if failed else 0
         return count, rang
 
@@ -247,7 +249,7 @@ class WaitSetIntake:
                 ended = self._context_ended(rang)
                 if count or rang or ended or (limit is not None and _now() >= limit):
                     return count
-        except _rclpy.RCLError:
+        except RCLError:
             if not is_over(self._context):
                 raise
             return 0
@@ -294,7 +296,7 @@ class WaitSetIntake:
 
     def stop(self) -> None:
         """
-        End the thread and let go of all entities; from any thread, and in any state.
+        End the thread and release all entities; from any thread, and in any state.
 
         What is ready by then stays where it is. Called by a receiver from the intake's thread, it
         returns at once and the thread ends after that call.
@@ -356,7 +358,7 @@ class WaitSetIntake:
         start = _now()
         try:
             events.wait(0)
-            events.hand_over()
+            events.take_ready()
         except InvalidHandle:
             self._changed = True  # one was destroyed
         end = _now()

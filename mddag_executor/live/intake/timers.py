@@ -27,9 +27,9 @@ Changes that nobody announces
     reset timer is due no sooner than a period later.
 
 Rounds
-    Timers that come due while others are handed over are handed over with them before anything is
-    dispatched (``hold``, ``let_go``): nobody waits for them, but a callback of little urgency that
-    came due some microseconds earlier would else take the last worker, and keep it.
+    Timers that come due while others are called are handed over with them. Nobody waits for them,
+    but a callback of little urgency that came due some microseconds earlier would else take the
+    last worker, and keep it.
 
 Simulated time
     Timers of a clock whose time is overridden have no due time on the monotonic clock. They are
@@ -44,8 +44,9 @@ from heapq import heapify, heappop, heappush
 import time
 from typing import Any
 
-from mddag_executor.live.entities import alive, Receiver
-from mddag_executor.live.slots import Slot, TOLERANCE_NS, WIDE_NS
+from mddag_executor.live.intake.arrivals import Arrival, Receiver
+from mddag_executor.live.intake.entities import alive
+from mddag_executor.live.intake.phase import PhasedTimer, TOLERANCE_NS, WIDE_NS
 from rclpy.clock import Clock, JumpHandle, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
@@ -55,9 +56,6 @@ from rclpy.timer import Timer
 # are repeated only after so many times what the last one took, so they have 1 % of a CPU at most.
 SCAN_GAP_NS, SCAN_LATEST_NS, SCAN_CANCELLED_NS = 10_000_000, 100_000_000, 5_000_000
 SCAN_SHARE = 100
-
-# A round is begun where another timer is due this soon: handing over one takes about as long.
-ROUND_NS = 100_000
 
 # A timer without a period is always due; so often it is handed over.
 ZERO_PERIOD_NS = 1_000_000
@@ -82,20 +80,16 @@ class TimerQueue:
     """
     The timers of an intake, by due time. All methods belong to one thread at a time.
 
-    :param receiver: gets ``on_timer`` and ``on_intake_error``, and ``hold`` and ``let_go`` around
-        several timers at once, so that it can choose among them.
+    :param receiver: whom to hand over to.
     :param wake: called, from any thread, when a clock jumped: ``fire`` is to be called soon.
     """
 
     def __init__(self, receiver: Receiver, wake: Callable[[], None]) -> None:
-        self._on_timer = receiver.on_timer
-        self._on_missed = receiver.on_missed
+        self._take_in = receiver.take_in
         self._on_error = receiver.on_intake_error
-        self._hold = receiver.hold
-        self._let_go = receiver.let_go
         self._wake = wake
-        self._slots: dict[int, Slot] = {}
-        self._heap: list[tuple[int, int, Slot]] = []
+        self._timers: dict[int, PhasedTimer] = {}
+        self._heap: list[tuple[int, int, PhasedTimer]] = []
         self._entries = 0
         self._jumps: dict[int, tuple[Clock, JumpHandle]] | None = None
         self._jumped = False
@@ -104,23 +98,22 @@ class TimerQueue:
 
     def __len__(self) -> int:
         """Return the number of timers."""
-        return len(self._slots)
+        return len(self._timers)
 
     def update(self, timers: Iterable[Timer]) -> None:
         """Set which timers there are; those that stay keep their phase grid."""
-        slots: dict[int, Slot] = {}
+        known, self._timers = self._timers, {}
         for timer in timers:
-            slot = self._slots.get(id(timer))
-            if slot is None:
+            phased = known.get(id(timer))
+            if phased is None:
                 try:
-                    slot = Slot(timer)
+                    phased = PhasedTimer(timer)
                 except Exception as error:
                     if not isinstance(error, InvalidHandle) and alive(timer):
                         self._on_error(error)
                     continue
-            slots[id(timer)] = slot
-        self._slots = slots
-        self._heap = [entry for entry in self._heap if id(entry[2].timer) in slots]
+            self._timers[id(timer)] = phased
+        self._heap = [entry for entry in self._heap if id(entry[2].timer) in self._timers]
         heapify(self._heap)
         if self._jumps is not None:
             self.watch_clocks(True)
@@ -136,7 +129,7 @@ class TimerQueue:
         if watch:
             wanted = {
                 id(s.timer.clock): s.timer.clock
-                for s in self._slots.values() if s.overridden is not None}
+                for s in self._timers.values() if s.may_be_overridden}
         jumps = self._jumps or {}
         for key in [key for key in jumps if key not in wanted]:
             try:
@@ -164,7 +157,7 @@ class TimerQueue:
         """Return when to call ``fire`` next (monotonic ns), None for never."""
         if self._jumped:
             return 0
-        if not self._slots:
+        if not self._timers:
             return None
         heap = self._heap
         while heap and heap[0][2].entry != heap[0][1]:
@@ -175,169 +168,156 @@ class TimerQueue:
 
     def fire(self, now: int) -> int:
         """Hand over what is due, and what comes due meanwhile; return how many it were."""
-        if self._jumped or (now >= self._scan_early and self._slots):
+        if self._jumped or (now >= self._scan_early and self._timers):
             self.scan()
         heap = self._heap
         if not heap or heap[0][0] > now:
             return 0
-        # The root's children are the next two: with neither due soon, there is at most one.
-        if not any(entry[0] <= now + ROUND_NS for entry in heap[1:3]):
-            return self._fire_due(now)
-        self._hold()
-        try:
-            return self._fire_due(now)
-        finally:
-            self._let_go()
-
-    def _fire_due(self, now: int) -> int:
-        count = 0
-        heap = self._heap
+        arrivals: list[Arrival] = []
         # An entry made meanwhile is of the next round, so this ends.
         last = self._entries
         while heap and heap[0][1] <= last and (heap[0][0] <= now or heap[0][0] <= _now()):
-            _, entry, slot = heappop(heap)
-            if slot.entry == entry:
-                slot.entry = 0
-                count += self._fire(slot)
-        return count
+            _, entry, timer = heappop(heap)
+            if timer.entry == entry:
+                timer.entry = 0
+                self._fire(timer, arrivals)
+        if arrivals:
+            try:
+                self._take_in(arrivals)
+            except Exception as error:
+                self._on_error(error)
+        return len(arrivals)
 
     def scan(self) -> None:
         """Ask every timer when it is due, and find out about changes."""
         self._jumped = False
         start = _now()
         shortest = SCAN_LATEST_NS
-        for slot in list(self._slots.values()):
+        for timer in list(self._timers.values()):
             try:
-                self._look_at(slot)
+                self._look_at(timer)
             except Exception as error:
-                self._failed(slot, error)
-            if slot.cancelled and slot.period < shortest:
-                shortest = max(slot.period, SCAN_CANCELLED_NS)
+                self._failed(timer, error)
+            if timer.cancelled and timer.period < shortest:
+                shortest = max(timer.period, SCAN_CANCELLED_NS)
         end = _now()
         rest = (end - start) * SCAN_SHARE
         self._scan_early = end + max(min(SCAN_GAP_NS, shortest), rest)
         self._scan_latest = end + max(shortest, rest)
 
-    def _look_at(self, slot: Slot) -> None:
-        simulated = slot.overridden is not None and slot.overridden()
-        if simulated != slot.simulated:
-            slot.simulated = simulated
-            slot.entry = 0
+    def _look_at(self, timer: PhasedTimer) -> None:
+        simulated = timer.overridden()
+        if simulated != timer.simulated:
+            timer.simulated = simulated
+            timer.entry = 0
         if simulated:
-            until = slot.until()
-            slot.cancelled = until is None
+            until = timer.until()
+            timer.cancelled = until is None
             if until is None or until > 0:
-                slot.entry = 0
-            elif not slot.entry:
-                self._push(slot, 0)
+                timer.entry = 0
+            elif not timer.entry:
+                self._push(timer, 0)
             return
-        interval = slot.measure()
-        slot.cancelled = interval is None
+        interval = timer.measure()
+        timer.cancelled = interval is None
         if interval is None:
-            slot.period = slot.get_period()
-            slot.entry = 0
+            timer.period = timer.get_period()
+            timer.entry = 0
             return
         low, high = interval
-        if slot.entry and low - TOLERANCE_NS <= slot.due <= high + TOLERANCE_NS:
+        if timer.entry and low - TOLERANCE_NS <= timer.due <= high + TOLERANCE_NS:
             return
-        self._aim(slot, low, high)
+        self._aim(timer, low, high)
 
-    def _aim(self, slot: Slot, low: int, high: int) -> None:
+    def _aim(self, timer: PhasedTimer, low: int, high: int) -> None:
         """Put a timer into the heap whose next call time lies in this interval."""
-        period = slot.get_period()
-        point = slot.grid_point(low, high) if period == slot.period and slot.anchor else None
+        period = timer.get_period()
+        point = timer.grid_point(low, high) if period == timer.period and timer.anchor else None
         if point is not None:
-            slot.due = point
-        elif not slot.take_anchor():
-            self._park(slot)
+            timer.due = point
+        elif not timer.take_anchor():
+            self._park(timer)
             return
-        self._push(slot, slot.due)
+        self._push(timer, timer.due)
 
-    def _park(self, slot: Slot) -> None:
+    def _park(self, timer: PhasedTimer) -> None:
         """Note that a timer is cancelled: only a scan finds out that it was reset."""
-        slot.cancelled = True
+        timer.cancelled = True
         self._scan_latest = min(
-            self._scan_latest, _now() + max(slot.period, SCAN_CANCELLED_NS))
+            self._scan_latest, _now() + max(timer.period, SCAN_CANCELLED_NS))
 
-    def _push(self, slot: Slot, due: int) -> None:
+    def _push(self, timer: PhasedTimer, due: int) -> None:
         self._entries += 1
-        slot.entry = self._entries
-        heappush(self._heap, (due, self._entries, slot))
+        timer.entry = self._entries
+        heappush(self._heap, (due, self._entries, timer))
 
-    def _fire(self, slot: Slot) -> int:
-        """Call a timer if rcl agrees that it is due; return how many were handed over."""
+    def _fire(self, timer: PhasedTimer, arrivals: list[Arrival]) -> None:
+        """Call a timer if rcl agrees that it is due."""
         try:
-            with slot.handle:
-                due = self._call(slot)
+            with timer.handle:
+                due = self._call(timer)
+                arrival = None if due is None else timer.arrival(due)
         except Exception as error:
-            self._failed(slot, error)
-            return 0
-        if due is None:
-            return 0
-        try:
-            self._on_timer(slot.timer, due)
-            if slot.missed:
-                missed, slot.missed = slot.missed, 0
-                self._on_missed(slot.timer, due, missed)
-        except Exception as error:
-            self._on_error(error)
-        return 1
+            self._failed(timer, error)
+            return
+        if arrival is not None:
+            arrivals.append(arrival)
 
-    def _call(self, slot: Slot) -> int | None:
+    def _call(self, timer: PhasedTimer) -> int | None:
         """Call a timer and aim at its next due time; return the one that it had, if it had."""
         before = _now()
-        until = slot.until()
+        until = timer.until()
         after = _now()
-        if slot.simulated:
+        if timer.simulated:
             if until is None or until > 0:
                 return None
-            slot.call()
+            timer.call()
             return before
         if after - before > WIDE_NS:
-            interval = slot.measure()
+            interval = timer.measure()
         else:
             interval = None if until is None else (before + until, after + until)
         if interval is None:
-            self._park(slot)
+            self._park(timer)
             return None
         low, high = interval
         if low > _now():
             # It was reset, or its period has changed: not due yet.
-            self._aim(slot, low, high)
+            self._aim(timer, low, high)
             return None
-        period = slot.get_period()
+        period = timer.get_period()
         if period <= 0:
-            slot.call()
-            slot.period = period
-            slot.due = before + ZERO_PERIOD_NS
-            self._push(slot, slot.due)
+            timer.call()
+            timer.period = period
+            timer.due = before + ZERO_PERIOD_NS
+            self._push(timer, timer.due)
             return before
-        due = slot.grid_point(low, high)
+        due = timer.grid_point(low, high)
         if due is None:
-            if not slot.take_anchor():
-                self._park(slot)
+            if not timer.take_anchor():
+                self._park(timer)
                 return None
-            due = slot.anchor
-        if period != slot.period:
+            due = timer.anchor
+        if period != timer.period:
             # The call that is due now was still aimed at by the old period.
-            slot.period, slot.anchor = period, due
-        slot.call()
-        slot.due = due + period
-        if slot.due < before:
+            timer.period, timer.anchor = period, due
+        timer.call()
+        timer.due = due + period
+        if timer.due < before:
             # rcl skips missed periods too; it read its clock later, so it can be ahead of this,
             # which then shows as "not due yet".
-            slot.missed = -(-(before - slot.due) // period)
-            slot.due += slot.missed * period
-        self._push(slot, slot.due)
+            timer.missed = -(-(before - timer.due) // period)
+            timer.due += timer.missed * period
+        self._push(timer, timer.due)
         return due
 
-    def _failed(self, slot: Slot, error: Exception) -> None:
+    def _failed(self, timer: PhasedTimer, error: Exception) -> None:
         """Sort out an exception of rcl: the timer was destroyed, cancelled, or it is an error."""
-        slot.entry = 0
-        if isinstance(error, InvalidHandle) or not alive(slot.timer):
-            self._slots.pop(id(slot.timer), None)
+        timer.entry = 0
+        if isinstance(error, InvalidHandle) or not alive(timer.timer):
+            self._timers.pop(id(timer.timer), None)
             return
-        if slot.until() is None:
-            self._park(slot)
+        if timer.until() is None:
+            self._park(timer)
         else:
             self._on_error(error)

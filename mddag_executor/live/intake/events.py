@@ -3,12 +3,12 @@
 """
 Intake by events: the middleware calls, and nothing is asked again for each wake-up.
 
-Subscriptions, services and clients go through one native EventsExecutor of rclpy, QoS events
-through another (see ``native``). What cannot, or crashes it, gets threads of its own: timers;
-guard conditions, actions and other waitables. A thread is started when there is something for it.
+Subscriptions, services and clients go through a native EventsExecutor of rclpy. What it cannot
+take, or what crashes it, gets wait sets in threads of their own: timers; and guard conditions,
+actions, QoS events and other waitables. A thread is started when there is something for it.
 
-A native executor cannot be repaired, and not even be disposed of, when the middleware refuses an
-entity half way. Should that happen, it is left lying, and a wait set takes over.
+A native executor cannot be repaired when the middleware refuses an entity half way. Should that
+happen, a wait set takes over.
 """
 
 from __future__ import annotations
@@ -19,78 +19,45 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.live.compat.events_executor import is_available, NativeExecutor
 from mddag_executor.live.direct import DirectTakes
 from mddag_executor.live.endings import call_at_shutdown, is_over, join, SecondLooks, stop_at_exit
-from mddag_executor.live.entities import EMPTY, EntitySet, Receiver, snapshot
-from mddag_executor.live.native import NodeStandIn
-from mddag_executor.live.waitset import PATIENCE, WaitSetIntake
+from mddag_executor.live.intake.arrivals import Receiver
+from mddag_executor.live.intake.entities import EMPTY, EntitySet, snapshot
+from mddag_executor.live.intake.sources import sources
+from mddag_executor.live.intake.waitset import PATIENCE, WaitSetIntake
 from rclpy.context import Context
-from rclpy.exceptions import InvalidHandle
-from rclpy.executors import ExternalShutdownException
 from rclpy.guard_condition import GuardCondition
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.task import Future
 
-SPIN_SEC = 3600.0
-"""The native executor spins for that long at a time: in rclpy 7.1.5 it does not for ever."""
-
-PROBE_SEC = 2.0
-
+_NATIVE = 'events'
 _PARTS = {
-    'events': ('subscriptions', 'services', 'clients'),
-    'qos': ('events',),
+    _NATIVE: ('subscriptions', 'services', 'clients'),
     'timers': ('timers',),
-    'waitables': ('waitables', 'guards'),
+    'waitables': ('waitables', 'guards', 'events'),
 }
-_NATIVE = ('events', 'qos')
-_SINGULAR = {
-    'subscriptions': 'subscription', 'services': 'service', 'clients': 'client',
-    'events': 'event', 'timers': 'timer', 'waitables': 'waitable', 'guards': 'guard'}
-
-
-class _OpenContext:
-    """
-    Stand in for the context of a native executor.
-
-    That one asks whether it is ok in its updates, and forgets all entities if not. The real one
-    would answer under a lock, which a shutdown holds while it waits for others; and its end is
-    noticed here anyway.
-    """
-
-    def __init__(self, handle: Any) -> None:
-        self.handle = handle
-
-    def ok(self) -> bool:
-        """Return True."""
-        return True
-
-
-_left_lying: list[Any] = []
+SPIN_S = 3600.0
 
 
 class _NativeThread:
     """
     A thread in which a native EventsExecutor spins, made anew for each start.
 
-    It installs no signal handler; rclpy's own, where it is installed, ends its spin on SIGINT and
-    SIGTERM. So the context is looked at whenever a spin ends, and some more times soon after.
+    A signal ends the native executor's spin. So the context is looked at whenever a spin ends, and
+    some more times soon after.
 
     :param on_end: called at the end of the thread, unless by ``stop``, with whether the context
         has ended; if not, the native executor has failed.
     """
 
     def __init__(
-        self, name: str, kinds: Iterable[str], context: Context, receiver: Receiver,
-        entities: EntitySet, on_end: Callable[[bool], None],
+        self, name: str, context: Context, receiver: Receiver, on_end: Callable[[bool], None]
     ) -> None:
         self._context = context
         self._receiver = receiver
         self._on_end = on_end
-        self._native: Any = _rclpy.EventsExecutor(_OpenContext(context.handle))
-        self._node = NodeStandIn(kinds, receiver, self._native.wake)
-        self._node.wanted = entities
-        self._native.add_node(self._node)
+        self._native = NativeExecutor(context, receiver.on_intake_error)
         self._lock = threading.Lock()
         self._stopping = False
         self._future: Any = None
@@ -103,12 +70,12 @@ class _NativeThread:
 
     def update(self, entities: EntitySet) -> None:
         """Set what to look after; it comes into force soon."""
-        self._node.wanted = entities
+        self._native.show(tuple(sources(entities, _PARTS[_NATIVE], self._receiver)))
         self._native.wake()
 
     def settled(self) -> bool:
         """Return whether what was set by ``update`` has come into force."""
-        return self._node.settled() or not self._thread.is_alive()
+        return self._native.settled() or not self._thread.is_alive()
 
     def wake(self) -> None:
         """Have the thread look at its context soon."""
@@ -117,11 +84,10 @@ class _NativeThread:
                 self._future.set_result(None)
 
     def stop(self) -> None:
-        """End the thread and let go of all entities."""
+        """End the thread and release all entities."""
         with self._lock:
             self._stopping = True
-            if self._future is not None:
-                self._future.set_result(None)
+        self.wake()
         self.join()
 
     def join(self) -> bool:
@@ -139,39 +105,28 @@ class _NativeThread:
                     if self._stopping:
                         break
                     future = self._future = Future()
+                waiting = looks.at is not None
                 try:
-                    if looks.at is None:
-                        self._native.spin_until_future_complete(future, SPIN_SEC)
-                        looks.begin()  # a signal, or a wake
-                    else:
-                        self._native.spin_until_future_complete(future, looks.seconds())
-                        looks.due()
+                    broken = not self._native.spin(future, looks.seconds() if waiting else SPIN_S)
                     failures = 0
-                except ExternalShutdownException:
-                    pass
-                except InvalidHandle as error:
-                    broken = not self._node.survives(error)
-                    if broken:
-                        self._receiver.on_intake_error(error)
                 except Exception as error:
                     failures += 1
                     self._receiver.on_intake_error(error)
-                    broken = not self._node.survives(error)
-                    if not broken:
-                        # A take failed. What was announced with it is announced no more.
-                        self._node.drain()
                     if failures > PATIENCE:
                         time.sleep(min(0.1, 0.001 * failures))
+                else:
+                    if waiting:
+                        looks.due()
+                    else:
+                        looks.begin()  # a signal, or a wake
                 ended = is_over(self._context)
         finally:
             with self._lock:
                 self._future = None
             if broken:
-                _left_lying.append((self._native, self._node))
-                self._node.withdraw()
+                self._native.abandon()
             else:
-                self._native.shutdown()
-                self._node.close()
+                self._native.close()
         if (ended or broken) and not self._stopping:
             self._on_end(ended)
 
@@ -188,7 +143,7 @@ class EventsIntake:
         ended, also by a signal.
     """
 
-    _available: bool | None = None
+    available = staticmethod(is_available)
 
     def __init__(
         self,
@@ -206,24 +161,10 @@ class EventsIntake:
         self._latest = EMPTY
         self._direct = DirectTakes(receiver, self._choose_again, partial(is_over, context))
         self._running = False
-        self._parts: dict[str, Any] = {}
-        self._ending: list[Any] = []
-        self._refused: set[str] = set()
+        self._refused = False
+        self._parts: dict[str, _NativeThread | WaitSetIntake] = {}
+        self._ending: list[_NativeThread] = []
         call_at_shutdown(context, self.wake)
-
-    @classmethod
-    def available(cls) -> bool:
-        """
-        Return whether this rclpy has a native EventsExecutor, and it does dispatch.
-
-        It needs no context, is found out once, and takes about a millisecond where it works.
-        """
-        if EventsIntake._available is None:
-            try:
-                EventsIntake._available = _probe()
-            except Exception:
-                EventsIntake._available = False
-        return EventsIntake._available
 
     def update(self, entities: EntitySet | Iterable[Node]) -> None:
         """
@@ -258,33 +199,28 @@ class EventsIntake:
         """Start the threads that have something to do, and have not had until now."""
         for name, kinds in _PARTS.items():
             # The first one always: it is whom signals wake.
-            needed = name == 'events' or any(getattr(self._latest, kind) for kind in kinds)
+            needed = name == _NATIVE or any(getattr(self._latest, kind) for kind in kinds)
             if not needed or name in self._parts:
                 continue
-            if name in _NATIVE and name not in self._refused:
-                part = self._parts[name] = _NativeThread(
-                    name, kinds, self._context, self._receiver, self._latest,
-                    partial(self._native_ended, name))
-                part.start()
+            part: _NativeThread | WaitSetIntake
+            if name == _NATIVE and not self._refused:
+                part = _NativeThread(name, self._context, self._receiver, self._native_ended)
             else:
-                self._start_wait_set(name, [_SINGULAR[kind] for kind in kinds])
+                part = WaitSetIntake(self._context, self._receiver, (), kinds, name=name)
+            self._parts[name] = part
+            part.update(self._latest)
+            part.start()
 
-    def _start_wait_set(self, name: str, kinds: Iterable[str]) -> None:
-        part = self._parts[name] = WaitSetIntake(
-            self._context, self._receiver, (), kinds, name=name)
-        part.update(self._latest)
-        part.start()
-
-    def _native_ended(self, name: str, context_ended: bool) -> None:
-        """React in a native executor's thread to its end."""
+    def _native_ended(self, context_ended: bool) -> None:
+        """React in the native executor's thread to its end."""
         if context_ended:
             self.wake()  # a signal has ended the context, which the others do not notice
             if self._on_shutdown is not None:
                 self._on_shutdown()
             return
         with self._lock:
-            self._refused.add(name)
-            if self._parts.pop(name, None) is not None and self._running:
+            self._refused = True
+            if self._parts.pop(_NATIVE, None) is not None and self._running:
                 self._start_parts()
 
     def settled(self) -> bool:
@@ -317,7 +253,7 @@ class EventsIntake:
 
     def stop(self) -> None:
         """
-        End the threads and let go of all entities; from any thread, and in any state.
+        End the threads and release all entities; from any thread, and in any state.
 
         What is ready by then stays where it is. Called by a receiver from one of the intake's
         threads, it returns without waiting for that thread, which ends after that call.
@@ -333,31 +269,3 @@ class EventsIntake:
                 part.update(EMPTY)
         if looker is not None:
             join(looker)
-
-
-class _Probe:
-    """A node without entities that completes a future when it is asked for them."""
-
-    executor: Any = None
-    timers = clients = services = waitables = guards = ()  # type: Any
-
-    def __init__(self, future: Any) -> None:
-        self._future = future
-
-    @property
-    def subscriptions(self) -> tuple[()]:
-        """Note that the native executor is at work."""
-        self._future.set_result(None)
-        return ()
-
-
-def _probe() -> bool:
-    native = _rclpy.EventsExecutor(_OpenContext(None))
-    future: Any = Future()
-    node = _Probe(future)
-    native.add_node(node)
-    native.wake()
-    native.spin_until_future_complete(future, PROBE_SEC)
-    native.shutdown()
-    node.executor = None
-    return bool(future.done())
