@@ -71,7 +71,6 @@ setup(
         'mcap>=1.0',
         'numpy>=1.21',
         'rosbags>=0.10',
-        'ruamel.yaml>=0.17.21',
         'zstandard>=0.18',
     ],
     extras_require={

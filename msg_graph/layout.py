@@ -11,21 +11,18 @@ Theory of operation
 2. The text must be a declaration before, and give an equal task set after; else it is left alone,
    with an error. Lines are the one thing that may differ.
 3. The normal form of a normal form is itself.
-4. No comment is ever left out: a text in which that cannot be had is left alone, too. (ruamel.yaml
-   drops comments in brackets, and its older versions those ahead of a list that is not indented;
-   the latter is tried once more with the list indented.)
-5. ruamel.yaml breaks no lines, as each version does it in another way; this module does.
-6. A file with ``include:`` or ``arguments:`` is one part of a declaration only. Of it all values
+4. No comment is ever left out: a text with comments in brackets is left alone, too. A comment
+   behind an entry keeps its column, if there is room. One on a line of its own is indented as the
+   entry below it, or, where it stood deeper than that, as the entries of the list or mapping above
+   that it belongs to.
+5. A file with ``include:`` or ``arguments:`` is one part of a declaration only. Of it all values
    must be equal after; whether it is right, the whole declaration shows.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
-import io
-import re
-import sys
+from typing import Any
 
 from msg_graph.errors import GraphError
 from msg_graph.include import is_composed, top_of
@@ -47,24 +44,19 @@ def format_text(text: str, name: str = '<string>') -> str:
         its meaning.
     """
     before = _meaning(text, name)
-    result = text
-    for _ in range(3):  # a comment that moves may make room for one more change
-        last, result = result, _with_comments(result, name)
-        if result == last:
-            break
-    else:
-        raise refused(name)
+    writer = _Writer(text.lstrip('\ufeff'), name)
+    writer.write()
+    result = '\n'.join(writer.lines).strip('\n') + '\n'
     try:
-        after = _meaning(result, name)
+        if _meaning(result, name) == before:
+            return result
     except GraphError:
-        raise refused(name) from None
-    if before != after:
-        raise refused(name)
-    return result
+        pass
+    raise refused(name)
 
 
 def _meaning(text: str, name: str) -> object:
-    """Return what must stay the same: the task set, or all that stands in the text (rule 6)."""
+    """Return what must stay the same: the task set, or all that stands in the text (rule 5)."""
     tree, top = top_of(text, name)
     return _plain(tree) if is_composed(top) else without_lines(loads(text, name))
 
@@ -77,131 +69,157 @@ def _plain(tree: Tree) -> object:
     return [(key, _plain(value)) for key, value in tree.entries.items()]
 
 
-def refused(name: str) -> GraphError:
-    """Return the error about a text that cannot be written anew."""
+def refused(name: str, comment: bool = False) -> GraphError:
+    """Return the error about a text that cannot be written anew; for a comment's sake, perhaps."""
+    if comment:
+        return GraphError(
+            name, None, 'its layout cannot be changed without the loss of a comment',
+            'write the comments that stand inside of brackets above or below them')
     return GraphError(name, None, 'its layout cannot be changed without a change of its meaning',
                       'write anchors, quotes and multi-line texts more plainly')
 
 
-def _with_comments(text: str, name: str) -> str:
-    """Return the text laid out anew, with the comments that it has (rule 4)."""
-    try:
-        comments = _comments(text)
-        for indent in (False, True):
-            result = _broken(_laid_out(_indented(text) if indent else text, name))
-            if _comments(result) == comments:
-                return result
-    except yaml.YAMLError:
-        raise refused(name) from None
-    raise GraphError(name, None, 'its layout cannot be changed without the loss of a comment',
-                     'write the comments that stand inside of brackets above or below them')
+_Comment = tuple[int, int, str]
+"""Line, column and text; a blank line has no text."""
 
 
-def _comments(text: str) -> list[str]:
-    """Return the comments: what stands between two tokens, from a ``#`` on."""
-    result: list[str] = []
-    end = 0
-    for token in yaml.scan(text, yaml.SafeLoader):
-        gap = text[end:token.start_mark.index]
-        result += (comment.rstrip() for comment in re.findall('#.*', gap))
-        end = max(end, token.end_mark.index)
-    return result
+class _Writer:
+    """
+    Writes what the parser tells anew.
 
+    ``_open`` has of each list and mapping in which the next entry may stand its column in the old
+    and in the new text, ``_above`` the same for the last line that was written.
+    """
 
-def _indented(text: str) -> str:
-    """Return the text with lists that stand in the column of their keys two columns deeper."""
-    lines = text.splitlines()
-    shifts = Counter[int]()
-    starts: list[tuple[int, int]] = []  # of what is open: line and column
-    for event in yaml.parse(text, yaml.SafeLoader):
-        mark = event.start_mark
-        if mark is None:
-            continue
-        if isinstance(event, yaml.CollectionStartEvent):
-            starts.append((mark.line, mark.column))
-        elif isinstance(event, yaml.CollectionEndEvent):
-            first, column = starts.pop()
-            if (isinstance(event, yaml.SequenceEndEvent) and starts
-                    and starts[-1][1] == column and starts[-1][0] < first):
-                shifts.update(range(first, mark.line + (mark.column > column)))
-    ends = _ends(text)
-    for index, times in shifts.items():
-        content, rest = lines[index][:ends.get(index)], lines[index][ends.get(index, 0):]
-        if content.strip() and content.lstrip()[0] != '#':
-            if not rest.lstrip().startswith('#') or index not in ends:
-                lines[index] = '  ' * times + lines[index]
-            else:  # a comment stays in its column, if there is room
-                room = len(rest) - len(rest.lstrip())
-                lines[index] = (
-                    '  ' * times + content + ' ' * max(2, room - 2 * times) + rest.lstrip())
-    return '\n'.join(lines) + '\n'
+    def __init__(self, text: str, name: str) -> None:
+        self.lines: list[str] = []
+        self._text = text
+        self._name = name
+        self._line = ''
+        self._last = -1  # line of the old text that the line being written comes from
+        self._behind: list[_Comment] = []
+        self._alone: list[_Comment] = []
+        self._open: list[tuple[int, int]] = []
+        self._above: list[tuple[int, int]] = []
+        self._find_comments()
+        self._events: Any = yaml.parse(text, yaml.SafeLoader)
 
+    def _find_comments(self) -> None:
+        """Find what stands between two tokens."""
+        end = depth = line = column = 0
+        for token in yaml.scan(self._text, yaml.SafeLoader):
+            gap = self._text[end:token.start_mark.index]
+            if depth and '#' in gap:
+                raise refused(self._name, comment=True)
+            parts = gap.split('\n')
+            for number, part in enumerate(parts):
+                text = part.strip()
+                indent = len(part) - len(part.lstrip())
+                if number == 0 and text and end:
+                    self._behind.append((line, column + indent, text))
+                elif not depth and (text or 0 < number < len(parts) - 1):
+                    self._alone.append((line + number, indent, text))
+            if token.end_mark.index > end:
+                end = token.end_mark.index
+                line, column = token.end_mark.line, token.end_mark.column
+            depth += isinstance(token, (yaml.FlowSequenceStartToken, yaml.FlowMappingStartToken))
+            depth -= isinstance(token, (yaml.FlowSequenceEndToken, yaml.FlowMappingEndToken))
 
-def _ends(text: str) -> dict[int, int]:
-    """Return the column at which the content of a line ends, for each with the end of a token."""
-    ends: dict[int, int] = {}
-    for token in yaml.scan(text, yaml.SafeLoader):
-        if token.end_mark.index > token.start_mark.index:
-            mark = token.end_mark
-            ends[mark.line] = max(ends.get(mark.line, 0), mark.column)
-    return ends
+    def write(self) -> None:
+        """Write all lines."""
+        for event in self._events:
+            if isinstance(event, yaml.DocumentStartEvent) and event.explicit:
+                raise refused(self._name)
+            if isinstance(event, yaml.NodeEvent):
+                self._value(event, -2)
+        self._begin(0, len(self._text), 0)
+        if self._behind or self._alone:
+            raise refused(self._name, comment=True)
 
+    def _begin(self, indent: int, line: int, column: int) -> None:
+        """End a line, and begin one for what stands in the old text at a line and column."""
+        while self._behind and self._behind[0][0] <= self._last:
+            _, at, text = self._behind.pop(0)
+            at = at - 2 if at + len(text) <= WIDTH else 0
+            self._line = f'{self._line.rstrip():<{at}}  {text}'
+        if self._last >= 0:
+            self.lines.append(self._line.rstrip())
+        while self._alone and self._alone[0][0] < line:
+            _, at, text = self._alone.pop(0)
+            deeper = [new for old, new in self._above if column < old <= at]
+            self.lines.append(text and ' ' * (deeper[-1] if deeper else indent) + text)
+        self._line = ' ' * indent
+        self._above = list(self._open)
 
-def _broken(text: str) -> str:
-    """Return the text with lines broken after commas in brackets, where they are too long."""
-    lines = text.splitlines()
-    if all(len(line) <= WIDTH for line in lines):
+    def _source(self, event: Any) -> str:
+        """Return how a text or an alias is written, with its anchor."""
+        text: str = self._text[event.start_mark.index:event.end_mark.index]
+        if '\n' in text:
+            raise refused(self._name)
+        self._last = event.end_mark.line
         return text
-    commas: dict[int, list[int]] = {}
-    inside: set[int] = set()  # lines that begin in brackets
-    depth = last = 0
-    for token in yaml.scan(text, yaml.SafeLoader):
-        mark = token.end_mark
-        if depth:
-            inside.update(range(last + 1, mark.line + 1))
-        last = mark.line
-        if isinstance(token, yaml.FlowEntryToken):
-            commas.setdefault(mark.line, []).append(mark.column)
-        depth += isinstance(token, (yaml.FlowSequenceStartToken, yaml.FlowMappingStartToken))
-        depth -= isinstance(token, (yaml.FlowSequenceEndToken, yaml.FlowMappingEndToken))
-    ends = _ends(text)
-    result: list[str] = []
-    for index, line in enumerate(lines):
-        places = [column for column in commas.get(index, []) if column < ends[index]]
-        result += _pieces(line, ends.get(index, 0), places, index in inside)
-    return '\n'.join(result) + '\n'
 
+    def _value(self, event: Any, indent: int) -> None:
+        """Write a value behind what stands on the line; its entries are indented by two more."""
+        if isinstance(event, (yaml.ScalarEvent, yaml.AliasEvent)):
+            self._line += self._source(event)
+        elif event.flow_style:
+            self._fill(self._pieces(event))
+        else:
+            if event.anchor:
+                self._line += f'&{event.anchor}'
+            self._entries(event, indent + 2)
 
-def _pieces(line: str, end: int, places: list[int], inside: bool) -> list[str]:
-    """Return a line, whose content ends at a column, broken at some of the places."""
-    start = len(line) - len(line.lstrip(' -' if not inside else ' '))
-    indent = ' ' * (start if inside else start + 2)
-    result: list[str] = []
-    begin = shift = 0  # of the piece: where it begins in the line, its indent less that
-    while end + shift > WIDTH and (later := [place for place in places if place > begin]):
-        fitting = [place for place in later if place + shift <= WIDTH]
-        place = fitting[-1] if fitting else later[0]
-        result.append((indent if begin else '') + line[begin:place])
-        begin = place + len(line[place:]) - len(line[place:].lstrip())
-        shift = len(indent) - begin
-    result.append((indent if begin else '') + line[begin:])
-    return result
+    def _entries(self, event: Any, indent: int) -> None:
+        """Write the entries of a list or mapping, the first one perhaps on the line of a dash."""
+        is_list = isinstance(event, yaml.SequenceStartEvent)
+        column = event.start_mark.column
+        self._open.append((column, indent))
+        inline = self._line == ' ' * (indent - 2) + '- '
+        self._above = list(self._open)
+        while not isinstance(entry := next(self._events), yaml.CollectionEndEvent):
+            if not inline:
+                self._begin(indent, entry.start_mark.line, column)
+            inline = False
+            if is_list:
+                self._line += '- '
+                self._value(entry, indent)
+            else:
+                self._line += self._source(entry) + ': '
+                self._value(next(self._events), indent)
+        self._open.pop()
 
+    def _pieces(self, event: Any) -> list[str]:
+        """Return a value in brackets in pieces between which a line may break."""
+        if isinstance(event, (yaml.ScalarEvent, yaml.AliasEvent)):
+            return [self._source(event)]
+        is_list = isinstance(event, yaml.SequenceStartEvent)
+        pieces = [f'&{event.anchor} ' if event.anchor else '']
+        pieces[0] += '[' if is_list else '{'
+        while not isinstance(entry := next(self._events), yaml.CollectionEndEvent):
+            first, *rest = self._pieces(entry if is_list else next(self._events))
+            if not is_list:
+                first = f'{self._source(entry)}: {first}'
+            if len(pieces) == 1 and pieces[0][-1] in '[{':
+                pieces[0] += first
+            else:
+                pieces[-1] += ','
+                pieces.append(first)
+            pieces += rest
+        pieces[-1] += ']' if is_list else '}'
+        self._source(entry)
+        return pieces
 
-def _laid_out(text: str, name: str) -> str:
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-    writer = YAML(typ='rt')
-    writer.preserve_quotes = True
-    writer.width = sys.maxsize  # rule 5
-    writer.indent(mapping=2, sequence=4, offset=2)
-    stream = io.StringIO()
-    try:
-        writer.dump(writer.load(text), stream)
-    except (YAMLError, ValueError, NotImplementedError):
-        raise refused(name) from None
-    lines = [line.rstrip() for line in stream.getvalue().strip('\n').splitlines()]
-    return '\n'.join(lines) + '\n'
+    def _fill(self, pieces: list[str]) -> None:
+        """Write a value in brackets, in several lines if need be."""
+        indent = len(self._line) - len(self._line.lstrip(' -')) + 2
+        self._line += pieces[0]
+        for piece in pieces[1:]:
+            if len(self._line) + 1 + len(piece) > WIDTH:
+                self.lines.append(self._line)
+                self._line = ' ' * indent + piece
+            else:
+                self._line += f' {piece}'
 
 
 def without_lines(task_set: TaskSet) -> TaskSet:

@@ -18,7 +18,6 @@ The tree is built from the parser's events, not by PyYAML's composer or construc
 
 from __future__ import annotations
 
-import json
 import re
 from typing import Any
 
@@ -119,10 +118,10 @@ def plain_scalar(text: str) -> str:
 
 
 def yaml_lines(tree: Tree) -> list[str]:
-    """Return the lines of a text that gives an equal tree."""
+    """Return the lines of a text that gives an equal tree; its texts have one line each."""
     if isinstance(tree, Scalar):
         simple = tree.plain and _SIMPLE.fullmatch(tree.text)
-        return [tree.text if simple else json.dumps(tree.text)]
+        return [tree.text if simple else "'" + tree.text.replace("'", "''") + "'"]
     if isinstance(tree, Sequence) and all(isinstance(item, Scalar) for item in tree.items):
         return [f'[{", ".join(line for item in tree.items for line in yaml_lines(item))}]']
     lines = []

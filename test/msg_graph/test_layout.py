@@ -30,6 +30,7 @@ nodes:
       subscription: /a
       deadline:    5ms
       execution_time: &e 0.50ms
+      # of x
 
   # last
   - name: '0x10'
@@ -45,15 +46,16 @@ mddag: 1      # the format
 nodes:
   - node: /n    # a node
     callbacks:
-  # first
+      # first
       - {name: t, timer: 10ms, publishes: [/a]}      # why
       - name: "x"
-      # on the topic
+        # on the topic
         subscription: /a
         deadline: 5ms
         execution_time: &e 0.50ms
+        # of x
 
-  # last
+      # last
       - name: '0x10'
         subscription: /a
         deadline: 010ms
