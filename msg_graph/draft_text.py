@@ -15,7 +15,6 @@ open (``open_blanks``), all of it at once, instead of the errors that come of it
 3. *publishes*, where it is not known which of a node's callbacks publishes a topic: on each that
    may.
 4. *timers* that are only supposed, as nothing else seems to start what their node publishes.
-5. *cycles*: at the top of the file, each with the queue edges that would cut it.
 
 A named path becomes an entry where each of its nodes has just one callback that fits.
 """
@@ -24,7 +23,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 import re
 
 from msg_graph.draft import Draft, DraftCallback, DraftPath, UNDEFINED
@@ -37,7 +36,6 @@ from msg_graph.yamltext import plain_scalar
 MARK = 'FILL IN'
 _OPEN = re.compile(rf'\s*#\s+(?:(\w+:).*\s#\s+)?{MARK}: (.*)')
 _ENTRY = re.compile(r'\s*- (?:name|node):|\s*-\s*\{')
-_MOST_EDGES = 60
 _LITTLE = 1e-4      # of a period
 
 
@@ -84,7 +82,6 @@ class _Writer:
                     self._started.setdefault(topic, []).append(callback)
         self._maybe = {topic for callback in self._callbacks for topic in callback.maybe}
         self._sources = Counter(c.node for c in self._callbacks if self._is_source(c))
-        self._next = {callback.key: self._successors(callback) for callback in self._callbacks}
         self._period = self._shortest_periods()
 
     def _is_source(self, callback: DraftCallback) -> bool:
@@ -92,10 +89,6 @@ class _Writer:
             return False
         return callback.kind != 'subscription' or not (
             callback.starts[0] in self._publishers or callback.starts[0] in self._maybe)
-
-    def _successors(self, callback: DraftCallback) -> list[tuple[str, DraftCallback]]:
-        return [(topic, after) for topic in callback.publishes
-                for after in self._started.get(topic, ())]
 
     def _shortest_periods(self) -> dict[str, DraftCallback]:
         """Return by callback the source with the shortest period that leads to it, perhaps."""
@@ -115,7 +108,6 @@ class _Writer:
         yield f'# From {printable(self._draft.origin)}.'
         yield f"# Lines with '{MARK}' are blanks: correct the value, then take the '# ' away."
         yield "# 'mddag graph check' tells what is still open."
-        yield from self._cycles()
         yield 'mddag: 1'
         if self._draft.workers is not None:
             yield f'workers: {self._draft.workers}'
@@ -136,7 +128,7 @@ class _Writer:
         yield from self._publishes(callback)
         if callback.reads:
             yield f'        reads: [{", ".join(map(plain_scalar, callback.reads))}]'
-        if not self._next[callback.key]:
+        if not any(topic in self._started for topic in callback.publishes):
             yield self._deadline(callback)
         if callback.times is not None:
             yield from _execution_time(*callback.times)
@@ -233,58 +225,6 @@ class _Writer:
                 return []
             keys.append(fits[0].key)
         return keys if len(keys) > 1 and PATH.check(path.name) is None else []
-
-    def _cycles(self) -> Iterator[str]:
-        for members in _cycles(self._next):
-            edges = [(before, topic, after) for before in members
-                     for topic, after in self._next[before] if after.key in members]
-            names = ', '.join(members)
-            yield f'# {MARK}: these callbacks start each other in a cycle: {names}.'
-            cuts = [edge for edge in edges[:_MOST_EDGES]
-                    if not _cyclic(self._next, members, (edge[0], edge[2].key))]
-            how = 'Each of these queue edges cuts it' if cuts else 'Several of these cut it'
-            yield f"# {how} (write it under 'reads:', start the callback by something else):"
-            for before, topic, after in cuts or edges[:_MOST_EDGES]:
-                yield f'#   {after.key} reads {topic} (published by {before})'
-
-
-_Next = dict[str, list[tuple[str, DraftCallback]]]
-
-
-def _cyclic(successors: _Next, keys: Iterable[str], without: tuple[str, str] | None = None
-            ) -> set[str]:
-    """Return those of some callbacks that are on a cycle of these, or on a way between two."""
-    left = set(keys)
-    edges = {(key, after.key) for key in left for _, after in successors[key]
-             if after.key in left} - {without}
-    while True:
-        inner = {key for key, _ in edges} & {key for _, key in edges}
-        if inner == left:
-            return left
-        left = inner
-        edges = {(key, after) for key, after in edges if key in left and after in left}
-
-
-def _cycles(successors: _Next) -> list[list[str]]:
-    """Return the sets of callbacks that lead back to each other, in file order."""
-    left = _cyclic(successors, successors)
-    reached = {key: _reached(successors, key, left) for key in left}
-    found: dict[frozenset[str], None] = {}
-    for key in successors:
-        if key in left and key in reached[key]:
-            found[frozenset(other for other in reached[key] if key in reached[other])] = None
-    return [[key for key in successors if key in members] for members in found]
-
-
-def _reached(successors: _Next, start: str, inside: set[str]) -> set[str]:
-    reached: set[str] = set()
-    stack = [start]
-    while stack:
-        for _, after in successors[stack.pop()]:
-            if after.key in inside and after.key not in reached:
-                reached.add(after.key)
-                stack.append(after.key)
-    return reached
 
 
 def _period(source: DraftCallback) -> str:

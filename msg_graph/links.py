@@ -10,6 +10,7 @@ vertices.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 
 from msg_graph.declaration import Declaration, DeclaredCallback, DeclaredPath
 from msg_graph.errors import did_you_mean, for_each, GraphError, listed, shown
@@ -109,12 +110,11 @@ class Links:
                     if open_topics[started] == 0:
                         ready.append(started)
         if len(order) < len(self.callbacks):
-            raise self._cycle_error(set(range(len(self.callbacks))).difference(order))
+            for_each(self._cycles(set(range(len(self.callbacks))).difference(order)),
+                     self._refuse_cycle)
         return order
 
-    def _cycle_error(self, stuck: set[int]) -> GraphError:
-        """Return the error about one cycle among the callbacks that wait for each other."""
-        cycle = self._cycle(stuck)
+    def _refuse_cycle(self, cycle: list[int]) -> None:
         # The edge to cut: one into a sync, which keeps its other topics, else one against the
         # order of the file, which is most likely the one that leads back.
         edges = [(cycle[i - 1], place) for i, place in enumerate(cycle)]
@@ -132,24 +132,25 @@ class Links:
         if len(keys) > 9:
             keys[8:-1] = [f'… ({len(keys) - 9} more)']
         entry = self.declared[cut].entry
-        return GraphError(
+        raise GraphError(
             entry.file, entry.line_of(callback.kind, topic),
             f'callbacks start each other in a cycle: {" -> ".join(keys)}',
             f'cut it with a queue edge: in {shown(callback.key)} list {shown(topic)} under '
             f"'reads:' and {how}")
 
-    def _cycle(self, stuck: set[int]) -> list[int]:
-        """Walk back from publisher to publisher until one comes again; return that cycle."""
-        place = min(stuck)
-        seen: dict[int, int] = {}
-        walk: list[int] = []
-        while place not in seen:
-            seen[place] = len(walk)
-            walk.append(place)
-            place = next(
-                publisher for topic in self.callbacks[place].topics
-                for publisher in self.publishers[topic] if publisher in stuck)
-        return walk[seen[place]:][::-1]
+    def _cycles(self, stuck: set[int]) -> Iterator[list[int]]:
+        """Yield cycles without a common callback: walk back from publisher to publisher."""
+        while stuck:
+            place: int | None = min(stuck)
+            walk: dict[int, None] = {}
+            while place is not None and place not in walk:
+                walk[place] = None
+                place = next((publisher for topic in self.callbacks[place].topics
+                              for publisher in self.publishers[topic] if publisher in stuck), None)
+            stuck -= walk.keys()
+            if place is not None:
+                places = list(walk)
+                yield places[places.index(place):][::-1]
 
     def check_deadlines(self, without: list[str] | None) -> None:
         """Check that sinks, and nothing else, have deadlines (rule 6); or collect who has none."""

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from msg_graph import GraphError, loads
+from msg_graph import GraphError, GraphErrors, loads
 import pytest
 
 from .helpers import graph, MARK, nodes_error
@@ -145,6 +145,22 @@ def test_cycle_is_found_behind_what_waits_for_it() -> None:
               publishes: [/x]
             - {{name: y, subscription: /x, publishes: [/y, /c]}}
     """, '/n:x -> /n:y -> /n:x')
+
+
+def test_all_cycles_are_told() -> None:
+    with pytest.raises(GraphErrors) as caught:
+        graph("""
+            - node: /n
+              callbacks:
+                - {name: a, subscription: /y, publishes: [/x]}
+                - {name: b, subscription: /x, publishes: [/y]}
+                - {name: c, subscription: /x, publishes: [/w]}
+                - {name: d, subscription: /w, publishes: [/v, /x]}
+                - {name: e, subscription: /self, publishes: [/self, /v]}
+                - {name: f, subscription: /v, deadline: 1ms}
+        """)
+    assert [error.problem.partition(': ')[2] for error in caught.value.errors] == [
+        '/n:a -> /n:b -> /n:a', '/n:c -> /n:d -> /n:c', '/n:e -> /n:e']
 
 
 def test_long_cycle_is_not_spelt_out() -> None:
