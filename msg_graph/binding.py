@@ -37,95 +37,8 @@ _PYTHON = re.compile(r'(?:[\w<>]+\.)*(\w+|<lambda>)')
 _CPP = re.compile(r'[\w:<>*& ]*?\b(\w+)\([^()]*\)')
 
 
-class Binder:
-    """
-    Hands out the declared callbacks of a task set to the entities that start them.
-
-    Every ``bind_...`` returns None where nothing (more) is declared that fits, so the entity's
-    callback is an undeclared one.
-    """
-
-    def __init__(self, task_set: TaskSet) -> None:
-        self._callbacks = task_set.callbacks
-        self._free: dict[tuple[str, str, str], list[int]] = {}
-        self._periods: dict[str, set[int]] = {}
-        self._place: dict[str, int] = {}
-        self._bound: list[set[str]] = []
-        for place, callback in enumerate(task_set.callbacks):
-            self._place[callback.key] = place
-            self._bound.append(set())
-            for leg in _legs(callback):
-                self._free.setdefault((callback.node, *leg), []).append(place)
-            if callback.timer_period_ns is not None:
-                self._periods.setdefault(callback.node, set()).add(callback.timer_period_ns)
-
-    def bind_timer(self, node: str, period_ns: int) -> Callback | None:
-        """
-        Return the callback of a timer.
-
-        The declared period may differ by 0.2 %; of several the nearest one is meant.
-
-        :param node: fully qualified name of the timer's node.
-        """
-        declared = [
-            period for period in self._periods.get(node, ())
-            if is_period(period_ns, period) and self._free[node, 'timer', str(period)]]
-        if not declared:
-            return None
-        nearest = min(declared, key=lambda period: (abs(period - period_ns), period))
-        return self._take(node, 'timer', str(nearest))
-
-    def bind_subscription(self, node: str, topic: str) -> Callback | None:
-        """
-        Return the callback of a subscription; of a sync callback's leg, the sync callback.
-
-        :param node: fully qualified name of the subscription's node.
-        :param topic: fully qualified name of its topic.
-        """
-        return self._take(node, 'topic', topic)
-
-    def bind_service(self, node: str, service: str) -> Callback | None:
-        """
-        Return the callback of a service.
-
-        :param node: fully qualified name of the service's node.
-        :param service: fully qualified name of the service.
-        """
-        return self._take(node, 'service', service)
-
-    def release(self, callback: Callback, topic: str | None = None) -> None:
-        """
-        Take a binding back, as its entity is gone; the callback can be bound anew.
-
-        :param topic: the leg of a sync callback; None for all that are bound.
-        :raises KeyError: the callback, or that leg of it, is not bound.
-        """
-        place = self._place[callback.key]
-        bound = self._bound[place]
-        starts = sorted(bound) if topic is None else [topic]
-        if not bound or not bound.issuperset(starts):
-            raise KeyError(callback.key if topic is None else topic)
-        kinds = {start: kind for kind, start in _legs(callback)}
-        for start in starts:
-            bound.remove(start)
-            heappush(self._free[callback.node, kinds[start], start], place)
-
-    def _take(self, node: str, kind: str, start: str) -> Callback | None:
-        free = self._free.get((node, kind, start))
-        if not free:
-            return None
-        place = heappop(free)
-        self._bound[place].add(start)
-        return self._callbacks[place]
-
-
-def is_period(period_ns: int, declared_ns: int) -> bool:
-    """Tell whether a timer's period is the declared one."""
-    return abs(declared_ns - period_ns) <= _PERIOD_TOLERANCE * declared_ns
-
-
 class Entity(NamedTuple):
-    """A timer, subscription or service that ran: its node, and what starts it."""
+    """A timer, subscription or service: its node, and what starts it."""
 
     node: str
     kind: str
@@ -135,9 +48,70 @@ class Entity(NamedTuple):
 
 def entities_of(callback: Callback) -> list[Entity]:
     """Return the entities that a declared callback stands for."""
-    return [Entity(callback.node, 'subscription' if kind == 'topic' else kind,
-                   '' if kind == 'timer' else start, callback.timer_period_ns)
-            for kind, start in _legs(callback)]
+    if callback.kind == 'timer':
+        return [Entity(callback.node, 'timer', '', callback.timer_period_ns)]
+    if callback.service is not None:
+        return [Entity(callback.node, 'service', callback.service)]
+    return [Entity(callback.node, 'subscription', topic) for topic in callback.topics]
+
+
+class Binder:
+    """Hands out the declared callbacks of a task set to the entities that start them."""
+
+    def __init__(self, task_set: TaskSet) -> None:
+        self._callbacks = task_set.callbacks
+        self._place = {callback.key: place for place, callback in enumerate(task_set.callbacks)}
+        self._free: dict[Entity, list[int]] = {}
+        self._timers: dict[str, set[Entity]] = {}
+        self._bound: set[tuple[int, Entity]] = set()
+        for place, callback in enumerate(task_set.callbacks):
+            for entity in entities_of(callback):
+                self._free.setdefault(entity, []).append(place)
+                if entity.kind == 'timer':
+                    self._timers.setdefault(entity.node, set()).add(entity)
+
+    def bind(self, entity: Entity) -> Callback | None:
+        """
+        Return the callback of an entity; of a sync callback's leg, the sync callback.
+
+        None where nothing (more) is declared that fits, so the entity's callback is an undeclared
+        one. The period of a timer may differ by 0.2 %; of several the nearest one is meant.
+
+        :param entity: with the full names of its node and of its topic or service.
+        """
+        if entity.kind == 'timer':
+            period = entity.period_ns or 0
+            entity = min(
+                (timer for timer in self._timers.get(entity.node, ())
+                 if self._free[timer] and is_period(period, timer.period_ns or 0)),
+                key=lambda timer: (abs((timer.period_ns or 0) - period), timer), default=entity)
+        free = self._free.get(entity)
+        if not free:
+            return None
+        place = heappop(free)
+        self._bound.add((place, entity))
+        return self._callbacks[place]
+
+    def release(self, callback: Callback, topic: str | None = None) -> None:
+        """
+        Take a binding back, as its entity is gone; the callback can be bound anew.
+
+        :param topic: the leg of a sync callback; None for all that are bound.
+        :raises KeyError: the callback, or that leg of it, is not bound.
+        """
+        place = self._place[callback.key]
+        bound = [entity for entity in entities_of(callback)
+                 if topic in (None, entity.start) and (place, entity) in self._bound]
+        if not bound:
+            raise KeyError(callback.key if topic is None else topic)
+        for entity in bound:
+            self._bound.remove((place, entity))
+            heappush(self._free[entity], place)
+
+
+def is_period(period_ns: int, declared_ns: int) -> bool:
+    """Tell whether a timer's period is the declared one."""
+    return abs(declared_ns - period_ns) <= _PERIOD_TOLERANCE * declared_ns
 
 
 def meant(callback: Callback, undeclared: Iterable[Entity]) -> str | None:
@@ -193,12 +167,3 @@ def entity_name(node: str, symbol: str, what: str) -> str:
     if not node:
         return f'{function or "callback"} ({what})'
     return f'{node}: {what}' if function is None else f'{node}: {function} ({what})'
-
-
-def _legs(callback: Callback) -> list[tuple[str, str]]:
-    """Return what starts a callback, as pairs of kind and name."""
-    if callback.kind == 'timer':
-        return [('timer', str(callback.timer_period_ns))]
-    if callback.kind == 'service':
-        return [('service', str(callback.service))]
-    return [('topic', topic) for topic in callback.topics]

@@ -207,22 +207,21 @@ class Registry:
             if kind == TIMER:
                 period = entity.timer_period_ns
                 depth, label = 1, exact_duration(period)
-                callback = self._binder.bind_timer(node, period) if self._binder else None
             elif kind == SUBSCRIPTION:
                 topic = label = entity.topic_name
                 qos = entity.qos_profile
                 depth = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else 0
-                callback = self._binder.bind_subscription(node, topic) if self._binder else None
             elif kind in (SERVICE, CLIENT):
                 label = service_name(entity)
-                if kind == SERVICE and self._binder is not None:
-                    callback = self._binder.bind_service(node, label)
             elif kind == GUARD:
                 label = 'condition'
         except Exception as error:
             if type(error).__name__ == 'InvalidHandle':
                 return None  # destroyed between being listed and looked at
             raise
+        bindable = Entity(node, kind, '' if kind == TIMER else label, period)
+        if kind in (TIMER, SUBSCRIPTION, SERVICE) and self._binder is not None:
+            callback = self._binder.bind(bindable)
         group = getattr(entity, 'callback_group', None)
         decides = group is not None and decides_itself(group)
         number = self._number(entity if decides else group)
@@ -232,8 +231,7 @@ class Registry:
         entry.at_once = callback is None and kind == SUBSCRIPTION and keeps_time(entity)
         if callback is None and kind in (TIMER, SUBSCRIPTION, SERVICE):
             if len(self._undeclared) < _MOST_UNDECLARED:
-                start = '' if kind == TIMER else label
-                self._undeclared[Entity(node, kind, start, period)] = None
+                self._undeclared[bindable] = None
         if callback is not None:
             assert self._task_set is not None
             link(entry, self._task_set, self._tables, topic)

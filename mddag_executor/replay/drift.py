@@ -142,12 +142,8 @@ def declared_keys(census: Census, task_set: TaskSet) -> dict[Address, str]:
     binder = Binder(task_set)
     found: dict[Address, str] = {}
     for entity in census.entities():
-        if entity.kind == 'timer':
-            callback = binder.bind_timer(entity.node, entity.period_ns or 0)
-        elif entity.kind == 'subscription':
-            callback = binder.bind_subscription(entity.node, entity.start)
-        else:
-            callback = binder.bind_service(entity.node, entity.start)
+        callback = binder.bind(
+            Entity(entity.node, entity.kind, entity.start, entity.period_ns))
         if callback is not None and entity.callback is not None:
             found[entity.callback] = callback.key
     return found

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from msg_graph.binding import Binder, Entity, entity_name, is_period, meant
+from msg_graph.binding import Binder, entities_of, Entity, entity_name, is_period, meant
 import pytest
 
 from .helpers import graph
@@ -32,41 +32,41 @@ def key(callback: object) -> str | None:
 
 def test_alike_ones_are_handed_out_in_order() -> None:
     binder = Binder(TASKS)
-    assert [key(binder.bind_subscription('/a', '/x')) for _ in range(4)] == [
+    assert [key(binder.bind(Entity('/a', 'subscription', '/x'))) for _ in range(4)] == [
         '/a:s0', '/a:j0', '/a:s1', None]
-    assert [key(binder.bind_timer('/a', 10_000_000)) for _ in range(3)] == [
+    assert [key(binder.bind(Entity('/a', 'timer', '', 10_000_000))) for _ in range(3)] == [
         '/a:t0', '/a:t1', None]
-    assert key(binder.bind_timer('/a', 20_000_000)) == '/a:t2'
-    assert [key(binder.bind_service('/a', '/ask')) for _ in range(2)] == ['/a:q', None]
-    assert key(binder.bind_subscription('/b', '/x')) == '/b:s'
+    assert key(binder.bind(Entity('/a', 'timer', '', 20_000_000))) == '/a:t2'
+    assert [key(binder.bind(Entity('/a', 'service', '/ask'))) for _ in range(2)] == ['/a:q', None]
+    assert key(binder.bind(Entity('/b', 'subscription', '/x'))) == '/b:s'
 
 
 def test_what_is_not_declared_is_none() -> None:
     binder = Binder(TASKS)
-    assert binder.bind_timer('/a', 15_000_000) is None
-    assert binder.bind_timer('/c', 10_000_000) is None
-    assert binder.bind_subscription('/a', '/z') is None
-    assert binder.bind_subscription('/b', '/y') is None
-    assert binder.bind_service('/b', '/ask') is None
-    assert binder.bind_service('/a', '/x') is None
+    assert binder.bind(Entity('/a', 'timer', '', 15_000_000)) is None
+    assert binder.bind(Entity('/c', 'timer', '', 10_000_000)) is None
+    assert binder.bind(Entity('/a', 'subscription', '/z')) is None
+    assert binder.bind(Entity('/b', 'subscription', '/y')) is None
+    assert binder.bind(Entity('/b', 'service', '/ask')) is None
+    assert binder.bind(Entity('/a', 'service', '/x')) is None
 
 
 def test_a_sync_is_bound_by_each_leg() -> None:
     binder = Binder(TASKS)
-    assert key(binder.bind_subscription('/a', '/y')) == '/a:j0'
-    assert binder.bind_subscription('/a', '/y') is None
-    binder.bind_subscription('/a', '/x')
-    assert key(binder.bind_subscription('/a', '/x')) == '/a:j0'
+    assert key(binder.bind(Entity('/a', 'subscription', '/y'))) == '/a:j0'
+    assert binder.bind(Entity('/a', 'subscription', '/y')) is None
+    binder.bind(Entity('/a', 'subscription', '/x'))
+    assert key(binder.bind(Entity('/a', 'subscription', '/x'))) == '/a:j0'
 
 
 def test_periods_may_be_rounded() -> None:
     binder = Binder(TASKS)
-    assert key(binder.bind_timer('/b', 33_333_333)) == '/b:t'
+    assert key(binder.bind(Entity('/b', 'timer', '', 33_333_333))) == '/b:t'
     assert is_period(33_333_333, 33_300_000) and is_period(16_666_666, 16_700_000)
     assert not is_period(33_333_333, 33_000_000)
     binder = Binder(TASKS)
-    assert binder.bind_timer('/b', 33_400_000) is None
-    assert key(binder.bind_timer('/a', 9_999_999)) == '/a:t0'
+    assert binder.bind(Entity('/b', 'timer', '', 33_400_000)) is None
+    assert key(binder.bind(Entity('/a', 'timer', '', 9_999_999))) == '/a:t0'
 
 
 def test_the_nearest_period_is_meant() -> None:
@@ -77,49 +77,43 @@ def test_the_nearest_period_is_meant() -> None:
             - {name: b, timer: 10.005ms, deadline: 1ms, dag: b}
     """)
     binder = Binder(tasks)
-    assert key(binder.bind_timer('/n', 10_005_001)) == '/n:b'
-    assert key(binder.bind_timer('/n', 10_005_001)) == '/n:a'
-    assert binder.bind_timer('/n', 10_005_001) is None
+    assert key(binder.bind(Entity('/n', 'timer', '', 10_005_001))) == '/n:b'
+    assert key(binder.bind(Entity('/n', 'timer', '', 10_005_001))) == '/n:a'
+    assert binder.bind(Entity('/n', 'timer', '', 10_005_001)) is None
 
 
 def test_every_callback_can_be_bound_once() -> None:
     binder = Binder(TASKS)
     for callback in reversed(TASKS.callbacks):
-        for topic in callback.topics:
-            assert binder.bind_subscription(callback.node, topic) is not None
-        if callback.timer_period_ns is not None:
-            assert binder.bind_timer(callback.node, callback.timer_period_ns) is not None
-        if callback.service is not None:
-            assert binder.bind_service(callback.node, callback.service) is callback
+        for entity in entities_of(callback):
+            assert binder.bind(entity) is not None
     for callback in TASKS.callbacks:
-        for topic in callback.topics:
-            assert binder.bind_subscription(callback.node, topic) is None
-        if callback.timer_period_ns is not None:
-            assert binder.bind_timer(callback.node, callback.timer_period_ns) is None
+        for entity in entities_of(callback):
+            assert binder.bind(entity) is None
 
 
 def test_release_gives_back_in_declaration_order() -> None:
     binder = Binder(TASKS)
-    first, join, second = (binder.bind_subscription('/a', '/x') for _ in range(3))
+    first, join, second = (binder.bind(Entity('/a', 'subscription', '/x')) for _ in range(3))
     assert first is not None and join is not None and second is not None
     binder.release(second)
     binder.release(first)
-    assert key(binder.bind_subscription('/a', '/x')) == '/a:s0'
-    assert key(binder.bind_subscription('/a', '/x')) == '/a:s1'
-    binder.bind_subscription('/a', '/y')
+    assert key(binder.bind(Entity('/a', 'subscription', '/x'))) == '/a:s0'
+    assert key(binder.bind(Entity('/a', 'subscription', '/x'))) == '/a:s1'
+    binder.bind(Entity('/a', 'subscription', '/y'))
     binder.release(join, '/x')
-    assert key(binder.bind_subscription('/a', '/x')) == '/a:j0'
+    assert key(binder.bind(Entity('/a', 'subscription', '/x'))) == '/a:j0'
     binder.release(join)
-    assert {key(binder.bind_subscription('/a', topic)) for topic in ('/x', '/y')} == {'/a:j0'}
-    timer = binder.bind_timer('/a', 20_000_000)
+    assert {key(binder.bind(entity)) for entity in entities_of(join)} == {'/a:j0'}
+    timer = binder.bind(Entity('/a', 'timer', '', 20_000_000))
     assert timer is not None
     binder.release(timer)
-    assert binder.bind_timer('/a', 20_000_000) is timer
+    assert binder.bind(Entity('/a', 'timer', '', 20_000_000)) is timer
 
 
 def test_release_of_what_is_not_bound() -> None:
     binder = Binder(TASKS)
-    first = binder.bind_subscription('/a', '/x')
+    first = binder.bind(Entity('/a', 'subscription', '/x'))
     assert first is not None
     with pytest.raises(KeyError):
         binder.release(first, '/y')
