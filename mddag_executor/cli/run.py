@@ -252,8 +252,8 @@ def _run_synthetic(
 ) -> dict[str, Any] | None:
     from mddag_executor.live import current_job
     from mddag_executor.live.session import run_synthetic
-    from mddag_executor.live.synthetic import build_nodes
-    workload = build_nodes(task_set, plan, current_job=current_job)
+    from mddag_executor.live.synthetic import SyntheticWorkload
+    workload = SyntheticWorkload(task_set, plan, current_job=current_job)
     for node in workload.nodes:
         session.executor.add_node(node)
     try:

@@ -120,6 +120,23 @@ class Session:
             if tick is not None:
                 tick(time.monotonic() - begin)
 
+    def wait_until_matched(self, unmatched: Callable[[], list[str]]) -> None:
+        """
+        Wait until publishers and subscriptions have met, or the run is to end.
+
+        :param unmatched: returns the topics where they have not yet.
+        :raises SessionError: when they don't in time.
+        """
+        end = time.monotonic() + MATCH_TIMEOUT_S
+        while topics := unmatched():
+            if self.wait(0.02):
+                return
+            if time.monotonic() > end:
+                raise SessionError(
+                    f'{topics[0]}: its publishers and subscriptions have not met within '
+                    f'{MATCH_TIMEOUT_S:.0f} s ({counted(len(topics), "topic")} in all): check '
+                    'ROS_DOMAIN_ID and the network')
+
     def end(self) -> None:
         """
         Shut the executor down, once.
@@ -159,7 +176,7 @@ def run_synthetic(
     """
     window: tuple[Reading, Reading] | None = None
     try:
-        _wait_until_matched(session, workload)
+        session.wait_until_matched(workload.unmatched)
         if not session.stopped:
             workload.start(session.executor.wake)
             if not session.wait(warm_up_s):
@@ -175,15 +192,3 @@ def run_synthetic(
     result['warm_up_ns'] = round(warm_up_s * 1e9)
     result['incomplete_joins_dropped'] = workload.evicted_joins
     return result
-
-
-def _wait_until_matched(session: Session, workload: SyntheticWorkload) -> None:
-    end = time.monotonic() + MATCH_TIMEOUT_S
-    while unmatched := workload.unmatched():
-        if session.wait(0.02):
-            return
-        if time.monotonic() > end:
-            raise SessionError(
-                f'{unmatched[0]}: its publishers and subscriptions have not met within '
-                f'{MATCH_TIMEOUT_S:.0f} s ({counted(len(unmatched), "topic")} in all): check '
-                'ROS_DOMAIN_ID and the network')

@@ -93,14 +93,15 @@ class SyntheticWorkload:
     """
     The nodes of a declaration, their timers and stand-in sensors, and the books about them.
 
-    Use: add ``nodes`` to an executor, let it spin, ``wait_until_matched``, ``start``, measure with
-    ``ledger``, ``stop``, shut the executor down, ``destroy``.
+    Use: add ``nodes`` to an executor, let it spin, wait until none is ``unmatched``, ``start``,
+    measure with ``ledger``, ``stop``, shut the executor down, ``destroy``.
 
     :param task_set: the declaration.
     :param plan: how long each vertex executes.
     :param current_job: ``mddag_executor.live.current_job`` under our executor; leave it out under
         others.
     :param context: where the nodes belong to; None is rclpy's default context.
+    :ivar timers: each with the DAG that it releases.
     """
 
     def __init__(
@@ -122,7 +123,7 @@ class SyntheticWorkload:
         self._publishers: dict[tuple[str, str], Publisher] = {}
         self._n_subscribers: dict[str, int] = {}
         self._groups: dict[tuple[str, str], CallbackGroup] = {}
-        self._timers: list[tuple[int, Timer]] = []
+        self.timers: list[tuple[int, Timer]] = []
         self._grids: dict[int, Grid] = {}
         self._sensors: dict[tuple[str, ...], Sensor] = {}
         self._sensor_thread: threading.Thread | None = None
@@ -154,14 +155,6 @@ class SyntheticWorkload:
                     found.add(subscription.topic_name)
         return sorted(found)
 
-    def wait_until_matched(self, timeout_s: float = 30.0) -> list[str]:
-        """Wait until no topic is unmatched; return those that still are after the time-out."""
-        end = time.monotonic() + timeout_s
-        while True:
-            unmatched = self.unmatched()
-            if not unmatched or time.monotonic() > end or self._stop.wait(0.02):
-                return unmatched
-
     def start(self, wake: Callable[[], None]) -> None:
         """
         Start all timers and sensors together.
@@ -169,7 +162,7 @@ class SyntheticWorkload:
         :param wake: wakes the executor: a wait set that waits already doesn't see a timer start.
         """
         first = self.ledger.first_release
-        for dag, timer in self._timers:
+        for dag, timer in self.timers:
             timer.reset()
             self._grids[dag] = Grid(timer, self.ledger.clock_offset_ns)
             first[dag] = self._grids[dag].first_release
@@ -281,7 +274,7 @@ class SyntheticWorkload:
             clock=self._clock, autostart=False)
         # Once more, exactly: seconds as a float may lose a nanosecond.
         timer.timer_period_ns = callback.timer_period_ns or 0
-        self._timers.append((dag, timer))
+        self.timers.append((dag, timer))
 
     def _add_service(self, node: Node, callback: Callback, role: Role) -> None:
         current_job = self._current_job
@@ -342,11 +335,3 @@ class SyntheticWorkload:
         if self._sensor_node is None:
             self._sensor_node = self._make_node(SENSORS_NODE)
         return self._sensor_node
-
-
-def build_nodes(
-    task_set: TaskSet, plan: ExecutionPlan, *, current_job: CurrentJob = no_job,
-    context: Context | None = None,
-) -> SyntheticWorkload:
-    """Make one rclpy node for each declared node; see ``SyntheticWorkload``."""
-    return SyntheticWorkload(task_set, plan, current_job=current_job, context=context)

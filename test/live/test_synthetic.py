@@ -14,7 +14,7 @@ from mddag_executor.live.bodies import Grid, Join, JOIN_LIMIT, Role
 from mddag_executor.live.execution import ExecutionPlan, PlanError, sleeper, spinner
 from mddag_executor.live.executor import MultiDeadlineExecutor
 from mddag_executor.live.session import run_synthetic, Session
-from mddag_executor.live.synthetic import build_nodes
+from mddag_executor.live.synthetic import SyntheticWorkload
 from mddag_executor.simulate import draw_execution_times
 from msg_graph import load, loads, TaskSet
 import pytest
@@ -246,7 +246,7 @@ def test_a_late_timer_call_does_not_move_the_release(ros_context: Any) -> None:
 # --- nodes ---------------------------------------------------------------------------------------
 
 def test_nodes_have_exactly_what_is_declared(task_set: TaskSet, ros_context: Any) -> None:
-    workload = build_nodes(task_set, ExecutionPlan(task_set), context=ros_context)
+    workload = SyntheticWorkload(task_set, ExecutionPlan(task_set), context=ros_context)
     nodes = {node.get_fully_qualified_name(): node for node in workload.nodes}
     assert set(nodes) == {c.node for c in task_set.callbacks}
     found = {}
@@ -278,7 +278,7 @@ def test_nodes_have_exactly_what_is_declared(task_set: TaskSet, ros_context: Any
 
 def test_every_release_reaches_every_sink(task_set: TaskSet, ros_context: Any) -> None:
     executor = MultiDeadlineExecutor(task_set, context=ros_context)
-    workload = build_nodes(
+    workload = SyntheticWorkload(
         task_set, ExecutionPlan(task_set), context=ros_context, current_job=current_job)
     for node in workload.nodes:
         executor.add_node(node)
@@ -314,7 +314,7 @@ def test_every_release_reaches_every_sink(task_set: TaskSet, ros_context: Any) -
 
 def test_groups_keep_their_callbacks_apart(task_set: TaskSet, ros_context: Any) -> None:
     executor = MultiDeadlineExecutor(task_set, context=ros_context)
-    workload = build_nodes(
+    workload = SyntheticWorkload(
         task_set, ExecutionPlan(task_set), context=ros_context, current_job=current_job)
     running: list[int] = []
     most = []

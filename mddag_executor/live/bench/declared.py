@@ -15,9 +15,8 @@ from mddag_executor.live.bench.spec import BenchError, OURS, Spec
 from mddag_executor.live.bodies import no_job
 from mddag_executor.live.execution import ExecutionPlan, Mode
 from mddag_executor.live.session import run_synthetic
-from mddag_executor.live.synthetic import build_nodes, SyntheticWorkload
+from mddag_executor.live.synthetic import SyntheticWorkload
 from msg_graph import load, TaskSet
-from rclpy.timer import Timer
 
 HOT_PATH = 'hot_path'
 """Name of the path in a declaration whose latency is reported."""
@@ -39,9 +38,11 @@ def run_declared(spec: Spec) -> dict[str, Any]:
         task_set, spec.seed, spec.utilisation, spec.workers, cast(Mode, spec.bodies))
     executor = make_executor(spec, task_set)
     job_of_thread = current_job if spec.executor in OURS else no_job
-    workload = build_nodes(task_set, plan, current_job=job_of_thread)
+    workload = SyntheticWorkload(task_set, plan, current_job=job_of_thread)
     starts = Starts()
-    _watch(starts, workload)
+    # before an executor learns of them
+    starts.watch(workload.nodes,
+                 {timer: workload.ledger.delays[dag] for dag, timer in workload.timers})
     for node in workload.nodes:
         executor.add_node(node)
     session = UnfinishedSession(executor, spec)
@@ -62,23 +63,6 @@ def run_declared(spec: Spec) -> dict[str, Any]:
     return {
         **result, 'infeasible_sinks': len(plan.infeasible()),
         'dispatch_latency_us': quantiles_us(latencies), 'hot_path_us': hot_path(task_set, result)}
-
-
-def _watch(starts: Starts, workload: SyntheticWorkload) -> None:
-    """Note the starts of everything, before an executor learns of it."""
-    delays: dict[Timer, list[int]] = {}
-    nodes = {node.get_fully_qualified_name(): node for node in workload.nodes}
-    timers = {name: iter(node.timers) for name, node in nodes.items()}
-    # The timers of a node were made in the order of the declaration.
-    for callback in workload.task_set.callbacks:
-        if callback.kind == 'timer':
-            timer = next(timers[callback.node])
-            delays[timer] = workload.ledger.delays[_dag_of(workload.task_set, callback.key)]
-    starts.watch(workload.nodes, delays.__getitem__)
-
-
-def _dag_of(task_set: TaskSet, key: str) -> int:
-    return next(v.dag for v in task_set.vertices if v.callback.key == key)
 
 
 def hot_path(task_set: TaskSet, result: dict[str, Any]) -> dict[str, Any] | None:

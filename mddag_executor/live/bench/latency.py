@@ -16,24 +16,14 @@ import time
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 Start = tuple[int, int]
 """When a callback started, ns since the epoch, and its dispatch latency, ns."""
 
 
-def _with_info(callback: Callable[..., None]) -> Callable[..., None]:
-    """
-    Let rclpy take a callback for one that wants message and info, as two arguments.
-
-    rclpy goes by the signature.  Its EventsExecutor (7.1) then gives both in one tuple, which is
-    why the second argument has a default.
-    """
-    parameters = [
-        inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY) for name in ('message', 'info')]
-    vars(callback)['__signature__'] = inspect.Signature(parameters)
-    return callback
+def _nothing(message: Any) -> None:
+    pass
 
 
 class Starts:
@@ -47,21 +37,9 @@ class Starts:
         self.messages: list[Start] = []
         self._timers: list[tuple[list[int], list[int]]] = []
 
-    def empty_callback(self) -> Callable[..., None]:
-        """Return a subscription's callback that does nothing else."""
+    def noting(self, callback: Callable[[Any], None] = _nothing) -> Callable[..., None]:
+        """Return a subscription's callback that notes its start and calls another one."""
         append, time_ns = self.messages.append, time.time_ns
-
-        def on_message(message: Any, info: Any = None) -> None:
-            now = time_ns()
-            if info is None:
-                message, info = message
-            append((now, now - info['source_timestamp']))
-
-        return _with_info(on_message)
-
-    def watch_subscription(self, subscription: Subscription) -> None:
-        """Note the starts of a subscription whose callback takes the message only."""
-        append, time_ns, callback = self.messages.append, time.time_ns, subscription.callback
 
         def on_message(message: Any, info: Any = None) -> None:
             now = time_ns()
@@ -70,7 +48,12 @@ class Starts:
             append((now, now - info['source_timestamp']))
             callback(message)
 
-        subscription.callback = _with_info(on_message)
+        # rclpy goes by the signature whether a callback wants message and info. Its EventsExecutor
+        # (7.1) then gives both in one tuple, which is why the second argument has a default.
+        vars(on_message)['__signature__'] = inspect.Signature([
+            inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY)
+            for name in ('message', 'info')])
+        return on_message
 
     def watch_timer(self, timer: Timer, delays: list[int]) -> None:
         """
@@ -88,13 +71,13 @@ class Starts:
         timer.callback = on_timer
         self._timers.append((starts, delays))
 
-    def watch(self, nodes: Iterable[Node], delays: Callable[[Timer], list[int]]) -> None:
+    def watch(self, nodes: Iterable[Node], delays: dict[Timer, list[int]]) -> None:
         """Note the starts of all subscriptions and timers of nodes."""
         for node in nodes:
             for subscription in node.subscriptions:
-                self.watch_subscription(subscription)
+                subscription.callback = self.noting(subscription.callback)
             for timer in node.timers:
-                self.watch_timer(timer, delays(timer))
+                self.watch_timer(timer, delays[timer])
 
     def within(self, begin: int, end: int, timers: bool = True) -> list[int]:
         """

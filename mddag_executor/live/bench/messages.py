@@ -12,16 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import os
+from pathlib import Path
 import time
 from typing import Any
 
 from mddag_executor.core.tally import quantiles_us
-from mddag_executor.live.bench.cpu import middleware_cpu_ns
 from mddag_executor.live.bench.executors import make_executor, UnfinishedSession
 from mddag_executor.live.bench.latency import Starts
 from mddag_executor.live.bench.publisher import make_node, PublisherProcess
-from mddag_executor.live.bench.spec import BenchError, Spec
-from mddag_executor.live.session import MATCH_TIMEOUT_S
+from mddag_executor.live.bench.spec import Spec
 from mddag_executor.live.synthetic import QOS
 from rclpy.callback_groups import (
     CallbackGroup,
@@ -35,6 +34,8 @@ from std_msgs.msg import Header
 QUIET_S = 0.5
 """When no callback has run for so long after the last publication, nothing comes any more."""
 DRAIN_S = 10.0
+MIDDLEWARE = 'dds.'
+"""What the names of Fast DDS's threads begin with."""
 
 
 def run_messages(spec: Spec) -> dict[str, Any]:
@@ -43,7 +44,8 @@ def run_messages(spec: Spec) -> dict[str, Any]:
 
     :return: callbacks, CPU time and dispatch latency within the window; ``published``,
         ``received`` and ``lost`` of the whole run.
-    :raises BenchError: when publishers and subscriptions do not find each other.
+    :raises mddag_executor.errors.MddagError: when publishers and subscriptions do not find each
+        other.
     """
     executor = make_executor(spec, None)
     # Topics of this process only, whoever else is in this domain.
@@ -60,7 +62,8 @@ def run_messages(spec: Spec) -> dict[str, Any]:
     seed = None if spec.phases == 'together' else spec.seed
     with session, PublisherProcess(topics, spec.rate_hz, seed) as publisher:
         publisher.wait_until_ready()
-        _wait_until_matched(session, active)
+        session.wait_until_matched(lambda: [
+            each.topic_name for each in active if not each.get_publisher_count()])
         publisher.begin()
         session.wait(spec.warm_up_s)
         begin, cpu_begin, dds_begin = _clocks()
@@ -86,7 +89,24 @@ def run_messages(spec: Spec) -> dict[str, Any]:
 
 def _clocks() -> tuple[int, int, int | None]:
     """Return the time, the CPU time of the process and that of its middleware's threads, ns."""
-    return time.time_ns(), time.process_time_ns(), middleware_cpu_ns()
+    return time.time_ns(), time.process_time_ns(), _middleware_cpu_ns()
+
+
+def _middleware_cpu_ns() -> int | None:
+    """
+    Return the CPU time that the middleware's own threads have taken, ns.
+
+    They receive and store messages, whatever the executor does.  None where the kernel does not
+    tell (no Linux), or where no thread has such a name (another middleware).
+    """
+    times = []
+    for task in Path('/proc/self/task').glob('*'):
+        try:
+            if (task / 'comm').read_text().startswith(MIDDLEWARE):
+                times.append(int((task / 'schedstat').read_text().split()[0]))
+        except (OSError, ValueError, IndexError):
+            continue  # it has ended, or is not told
+    return sum(times) if times else None
 
 
 def _groups(spec: Spec, node: Node) -> Callable[[], CallbackGroup]:
@@ -100,17 +120,7 @@ def _groups(spec: Spec, node: Node) -> Callable[[], CallbackGroup]:
 
 def _subscribe(node: Node, topic: str, starts: Starts, group: CallbackGroup) -> Subscription:
     return node.create_subscription(
-        Header, topic, starts.empty_callback(), QOS, callback_group=group)
-
-
-def _wait_until_matched(session: UnfinishedSession, active: list[Subscription]) -> None:
-    end = time.monotonic() + MATCH_TIMEOUT_S
-    while not all(subscription.get_publisher_count() for subscription in active):
-        if session.wait(0.01):
-            return
-        if time.monotonic() > end:
-            raise BenchError(
-                'the publishing process was not found: check ROS_DOMAIN_ID and the network')
+        Header, topic, starts.noting(), QOS, callback_group=group)
 
 
 def _drain(session: UnfinishedSession, starts: Starts, published: int) -> None:
