@@ -80,6 +80,17 @@ SENSORS_NODE = '/mddag_sensors'
 _LEAD_NS = 20_000_000
 
 
+def quiet_node(full_name: str, context: Context | None = None, **parameters: bool) -> Node:
+    """Make a node without the services and topics that every node has."""
+    namespace, _, name = full_name.rpartition('/')
+    # Without the process' arguments: a remapped node would not be the declared one any more.
+    return Node(
+        name, namespace=namespace or '/', context=context, enable_rosout=False,
+        start_parameter_services=False, use_global_arguments=False,
+        parameter_overrides=[Parameter(key, value=value) for key, value in {
+            'start_type_description_service': False, **parameters}.items()])
+
+
 @dataclass
 class Sensor:
     """Stand-in for what starts DAGs whose source is no timer, and what sends a release."""
@@ -212,7 +223,8 @@ class SyntheticWorkload:
         for callback in self.task_set.callbacks:
             node = self._nodes.get(callback.node)
             if node is None:
-                node = self._nodes[callback.node] = self._make_node(callback.node)
+                node = self._nodes[callback.node] = quiet_node(
+                    callback.node, self._context)
             publishers = [self._publisher(node, topic) for topic in callback.publishes]
             roles = [self._role(v, publishers) for v in vertices.get(callback.key, ())]
             if callback.kind == 'timer':
@@ -221,14 +233,6 @@ class SyntheticWorkload:
                 self._add_service(node, callback, roles[0])
             else:
                 self._add_subscriptions(node, callback, roles)
-
-    def _make_node(self, full_name: str) -> Node:
-        namespace, _, name = full_name.rpartition('/')
-        # Without the process' arguments: a remapped node would not be the declared one any more.
-        return Node(
-            name, namespace=namespace or '/', context=self._context, enable_rosout=False,
-            start_parameter_services=False, use_global_arguments=False,
-            parameter_overrides=[Parameter('start_type_description_service', value=False)])
 
     def _publisher(self, node: Node, topic: str) -> Publisher:
         # Callbacks of a node that publish the same topic share the publisher, as members do.
@@ -333,5 +337,5 @@ class SyntheticWorkload:
 
     def _sensors_node(self) -> Node:
         if self._sensor_node is None:
-            self._sensor_node = self._make_node(SENSORS_NODE)
+            self._sensor_node = quiet_node(SENSORS_NODE, self._context)
         return self._sensor_node

@@ -17,7 +17,7 @@ from typing import Any
 from mddag_executor.live import current_job
 from mddag_executor.live.bodies import release_of, stamped
 from mddag_executor.live.execution import emulator, ExecutionPlan
-from mddag_executor.live.synthetic import QOS
+from mddag_executor.live.synthetic import QOS, quiet_node
 from msg_graph import Callback, TaskSet, Vertex
 from rclpy.callback_groups import (
     CallbackGroup,
@@ -28,7 +28,6 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Header
@@ -71,8 +70,7 @@ class SoakNodes:
 
     def make(self, full_name: str) -> Node:
         """Make a node with its publishers and entities."""
-        namespace, _, name = full_name.rpartition('/')
-        node = self.nodes[full_name] = quiet_node(name, namespace or '/')
+        node = self.nodes[full_name] = quiet_node(full_name)
         publishers: dict[str, Any] = {}
         groups: dict[str, CallbackGroup] = {}
         for callback in self._by_node[full_name]:
@@ -156,21 +154,12 @@ class SoakNodes:
         return list(self.timers)
 
 
-def quiet_node(name: str, namespace: str = '/', **parameters: bool) -> Node:
-    """Make a node without the services and topics that every node has."""
-    return Node(
-        name, namespace=namespace, enable_rosout=False, start_parameter_services=False,
-        parameter_overrides=[
-            Parameter('start_type_description_service', value=False),
-            *(Parameter(key, value=value) for key, value in parameters.items())])
-
-
 class SimulatedTime:
     """A node that follows simulated time, and who publishes that."""
 
     def __init__(self) -> None:
-        self.node = quiet_node('soak_simulated', use_sim_time=True)
-        self._sender = quiet_node('soak_clock')
+        self.node = quiet_node('/soak_simulated', use_sim_time=True)
+        self._sender = quiet_node('/soak_clock')
         self._publisher = self._sender.create_publisher(ClockMessage, '/clock', 10)
         self.ticks = 0
         self.node.create_timer(0.1, self._tick)

@@ -19,9 +19,9 @@ from typing import Any
 from mddag_executor.core.tally import quantiles_us
 from mddag_executor.live.bench.executors import make_executor, UnfinishedSession
 from mddag_executor.live.bench.latency import Starts
-from mddag_executor.live.bench.publisher import make_node, PublisherProcess
+from mddag_executor.live.bench.publisher import PublisherProcess
 from mddag_executor.live.bench.spec import Spec
-from mddag_executor.live.synthetic import QOS
+from mddag_executor.live.synthetic import QOS, quiet_node
 from rclpy.callback_groups import (
     CallbackGroup,
     MutuallyExclusiveCallbackGroup,
@@ -51,7 +51,7 @@ def run_messages(spec: Spec) -> dict[str, Any]:
     # Topics of this process only, whoever else is in this domain.
     prefix = f'/mddag_bench_{os.getpid()}'
     topics = [f'{prefix}/topic_{i}' for i in range(spec.topics)]
-    node = make_node('mddag_bench')
+    node = quiet_node('/mddag_bench')
     starts = Starts()
     group = _groups(spec, node)
     active = [_subscribe(node, topic, starts, group()) for topic in topics]

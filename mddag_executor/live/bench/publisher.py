@@ -30,22 +30,13 @@ import time
 
 from mddag_executor.live.bench.spec import BenchError
 from mddag_executor.live.session import MATCH_TIMEOUT_S
-from mddag_executor.live.synthetic import QOS
+from mddag_executor.live.synthetic import QOS, quiet_node
 import rclpy
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Header
 
 END_TIMEOUT_S = 10.0
-
-
-def make_node(name: str) -> Node:
-    """Make a node without services and publishers of its own."""
-    return Node(
-        name, enable_rosout=False, start_parameter_services=False,
-        parameter_overrides=[Parameter('start_type_description_service', value=False)])
 
 
 class PublisherProcess:
@@ -154,7 +145,7 @@ def main(text: str) -> int:
     what = json.loads(text)
     orders = _Orders()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    node = make_node('mddag_bench_publisher')
+    node = quiet_node('/mddag_bench_publisher')
     publishers = [node.create_publisher(Header, topic, QOS) for topic in what['topics']]
     end = time.monotonic() + MATCH_TIMEOUT_S
     while not all(publisher.get_subscription_count() for publisher in publishers):
