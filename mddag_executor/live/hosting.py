@@ -128,7 +128,7 @@ class Host:
         """
         Shut the context down and let all spins return; ``rclpy.ok()`` is False then.
 
-        :return: the programs that don't end in time.
+        :return: the programs that do not end in time.
         """
         self._closed = True
         if self.guests:
@@ -189,7 +189,7 @@ class Host:
         """
         Give a node to the executor.
 
-        :raises LoadingError: when it lives in another context, where the executor can't reach it.
+        :raises LoadingError: when it lives in another context, where the executor cannot reach it.
         """
         if node.context is not self.executor.context:
             name = node.get_fully_qualified_name()

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-import difflib
 from importlib import import_module, metadata
 import inspect
 import os
@@ -40,6 +39,7 @@ from ament_index_python.packages import (
     PackageNotFoundError,
 )
 from mddag_executor.errors import MddagError
+from msg_graph.errors import did_you_mean
 from rclpy.node import Node
 
 _FORMS = 'write package/executable, module:function or module:NodeClass'
@@ -76,7 +76,7 @@ def resolve(text: str, ros_arguments: Iterable[str] = ()) -> Program:
 
     What is imported sees the command line that the program will see.
 
-    :raises LoadingError: when it can't be found or imported, or is nothing that brings nodes.
+    :raises LoadingError: when it cannot be found or imported, or is nothing that brings nodes.
     """
     try:
         spec, *arguments = shlex.split(text) or ['']
@@ -116,7 +116,9 @@ def _resolve_attribute(spec: str) -> Program:
         except AttributeError:
             raise LoadingError(
                 spec, f"module '{module_name}' has no '{attribute}'",
-                _did_you_mean(attribute, _callables(module))) from None
+                _suggest(attribute, [
+                    name for name, value in vars(module).items()
+                    if not name.startswith('_') and callable(value)])) from None
     if isinstance(target, type):
         if not issubclass(target, Node):
             raise LoadingError(
@@ -125,7 +127,8 @@ def _resolve_attribute(spec: str) -> Program:
         return Program(spec, module_name, target)
     if not callable(target):
         raise LoadingError(
-            spec, f"'{attribute}' is no function and no class, but {_kind(target)}",
+            spec, f"'{attribute}' is no function and no class, but of type "
+            f'{type(target).__name__}',
             'name a function or a subclass of rclpy.node.Node')
     return Program(spec, module_name, lambda: _call(spec, target))
 
@@ -144,7 +147,7 @@ def _import(spec: str, module_name: str) -> ModuleType:
             'install it') from error
     except Exception as error:
         raise LoadingError(
-            spec, f"'{module_name}' can't be imported ({describe(error)})",
+            spec, f"'{module_name}' cannot be imported ({describe(error)})",
             'correct it') from error
 
 
@@ -152,7 +155,7 @@ def _call(spec: str, function: Callable[..., Any]) -> Any:
     """Call with the command line arguments if the function requires one argument."""
     try:
         parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):  # a builtin that doesn't tell
+    except (TypeError, ValueError):  # a builtin that does not tell
         parameters = []
     required = [
         p for p in parameters
@@ -177,14 +180,14 @@ def _resolve_executable(spec: str) -> Program:
         known = {*_ament_packages(), *_distributions()}
         raise LoadingError(
             spec, f"there is no package '{package}'",
-            _did_you_mean(package, known, "source its workspace's setup file, or install it"))
+            did_you_mean(package, known, "source its workspace's setup file, or install it"))
     entry = (scripts or {}).get(executable)
     if entry is not None:
         return _entry_point(spec, entry)
     have = [*(scripts or ()), *_executables(folder)]
     raise LoadingError(
         spec, f"package '{package}' has no executable '{executable}'",
-        _did_you_mean(executable, have))
+        _suggest(executable, have))
 
 
 def _library_folder(package: str) -> Path | None:
@@ -208,7 +211,7 @@ def _distributions() -> list[str]:
 
 
 def _console_scripts(package: str) -> dict[str, metadata.EntryPoint] | None:
-    """Return the console scripts of a distribution, or None when it isn't installed."""
+    """Return the console scripts of a distribution, or None when it is not installed."""
     try:
         distribution = metadata.distribution(package)
     except (metadata.PackageNotFoundError, ValueError):
@@ -227,7 +230,7 @@ def _entry_point(spec: str, entry: metadata.EntryPoint) -> Program:
         function = entry.load()
     except Exception as error:
         raise LoadingError(
-            spec, f"its entry point '{entry.value}' can't be imported ({describe(error)})",
+            spec, f"its entry point '{entry.value}' cannot be imported ({describe(error)})",
             'install what it needs, or the package again') from error
     return Program(spec, entry.name, lambda: _call(spec, function))
 
@@ -272,24 +275,9 @@ def describe(error: BaseException) -> str:
     return f'{name}: {text}{place}' if text else f'{name}{place}'
 
 
-def _kind(value: object) -> str:
-    return f'of type {type(value).__name__}'
-
-
-def _callables(module: ModuleType) -> list[str]:
-    return [
-        name for name, value in vars(module).items()
-        if not name.startswith('_') and callable(value)]
-
-
-def _did_you_mean(word: str, known: Iterable[str], otherwise: str = '') -> str:
+def _suggest(word: str, known: Iterable[str]) -> str:
+    """Return a remedy for a word that is not among the known ones."""
     names = sorted(set(known))
-    near = difflib.get_close_matches(word, names, n=3, cutoff=0.6)
-    if near:
-        return f"did you mean {' or '.join(repr(n) for n in near)}?"
-    if otherwise:
-        return otherwise
-    if not names:
-        return 'it has none'
     more = ', …' if len(names) > 10 else ''
-    return f"it has {', '.join(names[:10])}{more}"
+    return did_you_mean(
+        word, names, f"it has {', '.join(names[:10])}{more}" if names else 'it has none')

@@ -49,7 +49,7 @@ class Session:
     Spins an executor in a thread; a context manager.
 
     :param executor: any rclpy executor, its nodes added or not.
-    :param spin: what spins it, if that isn't ``executor.spin``.
+    :param spin: what spins it, if that is not ``executor.spin``.
     :param on_end: called when its end begins.
     """
 
@@ -92,7 +92,7 @@ class Session:
         """
         Let the run end; from any thread, also from a signal's handler.
 
-        :param hurried: wait less for callbacks that don't end.
+        :param hurried: wait less for callbacks that do not end.
         """
         if hurried:
             self._patience_s = HURRIED_END_TIMEOUT_S
@@ -125,7 +125,7 @@ class Session:
         Wait until publishers and subscriptions have met, or the run is to end.
 
         :param unmatched: returns the topics where they have not yet.
-        :raises SessionError: when they don't in time.
+        :raises SessionError: when they do not in time.
         """
         end = time.monotonic() + MATCH_TIMEOUT_S
         while topics := unmatched():
@@ -141,7 +141,7 @@ class Session:
         """
         Shut the executor down, once.
 
-        ``clean`` tells whether all callbacks have ended; one that doesn't is left behind.
+        ``clean`` tells whether all callbacks have ended; one that does not is left behind.
         """
         self.stop()
         if self._ended:
@@ -172,7 +172,7 @@ def run_synthetic(
     :param duration_s: length of the measured window, which begins ``warm_up_s`` after the timers;
         None: until the session is stopped.
     :return: the figures of ``measure``; None when the run was stopped before the window began.
-    :raises SessionError: when publishers and subscriptions don't find each other.
+    :raises SessionError: when publishers and subscriptions do not find each other.
     """
     window: tuple[Reading, Reading] | None = None
     try:

@@ -170,7 +170,7 @@ class SyntheticWorkload:
         """
         Start all timers and sensors together.
 
-        :param wake: wakes the executor: a wait set that waits already doesn't see a timer start.
+        :param wake: wakes the executor: a wait set that waits already does not see a timer start.
         """
         first = self.ledger.first_release
         for dag, timer in self.timers:

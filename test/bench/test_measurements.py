@@ -215,7 +215,7 @@ def test_one_crash_does_not_end_the_others(monkeypatch: pytest.MonkeyPatch) -> N
         run_all([crashing], 1, lambda *_: None, told.append)
 
 
-def test_a_measurement_that_can_not_be_made_ends_all() -> None:
+def test_a_measurement_that_cannot_be_made_ends_all() -> None:
     with pytest.raises(BenchError, match='/none.yaml: '):
         measure(Spec('autoware', 'single', graph='/none.yaml'))
 

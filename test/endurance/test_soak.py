@@ -50,7 +50,7 @@ def test_memory_that_was_freed_is_not_in_use():
     before = in_use()
     blocks = [bytes(10_000) for _ in range(8_000)]
     assert resident() - before > 60_000_000
-    kept = blocks[::100]  # so that the C library can't give it all back by itself
+    kept = blocks[::100]  # so that the C library cannot give it all back by itself
     del blocks
     cycle: list[Any] = [Thread()]
     cycle.append(cycle)

@@ -139,7 +139,7 @@ def test_the_run_ends_when_all_programs_have_ended(world: Path, mddag: Mddag) ->
     ('chat:returns_nothing', 'it ended and neither returned a node nor let one spin'),
     ('chat:needs_two', 'the function requires the arguments one, two'),
 ])
-def test_a_program_that_can_not_start_ends_the_run_with_one_line(
+def test_a_program_that_cannot_start_ends_the_run_with_one_line(
     world: Path, mddag: Mddag, spec: str, message: str
 ) -> None:
     process = mddag('run', 'graph.yaml', '--node', spec, '--trace', 'out.mcap')

@@ -5,7 +5,7 @@ Make one measurement in this process and print it as JSON.
 
     python -m mddag_executor.live.bench '{"load": "topics", "executor": "multi", "topics": 20}'
 
-The process ends without destroying anything: rclpy's executors can't be stopped in an orderly way
+The process ends without destroying anything: rclpy's executors cannot be stopped in an orderly way
 while callbacks wait for their pool.  With ``--tied`` it also ends when its standard input does, so
 that it cannot outlive the process that started it, even when that was killed.
 """

@@ -44,7 +44,7 @@ class UnfinishedSession(Session):
     """
     A session whose executor is not shut down: the process ends instead.
 
-    rclpy's executors can't be stopped in an orderly way while callbacks wait for their pool.
+    rclpy's executors cannot be stopped in an orderly way while callbacks wait for their pool.
     """
 
     def __init__(self, executor: Executor, spec: Spec) -> None:
