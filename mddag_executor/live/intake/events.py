@@ -23,12 +23,11 @@ from mddag_executor.live.compat.events_executor import is_available, NativeExecu
 from mddag_executor.live.direct import DirectTakes
 from mddag_executor.live.endings import call_at_shutdown, is_over, join, SecondLooks, stop_at_exit
 from mddag_executor.live.intake.arrivals import Receiver
-from mddag_executor.live.intake.entities import EMPTY, EntitySet, snapshot
+from mddag_executor.live.intake.entities import EMPTY, EntitySet
 from mddag_executor.live.intake.sources import sources
 from mddag_executor.live.intake.waitset import PATIENCE, WaitSetIntake
 from rclpy.context import Context
 from rclpy.guard_condition import GuardCondition
-from rclpy.node import Node
 from rclpy.task import Future
 
 _NATIVE = 'events'
@@ -88,12 +87,7 @@ class _NativeThread:
         with self._lock:
             self._stopping = True
         self.wake()
-        self.join()
-
-    def join(self) -> bool:
-        """Wait for the end of the thread; False when this is the thread itself."""
         join(self._thread)
-        return self._thread is not threading.current_thread()
 
     def _run(self) -> None:
         ended = broken = False
@@ -163,19 +157,11 @@ class EventsIntake:
         self._running = False
         self._refused = False
         self._parts: dict[str, _NativeThread | WaitSetIntake] = {}
-        self._ending: list[_NativeThread] = []
         call_at_shutdown(context, self.wake)
 
-    def update(self, entities: EntitySet | Iterable[Node]) -> None:
-        """
-        Set what to wait for; from any thread. It comes into force at once.
-
-        :param entities: a snapshot, or the nodes to take one of. Nothing is done when nothing
-            has changed.
-        """
+    def update(self, entities: EntitySet) -> None:
+        """Set what to wait for; from any thread. It comes into force soon."""
         with self._lock:
-            if not isinstance(entities, EntitySet):
-                entities = snapshot(entities, self._given)
             self._given = entities
             self._choose()
 
@@ -233,19 +219,8 @@ class EventsIntake:
             part.wake()
 
     def start(self) -> None:
-        """
-        Hand over from threads of the intake's own until ``stop``.
-
-        :raises RuntimeError: when it runs already.
-        """
+        """Hand over from threads of the intake's own until ``stop``: once."""
         with self._lock:
-            if self._running:
-                raise RuntimeError('the intake runs already')
-            # One native executor's end would undo what the next one has told the middleware.
-            for part in self._ending:
-                if not part.join():
-                    raise RuntimeError('the intake ends only after what it hands over now')
-            self._ending = []
             self._running = True
             stop_at_exit(self)
             self._choose()
@@ -262,7 +237,6 @@ class EventsIntake:
             self._running = False
             looker = self._direct.stop()
             parts, self._parts = self._parts, {}
-            self._ending = [part for part in parts.values() if isinstance(part, _NativeThread)]
         for part in parts.values():
             part.stop()
             if isinstance(part, WaitSetIntake):

@@ -96,10 +96,6 @@ class TimerQueue:
         self._scan_early = 0
         self._scan_latest = 0
 
-    def __len__(self) -> int:
-        """Return the number of timers."""
-        return len(self._timers)
-
     def update(self, timers: Iterable[Timer]) -> None:
         """Set which timers there are; those that stay keep their phase grid."""
         known, self._timers = self._timers, {}

@@ -36,13 +36,12 @@ from mddag_executor.live.compat import RCLError
 from mddag_executor.live.compat.wait_set import RefilledSet
 from mddag_executor.live.endings import call_at_shutdown, is_over, join, SecondLooks, stop_at_exit
 from mddag_executor.live.intake.arrivals import Receiver
-from mddag_executor.live.intake.entities import EMPTY, EntitySet, snapshot
+from mddag_executor.live.intake.entities import EMPTY, EntitySet
 from mddag_executor.live.intake.sources import SOURCES, sources
 from mddag_executor.live.intake.timers import sharpen_wake_ups, TimerQueue
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
-from rclpy.node import Node
 
 ALL_KINDS = frozenset(('timers', *SOURCES))
 """The kinds of entities: lists of ``EntitySet``."""
@@ -100,7 +99,6 @@ class WaitSetIntake:
         self._name = f'mddag-intake-{name}'
         self._on_shutdown = on_shutdown
         self._timers = TimerQueue(receiver, self.wake)
-        self._lock = threading.Lock()
         self._latest = EMPTY
         self._changed = False
         self._rebuild_at = 0
@@ -115,31 +113,20 @@ class WaitSetIntake:
         self._stopping = False
         self._failures = 0
         self._looks = SecondLooks()
-        self._threaded = False
-        self._polling = False
+        self._waiting = False  # in a poll
         self._events: RefilledSet | None = None  # apart from the others in a thread only
         self._events_at = 0
         call_at_shutdown(context, self.wake)
 
     # --- what to wait for ------------------------------------------------------------------------
 
-    def update(self, entities: EntitySet | Iterable[Node]) -> None:
-        """
-        Set what to wait for; from any thread. It comes into force at once, also in a wait.
-
-        :param entities: a snapshot, or the nodes to take one of. Nothing is done when nothing
-            has changed.
-        """
-        with self._lock:
-            if not isinstance(entities, EntitySet):
-                entities = snapshot(entities, self._latest)
-            if entities is self._latest:
-                return
+    def update(self, entities: EntitySet) -> None:
+        """Set what to wait for; from any thread. It comes into force soon, also in a wait."""
+        if entities is not self._latest:
             self._latest = entities
-            pending = self._changed
             self._changed = True
-        if not pending and (self._polling or self.running):
-            self.wake()
+            if self._waiting or self.running:
+                self.wake()
 
     def settled(self) -> bool:
         """Return whether what was set by ``update`` has come into force."""
@@ -164,11 +151,10 @@ class WaitSetIntake:
         latest = self._latest
         self._drop()
         if self._guard is not None:
-            apart = {'events'} & self._kinds if self._threaded else set[str]()
-            self._filled = self._set_for(
-                latest, self._kinds - apart, (*self._guards, self._guard))
+            apart = {'events'} & self._kinds if self._thread is not None else set[str]()
+            self._filled = self._set_for(self._kinds - apart, (*self._guards, self._guard))
             if apart and latest.events:
-                events = self._set_for(latest, apart)
+                events = self._set_for(apart)
                 self._events = events if events.size else None  # all may be destroyed by now
                 self._events_at = 0
         if 'timers' in self._kinds:
@@ -177,11 +163,12 @@ class WaitSetIntake:
         self._rebuild_at = end + min((end - start) * REBUILD_SHARE, REBUILD_LATEST_NS)
 
     def _set_for(
-        self, entities: EntitySet, kinds: Iterable[str], bells: Iterable[GuardCondition] = ()
+        self, kinds: Iterable[str], bells: Iterable[GuardCondition] = ()
     ) -> RefilledSet:
         receiver = self._receiver
         return RefilledSet(
-            self._context, sources(entities, kinds, receiver), bells, receiver.on_intake_error)
+            self._context, sources(self._latest, kinds, receiver), bells,
+            receiver.on_intake_error)
 
     def _drop(self) -> None:
         for some in self._filled, self._events:
@@ -191,23 +178,35 @@ class WaitSetIntake:
 
     # --- waiting ---------------------------------------------------------------------------------
 
-    def _wait(self, until: int | None) -> tuple[int, bool]:
+    def _turn(self, limit: int | None = None) -> tuple[int, bool]:
         """
-        Wait once and hand over what is ready, timers excepted.
+        Wait once and hand over what is ready.
 
-        :param until: when to end the wait at the latest (monotonic ns).
+        :param limit: when to end the wait at the latest (monotonic ns).
         :return: how many things were handed over, and whether something rang to end the wait.
         """
+        if self._changed and _now() >= self._rebuild_at:
+            self._apply()
+        timers = self._timers
+        count = timers.fire(_now())
+        if self._events is not None and _now() >= self._events_at:
+            self._look_at_events(self._events)
+        ends = [
+            limit, timers.next_look(), self._looks.at,
+            self._events_at if self._events is not None else None,
+            self._rebuild_at if self._changed else None,
+            0 if count and self._waiting else None]
+        until = min((end for end in ends if end is not None), default=None)
+        more, rang = self._wait(-1 if until is None else max(0, until - _now()))
+        return count + more + timers.fire(_now()), rang
+
+    def _wait(self, timeout_ns: int) -> tuple[int, bool]:
+        """Wait for all but timers, for ever if the time is negative (see ``_turn``)."""
         filled = self._filled
-        look = self._looks.at
-        if look is not None and (until is None or look < until):
-            until = look
-        left = -1 if until is None else max(0, until - _now())
         if filled is None or not (filled.size or self._guards):
-            rang = self._bell.acquire(True, left / 1e9) if left >= 0 else self._bell.acquire()
-            return 0, rang
+            return 0, self._bell.acquire(True, timeout_ns / 1e9 if timeout_ns >= 0 else -1)
         try:
-            filled.wait(left)
+            filled.wait(timeout_ns)
         except InvalidHandle:
             # A waitable was destroyed; what it consists of is held, but it refuses to be used.
             self._apply()
@@ -221,31 +220,21 @@ class WaitSetIntake:
         """
         Wait once, in the calling thread, and hand over what is ready.
 
-        Not while the intake's thread runs.
-
         :param timeout_sec: seconds to wait; None or negative: until something is ready.
         :return: how many things were handed over: 0 after the time, and when a guard condition
             or ``wake`` ended the wait, or the context has been shut down.
-        :raises RuntimeError: when the intake's thread runs.
         :raises RCLError: when rcl cannot wait for another reason.
         """
-        if self.running:
-            raise RuntimeError('the intake runs in a thread of its own')
-        self._threaded = False
-        self._polling = True
         limit = None
         if timeout_sec is not None and timeout_sec >= 0:
             limit = _now() + int(min(timeout_sec, 1e9) * 1e9)
+        self._waiting = True
         try:
             self._timers.scan()
             if self._changed or self._filled is None or not self._filled.hold():
                 self._apply()
             while True:
-                count = self._timers.fire(_now())
-                look = self._timers.next_look()
-                until = limit if look is None or (limit is not None and limit < look) else look
-                more, rang = self._wait(0 if count else until)
-                count += more + self._timers.fire(_now())
+                count, rang = self._turn(limit)
                 ended = self._context_ended(rang)
                 if count or rang or ended or (limit is not None and _now() >= limit):
                     return count
@@ -254,7 +243,7 @@ class WaitSetIntake:
                 raise
             return 0
         finally:
-            self._polling = False
+            self._waiting = False
             if self._filled is not None:
                 self._filled.release()
 
@@ -274,23 +263,10 @@ class WaitSetIntake:
     # --- thread ----------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """
-        Hand over from a thread of the intake's own until ``stop``.
-
-        :raises RuntimeError: when it runs already.
-        """
-        ending = self._thread if self._stopping else None
-        if ending is threading.current_thread():
-            raise RuntimeError('the intake ends only after what it hands over now')
-        if ending is not None:
-            ending.join()
-        elif self.running:
-            raise RuntimeError('the intake runs already')
+        """Hand over from a thread of the intake's own until ``stop``: once."""
         stop_at_exit(self)
-        self._stopping = False
         self._changed = True
         self._rebuild_at = 0
-        self._threaded = True
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
         self._thread.start()
 
@@ -302,13 +278,9 @@ class WaitSetIntake:
         returns at once and the thread ends after that call.
         """
         self._stopping = True
-        thread = self._thread
-        if thread is None:
-            return
-        self.wake()
-        join(thread)
-        if thread is not threading.current_thread():
-            self._thread = None
+        if self._thread is not None:
+            self.wake()
+            join(self._thread)
 
     def _run(self) -> None:
         sharpen_wake_ups()
@@ -317,7 +289,7 @@ class WaitSetIntake:
         try:
             while not self._stopping and not ended:
                 try:
-                    ended = self._context_ended(self._turn())
+                    ended = self._context_ended(self._turn()[1])
                 except Exception as error:
                     ended = is_over(self._context)
                     if not ended:
@@ -333,26 +305,6 @@ class WaitSetIntake:
             self._drop()
         if ended and self._on_shutdown is not None:
             self._on_shutdown()
-
-    def _turn(self) -> bool:
-        """Wait once in the thread; return whether something rang."""
-        if self._changed and _now() >= self._rebuild_at:
-            self._apply()
-        timers = self._timers
-        look = timers.next_look()
-        if look is not None and look <= _now():
-            timers.fire(_now())
-            look = timers.next_look()
-        if self._events is not None:
-            if _now() >= self._events_at:
-                self._look_at_events(self._events)
-            look = self._events_at if look is None else min(look, self._events_at)
-        if self._changed and (look is None or look > self._rebuild_at):
-            look = self._rebuild_at
-        _, rang = self._wait(look)
-        if len(timers):
-            timers.fire(_now())
-        return rang
 
     def _look_at_events(self, events: RefilledSet) -> None:
         start = _now()

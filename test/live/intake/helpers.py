@@ -11,6 +11,7 @@ import time
 from typing import Any
 
 from mddag_executor.live.intake.arrivals import Arrival
+from mddag_executor.live.intake.entities import snapshot
 from mddag_executor.live.intake.events import EventsIntake
 from mddag_executor.live.intake.waitset import WaitSetIntake
 from rclpy.context import Context
@@ -29,8 +30,12 @@ def nothing(*_: Any) -> None:
     pass
 
 
+def look_after(intake: Any, *nodes: Node) -> None:
+    intake.update(snapshot(nodes))
+
+
 def start(intake: Any, *nodes: Node) -> None:
-    intake.update(nodes)
+    look_after(intake, *nodes)
     intake.start()
 
 
@@ -168,43 +173,6 @@ def cpu_ns(threads: Iterable[threading.Thread]) -> int:
 def matched(publisher: Any, count: int = 1) -> bool:
     """Wait until a publisher has found its subscriptions."""
     return bool(wait_for(lambda: publisher.get_subscription_count() >= count))
-
-
-class FakeExecutor:
-    """What a node and its futures need of an executor; tasks run in a thread of their own."""
-
-    def __init__(self, intake: Any) -> None:
-        self._intake = intake
-        self.nodes: list[Node] = []
-        self.errors: list[BaseException] = []
-
-    def add_node(self, node: Node) -> None:
-        if node not in self.nodes:
-            self.nodes.append(node)
-            self.wake()
-
-    def remove_node(self, node: Node) -> None:
-        self.nodes.remove(node)
-        self.wake()
-
-    def wake(self) -> None:
-        self._intake.update(list(self.nodes))
-
-    def create_task(self, function: Callable[..., Any], *args: Any) -> None:
-        threading.Thread(target=self.run, args=(function, *args), daemon=True).start()
-
-    def run(self, function: Callable[..., Any], *args: Any) -> None:
-        """Run a function, and what it returns if that is a coroutine, to its end."""
-        try:
-            result = function(*args)
-            if hasattr(result, 'send'):
-                while True:
-                    result.send(None)
-                    time.sleep(0.001)
-        except StopIteration:
-            pass
-        except Exception as error:
-            self.errors.append(error)
 
 
 def on_grid(dues: list[int], period: int) -> bool:

@@ -18,6 +18,7 @@ from std_srvs.srv import SetBool
 
 from .helpers import (
     intake_threads,
+    look_after,
     matched,
     nothing,
     Pulse,
@@ -132,14 +133,14 @@ def test_what_is_destroyed_while_it_is_added_does_no_harm(
     start(intake, node)
     try:
         assert wait_for(lambda: not doomed)
-        intake.update([node])  # as the executor does; its QoS events are held until then
+        look_after(intake, node)  # as the executor does; its QoS events are held until then
         assert wait_for(lambda: publisher.get_subscription_count() == 4)
         for k in range(3):
             publisher.publish(text(str(k)))
         assert wait_for(lambda: len(recorder.messages) == 12)
         assert recorder.texts(kept) == ['0', '1', '2']
         late = node.create_subscription(String, name, nothing, 10)
-        intake.update([node])
+        look_after(intake, node)
         assert matched(publisher, 5)
         publisher.publish(text('3'))
         assert wait_for(lambda: recorder.texts(late) == ['3'])

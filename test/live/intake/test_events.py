@@ -5,18 +5,12 @@
 from __future__ import annotations
 
 import random
-import threading
 import time
 from typing import Any
 
-from mddag_executor.live.intake.events import EventsIntake
 import pytest
-from rclpy.action.client import ActionClient
-from rclpy.action.server import ActionServer, CancelResponse
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
@@ -25,10 +19,8 @@ from rclpy.qos import (
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
-from test_msgs.action import Fibonacci
 
 from .helpers import (
-    FakeExecutor,
     INTAKES,
     make_intake,
     make_node,
@@ -44,10 +36,6 @@ from .helpers import (
 )
 
 # --- every kind ----------------------------------------------------------------------------------
-
-
-def test_it_is_available() -> None:
-    assert EventsIntake.available()
 
 
 def test_messages_come_with_their_info(
@@ -103,58 +91,6 @@ def test_messages_from_before_the_start_are_not_lost(
     assert recorder.texts(subscription) == ['0', '1', '2', '3', '4', '5']
 
 
-def test_services_and_clients(intake: Any, node: Node, recorder: Recorder) -> None:
-    name = topic()
-    service = node.create_service(SetBool, name, nothing)
-    client = node.create_client(SetBool, name)
-    start(intake, node)
-    assert client.wait_for_service(5.0)
-
-    recorder.react['request'] = lambda _, request, respond: respond(
-        SetBool.Response(success=not request.data))
-    for _ in range(5):  # five at once: a service keeps no more than ten
-        futures = [client.call_async(SetBool.Request(data=bool(k % 2))) for k in range(5)]
-        assert wait_for(lambda futures=futures: all(future.done() for future in futures))
-        assert [f.result().success for f in futures] == [True, False, True, False, True]
-    assert {id(s) for s, _ in recorder.requests} == {id(service)}
-    assert not recorder.errors
-
-
-def test_guard_conditions(intake: Any, node: Node, recorder: Recorder) -> None:
-    guards = [node.create_guard_condition(nothing) for _ in range(3)]
-    start(intake, node)
-    time.sleep(0.05)
-    for guard in guards:
-        guard.trigger()
-        assert wait_for(lambda guard=guard: guard in recorder.guards)
-    time.sleep(0.05)
-    assert recorder.guards == guards
-
-
-def test_timers_of_both_kinds_of_threads(intake: Any, node: Node, recorder: Recorder) -> None:
-    timer = node.create_timer(0.010, nothing)
-    node.create_guard_condition(nothing)
-    start(intake, node)
-    assert wait_for(lambda: len(recorder.timers) >= 30)
-    dues = recorder.dues(timer)
-    assert all((b - a) % (10 * MS) == 0 for a, b in zip(dues, dues[1:]))
-
-
-def test_parameter_services(intake: Any, node: Node, other: Node, recorder: Recorder) -> None:
-    node.declare_parameter('size', 3)
-    client = AsyncParameterClient(other, node.get_name())
-    recorder.react['request'] = lambda service, request, respond: respond(
-        service.callback(request, service.srv_type.Response()))
-    start(intake, node, other)
-    assert client.wait_for_services(5.0)
-    future = client.get_parameters(['size'])
-    assert wait_for(future.done)
-    assert future.result().values[0].integer_value == 3
-    future = client.list_parameters()
-    assert wait_for(future.done)
-    assert 'size' in future.result().result.names
-
-
 def test_waitables_are_taken_right_after_they_are_ready(
     intake: Any, node: Node, recorder: Recorder
 ) -> None:
@@ -171,73 +107,6 @@ def test_waitables_are_taken_right_after_they_are_ready(
     assert pulses[1].order == ['ready', 'take'] * 3 and not pulses[0].order
     for pulse in pulses:
         pulse.guard.destroy()
-
-
-def _run_waitables_in_order(executor: FakeExecutor, recorder: Recorder) -> None:
-    """Execute what waitables have taken, each one's in order, and answer nothing else."""
-    locks: dict[int, threading.Lock] = {}
-
-    def execute(waitable: Any, function: Any, data: Any) -> None:
-        with locks.setdefault(id(waitable), threading.Lock()):
-            executor.run(function, data)
-
-    recorder.react['waitable'] = execute
-
-
-def test_actions(intake: Any, ros_context: Context, recorder: Recorder) -> None:
-    node = make_node(ros_context)
-    executor = FakeExecutor(intake)
-    node.executor = executor
-    _run_waitables_in_order(executor, recorder)
-    name = topic()
-    feedback: list[tuple[int, int]] = []
-    wait_for_cancel = threading.Event()
-
-    def run(goal: Any) -> Fibonacci.Result:
-        for k in range(goal.request.order):
-            goal.publish_feedback(Fibonacci.Feedback(sequence=[goal.request.order, k]))
-        if goal.request.order == 7:
-            assert wait_for_cancel.wait(5.0) and wait_for(lambda: goal.is_cancel_requested)
-            goal.canceled()
-            return Fibonacci.Result()
-        goal.succeed()
-        return Fibonacci.Result(sequence=[goal.request.order] * 2)
-
-    group = ReentrantCallbackGroup()
-    server = ActionServer(
-        node, Fibonacci, name, run, callback_group=group,
-        cancel_callback=lambda _: CancelResponse.ACCEPT,
-        feedback_pub_qos_profile=QoSProfile(depth=20))
-    client = ActionClient(
-        node, Fibonacci, name, callback_group=group,
-        feedback_sub_qos_profile=QoSProfile(depth=20))
-    intake.start()
-    try:
-        assert wait_for(client.server_is_ready)
-        goals = [
-            client.send_goal_async(
-                Fibonacci.Goal(order=order),
-                feedback_callback=lambda m: feedback.append(tuple(m.feedback.sequence)))
-            for order in (1, 2, 3, 7)]
-        assert wait_for(lambda: all(goal.done() for goal in goals))
-        assert all(goal.result().accepted for goal in goals)
-        results = [goal.result().get_result_async() for goal in goals]
-        assert wait_for(lambda: all(result.done() for result in results[:3]))
-        assert [list(r.result().result.sequence) for r in results[:3]] == [[1, 1], [2, 2], [3, 3]]
-        assert not results[3].done()
-        cancel = goals[3].result().cancel_goal_async()
-        wait_for_cancel.set()
-        assert wait_for(lambda: cancel.done() and results[3].done())
-        assert len(cancel.result().goals_canceling) == 1
-        assert wait_for(lambda: len(feedback) == 13)
-        for order in (1, 2, 3, 7):
-            assert [k for o, k in feedback if o == order] == list(range(order))
-        assert not executor.errors and not recorder.errors
-    finally:
-        client.destroy()
-        server.destroy()
-        intake.stop()
-        node.destroy_node()
 
 
 # --- the same from all ---------------------------------------------------------------------------

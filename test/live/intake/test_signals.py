@@ -23,6 +23,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerGuardCondition
+from mddag_executor.live.intake.entities import snapshot
 from mddag_executor.live.intake.events import EventsIntake
 from mddag_executor.live.intake.waitset import WaitSetIntake
 
@@ -53,7 +54,7 @@ done = threading.Event()
 guard = SignalHandlerGuardCondition(context)
 intake = {'events': EventsIntake, 'waitset': WaitSetIntake}[kind](
     context, Receiver(), (guard,), on_shutdown=done.set)
-intake.update([node])
+intake.update(snapshot([node]))
 intake.start()
 time.sleep(0.1)
 assert handlers == (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM))

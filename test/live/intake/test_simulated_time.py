@@ -15,7 +15,17 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from .helpers import make_node, matched, MS, nothing, on_grid, Recorder, wait_for
+from .helpers import (
+    look_after,
+    make_node,
+    matched,
+    MS,
+    nothing,
+    on_grid,
+    Recorder,
+    start,
+    wait_for,
+)
 
 
 class Simulation:
@@ -31,8 +41,7 @@ class Simulation:
         self._publisher = self._other.create_publisher(ClockMessage, '/clock', qos)
         recorder.react['message'] = lambda subscription, message, _: subscription.callback(message)
         self.intake = WaitSetIntake(context, recorder)
-        self.intake.update([self.node])
-        self.intake.start()
+        start(self.intake, self.node)
         assert matched(self._publisher)
         self.set_clock(1000 * MS)
 
@@ -74,7 +83,7 @@ def simulation(ros_context: Context, recorder: Recorder) -> Iterator[Simulation]
 
 def test_simulated_time_drives_timers(simulation: Simulation) -> None:
     timer = simulation.node.create_timer(0.050, nothing)
-    simulation.intake.update([simulation.node])
+    look_after(simulation.intake, simulation.node)
     time.sleep(0.2)
     assert simulation.fired() == 0  # paused
     start = time.monotonic_ns()
@@ -93,7 +102,7 @@ def test_simulated_time_drives_timers(simulation: Simulation) -> None:
 def test_simulated_time_that_jumps_back_does_not_stall_timers(simulation: Simulation) -> None:
     """It is asked for in rclpy#1490 and rclcpp#2535."""
     simulation.node.create_timer(0.050, nothing)
-    simulation.intake.update([simulation.node])
+    look_after(simulation.intake, simulation.node)
     simulation.run(1000 * MS, 20)
     count = simulation.fired()
     assert count == 4
@@ -108,15 +117,15 @@ def test_a_timer_follows_its_clock_into_simulated_time_and_back(
 ) -> None:
     node, recorder = simulation.node, simulation.recorder
     timer = node.create_timer(0.020, nothing)
-    simulation.intake.update([node])
+    look_after(simulation.intake, node)
     time.sleep(0.1)
     assert not recorder.timers
     node.set_parameters([Parameter('use_sim_time', value=False)])
-    simulation.intake.update([node])
+    look_after(simulation.intake, node)
     assert wait_for(lambda: len(recorder.timers) >= 10)
     assert on_grid(recorder.dues(timer)[-8:], 20 * MS)
     node.set_parameters([Parameter('use_sim_time', value=True)])
-    simulation.intake.update([node])
+    look_after(simulation.intake, node)
     time.sleep(0.05)
     count = len(recorder.timers)
     time.sleep(0.2)

@@ -19,10 +19,12 @@ from rclpy.node import Node
 from .helpers import (
     cpu_ns,
     intake_threads,
+    look_after,
     MS,
     nothing,
     on_grid,
     Recorder,
+    start,
     wait_for,
 )
 
@@ -71,8 +73,7 @@ def test_due_times_form_a_grid_although_the_receiver_stalls(
             stalls.append(due)
 
     recorder.react['timer'] = stall
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     assert wait_for(lambda: len(recorder.timers) >= 150)
     dues = recorder.dues(timer)
     steps = [b - a for a, b in zip(dues, dues[1:])]
@@ -94,8 +95,7 @@ def test_due_times_are_those_of_rcl(
     intake: WaitSetIntake, node: Node, recorder: Recorder
 ) -> None:
     timer = node.create_timer(0.020, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     assert wait_for(lambda: len(recorder.timers) >= 5)
     before = time.monotonic_ns()
     expected = before + timer.time_until_next_call()
@@ -113,8 +113,7 @@ def test_timers_are_handed_over_soon_after_they_are_due(
     recorder.react['timer'] = lambda _, due: late.append(time.monotonic_ns() - due)
     for k in range(11):
         node.create_timer(0.010 + 0.001 * k, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     assert wait_for(lambda: len(late) > 500)
     late.sort()
     assert late[0] >= -1000  # never early, but for the measured phase
@@ -125,13 +124,12 @@ def test_many_timers_wake_their_thread_for_those_due_only(
     intake: WaitSetIntake, node: Node, recorder: Recorder
 ) -> None:
     timer = node.create_timer(0.010, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     time.sleep(0.2)
     few = _cpu_for(intake_threads(), 0.5)
     for _ in range(300):
         node.create_timer(100.0, nothing)
-    intake.update([node])
+    look_after(intake, node)
     time.sleep(0.2)
     many = _cpu_for(intake_threads(), 0.5)
     assert len(recorder.dues(timer)) > 80
@@ -152,8 +150,7 @@ def test_a_cancelled_timer_does_not_fire_until_it_is_reset(
     intake: WaitSetIntake, node: Node, recorder: Recorder
 ) -> None:
     timer = node.create_timer(0.030, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     assert wait_for(lambda: len(recorder.timers) >= 3)
     timer.cancel()
     time.sleep(0.05)
@@ -174,8 +171,7 @@ def test_a_timer_cancelled_for_a_moment_is_in_time_again(
     intake: WaitSetIntake, node: Node, recorder: Recorder
 ) -> None:
     timer = node.create_timer(0.030, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     late = []
     for _ in range(7):
         count = len(recorder.timers)
@@ -194,8 +190,7 @@ def test_a_timer_that_is_reset_again_and_again_does_not_fire(
     intake: WaitSetIntake, node: Node, recorder: Recorder
 ) -> None:
     timer = node.create_timer(0.050, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     for _ in range(30):
         timer.reset()
         time.sleep(0.010)
@@ -205,8 +200,7 @@ def test_a_timer_that_is_reset_again_and_again_does_not_fire(
 
 def test_a_reset_moves_the_grid(intake: WaitSetIntake, node: Node, recorder: Recorder) -> None:
     timer = node.create_timer(0.020, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     assert wait_for(lambda: len(recorder.timers) >= 4)
     time.sleep(0.007)
     timer.reset()
@@ -222,8 +216,7 @@ def test_a_changed_period_holds_from_the_next_call_on(
     intake: WaitSetIntake, node: Node, recorder: Recorder, period_ms: int
 ) -> None:
     timer = node.create_timer(0.010, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     assert wait_for(lambda: len(recorder.timers) >= 5)
     timer.timer_period_ns = period_ms * MS
     changed = time.monotonic_ns()
@@ -238,8 +231,7 @@ def test_a_shortened_period_and_reset_are_noticed(
     intake: WaitSetIntake, node: Node, recorder: Recorder
 ) -> None:
     timer = node.create_timer(30.0, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     time.sleep(0.05)
     timer.timer_period_ns = 10 * MS
     timer.reset()
@@ -250,8 +242,7 @@ def test_a_timer_without_autostart_fires_once_it_is_reset(
     intake: WaitSetIntake, node: Node, recorder: Recorder
 ) -> None:
     timer = node.create_timer(0.020, nothing, autostart=False)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     time.sleep(0.1)
     assert not recorder.timers
     timer.reset()
@@ -263,8 +254,7 @@ def test_a_timer_without_period_fires_often_but_not_all_the_time(
     intake: WaitSetIntake, node: Node, recorder: Recorder
 ) -> None:
     node.create_timer(0.0, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     time.sleep(0.5)
     assert 100 < len(recorder.timers) <= 501
 
@@ -273,8 +263,7 @@ def test_destroyed_timers_do_not_fire_and_new_ones_do(
     intake: WaitSetIntake, node: Node, recorder: Recorder
 ) -> None:
     old = node.create_timer(0.010, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     assert wait_for(lambda: len(recorder.timers) >= 3)
     node.destroy_timer(old)  # the intake is not told
     time.sleep(0.02)
@@ -282,7 +271,7 @@ def test_destroyed_timers_do_not_fire_and_new_ones_do(
     time.sleep(0.1)
     assert len(recorder.timers) == count
     new = node.create_timer(0.010, nothing)
-    intake.update([node])
+    look_after(intake, node)
     assert wait_for(lambda: len(recorder.dues(new)) >= 3)
     assert len(recorder.dues(old)) == count
 
@@ -291,8 +280,7 @@ def test_a_destroyed_timer_that_somebody_still_holds_does_not_fire(
     intake: WaitSetIntake, node: Node, recorder: Recorder
 ) -> None:
     timer = node.create_timer(0.010, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     assert wait_for(lambda: len(recorder.timers) >= 3)
     with timer.handle:
         node.destroy_timer(timer)
@@ -306,14 +294,13 @@ def test_the_grid_survives_other_timers_coming_and_going(
     intake: WaitSetIntake, node: Node, recorder: Recorder
 ) -> None:
     timer = node.create_timer(0.010, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     for _ in range(50):
         other = node.create_timer(0.003, nothing)
-        intake.update([node])
+        look_after(intake, node)
         time.sleep(0.010)
         node.destroy_timer(other)
-        intake.update([node])
+        look_after(intake, node)
     assert len(recorder.dues(timer)) >= 30
     assert on_grid(recorder.dues(timer), 10 * MS)
 
@@ -327,8 +314,7 @@ def test_a_receiver_that_raises_does_not_end_the_timers(
     recorder.react['timer'] = fail
     node.create_timer(0.010, nothing)
     intake = WaitSetIntake(ros_context, recorder, kinds={'timers'})
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     try:
         assert wait_for(lambda: len(recorder.errors) >= 5)
     finally:
@@ -344,8 +330,7 @@ def test_idle_timers_cost_little(
 ) -> None:
     for k in range(11):
         node.create_timer(1.0 + k, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     time.sleep(0.1)
     assert _cpu_for(intake_threads(), 0.5) < 50 * MS  # about 0.5 ms
 
@@ -355,8 +340,7 @@ def test_a_timer_wake_up_costs_little(
 ) -> None:
     for _ in range(11):
         node.create_timer(0.010, nothing)
-    intake.update([node])
-    intake.start()
+    start(intake, node)
     time.sleep(0.2)
     count = len(recorder.timers)
     cpu = _cpu_for(intake_threads(), 1.0)

@@ -16,7 +16,17 @@ from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from .helpers import make_node, matched, MS, nothing, Recorder, text, topic, wait_for
+from .helpers import (
+    look_after,
+    make_node,
+    matched,
+    MS,
+    nothing,
+    Recorder,
+    text,
+    topic,
+    wait_for,
+)
 
 
 @pytest.fixture
@@ -87,7 +97,7 @@ def inline(ros_context: Context, recorder: Recorder) -> WaitSetIntake:
 
 
 def test_poll_returns_after_its_time_and_not_before(inline: WaitSetIntake, node: Node) -> None:
-    inline.update([node])
+    look_after(inline, node)
     assert inline.poll(0.0) == 0
     start = time.monotonic()
     assert inline.poll(0.1) == 0
@@ -103,7 +113,7 @@ def test_poll_hands_over_what_is_ready(
     guard = node.create_guard_condition(nothing)
     timer = node.create_timer(0.010, nothing)
     timer.cancel()
-    inline.update([node])
+    look_after(inline, node)
     assert matched(publisher)
     for k in range(3):
         publisher.publish(text(str(k)))
@@ -124,7 +134,7 @@ def test_poll_ends_early_when_a_guard_condition_or_wake_says_so(
 ) -> None:
     guard = GuardCondition(None, None, ros_context)
     inline = WaitSetIntake(ros_context, recorder, (guard,))
-    inline.update([node])
+    look_after(inline, node)
     for ring in (guard.trigger, inline.wake):
         thread = threading.Timer(0.05, ring)
         thread.start()
@@ -140,24 +150,13 @@ def test_poll_holds_entities_no_longer_than_it_lasts(
 ) -> None:
     name = topic()
     subscription = node.create_subscription(String, name, lambda _: None, 10)
-    inline.update([node])
+    look_after(inline, node)
     inline.poll(0.0)
     assert node.count_subscribers(name) == 1
     node.destroy_subscription(subscription)
     assert wait_for(lambda: node.count_subscribers(name) == 0)
     inline.poll(0.0)  # which has not been told
     assert not recorder.errors
-
-
-def test_poll_and_start_exclude_each_other(inline: WaitSetIntake, node: Node) -> None:
-    inline.update([node])
-    inline.start()
-    with pytest.raises(RuntimeError, match='thread of its own'):
-        inline.poll(0.0)
-    with pytest.raises(RuntimeError, match='runs already'):
-        inline.start()
-    inline.stop()
-    assert inline.poll(0.0) == 0
 
 
 # --- cost ----------------------------------------------------------------------------------------
@@ -169,7 +168,7 @@ def test_one_take_empties_a_queue_up_to_its_depth(
     name = topic()
     subscription = node.create_subscription(String, name, lambda _: None, 4)
     publisher = node.create_publisher(String, name, 20)
-    inline.update([node])
+    look_after(inline, node)
     assert matched(publisher)
     for k in range(10):
         publisher.publish(text(str(k)))
@@ -190,7 +189,7 @@ def test_a_topic_that_never_rests_does_not_keep_a_poll_for_itself(
         time.sleep(0.010)
 
     recorder.react['message'] = answer
-    inline.update([node])
+    look_after(inline, node)
     assert matched(publisher)
     publisher.publish(text(''))
     assert 1 <= inline.poll(1.0) <= 4
