@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import replace
 import hashlib
 import json
 import os
@@ -26,7 +25,8 @@ from mddag_executor import __version__
 from mddag_executor.errors import InputError
 from mddag_executor.simulate.draws import Samples
 from mddag_executor.simulate.evaluation import Evaluation
-from msg_graph import Dag, TaskSet
+from msg_graph import TaskSet
+from msg_graph.layout import without_lines
 import numpy as np
 import numpy.typing as npt
 
@@ -163,13 +163,8 @@ def _difference(key: str, question: dict[str, Any], now: Any) -> str:
 
 def _digest(task_set: TaskSet) -> str:
     """Return a hash of what a declaration means, wherever it stands in whichever file."""
-    text = repr([_plain(dag) for dag in task_set.dags])
+    text = repr(without_lines(task_set).dags)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _plain(dag: Dag) -> Dag:
-    return replace(dag, vertices=tuple(
-        replace(vertex, callback=replace(vertex.callback, line=0)) for vertex in dag.vertices))
 
 
 def _digest_of_samples(samples: Samples | None) -> str | None:

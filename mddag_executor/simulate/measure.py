@@ -5,13 +5,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-import json
-import random
 from statistics import median
 import time
 from typing import Any
 
 from mddag_executor import defaults
+from mddag_executor.generate import generate, Options
 from mddag_executor.simulate.compiled import CompiledJudge
 from mddag_executor.simulate.draws import Draws
 from mddag_executor.simulate.evaluate import evaluate
@@ -21,9 +20,9 @@ from msg_graph import loads, TaskSet
 import numpy as np
 
 WORKERS = defaults.WORKERS
-_DAG = 10
-_PERIODS_MS = (10, 20, 33, 50, 100)
-_UTILISATION = 0.6
+_PERIODS_NS = (50_000_000, 100_000_000, 200_000_000)
+_MOST_DAGS = 1000
+_LOOSE = 1000.0
 
 
 def time_runs(
@@ -47,42 +46,18 @@ def time_runs(
         'runs_per_s': runs / median(taken)}
 
 
-def random_task_set(n_vertices: int, seed: int = 0) -> TaskSet:
+def random_task_set(n_vertices: int) -> TaskSet:
     """
-    Make DAGs of ten vertices (one to three predecessors each) whose deadlines are never missed.
+    Make DAGs of about ten vertices, or more where there would be too many, that miss no deadline.
 
     The normalised utilisation on ``WORKERS`` workers is 0.6.
     """
-    generator = random.Random(seed)
-    callbacks: list[dict[str, Any]] = []
-    for dag in range(-(-n_vertices // _DAG)):
-        period = generator.choice(_PERIODS_MS)
-        size = min(_DAG, n_vertices - dag * _DAG)
-        share = _UTILISATION * WORKERS * period * 1e6 / n_vertices  # ns for each vertex
-        mine: list[dict[str, Any]] = []
-        for number in range(size):
-            callback: dict[str, Any] = {
-                'name': f'd{dag}v{number}', 'publishes': [],
-                'execution_time': f'{max(1, round(share * generator.uniform(0.5, 1.5)))}ns'}
-            if number:
-                before = generator.sample(mine, min(len(mine), generator.randint(1, 3)))
-                topics = [f'/d{dag}/t{number}_{i}' for i in range(len(before))]
-                for publisher, topic in zip(before, topics):
-                    publisher['publishes'].append(topic)
-                if len(topics) == 1:
-                    callback['subscription'] = topics[0]
-                else:
-                    callback['sync'] = topics
-            else:
-                callback.update(timer=f'{period}ms', dag=f'd{dag}')
-            mine.append(callback)
-        callbacks += mine
-    for callback in callbacks:
-        if not callback['publishes']:
-            del callback['publishes']
-            callback['deadline'] = '86400s'
-    return loads(
-        json.dumps({'mddag': 1, 'nodes': [{'node': '/n', 'callbacks': callbacks}]}), '<random>')
+    dags = min(_MOST_DAGS, max(1, n_vertices // 10))
+    size = n_vertices // dags
+    return loads(generate(Options(
+        dags=(dags, dags), vertices=(size, size), edge_probability=min(1.0, 2 / size),
+        utilisation=0.6, workers=WORKERS, most_per_dag=WORKERS, periods_ns=_PERIODS_NS,
+        tightness=(_LOOSE, _LOOSE))), '<random>')
 
 
 def time_vertex_jobs(
@@ -96,7 +71,7 @@ def time_vertex_jobs(
     """
     task_set = random_task_set(n_vertices)
     rate = sum(len(dag.vertices) / dag.period_ns for dag in task_set.dags)
-    duration_ns = max(max(_PERIODS_MS) * 1_000_000, round(vertex_jobs / rate))
+    duration_ns = max(max(_PERIODS_NS), round(vertex_jobs / rate))
     judge: Judge
     if core == 'compiled':
         judge = CompiledJudge(task_set, duration_ns)
@@ -112,5 +87,5 @@ def time_vertex_jobs(
         accepted = judge(settings, times)
         taken.append(time.thread_time() - begin)
         assert np.all(accepted)  # else it ended early
-    return {'vertices': n_vertices, 'core': core, 'vertex_jobs': done,
+    return {'vertices': len(task_set.vertices), 'core': core, 'vertex_jobs': done,
             'ns': 1e9 * median(taken) / done}
