@@ -30,7 +30,7 @@ import time
 from typing import Any
 
 from mddag_executor.clocks import epoch_offset_ns
-from mddag_executor.core.tally import quantile, quantiles_us
+from mddag_executor.core.tally import quantiles_us, SinkTally
 from mddag_executor.live.execution import ExecutionPlan
 from msg_graph import Dag, TaskSet, Vertex
 
@@ -117,34 +117,24 @@ def measure(
 def _judge(ledger: Ledger, dag: Dag, vertex: Vertex, start: int, end: int) -> dict[str, Any]:
     """Return one sink's verdicts about the deadlines within ]start, end]."""
     deadline = vertex.deadline_ns or 0
-    result: dict[str, Any] = {
-        'relative_deadline_ns': deadline, 'due': 0, 'on_time': 0, 'late': 0, 'missing': 0,
-        'response_ns': None}
+    tally = SinkTally(deadline, None)
+    due = 0
     first = ledger.first_release[dag.index]
-    if first is None:
-        return result
-    completed: dict[int, int] = {}
-    for release, completion in list(ledger.completions[dag.index][vertex.index]):
-        job = (release - first + min(_EARLY_NS, dag.period_ns // 4)) // dag.period_ns
-        completed.setdefault(job, completion)
-    first_job = max(0, (start - deadline - first) // dag.period_ns + 1)
-    last_job = (end - deadline - first) // dag.period_ns
-    responses = []
-    for job in range(first_job, last_job + 1):
-        completion_or_none = completed.get(job)
-        result['due'] += 1
-        if completion_or_none is None:
-            result['missing'] += 1
-            continue
-        response = completion_or_none - (first + job * dag.period_ns)
-        responses.append(response)
-        result['on_time' if response <= deadline else 'late'] += 1
-    if responses:
-        responses.sort()
-        result['response_ns'] = {
-            'min': responses[0], 'median': quantile(responses, 0.5),
-            'p99': quantile(responses, 0.99), 'max': responses[-1]}
-    return result
+    if first is not None:
+        completed: dict[int, int] = {}
+        for release, completion in list(ledger.completions[dag.index][vertex.index]):
+            job = (release - first + min(_EARLY_NS, dag.period_ns // 4)) // dag.period_ns
+            completed.setdefault(job, completion)
+        first_job = max(0, (start - deadline - first) // dag.period_ns + 1)
+        for job in range(first_job, (end - deadline - first) // dag.period_ns + 1):
+            due += 1
+            if job in completed:
+                response = completed[job] - (first + job * dag.period_ns)
+                tally.done(response, response > deadline)
+    return {
+        'relative_deadline_ns': deadline, 'due': due, 'on_time': tally.completed - tally.late,
+        'late': tally.late, 'missing': due - tally.completed,
+        'response_ns': tally.result()['response_ns']}
 
 
 def _throughput(
