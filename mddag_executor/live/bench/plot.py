@@ -16,6 +16,7 @@ import os
 from typing import Any, BinaryIO, TYPE_CHECKING
 
 from mddag_executor.live.bench.spec import NONE
+from mddag_executor.simulate.plot import two_plots
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,15 +34,11 @@ def draw(results: Sequence[dict[str, Any]], file: BinaryIO, path: str) -> None:
     :param results: as ``run_all`` returns them.
     :param path: the file's name, whose ending tells the kind of picture.
     """
-    from matplotlib import rc_context, style
-    from matplotlib.figure import Figure
-    kind = os.path.splitext(path)[1].lower()[1:]
-    load = results[0]['load']
-    metadata: dict[str, Any] = {'png': {}, 'svg': {'Date': None}, 'pdf': {'CreationDate': None}}
-    with style.context('tableau-colorblind10'), rc_context(
-            {'svg.hashsalt': 'mddag', 'font.size': 9.0}):
-        figure = Figure(figsize=(6.4, 5.6), layout='constrained')
-        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    from matplotlib import style
+    first = results[0]
+    load = first['load']
+    with style.context('tableau-colorblind10'), two_plots(
+            file, path, (6.4, 5.6), (3, 2)) as (above, below):
         _curves(above, results, _in_time if load == 'autoware' else _latency)
         _curves(below, results, _cpu)
         if load == 'autoware':
@@ -62,11 +59,9 @@ def draw(results: Sequence[dict[str, Any]], file: BinaryIO, path: str) -> None:
             below.set_xscale('symlog', linthresh=1)
             below.set_xlim(left=-0.3)
         above.legend(fontsize=8, frameon=False)
-        first = results[0]
         above.set_title(
             f'{_load(first)}: {first["seconds"]:g} s each, median of {first["repeat"]}, '
             f'{first["workers"]} workers', fontsize=9)
-        figure.savefig(file, format=kind, dpi=150, metadata=metadata[kind])
 
 
 def _curves(axes: Axes, results: Sequence[dict[str, Any]], value: Any) -> None:
