@@ -33,6 +33,7 @@ class DraftCallback:
     :ivar interval_ns: measured mean time between two of its executions.
     :ivar times: its measured execution time, and the number of executions that were measured.
     :ivar guessed: whether it is only supposed that there is this timer.
+    :ivar also: other keys that were declared, with their values.
     """
 
     node: str
@@ -50,6 +51,7 @@ class DraftCallback:
     interval_ns: int | None = None
     times: tuple[ExecutionTime, int] | None = None
     guessed: bool = False
+    also: dict[str, str] = field(default_factory=dict)
 
     @property
     def key(self) -> str:

@@ -130,6 +130,7 @@ class _Writer:
             yield f'        reads: [{", ".join(map(plain_scalar, callback.reads))}]'
         if not any(topic in self._started for topic in callback.publishes):
             yield self._deadline(callback)
+        yield from (f'        {key}: {value}' for key, value in callback.also.items())
         if callback.times is not None:
             yield from _execution_time(*callback.times)
 

@@ -228,7 +228,11 @@ def _is_shown(entity: Entity) -> bool:
 
 def _from_declared(declared: Callback) -> DraftCallback:
     starts = [declared.service] if declared.service else list(declared.topics)
+    also = {key: str(value).lower() for key, value, usual in (
+        ('on_miss', declared.on_miss, 'continue'),
+        ('max_active_jobs', declared.max_active_jobs, None),
+        ('holds_interpreter', declared.holds_interpreter, None)) if value != usual}
     return DraftCallback(
         declared.node, declared.name, declared.kind, starts, declared.period_ns, [], [],
         list(declared.reads), declared.group, declared.dag, declared.deadline_ns,
-        declared.release_from)
+        declared.release_from, also=also)

@@ -40,6 +40,21 @@ def test_from_trace(mddag: Mddag, tmp_path: Path) -> None:
     assert done.stdout.splitlines()[1:] == (tmp_path / 'g.yaml').read_text().splitlines()[1:]
 
 
+def test_from_trace_keeps_what_was_declared(mddag: Mddag, tmp_path: Path) -> None:
+    pytest.importorskip('rclpy')
+    (tmp_path / 'g.yaml').write_text(
+        'mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n      - {name: t, timer: 10ms, '
+        'deadline: 5s, on_miss: abort, max_active_jobs: 900, holds_interpreter: false}\n')
+    done = mddag('run', 'g.yaml', '--synthetic', 'sleep', '--duration', '0.3s', '--trace',
+                 'r.mcap', cwd=tmp_path)
+    assert done.returncode == 0
+    done = mddag('graph', 'from-trace', 'r.mcap', '-o', 'again.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    callback, = msg_graph.load(tmp_path / 'again.yaml').callbacks
+    assert (callback.on_miss, callback.max_active_jobs, callback.holds_interpreter) == (
+        'abort', 900, False)
+
+
 def test_from_trace_of_something_else(mddag: Mddag, tmp_path: Path) -> None:
     (tmp_path / 'x').write_text('no trace')
     (tmp_path / 'empty').mkdir()
