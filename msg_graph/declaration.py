@@ -22,34 +22,21 @@ from msg_graph.yamltext import yaml_lines
 
 
 @dataclass(frozen=True, slots=True)
-class DeclaredCallback:
-    """A callback and the entry that declares it, which knows the lines."""
-
-    callback: Callback
-    entry: Entry
-
-
-@dataclass(frozen=True, slots=True)
-class DeclaredPath:
-    """A path and the entry that declares it."""
-
-    path: Path
-    entry: Entry
-
-
-@dataclass(frozen=True, slots=True)
 class Declaration:
     """
     A declaration as it stands in its files; callbacks in the order of the file.
 
     :ivar text: all of it in one text, which needs no other file.
+    :ivar entries: what declares each callback, by its key, and so each path, by its name; they
+        know the lines.
     """
 
     file: str
     text: str
     workers: int | None
-    callbacks: list[DeclaredCallback]
-    paths: list[DeclaredPath]
+    callbacks: list[Callback]
+    paths: list[Path]
+    entries: dict[str, Entry]
 
 
 def parse_declaration(text: str, file: str, path: str | None = None) -> Declaration:
@@ -69,18 +56,19 @@ def parse_declaration(text: str, file: str, path: str | None = None) -> Declarat
         top, nodes, paths = Assembler(path).assemble(tree, file)
     with found:
         workers = top.get('workers')
-    callbacks: list[DeclaredCallback] = []
-    declared_paths: list[DeclaredPath] = []
+    callbacks: list[Callback] = []
+    declared_paths: list[Path] = []
+    entries: dict[str, Entry] = {}
     with found:
         nodes = nodes or [(each, file) for each in top.get('nodes')]
-        callbacks = _callbacks(nodes, file)
+        callbacks = _callbacks(nodes, file, entries)
     with found:
         paths = paths if composed else [(each, file) for each in top.get('paths') or ()]
-        declared_paths = _paths(paths)
+        declared_paths = _paths(paths, entries)
     found.check()
     if composed:
         text = _one_text(file, workers, nodes, paths)
-    return Declaration(file, text, workers, callbacks, declared_paths)
+    return Declaration(file, text, workers, callbacks, declared_paths, entries)
 
 
 def _one_text(file: str, workers: int | None, nodes: list[Part], paths: list[Part]) -> str:
@@ -97,8 +85,8 @@ def _one_text(file: str, workers: int | None, nodes: list[Part], paths: list[Par
     return '\n'.join(lines) + '\n'
 
 
-def _callbacks(nodes: list[Part], top: str) -> list[DeclaredCallback]:
-    declared: dict[str, DeclaredCallback] = {}
+def _callbacks(nodes: list[Part], top: str, entries: dict[str, Entry]) -> list[Callback]:
+    callbacks: list[Callback] = []
     found = Collector()
     for place, (tree, file) in enumerate(nodes, 1):
         with found:
@@ -108,24 +96,26 @@ def _callbacks(nodes: list[Part], top: str) -> list[DeclaredCallback]:
             for number, callback_tree in enumerate(entry.get('callbacks'), 1):
                 name = f'callback {number} of node {shown(node)}'
                 with found:
-                    each = _callback(Entry(callback_tree, file, name, CALLBACK_KEYS), node, top)
-                    other = declared.setdefault(each.callback.key, each).entry
-                    if other is not each.entry:
+                    each = Entry(callback_tree, file, name, CALLBACK_KEYS)
+                    callback = _callback(each, node, top)
+                    other = entries.setdefault(callback.key, each)
+                    if other is not each:
                         where = '' if other.file == file else f'{other.file}:'
-                        raise each.entry.error(
+                        raise each.error(
                             'name', f'this name is taken in {where or "line "}{other.line}',
                             'give each callback of a node a name of its own')
+                    callbacks.append(callback)
     found.check()
-    return list(declared.values())
+    return callbacks
 
 
-def _callback(entry: Entry, node: str, top: str) -> DeclaredCallback:
+def _callback(entry: Entry, node: str, top: str) -> Callback:
     name = entry.get('name')
     key = f'{node}:{name}'
     entry.name = f'callback {shown(key)}'
     kind = entry.one_of(TRIGGERS, 'what starts the callback')
     timer_period = entry.get('timer')
-    callback = Callback(
+    return Callback(
         node=node, name=name, key=key,
         kind=kind,  # type: ignore[arg-type]
         timer_period_ns=timer_period,
@@ -138,7 +128,6 @@ def _callback(entry: Entry, node: str, top: str) -> DeclaredCallback:
             'max_active_jobs', 'holds_interpreter')},
         line=entry.line,
         file=None if entry.file == top else entry.file)
-    return DeclaredCallback(callback, entry)
 
 
 def _period(entry: Entry, timer_period: int | None) -> int | None:
@@ -155,8 +144,8 @@ def _period(entry: Entry, timer_period: int | None) -> int | None:
     return period
 
 
-def _paths(parts: list[Part]) -> list[DeclaredPath]:
-    declared: dict[str, DeclaredPath] = {}
+def _paths(parts: list[Part], entries: dict[str, Entry]) -> list[Path]:
+    paths: list[Path] = []
     found = Collector()
     for place, (tree, file) in enumerate(parts, 1):
         with found:
@@ -164,8 +153,8 @@ def _paths(parts: list[Part]) -> list[DeclaredPath]:
             name = entry.get('name')
             entry.name = f'path {shown(name)}'
             path = Path(name, entry.get('callbacks'))
-            if name in declared:
+            if entries.setdefault(name, entry) is not entry:
                 raise entry.error('name', 'this name is taken', 'give each path a name of its own')
-            declared[name] = DeclaredPath(path, entry)
+            paths.append(path)
     found.check()
-    return list(declared.values())
+    return paths

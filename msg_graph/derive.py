@@ -83,7 +83,7 @@ def derive_task_set(
         expansion.expand(callback)
     return TaskSet(
         dags=_dags(links, expansion),
-        callbacks=tuple(each.callback for each in declaration.callbacks),
+        callbacks=tuple(declaration.callbacks),
         queue_edges=queue_edges,
         paths=paths,
         workers=declaration.workers,
@@ -134,7 +134,7 @@ class _Expansion:
             ('edges', self.edges, MAX_EDGES),
         ):
             if count > most:
-                raise self.links.declared[place].entry.error(
+                raise self.links.entries[self.links.callbacks[place].key].error(
                     None, f'with it the DAGs have {count} {what}, more than {most}',
                     'a callback runs once for each publisher before it: use fewer publishers for '
                     "one topic, or read some by a queue edge ('reads:')")
@@ -144,11 +144,11 @@ class _Expansion:
         other = next((v for v in vertices if self.source[v] != first), None)
         if other is None:
             return
-        declared = self.links.declared[place]
+        callback = self.links.callbacks[place]
         published = self.links.callbacks[self.callback[other]].publishes
-        topic = next(topic for topic in declared.callback.topics if topic in published)
+        topic = next(topic for topic in callback.topics if topic in published)
         keys = [self.links.callbacks[source].key for source in (first, self.source[other])]
-        raise declared.entry.error(
+        raise self.links.entries[callback.key].error(
             'sync',
             f'it joins two sources, {shown(keys[0])} and {shown(keys[1])}, but a DAG has one',
             f"read {shown(topic)} by a queue edge: take it out of 'sync:' and list it under "
@@ -176,7 +176,7 @@ def _dag_names(links: Links, sources: list[int]) -> dict[int, str]:
         name = callback.dag or callback.node
         if name in taken:
             other = links.callbacks[taken[name]].key
-            raise links.declared[source].entry.error(
+            raise links.entries[callback.key].error(
                 'dag' if callback.dag else None,
                 f'its DAG has the name {shown(name)}, as that of {shown(other)}',
                 "give it another one with 'dag:'")
