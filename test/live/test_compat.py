@@ -13,6 +13,7 @@ from mddag_executor.live import compat
 from mddag_executor.live.compat.events_executor import is_available
 import pytest
 import rclpy
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future
 from rclpy.waitable import NumberOfEntities, Waitable
@@ -291,6 +292,15 @@ def test_the_subscription_that_keeps_time_is_known(make_node):
     other = node.create_subscription(String, 'said', print, 1)
     kept = [s for s in node.subscriptions if compat.keeps_time(s)]
     assert [s.topic_name for s in kept] == ['/clock'] and other not in kept
+
+
+def test_which_qos_events_only_write_to_the_log_is_known(make_node):
+    node = make_node()
+    node.create_subscription(String, 'said', print, 1, event_callbacks=SubscriptionEventCallbacks(
+        deadline=print))
+    logs = {w.event_type.name.rpartition('_')[2]: compat.only_logs(w) for w in node.waitables}
+    assert logs.pop('MISSED') is False
+    assert logs and all(logs.values())
 
 
 def test_names_of_services(pair):

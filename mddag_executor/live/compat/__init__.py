@@ -306,6 +306,11 @@ def is_of_wait_for_message(entity: Any) -> bool:
     return getattr(callback, '__module__', None) == 'rclpy.wait_for_message'
 
 
+def only_logs(event: Any) -> bool:
+    """Return whether a QoS event's callback is rclpy's own, which only writes to the log."""
+    return getattr(event.callback, '__module__', None) == 'rclpy.event_handler'
+
+
 def service_name(entity: Any) -> str:
     """Return the name of a service or client. 7.1.5 has no ``service_name``."""
     name: str = entity.service_name if hasattr(entity, 'service_name') else entity.srv_name

@@ -38,7 +38,6 @@ crash it when they are removed, and it refuses guard conditions: it gets none of
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import cache
 from itertools import chain
 from operator import length_hint, methodcaller
 from types import SimpleNamespace
@@ -55,7 +54,6 @@ DRAIN_TURNS = 16
 """So many times a source's share is taken from a new entity at the most."""
 SPIN_SEC = 3600.0
 """It spins for that long at a time: see above."""
-PROBE_SEC = 2.0
 
 KINDS = ('subscription', 'service', 'client')
 """The kinds of entities that it can look after."""
@@ -373,38 +371,6 @@ class NativeExecutor:
         self._node.withdraw()
 
 
-class _Probe:
-    """A node without entities that completes a future when it is asked for them."""
-
-    executor: Any = None
-    timers = clients = services = waitables = guards = ()  # type: Any
-
-    def __init__(self, future: Any) -> None:
-        self._future = future
-
-    @property
-    def subscriptions(self) -> tuple[()]:
-        """Note that the native executor is at work."""
-        self._future.set_result(None)
-        return ()
-
-
-@cache
 def is_available() -> bool:
-    """
-    Return whether this rclpy has a native EventsExecutor, and it does dispatch.
-
-    It needs no context, is found out once, and takes about a millisecond where it works.
-    """
-    try:
-        native = _rclpy.EventsExecutor(_OpenContext(None))
-        future: Any = Future()
-        node = _Probe(future)
-        native.add_node(node)
-        native.wake()
-        native.spin_until_future_complete(future, PROBE_SEC)
-        native.shutdown()
-        node.executor = None
-        return bool(future.done())
-    except Exception:
-        return False
+    """Return whether this rclpy has a native EventsExecutor: the first ones of 7.1 had none."""
+    return hasattr(_rclpy, 'EventsExecutor')

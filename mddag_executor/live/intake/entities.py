@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from mddag_executor.live.compat import is_of_wait_for_message
+from mddag_executor.live.compat import is_of_wait_for_message, only_logs
 from rclpy.client import Client
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
@@ -33,9 +33,9 @@ class EntitySet:
     """
     What some nodes have to wait for, at one moment, in the order of their creation by node.
 
-    ``events`` holds the QoS events (rclpy's ``EventHandler``, as it is), ``waitables`` all other
-    waitables: a node has a few of the former for every publisher and subscription, and they
-    hardly ever become ready.
+    QoS events (rclpy's ``EventHandler``, as it is) are apart from all other ``waitables``: a node
+    has a few of them for every publisher and subscription, and they hardly ever become ready.
+    ``logged_events`` are those that rclpy makes by itself, which only write to the log.
     """
 
     subscriptions: list[Subscription]
@@ -45,6 +45,7 @@ class EntitySet:
     guards: list[GuardCondition]
     waitables: list[Waitable]
     events: list[EventHandler]
+    logged_events: list[EventHandler]
     by_node: dict[Node, tuple[list[Any], ...]]
 
     @property
@@ -53,7 +54,7 @@ class EntitySet:
         return list(self.by_node)
 
 
-EMPTY = EntitySet([], [], [], [], [], [], [], {})
+EMPTY = EntitySet([], [], [], [], [], [], [], [], {})
 
 
 def snapshot(nodes: Iterable[Node], previous: EntitySet | None = None) -> EntitySet:
@@ -72,12 +73,12 @@ def snapshot(nodes: Iterable[Node], previous: EntitySet | None = None) -> Entity
     subscriptions, timers, clients, services, guards, waitables = (
         [entity for lists in found.values() for entity in lists[index]]
         for index in range(len(_LISTS)))
+    events = [w for w in waitables if is_qos_event(w)]
     return EntitySet(
         [s for s in subscriptions if not is_of_wait_for_message(s)],
         timers, clients, services, guards,
         [w for w in waitables if not is_qos_event(w)],
-        [w for w in waitables if is_qos_event(w)],
-        found)
+        [e for e in events if not only_logs(e)], [e for e in events if only_logs(e)], found)
 
 
 def alive(entity: Any) -> bool:

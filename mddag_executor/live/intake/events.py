@@ -25,7 +25,7 @@ from mddag_executor.live.endings import call_at_shutdown, is_over, join, SecondL
 from mddag_executor.live.intake.arrivals import Receiver
 from mddag_executor.live.intake.entities import EMPTY, EntitySet
 from mddag_executor.live.intake.sources import sources
-from mddag_executor.live.intake.waitset import PATIENCE, WaitSetIntake
+from mddag_executor.live.intake.waitset import PATIENCE, QOS_EVENTS, WaitSetIntake
 from rclpy.context import Context
 from rclpy.guard_condition import GuardCondition
 from rclpy.task import Future
@@ -34,7 +34,7 @@ _NATIVE = 'events'
 _PARTS = {
     _NATIVE: ('subscriptions', 'services', 'clients'),
     'timers': ('timers',),
-    'waitables': ('waitables', 'guards', 'events'),
+    'waitables': ('waitables', 'guards', *QOS_EVENTS),
 }
 SPIN_S = 3600.0
 

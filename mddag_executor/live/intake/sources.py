@@ -208,6 +208,7 @@ SOURCES: dict[str, type[Source]] = {
     'guards': GuardSource,
     'waitables': WaitableSource,
     'events': WaitableSource,
+    'logged_events': WaitableSource,
 }
 
 

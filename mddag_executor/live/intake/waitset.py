@@ -28,6 +28,7 @@ cheaper.
 
 from __future__ import annotations
 
+from bisect import insort
 from collections.abc import Callable, Iterable
 import threading
 import time
@@ -52,9 +53,10 @@ REBUILD_SHARE = 10
 REBUILD_LATEST_NS = 50_000_000
 
 EVENTS_NS = 100_000_000
-"""A thread looks at QoS events so often, if that takes no more than 0.5 % of a CPU."""
+"""A thread looks at QoS events so often, if that takes no more than their share of a CPU."""
 
-EVENTS_SHARE = 200
+QOS_EVENTS = {'events': 200, 'logged_events': 2000}
+"""The kinds of QoS events, each with its share: one part of so many."""
 
 PATIENCE = 3
 """So many waits in a row may bring errors before the thread slows down."""
@@ -68,7 +70,8 @@ class WaitSetIntake:
 
     In a thread, QoS events are only looked at ten times a second, or less often if they are that
     many: there are several for each publisher and subscription, they hardly ever become ready, and
-    waiting for them would cost more than all the rest. (Waiting for them in a thread of their own
+    waiting for them would cost more than all the rest. Those that only write to the log are looked
+    at ten times less often where they are many. (Waiting for them in a thread of their own
     does not help: with Fast DDS a message that is not taken yet ends the wait for the events of
     its subscription.)
 
@@ -114,8 +117,8 @@ class WaitSetIntake:
         self._failures = 0
         self._looks = SecondLooks()
         self._waiting = False  # in a poll
-        self._events: RefilledSet | None = None  # apart from the others in a thread only
-        self._events_at = 0
+        # in a thread: QoS events with the part of their share, by when to look at them next
+        self._events: list[tuple[int, int, RefilledSet]] = []
         call_at_shutdown(context, self.wake)
 
     # --- what to wait for ------------------------------------------------------------------------
@@ -151,12 +154,11 @@ class WaitSetIntake:
         latest = self._latest
         self._drop()
         if self._guard is not None:
-            apart = {'events'} & self._kinds if self._thread is not None else set[str]()
+            apart = self._kinds & QOS_EVENTS.keys() if self._thread is not None else set[str]()
             self._filled = self._set_for(self._kinds - apart, (*self._guards, self._guard))
-            if apart and latest.events:
-                events = self._set_for(apart)
-                self._events = events if events.size else None  # all may be destroyed by now
-                self._events_at = 0
+            self._events = [
+                (0, QOS_EVENTS[kind], self._set_for({kind}))
+                for kind in sorted(apart) if getattr(latest, kind)]
         if 'timers' in self._kinds:
             self._timers.update(latest.timers)
         end = _now()
@@ -171,10 +173,12 @@ class WaitSetIntake:
             receiver.on_intake_error)
 
     def _drop(self) -> None:
-        for some in self._filled, self._events:
-            if some is not None:
-                some.release()
-        self._filled = self._events = None
+        for _, _, events in self._events:
+            events.release()
+        self._events = []
+        if self._filled is not None:
+            self._filled.release()
+            self._filled = None
 
     # --- waiting ---------------------------------------------------------------------------------
 
@@ -189,11 +193,11 @@ class WaitSetIntake:
             self._apply()
         timers = self._timers
         count = timers.fire(_now())
-        if self._events is not None and _now() >= self._events_at:
-            self._look_at_events(self._events)
+        if self._events and _now() >= self._events[0][0]:
+            self._look_at_events()
         ends = [
             limit, timers.next_look(), self._looks.at,
-            self._events_at if self._events is not None else None,
+            self._events[0][0] if self._events else None,
             self._rebuild_at if self._changed else None,
             0 if count and self._waiting else None]
         until = min((end for end in ends if end is not None), default=None)
@@ -306,12 +310,15 @@ class WaitSetIntake:
         if ended and self._on_shutdown is not None:
             self._on_shutdown()
 
-    def _look_at_events(self, events: RefilledSet) -> None:
+    def _look_at_events(self) -> None:
+        """Look at those QoS events whose turn it is."""
+        _, share, events = self._events.pop(0)
         start = _now()
         try:
-            events.wait(0)
-            events.take_ready()
+            if events.size:  # else all were destroyed by then
+                events.wait(0)
+                events.take_ready()
         except InvalidHandle:
             self._changed = True  # one was destroyed
         end = _now()
-        self._events_at = end + max(EVENTS_NS, (end - start) * EVENTS_SHARE)
+        insort(self._events, (end + max(EVENTS_NS, (end - start) * share), share, events))

@@ -107,7 +107,7 @@ def test_all_is_destroyed_before_it_is_looked_at(
     for _ in range(3):
         node.create_subscription(String, name, nothing, 10)
     entities = snapshot([node])
-    assert entities.events
+    assert entities.logged_events
     node.destroy_node()
     start(intake)
     intake.update(entities)
