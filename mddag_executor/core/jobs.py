@@ -51,7 +51,7 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     if s.scalars[SKIP] > 0 and s.scalars[JUDGE_FROM] == -NEVER:
         s.scalars[JUDGE_FROM] = release + s.scalars[SKIP]
     s.job_state[slot] = OPEN
-    s.job_sinks_left[slot] = t.first_sink[dag + 1] - t.first_sink[dag] if dag < t.n_dags else 0
+    s.job_sinks_left[slot] = t.first_sink[dag + 1] - t.first_sink[dag]
     s.job_late[slot] = 0
     s.job_active[slot] = 0
     _link_newest(s, dag, slot)
@@ -62,6 +62,21 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
         s.x_worker[x] = -1
     if s.partial[dag] != 0:
         _leave_out(t, s, slot)
+    return slot
+
+
+def open_undeclared(t: Tables, s: State, index: int, now: int) -> int:
+    """
+    Open the job of a callback that no DAG declares; return its slot, or -1 as ``release_job``.
+
+    It has one execution and nobody judges it, so it stands in no list of open jobs.
+    """
+    slot = s.free_slot[t.n_dags]
+    if slot >= 0:
+        s.free_slot[t.n_dags] = s.job_next[slot]
+        s.job_index[slot] = index
+        s.job_release[slot] = now
+        s.job_state[slot] = OPEN
     return slot
 
 
@@ -136,10 +151,8 @@ def judge(s: State, slot: int, kind: int, vertex: int, deadline: int, time: int)
 
 def close_job(s: State, slot: int, end: int, now: int) -> None:
     """End an open job (rule 8): it leaves the open jobs and, when nothing is active, its slot."""
-    dag = s.job_dag[slot]
-    if dag < len(s.oldest) - 1:  # jobs of the undeclared DAG are nobody's to judge
-        judged = -1 if is_judged(s, slot) else NOT_JUDGED
-        s.decisions.append((JOB_END, dag, judged, s.job_index[slot], end, now))
+    judged = -1 if is_judged(s, slot) else NOT_JUDGED
+    s.decisions.append((JOB_END, s.job_dag[slot], judged, s.job_index[slot], end, now))
     withdraw_job(s, slot, end)
 
 

@@ -86,10 +86,9 @@ def next_queue(s: State) -> list[Entry]:
 
     What was held back counts as soon as the interpreter is free for it (rule 11).
     """
-    _drop_stale(s, s.ready)
-    if len(s.held_back) == 0:
-        return s.ready
-    _drop_stale(s, s.held_back)
+    if s.scalars[N_STALE] > 0:
+        _drop_stale(s, s.ready)
+        _drop_stale(s, s.held_back)
     if len(s.held_back) == 0 or (len(s.ready) > 0 and s.ready[0] < s.held_back[0]):
         return s.ready
     return s.held_back if interpreter_is_free(s, s.held_back[0]) else s.ready

@@ -155,8 +155,8 @@ def drop(s: State, x: int, now: int) -> None:
     group = s.x_group[x]
     if group >= 0 and (s.group_owner[group] == -1 or s.group_owner[group] == x):
         _release_group(s, group)  # it may have stood in the ready queue for those of its group
-    if dag == len(s.oldest) - 1 and s.job_state[slot] == OPEN:
-        close_job(s, slot, EXPIRED, now)
+    if dag == len(s.free_slot) - 1:
+        s.job_state[slot] = EXPIRED
     deactivate(s, slot)
     if in_queue:
         add_stale(s)
@@ -334,6 +334,10 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
         _release_group(s, group)
     slot = s.x_slot[x]
     vertex = s.x_vertex[x]
+    if vertex == t.n_vertices:  # no DAG declares it
+        s.job_state[slot] = COMPLETED
+        deactivate(s, slot)
+        return True
     head = s.job_base[slot] + t.region_offset[vertex]
     whole = True
     if s.scalars[PROPAGATE] == 0 and t.n_predecessors[vertex] > 0:
@@ -369,9 +373,6 @@ def _complete_vertex(
     t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int
 ) -> None:
     dag = s.job_dag[slot]
-    if dag == t.n_dags:
-        close_job(s, slot, COMPLETED, now)
-        return
     if t.sink_deadline[vertex] >= 0:
         deadline = s.job_release[slot] + t.sink_deadline[vertex]
         late = now > deadline

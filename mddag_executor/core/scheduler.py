@@ -4,6 +4,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import policy
 from mddag_executor.core.state import (
@@ -31,6 +34,14 @@ class Scheduler:
     :param n_workers: size of the bounded pool.
     :param policy_name: a row of ``core.policies``; PolicyError when there is none.
     :param preemptive: see ``core.state.new_state``, as the remaining ones.
+    :ivar ready: ``ready(x, now)`` makes an execution ready.
+    :ivar take: ``take(worker, now)`` dispatches the next execution on an idle worker and returns
+        it; -1 when there is none to run.
+    :ivar schedule: ``schedule(now)`` dispatches one execution where the rules want it; -1 when
+        there is nothing to do.
+    :ivar complete: ``complete(x, now)`` ends a running execution; it returns False for a leg that
+        did not make its vertex whole.
+    :ivar fail: ``fail(x, now)`` ends one that failed; see ``complete``.
     """
 
     def __init__(
@@ -50,8 +61,16 @@ class Scheduler:
             tables, n_workers, preemptive=self.policy.mode(preemptive), propagate=propagate,
             dispatch_overhead=dispatch_overhead, switch_overhead=switch_overhead,
             polling=self.policy.polling)
-        self._key = self.policy.key
         self._free_groups: list[int] = []
+        # bound here: a method of its own would be one more call for each execution
+        rule = self.tables, self.state
+        self.ready: Callable[[int, int], None] = partial(
+            rules.make_ready, *rule, self.policy.key)
+        self.take: Callable[[int, int], int] = partial(rules.take, *rule)
+        self.schedule: Callable[[int], int] = partial(rules.schedule, *rule, self.policy.key)
+        self.complete: Callable[[int, int], bool] = partial(
+            rules.complete, *rule, self.policy.key)
+        self.fail: Callable[[int, int], bool] = partial(rules.fail, *rule, self.policy.key)
 
     def release(self, dag: int, job: int, release: int, now: int) -> int:
         """Open a job of a DAG and return its slot."""
@@ -73,34 +92,21 @@ class Scheduler:
         """Return the execution of the source of the job in a slot."""
         return self.execution(slot, self.tables.source[self.state.job_dag[slot]])
 
-    def ready(self, x: int, now: int) -> None:
-        """Make an execution ready."""
-        rules.make_ready(self.tables, self.state, self._key, x, now)
-
     def undeclared(self, job: int, group: int, now: int, holds: int = 0) -> int:
         """Make a callback that no DAG declares ready; return its execution."""
-        slot = self.release(self.tables.n_dags, job, now, now)
+        slot = jobs.open_undeclared(self.tables, self.state, job, now)
+        if slot < 0:
+            add_slot(self.tables, self.state, self.tables.n_dags)
+            slot = jobs.open_undeclared(self.tables, self.state, job, now)
         x = self.state.job_base[slot]
         self.state.x_group[x] = group
         self.state.x_holds[x] = holds
-        rules.make_ready(self.tables, self.state, self._key, x, now)
+        self.ready(x, now)
         return x
-
-    def take(self, worker: int, now: int) -> int:
-        """Dispatch the next execution on an idle worker; -1 when there is none to run."""
-        return rules.take(self.tables, self.state, worker, now)
-
-    def schedule(self, now: int) -> int:
-        """Dispatch one execution where the rules want it; -1 when there is nothing to do."""
-        return rules.schedule(self.tables, self.state, self._key, now)
 
     def admit(self, x: int, now: int) -> None:
         """Start an execution as it was recorded; it takes no worker and no callback group."""
         rules.admit(self.state, x, now)
-
-    def complete(self, x: int, now: int) -> bool:
-        """End a running execution; False for a leg that did not make its vertex whole."""
-        return rules.complete(self.tables, self.state, self._key, x, now)
 
     def fail_open(self, slot: int, now: int) -> None:
         """Fail the job in a slot unless it has ended already."""

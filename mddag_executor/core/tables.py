@@ -122,6 +122,10 @@ class Tables(NamedTuple):
             columns.add_dag(dag)
         return columns.finish(default_deadline)
 
+    def source_depth(self, dag: int) -> int:
+        """Return how many releases of a timer source may wait: as many as can be in time."""
+        return max(1, -(-self.dag_deadline[dag] // self.period[dag]))
+
 
 class _Columns:
     """Collects the columns of ``Tables`` DAG by DAG."""

@@ -30,14 +30,10 @@ def current_job() -> Job | None:
 
     None outside of callbacks of this executor, and in callbacks that no DAG declares.
     """
-    hooks = sys.modules.get('mddag_executor.live.hooks')  # not imported: there is no executor
-    running: Any = hooks.current.running if hooks is not None else None
-    if running is None or running.work.origin is None:
-        return None
-    origin = running.work.origin
-    return Job(
-        running.pool.dispatcher.dag_names[origin.dag], origin.job,
-        running.pool.dispatcher.release_of(running.work))
+    seat = sys.modules.get('mddag_executor.live.seat')  # not imported: there is no executor
+    running: Any = seat.current.running if seat is not None else None
+    job = running.job if running is not None else None
+    return None if job is None else Job(*job)
 
 
 def __getattr__(name: str) -> Any:

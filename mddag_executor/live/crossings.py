@@ -39,11 +39,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 import threading
-from typing import Any
 
 from mddag_executor.core import Scheduler, Tables
-from mddag_executor.live.attribution import Attribution, Origin
-from mddag_executor.live.entries import Entry
+from mddag_executor.live.entity import Entity
+from mddag_executor.live.jobs import Jobs, Origin
 from mddag_executor.live.verdicts import Record
 from msg_graph import TaskSet
 
@@ -51,32 +50,21 @@ KEEP = 4096
 """The jobs of so many stamps are remembered."""
 
 
-def header_stamp(message: Any) -> int:
-    """Return the stamp of a message's header (or of a Header), system time in ns; -1 for none."""
-    stamp = getattr(getattr(message, 'header', message), 'stamp', None)
-    if stamp is None:
-        return -1
-    try:
-        return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or -1
-    except (AttributeError, TypeError, ValueError):
-        return -1  # something else is called so
-
-
 class Crossings:
     """
     The DAGs that may reach beyond this process, and the jobs of their stamps.
 
-    ``update`` and ``find`` are called under the dispatcher's lock; ``note`` from any thread.
+    ``update`` and ``find`` are called under the engine's lock; ``note`` from any thread.
     """
 
     def __init__(
-        self, task_set: TaskSet, tables: Tables, scheduler: Scheduler, attribution: Attribution,
+        self, task_set: TaskSet, tables: Tables, scheduler: Scheduler, jobs: Jobs,
     ) -> None:
         self._dags = [d for d in task_set.dags if d.release_from == 'header_stamp']
         self._crossing = {d.index for d in self._dags}
         self._tables = tables
         self._scheduler = scheduler
-        self._attribution = attribution
+        self._job_notes = jobs
         self._callbacks = [v.callback.key for d in task_set.dags for v in d.vertices]
         self._here: dict[int, list[int]] = {}
         self._jobs: dict[tuple[int, int], Origin] = {}
@@ -84,14 +72,14 @@ class Crossings:
 
     @staticmethod
     def of(
-        task_set: TaskSet | None, tables: Tables, scheduler: Scheduler, attribution: Attribution,
+        task_set: TaskSet | None, tables: Tables, scheduler: Scheduler, jobs: Jobs,
     ) -> Crossings | None:
         """Return the crossings of a declaration, None where no DAG has any."""
         if task_set is None or all(d.release_from != 'header_stamp' for d in task_set.dags):
             return None
-        return Crossings(task_set, tables, scheduler, attribution)
+        return Crossings(task_set, tables, scheduler, jobs)
 
-    def update(self, hosted: set[str], entries: Iterable[Entry]) -> list[tuple[int, list[int]]]:
+    def update(self, hosted: set[str], entities: Iterable[Entity]) -> list[tuple[int, list[int]]]:
         """
         Take in which callbacks are here now (rules 1 and 3).
 
@@ -109,30 +97,27 @@ class Crossings:
             if not all(here):
                 leaving.update(
                     t for v in dag.vertices if here[v.index] for t in v.callback.publishes)
-        self._attribution.tell(self._published, leaving)
-        for entry in entries:
-            entry.enters = self._entrance(entry, hosted)
+        self._job_notes.note_headers(self.note, leaving)
+        for entity in entities:
+            entity.enters = self._entrance(entity, hosted)
         return changes
 
     def host(
-        self, hosted: set[str], entries: Iterable[Entry], record: Record | None, now: int
+        self, hosted: set[str], entities: Iterable[Entity], record: Record | None, now: int
     ) -> None:
         """Take in which callbacks are here now, as ``update`` does, and record what changes."""
-        for dag, here in self.update(hosted, entries):
+        for dag, here in self.update(hosted, entities):
             if record is not None:
                 vertices = ','.join(str(i) for i, is_here in enumerate(here) if is_here)
                 record('hosted', now, threading.get_native_id(), dag, vertices)
 
-    def _entrance(self, entry: Entry, hosted: set[str]) -> list[int]:
+    def _entrance(self, entity: Entity, hosted: set[str]) -> list[int]:
         """Return the vertices elsewhere from which messages enter at an entity."""
-        remote = [v for v in entry.targets if self._callbacks[v] not in hosted]
-        if len({entry.targets[v][0] for v in remote}) > 1:
+        remote = [v for v in entity.targets if self._callbacks[v] not in hosted]
+        if len({entity.targets[v][0] for v in remote}) > 1:
             return []
         crossing = all(self._tables.dag_of[v] in self._crossing for v in remote)
         return remote if crossing else []
-
-    def _published(self, message: Any, origin: Origin) -> None:
-        self.note(header_stamp(message), origin)
 
     def elsewhere(self) -> set[str]:
         """Return the callbacks of these DAGs that are not here."""

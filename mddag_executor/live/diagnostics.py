@@ -38,7 +38,6 @@ from mddag_executor.text import counted
 from rclpy.logging import get_logger
 
 if TYPE_CHECKING:
-    from mddag_executor.live.dispatcher import Dispatcher
     from mddag_executor.live.pool import Pool
     from mddag_executor.live.recorder import Recorder
     from mddag_executor.live.registry import Registry
@@ -193,10 +192,10 @@ class PoolWatch:
     """Judges the state of the workers and of what everybody shares, period by period."""
 
     def __init__(
-        self, dispatcher: Dispatcher, pool: Pool, registry: Registry, recorder: Recorder | None,
+        self, pool: Pool, registry: Registry, recorder: Recorder | None,
         thresholds: Thresholds,
     ) -> None:
-        self._dispatcher = dispatcher
+        self._engine = pool.engine
         self._pool = pool
         self._registry = registry
         self._recorder = recorder
@@ -205,9 +204,9 @@ class PoolWatch:
         self._at = time.monotonic_ns(), time.process_time_ns()
 
     def _read(self) -> dict[str, int]:
-        attribution = self._dispatcher.attribution
+        jobs = self._engine.jobs
         return {
-            **self._registry.totals(), 'doubtful': attribution.doubtful,
+            **self._registry.totals(), 'doubtful': jobs.doubtful,
             'trace_lost': 0 if self._recorder is None else self._recorder.writer.dropped}
 
     def status(self, now: int) -> Status:
@@ -217,7 +216,7 @@ class PoolWatch:
         cpu = time.process_time_ns()
         passed, cpu_used = max(1, now - self._at[0]), cpu - self._at[1]
         self._last, self._at = counts, (now, cpu)
-        workers = self._dispatcher.n_workers
+        workers = self._engine.n_workers
         lost = [f'{step[key]} {what}' for key, what in (
             ('dropped', 'dropped'), ('skipped', 'timer releases skipped'),
             ('unattributed', 'messages without a job'), ('trace_lost', 'trace events lost'),
@@ -225,7 +224,7 @@ class PoolWatch:
         failed = self._recorder is not None and self._recorder.writer.error is not None
         if failed:
             lost.append('the trace cannot be written')
-        scheduler = self._dispatcher.scheduler
+        scheduler = self._engine.scheduler
         values = {
             'policy': scheduler.policy.name, 'workers': str(workers),
             'idle_workers': str(scheduler.idle_workers), 'lent': str(self._pool.lent),
@@ -250,14 +249,14 @@ class Diagnostics:
     """
 
     def __init__(
-        self, context: Context, task_set: TaskSet | None, dispatcher: Dispatcher, pool: Pool,
-        registry: Registry, recorder: Recorder | None, period_ns: int, thresholds: Thresholds,
+        self, context: Context, task_set: TaskSet | None, pool: Pool, registry: Registry,
+        recorder: Recorder | None, period_ns: int, thresholds: Thresholds,
     ) -> None:
         self._context = context
         self._registry = registry
         self._period_ns = period_ns
         self._hardware_id = f'{socket.gethostname()}/{os.getpid()}'
-        tally, tables = dispatcher.verdicts.tally, dispatcher.tables
+        tally, tables = pool.engine.verdicts.tally, pool.engine.tables
         self._dags = []
         for dag in task_set.dags if task_set is not None else ():
             sinks = tables.sinks[tables.first_sink[dag.index]:tables.first_sink[dag.index + 1]]
@@ -265,7 +264,7 @@ class Diagnostics:
                 {vertex.callback.key for vertex in dag.vertices},
                 DagWatch(tally, dag.index, dag.name, dag.period_ns,
                          [tally.sinks[v] for v in sinks], thresholds, period_ns)))
-        self._pool = PoolWatch(dispatcher, pool, registry, recorder, thresholds)
+        self._pool = PoolWatch(pool, registry, recorder, thresholds)
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
 

@@ -25,15 +25,15 @@ import threading
 import time
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.clocks import epoch_offset_ns
+from mddag_executor.clocks import TraceClock
 from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.live import hooks
-from mddag_executor.live.compat import RCL_ERRORS
+from mddag_executor.live.compat import BareExecutor, is_called_by_spin, RCL_ERRORS
 from mddag_executor.live.diagnostics import Diagnostics
-from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.endings import call_at_shutdown, halt_at_exit, is_over
-from mddag_executor.live.entries import AtOnce, Entry, TASK, Work
-from mddag_executor.live.intake.entities import EMPTY
+from mddag_executor.live.engine import Engine
+from mddag_executor.live.entity import Entity, TASK
+from mddag_executor.live.groups import Groups
 from mddag_executor.live.intake.events import EventsIntake
 from mddag_executor.live.intake.waitset import WaitSetIntake
 from mddag_executor.live.interpreter import short_switch_interval
@@ -54,16 +54,20 @@ from mddag_executor.live.settings import (
     whole,
 )
 from mddag_executor.live.statistics import statistics
-from mddag_executor.live.stepping import deadline_of, Stepping
+from mddag_executor.live.stepping import Stepper
 from mddag_executor.live.stop_watch import StopWatch
 from mddag_executor.live.tasks import make_task, Unclaimed
+from mddag_executor.live.upkeep import Upkeep
 from mddag_executor.live.verdicts import DeadlineMiss
+from mddag_executor.live.work import AtOnce, Work
 from msg_graph import TaskSet
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, TimeoutObject
 from rclpy.task import Future, Task
 
 if TYPE_CHECKING:
+    from rclpy.callback_groups import CallbackGroup
     from rclpy.context import Context
+    from rclpy.node import Node
 
 LOOK_AFTER_S = 0.1
 """How often ``spin`` looks whether the context is still there (signals only end the context)."""
@@ -76,7 +80,19 @@ EXPIRE_AFTER_NS = 1_000_000_000
 MAX_ACTIVE_JOBS = 64
 
 
-class MultiDeadlineExecutor(Stepping):
+def deadline_of(timeout_sec: float | None) -> float | None:
+    """
+    Return the monotonic time at which a time-out is over; None for never.
+
+    :param timeout_sec: seconds; None or negative: for ever.
+    :raises TypeError: when it is no number.
+    """
+    if timeout_sec is None or timeout_sec < 0:
+        return None
+    return time.monotonic() + timeout_sec
+
+
+class MultiDeadlineExecutor(BareExecutor):
     """
     Run callbacks in the order that their deadlines need, on a bounded pool of workers.
 
@@ -137,54 +153,120 @@ class MultiDeadlineExecutor(Stepping):
         thresholds = check_thresholds(thresholds)
         # All is checked by now: nothing below leaves a trace or a thread of what can't be made.
         hooks.install()
-        self._recorder = None
-        clock_offset = epoch_offset_ns()
-        if trace is not None:
-            self._recorder = Recorder(
-                trace, task_set, policy, num_workers, deadline_ns, max_active_jobs,
-                clock_offset)
+        self._trace_clock = TraceClock()
+        self._recorder = None if trace is None else Recorder(
+            trace, task_set, policy, num_workers, deadline_ns, max_active_jobs, self._trace_clock)
         self._errors: deque[BaseException] = deque()
         self._unclaimed = Unclaimed(self._fail)
         self._attention = threading.Event()
-        self._changed = True
-        self._refresh_at = 0.0
-        self._entities = None
         self._spinning = threading.Lock()
-        self._refreshing = threading.Lock()
         self._finished = False
         self._freeze_gc = freeze_gc
-        self._dispatcher = Dispatcher(
+        self._engine = Engine(
             task_set, num_workers, policy, default_deadline=deadline_ns,
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
-            clock_offset=clock_offset, fail=self._fail,
-            record=self._recorder.record if self._recorder else None, on_miss=on_deadline_miss)
-        self._stop_watch = StopWatch(self._attention, self._dispatcher.stopped)
-        self._pool = Pool(self._dispatcher, prepare)
+            record=self._recorder.record if self._recorder else None, on_miss=on_deadline_miss,
+            fail=self._fail)
+        self._pool = Pool(
+            self._engine, self._trace_clock, self._fail, self._context_ended, prepare)
         self._pool.pump = self._pump
+        self._pool.relieve_intake = self._relieve_intake
+        self._stop_watch = StopWatch(
+            self._attention, self._stopped, look=self._pool.relieve_late_intakes)
         self._registry = Registry(
-            task_set, self._dispatcher.tables, self._dispatcher.scheduler,
-            self._dispatcher.passed)
+            task_set, self._engine.tables, self._engine.scheduler, self._pool.leave_group)
         self._receiver = Receiver(
-            self._dispatcher, self._registry, task_set, self, self._fail, self._recorder,
-            self._pool)
+            self._pool, self._registry, self, self._fail, self._recorder)
         self._new_tasks: deque[Work] = deque()
-        self._task_entry = Entry(TASK, None, '', None, -1, 0, '')
+        self._task_entity = Entity(TASK, None, '', None, -1, 0, '')
         if self._recorder is not None:
-            self._recorder.entities((), [self._task_entry])
+            self._recorder.entities((), [self._task_entity])
         self._rates = RateWatch(self._registry)
-        self._intake = None
+        self._groups = Groups(self, self.wake, self._hand_over)
+        self._upkeep = Upkeep(
+            self._groups.served_nodes, self._registry, self._pool, self._recorder)
+        self._intake: EventsIntake | WaitSetIntake | None = None
+        self._stepper: Stepper | None = None
         super().__init__(context=context)
-        self._inline = None
         self._diagnostics: Diagnostics | None = None
         if every_ns is not None:
             self._diagnostics = Diagnostics(
-                self.context, task_set, self._dispatcher, self._pool, self._registry,
-                self._recorder, every_ns, thresholds)
+                self.context, task_set, self._pool, self._registry, self._recorder, every_ns,
+                thresholds)
         self._intake_kind = intake
         # What is ready still would run before the spin notices.
         call_at_shutdown(self.context, self._pool.start_no_more)
-        self._dispatcher.context_ended = lambda: is_over(self.context)
         halt_at_exit(self)
+
+    def _context_ended(self) -> bool:
+        return is_over(self.context)
+
+    # --- nodes and callback groups ---------------------------------------------------------------
+
+    def add_node(self, node: Node) -> bool:
+        """
+        Add a node whose callbacks this executor runs; False when it has it already.
+
+        :raises TypeError: when it is no node.
+        :raises RuntimeError: when the executor was shut down.
+        """
+        if not hasattr(node, 'executor'):
+            raise TypeError(f'{node!r} is no node: add an rclpy.node.Node')
+        if self.is_gone():
+            raise RuntimeError('The executor was shut down: add the node to a new one')
+        added: bool = super().add_node(node)
+        if added:
+            self.wake()
+        return added
+
+    def remove_node(self, node: Node) -> None:
+        """Stop running a node's callbacks."""
+        super().remove_node(node)
+        self.wake()
+
+    def add_callback_group(self, group: CallbackGroup, node: Node) -> None:
+        """
+        Run the callbacks of one group of a node, and of those that will be created in it.
+
+        The executor that the node was added to, if there is one, runs the others.
+
+        :raises RuntimeError: when the group has been added to an executor already, or rclpy's own
+            executor has the node, which would run the group too.
+        """
+        self._groups.add(group, node)
+
+    def remove_callback_group(self, group: CallbackGroup) -> None:
+        """
+        Stop running a group that was added by itself; who has its node runs it again.
+
+        :raises RuntimeError: when it was not added to this executor.
+        """
+        self._groups.remove(group)
+
+    def get_manually_added_callback_groups(self) -> list[CallbackGroup]:
+        """Return the groups that were added one by one."""
+        return self._groups.one_by_one()
+
+    def get_automatically_added_callback_groups_from_nodes(self) -> list[CallbackGroup]:
+        """Return the groups that came with their nodes."""
+        return self._groups.from_nodes()
+
+    def get_all_callback_groups(self) -> list[CallbackGroup]:
+        """Return all groups that this executor runs."""
+        return [*self._groups.one_by_one(), *self._groups.from_nodes()]
+
+    def wake(self) -> None:
+        """Take note of entities that were created or destroyed, or of a change of state."""
+        self._upkeep.changed = True
+        self._ring()
+
+    def _ring(self) -> None:
+        """End the wait of whoever spins."""
+        self._attention.set()
+        self.ring()
+
+    def _hand_over(self) -> None:
+        self._upkeep.hand_over()
 
     # --- tasks -----------------------------------------------------------------------------------
 
@@ -195,10 +277,9 @@ class MultiDeadlineExecutor(Stepping):
             task()
             return task
         task, work = make_task(
-            self._task_entry, self, self._dispatcher.resume, self._unclaimed, callback, args,
-            kwargs)
+            self._task_entity, self, self._pool.resume, self._unclaimed, callback, args, kwargs)
         if self._spinning.locked():
-            self._dispatcher.undeclared_ready(self._task_entry, work)
+            self._pool.tell(self._engine.ready, work)
         else:
             self._new_tasks.append(work)
         if not self._pool.running:
@@ -212,7 +293,7 @@ class MultiDeadlineExecutor(Stepping):
     def _submit_tasks(self) -> None:
         """Have the tasks run that were created while nobody spun: the newest first (rclpy)."""
         while self._new_tasks:
-            self._dispatcher.undeclared_ready(self._task_entry, self._new_tasks.pop())
+            self._pool.tell(self._engine.ready, self._new_tasks.pop())
 
     # --- spinning --------------------------------------------------------------------------------
 
@@ -266,13 +347,11 @@ class MultiDeadlineExecutor(Stepping):
                     return
                 self._check_context()
                 self._look_after()
-                left = LOOK_AFTER_S
-                if self._changed:  # where entities are made in a row, not anew for each of them
-                    left = min(left, max(0.0, self._refresh_at - time.monotonic()))
-                if left == 0.0:
-                    self._refresh()
-                    left = LOOK_AFTER_S
-                left = min(left, self._pool.resume_polled())
+                rest = self._upkeep.rest_s()
+                if rest == 0.0:
+                    self._upkeep.refresh()
+                    rest = None
+                left = min(LOOK_AFTER_S if rest is None else rest, self._pool.look_around())
                 if deadline is not None:
                     left = min(left, deadline - time.monotonic())
                     if left <= 0:
@@ -298,7 +377,7 @@ class MultiDeadlineExecutor(Stepping):
         With one thread that was published before the answer which completed the future; with
         several it may take a moment longer.  So wait until nothing has been to do for a while.
         """
-        if self._entities is None or not self._entities.waitables:
+        if self._upkeep.entities is None or not self._upkeep.entities.waitables:
             return
         quiet = 0
         for _ in range(SETTLE_TURNS):
@@ -311,7 +390,7 @@ class MultiDeadlineExecutor(Stepping):
         """Do what is to be done now and then while somebody spins."""
         self._submit_tasks()
         if self._rates.look() and self._registry.is_stale():
-            self._changed = True
+            self._upkeep.changed = True
         if self._diagnostics is not None:
             self._diagnostics.start()
 
@@ -323,18 +402,35 @@ class MultiDeadlineExecutor(Stepping):
         kind = self._intake_kind
         if kind == 'auto':
             kind = 'events' if EventsIntake.available() else 'waitset'
-        intake_type = EventsIntake if kind == 'events' else WaitSetIntake
-        self._intake = intake_type(
-            self.context, self._receiver, self.guards(), on_shutdown=self._attention.set)
-        self._changed = True
-        self._refresh()
-        self._intake.start()
+        intake: EventsIntake | WaitSetIntake
+        if kind == 'events':
+            intake = EventsIntake(
+                self.context, self._receiver, on_shutdown=self._attention.set,
+                serve_here=self._pool.serve_here)
+        else:
+            intake = WaitSetIntake(
+                self.context, self._receiver, self.guards(), on_shutdown=self._attention.set)
+        self._intake = intake
+        self._upkeep.add_intake(intake)
+        self._upkeep.refresh()
+        intake.start()
 
     def _stop_intake(self) -> None:
         intake, self._intake = self._intake, None
         if intake is not None:
             intake.stop()
-            intake.update(EMPTY)  # its threads refer to it: until it is collected, to no entity
+            self._upkeep.remove_intake(intake)
+
+    def _relieve_intake(self, relieved: bool) -> None:
+        intake = self._intake
+        if isinstance(intake, EventsIntake):
+            intake.relieve(relieved)
+
+    def _stopped(self, begin: int, end: int) -> None:
+        """Take note that no thread of the process ran from ``begin`` to ``end`` (monotonic)."""
+        with self._pool.lock:
+            self._engine.verdicts.stops.stopped(
+                begin + self._trace_clock.offset_ns, end + self._trace_clock.offset_ns)
 
     def _fail(self, error: BaseException) -> None:
         """Take an exception from a worker or the intake; it comes out of the spin."""
@@ -357,6 +453,55 @@ class MultiDeadlineExecutor(Stepping):
             self._pool.pause()
             self._stop_intake()
 
+    # --- one callback at a time ------------------------------------------------------------------
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """
+        Wait for one callback and run it in the calling thread.
+
+        Called by ``rclpy.spin``, which would otherwise run one callback at a time, it does what
+        ``spin`` does.
+
+        :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
+        """
+        if timeout_sec is None and is_called_by_spin():
+            self.spin()
+            return
+        self._spin_once(timeout_sec, lambda: False)
+
+    def spin_once_until_future_complete(
+        self, future: Future, timeout_sec: float | TimeoutObject | None = None
+    ) -> None:
+        """Wait for one callback, or until a future is done, and run it."""
+        seconds = timeout_sec.timeout if isinstance(timeout_sec, TimeoutObject) else timeout_sec
+        future.add_done_callback(AtOnce(self.wake))
+        self._spin_once(seconds, lambda: future.done() or future.cancelled())
+
+    def _spin_once(self, timeout_sec: float | None, done: Callable[[], bool]) -> None:
+        deadline = deadline_of(timeout_sec)
+        if not self._spinning.acquire(blocking=False):
+            raise RuntimeError('Executor is already spinning')
+        try:
+            while not self.is_ending():
+                self._check_context()
+                self._look_after()
+                self._raise_error()
+                if self._stepper is None:
+                    self._stepper = Stepper(
+                        self.context, self._receiver, self.guards(), self._upkeep, self._pool,
+                        self._submit_tasks)
+                ran = self._stepper.step(deadline, done)
+                self._raise_error()
+                if ran or done():
+                    return
+                if deadline is not None and time.monotonic() >= deadline:
+                    return
+        except RCL_ERRORS:
+            self._check_context()
+            raise
+        finally:
+            self._spinning.release()
+
     # --- the end ---------------------------------------------------------------------------------
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
@@ -371,9 +516,9 @@ class MultiDeadlineExecutor(Stepping):
         self.begin_end()
         self.wake()
         self._pool.pause()
-        if self._inline is not None and self._spinning.acquire(blocking=False):
-            self._inline.stop()
-            self._inline = None
+        if self._stepper is not None and self._spinning.acquire(blocking=False):
+            self._stepper.stop()
+            self._stepper = None
             self._spinning.release()
         if not self._pool.close(timeout_sec):
             return False
@@ -388,15 +533,32 @@ class MultiDeadlineExecutor(Stepping):
         self._finished = True
         if self._diagnostics is not None:
             self._diagnostics.stop()
-        self._release_groups()
-        end = self._dispatcher.finish()
+        self._groups.release()
+        with self._pool.lock:
+            end = self._pool.tick()
+            self._engine.finish(end)
+        self._engine.verdicts.report_misses()
         if self._recorder is not None:
             self._recorder.close(end)
 
+    def halt(self) -> None:
+        """Start nothing more, since the interpreter ends; see ``wait_halted``."""
+        self.begin_end()
+        self._pool.pause()
+        self.wake()
+
+    def wait_halted(self, seconds: float) -> None:
+        """Wait until what runs has ended and nobody spins, at most for a time."""
+        end = time.monotonic() + seconds
+        self._pool.close(seconds)
+        # Not by taking the lock: a thread that steps once more meanwhile would get an exception.
+        while self._spinning.locked() and time.monotonic() < end:
+            time.sleep(0.001)
+
     def set_judging(self, judging: bool) -> None:
         """Give verdicts about jobs that are released from now on, or about none until told so."""
-        self._dispatcher.set_judging(judging)
+        self._pool.tell(self._engine.set_judging, judging)
 
     def statistics(self) -> dict[str, Any]:
         """Return a snapshot of what has happened so far (see the module ``statistics``)."""
-        return statistics(self._dispatcher, self._pool, self._registry, self._recorder)
+        return statistics(self._pool, self._registry, self._recorder)

@@ -8,7 +8,7 @@ Theory of operation
 Of rclpy's two kinds of callback groups the core knows what they allow.  Any other is asked, as
 rclpy's executors do: ``can_execute`` and ``beginning_execution`` before a callback, and
 ``ending_execution`` after it.  That is code of the user's, which may wait for a lock.  So the
-worker that is to run the callback asks, without the dispatcher's lock.
+worker that is to run the callback asks, without the engine's lock.
 
 Each entity of such a group is a group of one in the core (rule 4), which it leaves as soon as it
 may run: so its messages are asked about one at a time, in their order.  What is refused waits,
@@ -23,7 +23,7 @@ from typing import Any, TYPE_CHECKING
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 
 if TYPE_CHECKING:
-    from mddag_executor.live.entries import Work
+    from mddag_executor.live.work import Work
 
 _METHODS = ('can_execute', 'beginning_execution', 'ending_execution')
 

@@ -26,30 +26,29 @@ running the group.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 import threading
-import time
 from typing import Any, TYPE_CHECKING
 import weakref
 
-from mddag_executor.live.compat import BareExecutor, tell_of_changes
+from mddag_executor.live.compat import tell_of_changes
+from rclpy.executors import Executor
 from rclpy.node import Node
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
-HAND_OVER_S = 2.0
-"""For so long an executor is given to let go of a group; it takes a few milliseconds."""
-
 _lock = threading.Lock()
-_owners: weakref.WeakKeyDictionary[CallbackGroup, weakref.ref[GroupOwner]] = \
+_owners: weakref.WeakKeyDictionary[CallbackGroup, weakref.ref[Groups]] = \
     weakref.WeakKeyDictionary()
-_sharers: weakref.WeakKeyDictionary[Node, weakref.WeakSet[GroupOwner]] = \
+_sharers: weakref.WeakKeyDictionary[Node, weakref.WeakSet[Groups]] = weakref.WeakKeyDictionary()
+_by_executor: weakref.WeakKeyDictionary[Executor, weakref.ref[Groups]] = \
     weakref.WeakKeyDictionary()
 _hooked = False
 
 
-def owner_of(group: CallbackGroup | None) -> GroupOwner | None:
-    """Return the executor that a group was added to by itself, None where there is none."""
+def owner_of(group: CallbackGroup | None) -> Groups | None:
+    """Return who has a group that was added to an executor by itself; None: nobody."""
     found = _owners.get(group) if group is not None and _owners else None
     return found() if found is not None else None
 
@@ -89,21 +88,27 @@ class NodeShare:
         return [e for e in list(value) if self._has(getattr(e, 'callback_group', None))]
 
 
-class GroupOwner(BareExecutor):
-    """The part of the executor that has callback groups."""
+class Groups:
+    """
+    The callback groups of an executor, and its nodes as far as it runs them.
 
-    _intake: Any
+    :param executor: whose they are.
+    :param wake: has the executor look at its entities anew.
+    :param hand_over: has it take nothing more of what is not its own now, and then forget that.
+    """
 
-    def __init__(self, **kwargs: Any) -> None:
+    def __init__(
+        self, executor: Executor, wake: Callable[[], None], hand_over: Callable[[], None],
+    ) -> None:
         # groups that were added one by one, with their nodes
         self._groups: dict[CallbackGroup, Node] = {}
         self._shares: dict[Node, NodeShare] = {}
-        super().__init__(**kwargs)
+        self._executor = weakref.ref(executor)
+        self._wake = wake
+        self._hand_over = hand_over
+        _by_executor[executor] = weakref.ref(self)
 
-    def _let_go(self, settled: Callable[[], bool]) -> None:
-        raise NotImplementedError
-
-    def add_callback_group(self, group: CallbackGroup, node: Node) -> None:
+    def add(self, group: CallbackGroup, node: Node) -> None:
         """
         Run the callbacks of one group of a node, and of those that will be created in it.
 
@@ -114,7 +119,9 @@ class GroupOwner(BareExecutor):
         """
         _hook_nodes()
         holder = node.executor
-        if holder is not None and not isinstance(holder, GroupOwner):
+        known = _by_executor.get(holder) if holder is not None else None
+        holding = known() if known is not None else None
+        if holder is not None and holding is None:
             raise RuntimeError(
                 f'node {node.get_fully_qualified_name()} is on a {type(holder).__name__}, which '
                 'would run the callback group too: remove it there, or use a '
@@ -125,11 +132,11 @@ class GroupOwner(BareExecutor):
             _owners[group] = weakref.ref(self)
             self._groups[group] = node
             _sharers.setdefault(node, weakref.WeakSet()).add(self)
-        if holder is not None and holder is not self:
-            holder._hand_over()
-        self.wake()
+        if holding is not None and holding is not self:
+            holding._hand_over()
+        self._wake()
 
-    def remove_callback_group(self, group: CallbackGroup) -> None:
+    def remove(self, group: CallbackGroup) -> None:
         """
         Stop running a group that was added by itself; who has its node runs it again.
 
@@ -145,24 +152,23 @@ class GroupOwner(BareExecutor):
         if holder is not None:
             holder.wake()
 
-    def get_manually_added_callback_groups(self) -> list[CallbackGroup]:
+    def one_by_one(self) -> list[CallbackGroup]:
         """Return the groups that were added one by one."""
         with _lock:
             return list(self._groups)
 
-    def get_automatically_added_callback_groups_from_nodes(self) -> list[CallbackGroup]:
+    def from_nodes(self) -> list[CallbackGroup]:
         """Return the groups that came with their nodes."""
-        return [group for node in self.get_nodes() for group in groups_of(node)
+        return [group for node in self._nodes() for group in groups_of(node)
                 if owner_of(group) is None]
 
-    def get_all_callback_groups(self) -> list[CallbackGroup]:
-        """Return all groups that this executor runs."""
-        return [*self.get_manually_added_callback_groups(),
-                *self.get_automatically_added_callback_groups_from_nodes()]
+    def _nodes(self) -> list[Any]:
+        executor = self._executor()
+        return [] if executor is None else executor.get_nodes()
 
-    def _served_nodes(self) -> list[Any]:
+    def served_nodes(self) -> list[Any]:
         """Return the nodes with what this executor is to run of them."""
-        nodes: list[Any] = self.get_nodes()
+        nodes = self._nodes()
         if not _owners:
             return nodes
         with _lock:
@@ -170,46 +176,25 @@ class GroupOwner(BareExecutor):
             shared = {node for node, sharers in _sharers.items() if len(sharers)}
         nodes.extend(own.difference(nodes))
         self._shares = {
-            node: self._shares.get(node) or NodeShare(node, _Has(self, node))
+            node: self._shares.get(node) or NodeShare(node, partial(self._has, node))
             for node in nodes if node in shared}
         return [self._shares.get(node, node) for node in nodes]
 
-    def _hand_over(self) -> None:
-        """Let go of what is no longer this executor's, and return when that is done."""
-        self._let_go(self._wait_until_settled)
-
-    def _wait_until_settled(self) -> bool:
-        end = time.monotonic() + HAND_OVER_S
-        while True:
-            intake = self._intake
-            if intake is None or intake.settled():
-                return True
-            if time.monotonic() > end:
-                return False
-            time.sleep(0.001)
-
-    def _release_groups(self) -> None:
-        """Give all groups up, at the end."""
-        for group in self.get_manually_added_callback_groups():
-            try:
-                self.remove_callback_group(group)
-            except RuntimeError:
-                pass  # somebody else has removed it meanwhile
-
-
-class _Has:
-    """Tells whether an executor runs a group of a node."""
-
-    def __init__(self, executor: GroupOwner, node: Node) -> None:
-        self._executor = weakref.ref(executor)
-        self._node = node
-
-    def __call__(self, group: CallbackGroup | None) -> bool:
-        executor = self._executor()
+    def _has(self, node: Node, group: CallbackGroup | None) -> bool:
+        """Return whether the executor runs a group of a node."""
         owner = owner_of(group)
         if owner is None:
-            return executor is not None and self._node.executor is executor
-        return owner is executor
+            executor = self._executor()
+            return executor is not None and node.executor is executor
+        return owner is self
+
+    def release(self) -> None:
+        """Give all groups up, at the end."""
+        for group in self.one_by_one():
+            try:
+                self.remove(group)
+            except RuntimeError:
+                pass  # somebody else has removed it meanwhile
 
 
 def _hook_nodes() -> None:
@@ -223,5 +208,5 @@ def _hook_nodes() -> None:
 
 
 def _wake_sharers(node: Node) -> None:
-    for executor in list(_sharers.get(node, ())):
-        executor.wake()
+    for groups in list(_sharers.get(node, ())):
+        groups._wake()

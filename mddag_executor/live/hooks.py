@@ -13,36 +13,12 @@ from __future__ import annotations
 
 import threading
 from time import time_ns
-from typing import Any, Protocol
+from typing import Any
 
-from mddag_executor.live.attribution import PublisherState
+from mddag_executor.live.jobs import PublisherState
+from mddag_executor.live.seat import current
 from rclpy.client import Client
 from rclpy.publisher import Publisher
-
-
-class Running(Protocol):
-    """What runs in a thread, as far as the hooks need it."""
-
-    def publish(self, send: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
-        """Send a message on behalf of the running callback."""
-
-    def ends_soon(self, dispatcher: Any) -> bool:
-        """
-        Return whether this callback has ended soon after it published, the last times.
-
-        And is of this dispatcher.
-        """
-
-    def waits(self) -> Any:
-        """Return a context manager that lends the worker's place while it is entered."""
-
-
-class _Thread(threading.local):
-    running: Running | None = None
-
-
-current = _Thread()
-"""``current.running``: the execution whose callback runs in the calling thread, or None."""
 
 _STATE = '_mddag_publisher_state'
 _installed = threading.Lock()
@@ -77,14 +53,14 @@ def install() -> None:
                 send(self, msg)
             else:
                 running.publish(send, self, msg, state)
-        for takes in state.takes:  # looked up after it is sent: see ``direct``
-            takes.take(begin)
+        for deliver in state.deliver:  # looked up after it is sent: see ``inline``
+            deliver(begin)
 
     def call_and_wait(self: Any, request: Any, *args: Any, **kwargs: Any) -> Any:
         running = current.running
         if running is None:
             return call(self, request, *args, **kwargs)
-        with running.waits():
+        with running.lend():
             return call(self, request, *args, **kwargs)
 
     publish.__doc__ = send.__doc__

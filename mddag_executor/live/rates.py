@@ -21,7 +21,7 @@ import time
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from mddag_executor.live.entries import Entry
+from mddag_executor.live.entity import Entity
 from mddag_executor.live.registry import Registry
 from rclpy.exceptions import InvalidHandle
 from rclpy.logging import get_logger
@@ -43,10 +43,10 @@ class _Known:
         self.next = 0.0
         self.pause = AGAIN_S
 
-    def begin(self, entry: Entry, now: float) -> None:
+    def begin(self, entity: Entity, now: float) -> None:
         """Look from here on."""
         self.skipped, self.ran, self.busy_ns, self.at = (
-            entry.skipped, entry.ran, entry.busy_ns, now)
+            entity.skipped, entity.ran, entity.busy_ns, now)
 
 
 class RateWatch:
@@ -64,7 +64,7 @@ class RateWatch:
         self._warn = warn
         self._clock = clock
         self._next = self._looked = clock()
-        self._known = WeakKeyDictionary[Entry, _Known]()
+        self._known = WeakKeyDictionary[Entity, _Known]()
 
     def look(self) -> bool:
         """Look at all timers, unless that was done just now; return whether it was not."""
@@ -74,32 +74,32 @@ class RateWatch:
         since, self._looked, self._next = self._looked, now, now + LOOK_S
         before = self._known
         self._known = WeakKeyDictionary({
-            entry: before.get(entry) or _Known(since) for entry in self._registry.timers()
-            if entry.gate is None})  # else its callback group may want it slower
-        for entry, known in self._known.items():
+            entity: before.get(entity) or _Known(since) for entity in self._registry.timers()
+            if entity.gate is None})  # else its callback group may want it slower
+        for entity, known in self._known.items():
             if now < known.next:
                 continue
-            skipped, ran = entry.skipped - known.skipped, entry.ran - known.ran
+            skipped, ran = entity.skipped - known.skipped, entity.ran - known.ran
             if skipped >= max(FEWEST, LEAST * (skipped + ran)):
-                self._tell(entry, known, now)
+                self._tell(entity, known, now)
             elif now - known.at >= AGAIN_S and skipped + ran >= 2 * FEWEST:
-                known.begin(entry, now)
+                known.begin(entity, now)
         return True
 
-    def _tell(self, entry: Entry, known: _Known, now: float) -> None:
-        skipped = entry.skipped - known.skipped
-        ran, busy = entry.ran - known.ran, entry.busy_ns - known.busy_ns
+    def _tell(self, entity: Entity, known: _Known, now: float) -> None:
+        skipped = entity.skipped - known.skipped
+        ran, busy = entity.ran - known.ran, entity.busy_ns - known.busy_ns
         try:
-            period = entry.entity.timer_period_ns
+            period = entity.rclpy.timer_period_ns
         except InvalidHandle:
             return  # destroyed meanwhile
         text = (
-            f'the timer of {entry.node} with a period of {period / 1e6:g} ms cannot keep its '
+            f'the timer of {entity.node} with a period of {period / 1e6:g} ms cannot keep its '
             f'rate: {skipped} of {skipped + ran} periods were skipped within '
             f'{max(0.0, now - known.at):.1f} s')
         if ran > 0:
             text += f', its callback takes {busy / ran / 1e6:.3g} ms'
         (self._warn or get_logger('mddag_executor').warning)(text)
-        known.begin(entry, now)
+        known.begin(entity, now)
         known.next = now + known.pause
         known.pause = min(2 * known.pause, RARELY_S)

@@ -6,11 +6,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 import threading
-import time
 from typing import Any
 import weakref
 
-from mddag_executor.live.entries import Entry, SERVICE, SUBSCRIPTION, TIMER
+from mddag_executor.clocks import TraceClock
+from mddag_executor.live.entity import Entity, SERVICE, SUBSCRIPTION, TIMER
 from mddag_executor.trace.errors import TraceError
 from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
@@ -22,34 +22,34 @@ class Recorder:
     """
     The trace of one executor.
 
-    Addresses are those of Python objects: the node, the entity, and, for callbacks, the entry.
+    Addresses are those of Python objects: the node, the entity, and, for callbacks, what is kept
+    for the entity (``Entity``).
 
     :raises mddag_executor.trace.TraceError: when the file cannot be written.
     """
 
     def __init__(
         self, path: str, task_set: TaskSet | None, policy: str, workers: int,
-        default_deadline: int, max_active_jobs: int, clock_offset: int,
+        default_deadline: int, max_active_jobs: int, clock: TraceClock,
     ) -> None:
         from mddag_executor.trace.writer import TraceWriter  # late: it loads the compression
-        self.writer = TraceWriter(path, clock_offset=clock_offset)
+        self.writer = TraceWriter(path, clock_offset=clock.offset_ns)
         self.record = self.writer.record
         self.path = path
-        self._clock_offset = clock_offset
+        self._clock = clock
         # by themselves: another one may have the address of one that is gone
         self._known: weakref.WeakSet[Any] = weakref.WeakSet()
         self._say(
             'task_set', task_set.text if task_set else '', task_set.file if task_set else '',
             policy, workers, default_deadline, max_active_jobs, False)
-        self._say('caret_init', clock_offset, 'jazzy')
+        self._say('caret_init', clock.offset_ns, 'jazzy')
         self._say('rmw_implementation', get_rmw_implementation_identifier())
         self._say('construct_executor', id(self), 'multi_deadline_executor')
 
     def _say(self, event: str, *fields: Any) -> None:
-        now = time.monotonic_ns() + self._clock_offset
-        self.record(event, now, threading.get_native_id(), *fields)
+        self.record(event, self._clock.now(), threading.get_native_id(), *fields)
 
-    def entities(self, nodes: Iterable[Any], added: list[Entry]) -> None:
+    def entities(self, nodes: Iterable[Any], added: list[Entity]) -> None:
         """Record new nodes, publishers and entities, with the tracepoints CARET expects."""
         by_name: dict[str, int] = {}
         for node in nodes:
@@ -58,9 +58,9 @@ class Recorder:
                 self._node(node)
             except InvalidHandle:
                 continue  # destroyed meanwhile
-        for entry in added:
+        for entity in added:
             try:
-                self._entity(entry, by_name.get(entry.node, 0))
+                self._entity(entity, by_name.get(entity.node, 0))
             except InvalidHandle:
                 continue
 
@@ -76,35 +76,35 @@ class Recorder:
                     'rcl_publisher_init', id(publisher), address, id(publisher),
                     publisher.topic_name, publisher.qos_profile.depth)
 
-    def _entity(self, entry: Entry, node: int) -> None:
-        entity = id(entry.entity)
-        if entry.kind == TIMER:
-            self._say('rcl_timer_init', entity, entry.entity.timer_period_ns)
-            self._say('rclcpp_timer_callback_added', entity, entry.address)
-            self._say('rclcpp_timer_link_node', entity, node)
-        elif entry.kind == SUBSCRIPTION:
-            self._say('rcl_subscription_init', entity, node, entity, entry.label, entry.depth)
-            self._say('rclcpp_subscription_init', entity, entity)
-            self._say('rclcpp_subscription_callback_added', entity, entry.address)
-        elif entry.kind == SERVICE:
-            self._say('rcl_service_init', entity, node, entity, entry.label)
-            self._say('rclcpp_service_callback_added', entity, entry.address)
+    def _entity(self, entity: Entity, node: int) -> None:
+        handle = id(entity.rclpy)
+        if entity.kind == TIMER:
+            self._say('rcl_timer_init', handle, entity.rclpy.timer_period_ns)
+            self._say('rclcpp_timer_callback_added', handle, entity.address)
+            self._say('rclcpp_timer_link_node', handle, node)
+        elif entity.kind == SUBSCRIPTION:
+            self._say('rcl_subscription_init', handle, node, handle, entity.label, entity.depth)
+            self._say('rclcpp_subscription_init', handle, handle)
+            self._say('rclcpp_subscription_callback_added', handle, entity.address)
+        elif entity.kind == SERVICE:
+            self._say('rcl_service_init', handle, node, handle, entity.label)
+            self._say('rclcpp_service_callback_added', handle, entity.address)
         else:
-            self._say('rclcpp_callback_register', entry.address, entry.name)
+            self._say('rclcpp_callback_register', entity.address, entity.name)
             return
-        self._say('rclcpp_callback_register', entry.address, entry.symbol)
-        group = getattr(entry.entity, 'callback_group', None)
+        self._say('rclcpp_callback_register', entity.address, entity.symbol)
+        group = getattr(entity.rclpy, 'callback_group', None)
         if group is not None and group not in self._known:
             self._known.add(group)
-            exclusive = entry.group >= 0 and entry.gate is None
+            exclusive = entity.group >= 0 and entity.gate is None
             kind = 'mutually_exclusive' if exclusive else 'reentrant'
             self._say('add_callback_group', id(self), id(group), kind)
         if group is not None:
-            self._say(f'callback_group_add_{entry.kind}', id(group), entity)
+            self._say(f'callback_group_add_{entity.kind}', id(group), handle)
 
-    def taken(self, entry: Entry, message: Any, source_timestamp: int) -> None:
+    def taken(self, entity: Entity, message: Any, source_timestamp: int) -> None:
         """Record that a message was taken."""
-        self._say('rmw_take', id(entry.entity), id(message), source_timestamp, True)
+        self._say('rmw_take', id(entity.rclpy), id(message), source_timestamp, True)
 
     def close(self, end: int) -> None:
         """

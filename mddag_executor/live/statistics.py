@@ -7,14 +7,13 @@ from __future__ import annotations
 from typing import Any
 
 from mddag_executor.core.tally import counts, never_due
-from mddag_executor.live.dispatcher import Dispatcher
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 
 
 def statistics(
-    dispatcher: Dispatcher, pool: Pool, registry: Registry, recorder: Recorder | None
+    pool: Pool, registry: Registry, recorder: Recorder | None
 ) -> dict[str, Any]:
     """
     Return the counts of a run.
@@ -27,13 +26,14 @@ def statistics(
     long no thread of the process ran while it spun, how many misses fell into these stops, and
     the times of the last ones (ns since the epoch).
     """
-    with dispatcher.lock:
-        result = dispatcher.verdicts.tally.result()
-        stops = dispatcher.verdicts.stops.result()
-        waiting = dispatcher.scheduler.queue_length
-        idle = dispatcher.scheduler.idle_workers
-        undeclared = dispatcher.undeclared
-        elsewhere = set() if dispatcher.crossings is None else dispatcher.crossings.elsewhere()
+    engine = pool.engine
+    with pool.lock:
+        result = engine.verdicts.tally.result()
+        stops = engine.verdicts.stops.result()
+        waiting = engine.scheduler.queue_length
+        idle = engine.scheduler.idle_workers
+        undeclared = engine.undeclared
+        elsewhere = set() if engine.crossings is None else engine.crossings.elsewhere()
     callbacks = registry.counts()
     never_ran = [c.key for c in registry.declared
                  if c.key not in elsewhere
@@ -43,13 +43,13 @@ def statistics(
                         if name.partition('@')[0] not in elsewhere or counts(sink).due}
     result['never_due'] = never_due(result['dags'])
     return {
-        'policy': dispatcher.scheduler.policy.name, 'workers': dispatcher.n_workers,
+        'policy': engine.scheduler.policy.name, 'workers': engine.n_workers,
         **result, 'stops': stops, 'callbacks': callbacks, 'undeclared': undeclared,
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
         'queue': waiting, 'idle_workers': idle, 'lent': pool.lent,
         'unattributed': {
-            'unknown': dispatcher.attribution.unknown,
-            'doubtful': dispatcher.attribution.doubtful},
+            'unknown': engine.jobs.unknown,
+            'doubtful': engine.jobs.doubtful},
         'never_ran': never_ran,
         'trace': None if recorder is None else {
             'path': recorder.path, 'lost': recorder.writer.dropped,

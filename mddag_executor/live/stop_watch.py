@@ -34,18 +34,21 @@ class StopWatch:
     """
     Waits for an event, and tells of the stops meanwhile.
 
-    :param stopped: told begin and end of each stop, as ``clock`` has them.
+    :param stopped: gets begin and end of each stop, as ``clock`` has them.
     :param clock: ns.
     :param cpu: CPU time of the process, ns.
+    :param look: called after each slice.
     """
 
     def __init__(
         self, event: threading.Event, stopped: Callable[[int, int], None],
         clock: Callable[[], int] = time.monotonic_ns,
         cpu: Callable[[], int] = time.process_time_ns,
+        look: Callable[[], None] = lambda: None,
     ) -> None:
         self._event = event
         self._stopped = stopped
+        self._look = look
         self._clock = clock
         self._cpu = cpu
 
@@ -60,3 +63,4 @@ class StopWatch:
             now, before, used = self._clock(), used, self._cpu()
             if now - due >= LEAST_NS and (used - before) * CPU_SHARE < now - due:
                 self._stopped(due, now)
+            self._look()

@@ -23,8 +23,9 @@ from typing import Any
 import weakref
 
 from mddag_executor.live.compat import BareTask, forget_task_frames
-from mddag_executor.live.entries import AtOnce, Entry, TaskWork, Work
-from mddag_executor.live.hooks import current
+from mddag_executor.live.entity import Entity
+from mddag_executor.live.seat import current
+from mddag_executor.live.work import AtOnce, TaskWork, Work
 from rclpy.task import Future
 
 
@@ -38,7 +39,7 @@ class ObservedTask(BareTask):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.observed = False
-        running: Any = current.running
+        running = current.running
         self.maker: Work | None = None if running is None else running.work
         self.put_by: Callable[[BaseException], None] | None = None
         super().__init__(*args, **kwargs)
@@ -110,7 +111,7 @@ class Unclaimed:
 
 
 def make_task(
-    entry: Entry, executor: Any, resume: Callable[[TaskWork], None], unclaimed: Unclaimed,
+    entity: Entity, executor: Any, resume: Callable[[TaskWork], None], unclaimed: Unclaimed,
     callback: Any, args: tuple[Any, ...], kwargs: dict[str, Any],
 ) -> tuple[ObservedTask, TaskWork]:
     """
@@ -125,7 +126,7 @@ def make_task(
     if inspect.iscoroutine(callback):
         coroutine = callback
     task = ObservedTask(callback, args, kwargs, executor=executor)
-    work = TaskWork(entry, task, ())
+    work = TaskWork(entity, task, ())
     work.coroutine = coroutine
     work.then = unclaimed.ended
     if coroutine is not None:

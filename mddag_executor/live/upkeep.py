@@ -3,9 +3,9 @@
 """
 Keeping up with nodes: whose entities there are now, and who has to know.
 
-Nodes say that something has changed (``wake``), not what.  So registry, intake and trace are
-brought up to date with all nodes at once, by whoever spins, and where entities are made in a row
-not anew for each of them.
+Nodes say that something has changed (``Executor.wake``), not what.  So registry, intakes and trace
+are brought up to date with all nodes at once, by whoever spins, and where entities are made in a
+row not anew for each of them.
 """
 
 from __future__ import annotations
@@ -13,106 +13,109 @@ from __future__ import annotations
 from collections.abc import Callable
 import threading
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any, Protocol
 
-from mddag_executor.live.dispatcher import Dispatcher
-from mddag_executor.live.groups import GroupOwner
-from mddag_executor.live.intake.entities import EntitySet, snapshot
-from mddag_executor.live.intake.waitset import WaitSetIntake
+from mddag_executor.live.intake.entities import EMPTY, EntitySet, snapshot
+from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 
-if TYPE_CHECKING:
-    from rclpy.node import Node
-
 REFRESH_REST = 3
 """After looking at all entities, rest for so many times what it took."""
+HAND_OVER_S = 2.0
+"""For so long an intake is given to take no more of something; it takes a few milliseconds."""
 
 
-class Upkeep(GroupOwner):
-    """The part of the executor that keeps up with its nodes."""
+class Intake(Protocol):
+    """What is kept up to date of an intake."""
 
-    _attention: threading.Event
-    _changed: bool
-    _dispatcher: Dispatcher
-    _entities: EntitySet | None
-    _inline: WaitSetIntake | None
-    _recorder: Recorder | None
-    _refresh_at: float
-    _refreshing: threading.Lock
-    _registry: Registry
+    def update(self, entities: EntitySet) -> None:
+        """Set what to look after."""
 
-    def add_node(self, node: Node) -> bool:
-        """
-        Add a node whose callbacks this executor runs; False when it has it already.
+    def settled(self) -> bool:
+        """Return whether what was set has come into force."""
 
-        :raises TypeError: when it is no node.
-        :raises RuntimeError: when the executor was shut down.
-        """
-        if not hasattr(node, 'executor'):
-            raise TypeError(f'{node!r} is no node: add an rclpy.node.Node')
-        if self.is_gone():
-            raise RuntimeError('The executor was shut down: add the node to a new one')
-        added: bool = super().add_node(node)
-        if added:
-            self.wake()
-        return added
 
-    def remove_node(self, node: Node) -> None:
-        """Stop running a node's callbacks."""
-        super().remove_node(node)
-        self.wake()
+class Upkeep:
+    """
+    Keeps registry, intakes and trace up to date.
 
-    def wake(self) -> None:
-        """Take note of entities that were created or destroyed, or of a change of state."""
-        self._changed = True
-        self._ring()
+    :param nodes: returns the nodes with what the executor is to run of them.
+    :ivar changed: whether there may be something new.
+    :ivar entities: what there was when it was looked at last.
+    """
 
-    def _ring(self) -> None:
-        """End the wait of whoever spins."""
-        self._attention.set()
-        self.ring()
+    def __init__(
+        self, nodes: Callable[[], list[Any]], registry: Registry, pool: Pool,
+        recorder: Recorder | None,
+    ) -> None:
+        self.changed = True
+        self.entities: EntitySet | None = None
+        self._nodes = nodes
+        self._registry = registry
+        self._pool = pool
+        self._recorder = recorder
+        self._intakes: list[Intake] = []
+        self._lock = threading.Lock()
+        self._refresh_at = 0.0
 
-    def _refresh(self) -> None:
-        """Bring registry, intake and trace up to date with the nodes' entities."""
-        with self._refreshing:
-            if not self._changed:
+    def add_intake(self, intake: Intake) -> None:
+        """Keep an intake up to date, too; it learns what there is with the next ``refresh``."""
+        self._intakes.append(intake)
+        self.changed = True
+
+    def remove_intake(self, intake: Intake) -> None:
+        """Leave an intake, which has been stopped, with nothing: its threads refer to it."""
+        self._intakes.remove(intake)
+        intake.update(EMPTY)
+
+    def rest_s(self) -> float | None:
+        """Return after how many seconds to ``refresh``; None: nothing has changed."""
+        return max(0.0, self._refresh_at - time.monotonic()) if self.changed else None
+
+    def refresh(self) -> None:
+        """Bring all up to date if anything may have changed."""
+        with self._lock:
+            if not self.changed:
                 return
             start = time.monotonic()
-            self._changed = False
-            nodes = self._served_nodes()
+            self.changed = False
+            nodes = self._nodes()
             self._register(nodes)
             self._inform_intakes(nodes)
             end = time.monotonic()
             self._refresh_at = end + REFRESH_REST * (end - start)
 
+    def hand_over(self) -> None:
+        """Take nothing more of what another executor gets, and only then forget it."""
+        with self._lock:
+            nodes = self._nodes()
+            self._register(nodes, keep=True)
+            self._inform_intakes(nodes)
+            end = time.monotonic() + HAND_OVER_S
+            while not all(each.settled() for each in list(self._intakes)):
+                if time.monotonic() > end:
+                    break
+                time.sleep(0.001)
+            self._register(nodes)
+
     def _register(self, nodes: list[Any], keep: bool = False) -> None:
         added, gone = self._registry.refresh(nodes, keep)
-        crossings = self._dispatcher.crossings
-        if crossings is not None and (added or gone):
-            with self._dispatcher.lock:
-                crossings.host(
-                    self._registry.hosted(), self._registry.subscriptions(),
-                    self._dispatcher.record, self._dispatcher.tick())
-        since = self._dispatcher.now()
-        for entry in added:
-            entry.since = since
-        for entry in gone:
-            self._dispatcher.remove(entry)
+        engine, pool = self._pool.engine, self._pool
+        if engine.crossings is not None and (added or gone):
+            with pool.lock:
+                engine.crossings.host(
+                    self._registry.hosted(), self._registry.subscriptions(), engine.record,
+                    pool.tick())
+        since = pool.clock.now()
+        for entity in added:
+            entity.since = since
+        for entity in gone:
+            pool.tell(engine.remove, entity)
         if self._recorder is not None:
             self._recorder.entities(nodes, added)
 
     def _inform_intakes(self, nodes: list[Any]) -> None:
-        self._entities = snapshot(nodes, self._entities)
-        for intake in (self._intake, self._inline):
-            if intake is not None:
-                intake.update(self._entities)
-
-    def _let_go(self, settled: Callable[[], bool]) -> None:
-        """Take nothing more of what another executor gets, and only then forget it."""
-        with self._refreshing:
-            nodes = self._served_nodes()
-            self._register(nodes, keep=True)
-            self._inform_intakes(nodes)
-            settled()
-            self._register(nodes)
+        self.entities = snapshot(nodes, self.entities)
+        for intake in self._intakes:
+            intake.update(self.entities)

@@ -25,13 +25,12 @@ from mddag_executor.core.state import (
     SINK_MISSED,
 )
 from mddag_executor.core.stops import Stops
-from mddag_executor.live.attribution import Origin
-from mddag_executor.live.entries import Entry
+from mddag_executor.live.entity import Entity
+from mddag_executor.live.jobs import Origin
 from msg_graph import TaskSet
 
 KEEP_RESPONSES = 2_000
 KEEP_ABORTED = 4096
-NO_ORIGIN = Origin(-1, -1, -1, -1)
 
 _WHY = {SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
         SINK_ABORTED: 'aborted', SINK_FAILED: 'failed'}
@@ -66,12 +65,11 @@ class Verdicts:
     """
     The run's counts, misses and mddag trace events.
 
-    ``add`` and the ``note_`` methods are called under the dispatcher's lock; ``tell`` without,
-    because it calls the user.
+    ``report_misses`` calls the user, so it is not to be called under a lock.
 
     :param record: where trace events go; None records nothing.
-    :param on_miss: told every miss, from the thread that found it.
-    :param fail: told what ``on_miss`` raises.
+    :param on_miss: gets every miss, in the thread that calls ``report_misses``.
+    :param fail: gets what ``on_miss`` raises.
     """
 
     def __init__(
@@ -85,7 +83,7 @@ class Verdicts:
         self._tables = tables
         self._on_miss = on_miss
         self._fail = fail
-        #: Told DAG and release of each job that starts, under the dispatcher's lock.
+        #: Called with DAG and release of each job that starts.
         self.on_release: Callable[[int, int], None] | None = None
         self.misses: deque[DeadlineMiss] = deque()
         self._aborted: dict[tuple[int, int], None] = {}
@@ -131,13 +129,13 @@ class Verdicts:
                 self._dags[dag].name, self.tally.vertex_name(vertex), job, release, deadline,
                 time if kind == SINK_LATE else None, _WHY[kind]))
 
-    def tell(self) -> None:
-        """Tell the user of the misses since the last call."""
+    def report_misses(self) -> None:
+        """Call ``on_miss`` for the misses since the last call."""
         while self.misses and self._on_miss is not None:
             try:
                 self._on_miss(self.misses.popleft())
             except IndexError:
-                return  # another thread told it
+                return  # another thread has reported it
             except Exception as error:
                 self._fail(error)
 
@@ -150,11 +148,11 @@ class Verdicts:
         if self.record is not None:
             self.record('job_release', now, threading.get_native_id(), dag, job, release)
 
-    def note_drop(self, entry: Entry, origin: Origin, reason: str, now: int) -> None:
+    def dropped(self, entity: Entity, origin: Origin, reason: str, now: int) -> None:
         """Take in that an execution was dropped."""
-        entry.dropped += 1
+        entity.dropped += 1
         if self.record is not None:
             _, dag, job, vertex = origin
             self.record(
-                'drop', now, threading.get_native_id(), entry.address, dag,
+                'drop', now, threading.get_native_id(), entity.address, dag,
                 self._tables.index_in_dag[vertex] if dag >= 0 else -1, job, reason)

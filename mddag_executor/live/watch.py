@@ -26,11 +26,10 @@ class Watch:
     def __init__(self, executor: MultiDeadlineExecutor, task_set: TaskSet) -> None:
         self._executor = executor
         self._task_set = task_set
-        dispatcher = executor._dispatcher
-        self._now = dispatcher.now
-        self._begin = dispatcher.now()
+        self._now = executor._trace_clock.now
+        self._begin = self._now()
         self._releases = [Releases() for _ in task_set.dags]
-        dispatcher.verdicts.on_release = self._released
+        executor._engine.verdicts.on_release = self._released
 
     def _released(self, dag: int, release: int) -> None:
         if dag < len(self._releases):

@@ -25,7 +25,7 @@ from mddag_executor.core.state import (
     SINK_MISSED,
 )
 from mddag_executor.live import current_job
-from mddag_executor.live.crossings import header_stamp
+from mddag_executor.live.jobs import header_stamp
 from mddag_executor.replay import replay
 from mddag_executor.trace import read_events
 from msg_graph import loads

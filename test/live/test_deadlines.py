@@ -316,7 +316,7 @@ def test_of_timers_due_at_one_instant_the_most_urgent_starts_first(make_executor
             autostart=False)
         executor.add_node(node)
     with Spinning(executor):
-        assert wait_for(lambda: not executor._changed)
+        assert wait_for(lambda: not executor._upkeep.changed)
         for timer in timers.values():
             timer.reset()
         executor.wake()

@@ -81,7 +81,7 @@ def test_a_forked_child_ends_without_what_the_parent_has() -> None:
     # Only what Python does at exit: Fast DDS itself does not survive the end of such a child.
     end = (
         'import atexit\n'
-        'with executor._dispatcher.lock:\n'
+        'with executor._pool.lock:\n'
         '    child = os.fork()\n'
         '    if not child:\n'
         '        atexit._run_exitfuncs()\n'

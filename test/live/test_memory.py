@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 import weakref
 
+from mddag_executor.clocks import TraceClock
 from mddag_executor.live.rates import LOOK_S
 from mddag_executor.live.recorder import Recorder
 from msg_graph import loads
@@ -101,11 +102,11 @@ def used(scheduler: Any) -> dict[str, int]:
 
 
 def tables(executor: Any) -> dict[str, int]:
-    dispatcher = executor._dispatcher
+    engine = executor._engine
     intake = executor._intake
-    parts = [intake, getattr(intake, '_direct', None), *getattr(intake, '_parts', {}).values()]
-    return used(dispatcher.scheduler) | sizes(
-        executor, dispatcher, dispatcher.attribution, dispatcher.verdicts, executor._registry,
+    parts = [intake, getattr(intake, '_inline', None), *getattr(intake, '_parts', {}).values()]
+    return used(engine.scheduler) | sizes(
+        executor, engine, engine.jobs, engine.verdicts, executor._registry, executor._upkeep,
         executor._pool, executor._rates, *(part for part in parts if part is not None),
         *(part._native._node for part in parts if hasattr(part, '_native')),
         *(part._timers for part in parts if hasattr(part, '_timers')))
@@ -128,7 +129,7 @@ def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context)
 
     def nothing_left() -> bool:
         gc.collect()
-        return len(executor._registry._entries) == 0 and not executor._registry._retired
+        return len(executor._registry._entities) == 0 and not executor._registry._retired
 
     with Spinning(executor) as spinning:
         cycle(SETTLED)
@@ -171,9 +172,9 @@ def test_a_destroyed_node_is_freed_without_the_collector(make_executor, ros_cont
         subscription = node.create_subscription(Header, 'chatter', print, 10)
         things = [publisher, subscription, *publisher.event_handlers,
                   *subscription.event_handlers, node.create_timer(100.0, print)]
-        n_things = len(things) - 1  # publishers have no entry
+        n_things = len(things) - 1  # publishers are not kept
         executor.add_node(node)
-        assert wait_for(lambda: len(executor._registry._entries) >= n_things)
+        assert wait_for(lambda: len(executor._registry._entities) >= n_things)
         assert wait_for(lambda: executor._intake.settled())
         time.sleep(0.1)
         left = [weakref.ref(thing) for thing in (node, *things)]
@@ -202,7 +203,7 @@ def test_a_node_that_went_while_its_callback_ran_is_freed(make_executor, ros_con
         executor.remove_node(node)
         node.destroy_node()
         del node
-        assert wait_for(lambda: not executor._registry._entries)
+        assert wait_for(lambda: not executor._registry._entities)
         go_on.set()
 
         def is_free() -> bool:
@@ -248,7 +249,7 @@ class Thing:
 
 @pytest.mark.parametrize('trace', ['out.mcap'])
 def test_what_gets_the_address_of_one_before_is_recorded(tmp_path, trace):
-    recorder = Recorder(str(tmp_path / trace), None, 'rad', 1, 100, 64, 0)
+    recorder = Recorder(str(tmp_path / trace), None, 'rad', 1, 100, 64, TraceClock())
     recorded: list[tuple[str, int]] = []
     recorder.record = lambda event, now, vtid, *fields: recorded.append((event, fields[0]))
     for _ in range(20):

@@ -15,11 +15,11 @@ from .conftest import Spinning, wait_for
 
 
 class Timer:
-    """An entry of a timer as far as the watch looks at it."""
+    """A timer as far as the watch looks at it."""
 
     def __init__(self) -> None:
         self.node = '/node'
-        self.entity = SimpleNamespace(timer_period_ns=10_000_000)
+        self.rclpy = SimpleNamespace(timer_period_ns=10_000_000)
         self.skipped = self.ran = self.busy_ns = 0
         self.gate: Any = None
 

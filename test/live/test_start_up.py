@@ -42,9 +42,9 @@ def test_periods_before_the_spin_are_no_jobs_and_no_misses(make_executor, make_n
     executor = make_executor(loads(GRAPH))
     executor.add_node(node)
     releases: list[int] = []
-    executor._dispatcher.verdicts.on_release = lambda dag, release: releases.append(release)
+    executor._engine.verdicts.on_release = lambda dag, release: releases.append(release)
     time.sleep(1.0)
-    begin = executor._dispatcher.now()
+    begin = executor._trace_clock.now()
     with Spinning(executor):
         assert wait_for(lambda: len(ran) > 5)
     assert min(releases) >= begin
@@ -74,10 +74,10 @@ nodes:
     executor = make_executor(graph)
     executor.add_node(node)
     releases: list[int] = []
-    executor._dispatcher.verdicts.on_release = lambda dag, release: releases.append(release)
+    executor._engine.verdicts.on_release = lambda dag, release: releases.append(release)
     publisher.publish(Header(stamp=node.get_clock().now().to_msg()))
     time.sleep(0.2)
-    begin = executor._dispatcher.now()
+    begin = executor._trace_clock.now()
     with Spinning(executor):
         assert wait_for(lambda: got)
     assert len(releases) == 1 and releases[0] >= begin

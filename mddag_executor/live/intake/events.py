@@ -14,14 +14,15 @@ happen, a wait set takes over.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 import threading
 import time
 from typing import Any
 
 from mddag_executor.live.compat.events_executor import is_available, NativeExecutor
-from mddag_executor.live.direct import DirectTakes
 from mddag_executor.live.endings import call_at_shutdown, is_over, join, SecondLooks, stop_at_exit
+from mddag_executor.live.inline import InlineDelivery
 from mddag_executor.live.intake.arrivals import Receiver
 from mddag_executor.live.intake.entities import EMPTY, EntitySet
 from mddag_executor.live.intake.sources import sources
@@ -31,6 +32,7 @@ from rclpy.guard_condition import GuardCondition
 from rclpy.task import Future
 
 _NATIVE = 'events'
+_RELIEF = 'relief'
 _PARTS = {
     _NATIVE: ('subscriptions', 'services', 'clients'),
     'timers': ('timers',),
@@ -48,11 +50,14 @@ class _NativeThread:
 
     :param on_end: called at the end of the thread, unless by ``stop``, with whether the context
         has ended; if not, the native executor has failed.
+    :param serve_here: entered in the thread; the receiver may then run callbacks in it.
     """
 
     def __init__(
-        self, name: str, context: Context, receiver: Receiver, on_end: Callable[[bool], None]
+        self, name: str, context: Context, receiver: Receiver, on_end: Callable[[bool], None],
+        serve_here: Callable[[], AbstractContextManager[None]],
     ) -> None:
+        self._serve_here = serve_here
         self._context = context
         self._receiver = receiver
         self._on_end = on_end
@@ -90,6 +95,10 @@ class _NativeThread:
         join(self._thread)
 
     def _run(self) -> None:
+        with self._serve_here():
+            self._spin()
+
+    def _spin(self) -> None:
         ended = broken = False
         failures = 0
         looks = SecondLooks()
@@ -135,6 +144,8 @@ class EventsIntake:
         of this intake needs to be told more than by ``update``, ``wake`` and ``stop``.
     :param on_shutdown: called in a thread of the intake when that ends because the context has
         ended, also by a signal.
+    :param serve_here: entered in the thread that takes messages, requests and responses: the
+        receiver may run callbacks in it.  See ``relieve``.
     """
 
     available = staticmethod(is_available)
@@ -146,14 +157,16 @@ class EventsIntake:
         guards: Iterable[GuardCondition] = (),
         *,
         on_shutdown: Callable[[], None] | None = None,
+        serve_here: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
         self._context = context
         self._receiver = receiver
         self._on_shutdown = on_shutdown
+        self._serve_here = serve_here
         self._lock = threading.RLock()
         self._given = EMPTY
         self._latest = EMPTY
-        self._direct = DirectTakes(receiver, self._choose_again, partial(is_over, context))
+        self._inline = InlineDelivery(receiver, self._choose_again, partial(is_over, context))
         self._running = False
         self._refused = False
         self._parts: dict[str, _NativeThread | WaitSetIntake] = {}
@@ -167,14 +180,14 @@ class EventsIntake:
 
     def _choose(self) -> None:
         """Share what is given out among the publishers and the threads."""
-        entities = self._direct.choose(self._given) if self._running else self._given
+        entities = self._inline.choose(self._given) if self._running else self._given
         if entities is not self._latest:
             self._latest = entities
             for part in list(self._parts.values()):
                 part.update(entities)
             if self._running:
                 self._start_parts()
-        self._direct.settle()
+        self._inline.settle()
 
     def _choose_again(self) -> None:
         with self._lock:
@@ -190,7 +203,8 @@ class EventsIntake:
                 continue
             part: _NativeThread | WaitSetIntake
             if name == _NATIVE and not self._refused:
-                part = _NativeThread(name, self._context, self._receiver, self._native_ended)
+                part = _NativeThread(
+                    name, self._context, self._receiver, self._native_ended, self._serve_here)
             else:
                 part = WaitSetIntake(self._context, self._receiver, (), kinds, name=name)
             self._parts[name] = part
@@ -208,6 +222,26 @@ class EventsIntake:
             self._refused = True
             if self._parts.pop(_NATIVE, None) is not None and self._running:
                 self._start_parts()
+
+    def relieve(self, relieved: bool) -> None:
+        """
+        Have a wait set look after messages, requests and responses, too, or no longer.
+
+        To be called while the receiver keeps the thread that does so otherwise.
+        """
+        part: _NativeThread | WaitSetIntake | None = None
+        with self._lock:
+            if not relieved:
+                part = self._parts.pop(_RELIEF, None)
+            elif self._running and _RELIEF not in self._parts:
+                part = self._parts[_RELIEF] = WaitSetIntake(
+                    self._context, self._receiver, (), _PARTS[_NATIVE], name=_RELIEF)
+                part.update(self._latest)
+                part.start()
+                return
+        if part is not None:
+            part.stop()
+            part.update(EMPTY)
 
     def settled(self) -> bool:
         """Return whether what was set by ``update`` has come into force everywhere."""
@@ -235,7 +269,7 @@ class EventsIntake:
         """
         with self._lock:
             self._running = False
-            looker = self._direct.stop()
+            looker = self._inline.stop()
             parts, self._parts = self._parts, {}
         for part in parts.values():
             part.stop()

@@ -20,17 +20,18 @@ from typing import Any
 
 from mddag_executor.core import policies, tally
 from mddag_executor.core.state import COMPLETED, IDLE, JOB_END, LATE, OPEN
-from mddag_executor.live import executor, upkeep
-from mddag_executor.live.attribution import Attribution, Origin
+from mddag_executor.live import executor
 from mddag_executor.live.compat import BareTask
-from mddag_executor.live.dispatcher import Dispatcher
-from mddag_executor.live.entries import Entry, TASK, TaskWork, Work
+from mddag_executor.live.engine import Engine
+from mddag_executor.live.entity import Entity, TASK
 from mddag_executor.live.intake.arrivals import Arrival
 from mddag_executor.live.intake.events import EventsIntake
 from mddag_executor.live.intake.sources import ClientSource
 from mddag_executor.live.intake.waitset import WaitSetIntake
+from mddag_executor.live.jobs import Jobs, Origin
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.receiver import Receiver
+from mddag_executor.live.work import TaskWork, Work
 import pytest
 
 MUTATIONS: dict[str, Callable[[], None]] = {}
@@ -59,11 +60,11 @@ def replace(owner: Any, name: str, make: Callable[[Any], Any]) -> None:
 @mutation('Callbacks of one mutually exclusive group run at once.')
 def groups_ignored() -> None:
     def make(init: Any) -> Any:
-        def broken(self: Entry, *args: Any) -> None:
+        def broken(self: Entity, *args: Any) -> None:
             init(self, *args)
             self.group = -1
         return broken
-    replace(Entry, '__init__', make)
+    replace(Entity, '__init__', make)
 
 
 @mutation('Callbacks run in the order of becoming ready, whatever their deadlines.')
@@ -74,11 +75,11 @@ def rad_is_fifo() -> None:
 @mutation("All messages wait that come, however many the queue's depth allows.")
 def depth_not_kept() -> None:
     def make(message: Any) -> Any:
-        def broken(self: Dispatcher, entry: Entry, *args: Any) -> None:
-            entry.depth = 0
-            message(self, entry, *args)
+        def broken(self: Engine, work: Work, *args: Any) -> None:
+            work.entity.depth = 0
+            message(self, work, *args)
         return broken
-    replace(Dispatcher, 'message', make)
+    replace(Engine, 'arrived', make)
 
 
 @mutation('Of each kind of entity every twentieth callback does not run, and counts as run.')
@@ -88,8 +89,8 @@ def every_twentieth_lost() -> None:
     def make(step: Any) -> Any:
         def broken(self: Work) -> Any:
             if self.coroutine is None:
-                seen[self.entry.kind] += 1
-                if seen[self.entry.kind] % 20 == 0:
+                seen[self.entity.kind] += 1
+                if seen[self.entity.kind] % 20 == 0:
                     return None
             return step(self)
         return broken
@@ -116,17 +117,17 @@ def every_twentieth_response_lost() -> None:
 
 @mutation('A coroutine that has been suspended never goes on.')
 def coroutines_not_resumed() -> None:
-    replace(Dispatcher, 'resume', lambda resume: lambda self, work: None)
+    replace(Engine, 'resume', lambda resume: lambda self, work: None)
 
 
 @mutation("A coroutine never goes on that awaits something other than one of rclpy's futures.")
 def unknown_waits_not_resumed() -> None:
-    def make(resume_polled: Any) -> Any:
+    def make(look_around: Any) -> Any:
         def broken(self: Pool) -> Any:
             self._polled.clear()
-            return resume_polled(self)
+            return look_around(self)
         return broken
-    replace(Pool, 'resume_polled', make)
+    replace(Pool, 'look_around', make)
 
 
 @mutation('A task of rclpy 7.1.9 goes on by itself as well, so it does so twice.')
@@ -148,15 +149,15 @@ def exceptions_of_the_intake_swallowed() -> None:
 
 @mutation('A task of a spinning executor is there, and nobody is told.')
 def create_task_does_not_wake_workers() -> None:
-    def make(ready: Any) -> Any:
-        def broken(self: Dispatcher, entry: Entry, work: Work) -> None:
-            if entry.kind != TASK:
-                ready(self, entry, work)
-                return
-            with self.lock:
-                self._start_undeclared(entry, work, self.tick())
+    def make(tell: Any) -> Any:
+        def broken(self: Pool, event: Any, *args: Any) -> None:
+            if event == self.engine.ready and args[0].entity.kind == TASK:
+                with self.lock:
+                    event(*args, self.tick())
+            else:
+                tell(self, event, *args)
         return broken
-    replace(Dispatcher, 'undeclared_ready', make)
+    replace(Pool, 'tell', make)
 
 
 @mutation('A task does not end the wait of a spin_once.')
@@ -166,7 +167,7 @@ def create_task_does_not_wake_spin_once() -> None:
 
 @mutation('A node that is added is noted, and whoever spins is not told.')
 def add_node_does_not_wake() -> None:
-    _wakes_nobody(upkeep.Upkeep, 'add_node')
+    _wakes_nobody(executor.MultiDeadlineExecutor, 'add_node')
 
 
 def _wakes_nobody(owner: Any, name: str) -> None:
@@ -181,7 +182,7 @@ def _wakes_nobody(owner: Any, name: str) -> None:
             finally:
                 silent.on = before  # rclpy calls add_node in add_node
         return broken
-    replace(upkeep.Upkeep, '_ring', make_deaf)
+    replace(executor.MultiDeadlineExecutor, '_ring', make_deaf)
     replace(owner, name, make)
 
 
@@ -215,8 +216,8 @@ def release_is_when_noticed() -> None:
 @mutation('A message belongs to the oldest open job that still waits for one like it.')
 def messages_go_to_the_oldest_job() -> None:
     def make(start: Any) -> Any:
-        def broken(self: Dispatcher, entry: Entry, work: Work, origin: Origin, now: int) -> Any:
-            target = entry.targets.get(origin.vertex)
+        def broken(self: Engine, work: Work, origin: Origin, now: int) -> Any:
+            target = work.entity.targets.get(origin.vertex)
             state = self.scheduler.state
             waits = []
             for slot in range(len(state.job_dag)) if target is not None else ():
@@ -227,21 +228,21 @@ def messages_go_to_the_oldest_job() -> None:
             if waits:
                 job, slot = min(waits)
                 origin = Origin(slot, origin.dag, job, origin.vertex)
-            return start(self, entry, work, origin, now)
+            return start(self, work, origin, now)
         return broken
-    replace(Dispatcher, '_start_successor', make)
+    replace(Engine, '_start_successor', make)
 
 
 @mutation('A message belongs to the job before that of its publication.')
 def messages_go_to_the_job_before() -> None:
     def make(find: Any) -> Any:
-        def broken(self: Attribution, *args: Any) -> Origin | None:
+        def broken(self: Jobs, *args: Any) -> Origin | None:
             origin = find(self, *args)
             broken.last, before = origin, broken.last  # type: ignore[attr-defined]
             return before if origin is not None and before is not None else origin
         broken.last = None  # type: ignore[attr-defined]
         return broken
-    replace(Attribution, 'find', make)
+    replace(Jobs, 'find', make)
 
 
 @mutation('A sink that completes after its deadline counts as completed only.')

@@ -12,7 +12,7 @@ import time
 from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
-from mddag_executor.live import direct, hooks, pool
+from mddag_executor.live import entity, hooks, inline
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -32,8 +32,8 @@ nodes:
 
 
 def takes_of(publisher: Any) -> Any:
-    takes = hooks.publisher_state(publisher).takes
-    return takes[0] if takes else None
+    deliver = hooks.publisher_state(publisher).deliver
+    return deliver[0] if deliver else None
 
 
 def make_direct(ros_context: Any) -> MultiDeadlineExecutor:
@@ -44,13 +44,13 @@ def test_the_publishing_thread_takes(ros_context, make_node, monkeypatch):
     node, got, threads = make_node(), [], []
     node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 10)
     publisher = node.create_publisher(Header, '/a', 10)
-    take = direct.Direct.take
+    take = inline.Direct.take
 
     def noted(self, begin, arrivals):
         threads.append(threading.get_ident())
         return take(self, begin, arrivals)
 
-    monkeypatch.setattr(direct.Direct, 'take', noted)
+    monkeypatch.setattr(inline.Direct, 'take', noted)
     executor = make_direct(ros_context)
     executor.add_node(node)
     publisher.publish(Header(frame_id='before'))
@@ -157,7 +157,7 @@ executor.add_node(node)
 thread = threading.Thread(target=executor.spin)
 thread.start()
 state = hooks.publisher_state(publisher)
-while not state.takes:
+while not state.deliver:
     time.sleep(0.01)
 for number in range(50):
     publisher.publish(Header(frame_id=str(number)))
@@ -165,7 +165,7 @@ for number in range(50):
 end = time.monotonic() + 10
 while len(got) < 50 and time.monotonic() < end:
     time.sleep(0.01)
-print(len(got), got == [str(n) for n in range(50)], not state.takes)
+print(len(got), got == [str(n) for n in range(50)], not state.deliver)
 executor.shutdown()
 thread.join()
 rclpy.shutdown()
@@ -206,12 +206,12 @@ def test_a_destroyed_subscription_is_no_harm(ros_context, make_node):
     executor = make_direct(ros_context)
     executor.add_node(node)
     with Spinning(executor) as spinning:
-        assert wait_for(lambda: len(takes_of(publisher)._directs) == 2)
+        assert wait_for(lambda: len(takes_of(publisher).__self__._directs) == 2)
         first.destroy()
         publisher.publish(Header())
         assert wait_for(lambda: got == ['second'])
         node.destroy_subscription(first)
-        assert wait_for(lambda: len(takes_of(publisher)._directs) == 1)
+        assert wait_for(lambda: len(takes_of(publisher).__self__._directs) == 1)
         node.destroy_node()
         executor.wake()
         assert wait_for(lambda: takes_of(publisher) is None)
@@ -221,7 +221,7 @@ def test_a_destroyed_subscription_is_no_harm(ros_context, make_node):
 def test_a_chain_goes_on_in_one_thread_when_callbacks_end_after_publishing(
     ros_context, make_node, monkeypatch,
 ):
-    monkeypatch.setattr(pool, 'SOON_NS', 10_000_000)  # on the busiest machine
+    monkeypatch.setattr(entity, 'SOON_NS', 10_000_000)  # on the busiest machine
     node, threads = make_node(), []
     one, two = node.create_publisher(Header, '/one', 1), node.create_publisher(Header, '/two', 1)
     group = ReentrantCallbackGroup()
@@ -314,7 +314,7 @@ nodes:
 def test_counts_are_the_same_with_and_without(ros_context, make_node, monkeypatch, takes_first):
     """Also where the intake does all: one declaration, one result."""
     if not takes_first:
-        monkeypatch.setattr(direct.DirectTakes, '_direct', lambda self, subscription: None)
+        monkeypatch.setattr(inline.InlineDelivery, '_direct', lambda self, subscription: None)
     node, got = make_node(), []
     one = node.create_publisher(Header, '/one', 10)
     two = node.create_publisher(Header, '/two', 10)
@@ -343,12 +343,12 @@ def test_two_executors_share_a_node_and_each_gets_its_own(ros_context, make_node
     first.add_node(node)
     second.add_callback_group(group, node)
     with Spinning(first), Spinning(second):
-        assert wait_for(lambda: len(hooks.publisher_state(publisher).takes) == 2)
+        assert wait_for(lambda: len(hooks.publisher_state(publisher).deliver) == 2)
         for number in range(50):
             publisher.publish(Header(frame_id=str(number)))
         assert wait_for(lambda: all(len(ids) >= 50 for ids in got.values())), got
     assert got['first'] == got['second'] == [str(number) for number in range(50)]
-    assert not hooks.publisher_state(publisher).takes
+    assert not hooks.publisher_state(publisher).deliver
 
 
 def test_a_publishing_callback_wakes_the_workers_of_another_executor(ros_context, make_node):
@@ -394,4 +394,4 @@ def test_no_thread_is_left(ros_context, make_node):
     with Spinning(executor):
         assert wait_for(lambda: takes_of(publisher) is not None)
     assert wait_for(
-        lambda: not [t for t in threading.enumerate() if t.name == 'mddag-intake-direct'], 1.0)
+        lambda: not [t for t in threading.enumerate() if t.name == 'mddag-intake-inline'], 1.0)

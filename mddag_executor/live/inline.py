@@ -46,12 +46,12 @@ from dataclasses import replace
 import threading
 from typing import Any
 
-from mddag_executor.live.attribution import PublisherState
 from mddag_executor.live.compat import keeps_time
 from mddag_executor.live.hooks import install, publisher_state
 from mddag_executor.live.intake.arrivals import Arrival, Receiver
 from mddag_executor.live.intake.entities import EntitySet
 from mddag_executor.live.intake.sources import MOST_AT_ONCE, SubscriptionSource
+from mddag_executor.live.jobs import PublisherState
 from rclpy.exceptions import InvalidHandle
 from rclpy.qos import DurabilityPolicy, qos_check_compatible, QoSCompatibility
 from rclpy.subscription import Subscription
@@ -60,8 +60,6 @@ LOOK_S = 0.2
 """How often to count publishers anew."""
 TAKE_EVERY = 5
 """So many times less often, all that has arrived is taken."""
-
-_several_executors = threading.Lock()
 
 
 class Direct:
@@ -114,25 +112,23 @@ class Direct:
         return False
 
 
-class PublisherTakes:
+class Delivery:
     """
-    All subscriptions that one publisher takes from.
+    Takes from some subscriptions what was published for them.
 
     :param on_miss: called when a message is not there that was published.
     """
 
-    __slots__ = ('owner', '_directs', '_receiver', '_on_miss')
+    __slots__ = ('_directs', '_receiver', '_on_miss')
 
     def __init__(
-        self, owner: DirectTakes, directs: Iterable[Direct], receiver: Receiver,
-        on_miss: Callable[[], None],
+        self, directs: Iterable[Direct], receiver: Receiver, on_miss: Callable[[], None],
     ) -> None:
-        self.owner = owner
         self._directs = sorted(directs, key=id)  # so no two threads wait for each other's locks
         self._receiver = receiver
         self._on_miss = on_miss
 
-    def take(self, begin: int) -> None:
+    def deliver(self, begin: int) -> None:
         """Take what is there (see ``Direct.take``), and hand it over in one piece."""
         arrivals: list[Arrival] = []
         missed = False
@@ -152,7 +148,7 @@ class PublisherTakes:
             self._on_miss()
 
 
-class DirectTakes:
+class InlineDelivery:
     """
     Which subscriptions are taken from directly.
 
@@ -214,7 +210,7 @@ class DirectTakes:
         self._forget(entities)
         if self._thread is None:
             self._thread = threading.Thread(
-                target=self._look_after, args=(self._stopping,), name='mddag-intake-direct',
+                target=self._look_after, args=(self._stopping,), name='mddag-intake-inline',
                 daemon=True)
             self._thread.start()
         return self._rest(entities, chosen)
@@ -231,7 +227,7 @@ class DirectTakes:
         changed = False
         for key, direct in list(self._known.items()):
             if take and key in self._chosen:
-                self._takes_of([direct]).take(0)
+                self._delivery([direct]).deliver(0)
             changed = changed or direct.changed()
         return changed
 
@@ -240,10 +236,10 @@ class DirectTakes:
         for key in self._chosen:
             direct = self._known.get(key)
             if direct is not None:
-                self._takes_of([direct]).take(0)
+                self._delivery([direct]).deliver(0)
 
-    def _takes_of(self, directs: list[Direct]) -> PublisherTakes:
-        return PublisherTakes(self, directs, self._receiver, self._on_change)
+    def _delivery(self, directs: list[Direct]) -> Delivery:
+        return Delivery(directs, self._receiver, self._on_change)
 
     def stop(self) -> threading.Thread | None:
         """
@@ -278,11 +274,9 @@ class DirectTakes:
     def _set_takes(
         self, takes: dict[int, list[Direct]], states: dict[int, PublisherState]
     ) -> None:
-        with _several_executors:  # a node's callback groups may be on several
-            for key, state in (*self._states.items(), *states.items()):
-                others = tuple(t for t in state.takes if t.owner is not self)
-                mine = takes.get(key, []) if states.get(key) is state else []
-                state.takes = (*others, self._takes_of(mine)) if mine else others
+        for key, state in (*self._states.items(), *states.items()):
+            mine = takes.get(key, []) if states.get(key) is state else []
+            state.set_delivery(self, self._delivery(mine).deliver if mine else None)
         self._states = states
 
     def _forget(self, entities: EntitySet) -> None:

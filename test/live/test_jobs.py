@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Attribution: which publication a message comes from, and when nobody can say."""
+"""Which publication a message comes from, and when nobody can say."""
 
 from __future__ import annotations
 
@@ -8,24 +8,33 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.live.attribution import (
-    Attribution,
+from mddag_executor.live.jobs import (
+    Jobs,
     KEEP,
     Origin,
     Publication,
     PublisherState,
     ROUNDING_NS,
 )
+import msg_graph
 
 TOPIC = '/topic'
+GRAPH = """
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: tick, timer: 10ms, publishes: [/topic]}
+      - {name: end, subscription: /topic, deadline: 5ms}
+"""
 
 
 class Bench:
-    """An attribution whose publications are given, with a publisher or two."""
+    """Jobs whose publications are given, with a publisher or two."""
 
     def __init__(self) -> None:
-        self.attribution = Attribution({TOPIC})
-        self.topic = self.attribution._topics[TOPIC]
+        self.jobs = Jobs(msg_graph.loads(GRAPH, 'g.yaml'))
+        self.topic = self.jobs._topics[TOPIC]
         self.publishers = [PublisherState(TOPIC), PublisherState(TOPIC)]
 
     def published(self, begin: int, end: int | None, job: int, publisher: int = 0) -> None:
@@ -37,7 +46,7 @@ class Bench:
             self.topic.ended(publication, end)
 
     def job(self, stamp: int, sequence: int | None = None) -> Any:
-        origin = self.attribution.find(TOPIC, stamp, sequence)
+        origin = self.jobs.find(TOPIC, stamp, sequence)
         return None if origin is None else origin.job
 
 
@@ -49,7 +58,7 @@ def test_the_window_that_holds_the_stamp():
     assert bench.job(50_000 + 10 + ROUNDING_NS) == 50
     assert bench.job(50_500) is None
     assert bench.job(-5) is None
-    assert bench.attribution.unknown == 2
+    assert bench.jobs.unknown == 2
 
 
 def test_a_publication_that_has_not_returned_yet():
@@ -61,8 +70,8 @@ def test_a_publication_that_has_not_returned_yet():
 def test_other_topics_and_empty_ones_are_unknown():
     bench = Bench()
     assert bench.job(5) is None
-    assert bench.attribution.find('/other', 5, None) is None
-    assert bench.attribution.unknown == 2
+    assert bench.jobs.find('/other', 5, None) is None
+    assert bench.jobs.unknown == 2
 
 
 def test_the_sequence_number_decides_between_publishers():
@@ -73,11 +82,11 @@ def test_the_sequence_number_decides_between_publishers():
     bench.published(3000, 3100, 4, publisher=0)
     bench.published(3050, 3150, 5, publisher=1)
     assert bench.job(3080) is None, 'without a number nobody knows'
-    assert bench.attribution.doubtful == 1
+    assert bench.jobs.doubtful == 1
     assert bench.job(3080, 2) == 4
     assert bench.job(3080, 3) == 5
     assert bench.job(3080, 9) is None
-    assert bench.attribution.doubtful == 2
+    assert bench.jobs.doubtful == 2
 
 
 def test_publications_before_the_count_began_are_learnt():
@@ -128,7 +137,7 @@ def test_publish_notes_its_window_and_passes_exceptions_on():
     state = bench.publishers[0]
     state.count = 1
     sent = []
-    bench.attribution.publish(
+    bench.jobs.publish(
         lambda publisher, msg: sent.append((publisher, msg)), 'p', 'm', state, Origin(1, 2, 3, 4))
     publication = bench.topic.publications[0]
     assert sent == [('p', 'm')] and publication.begin <= publication.end
@@ -138,7 +147,7 @@ def test_publish_notes_its_window_and_passes_exceptions_on():
         raise TypeError('no such message')
 
     try:
-        bench.attribution.publish(fail, 'p', 'm', state, Origin(1, 2, 3, 4))
+        bench.jobs.publish(fail, 'p', 'm', state, Origin(1, 2, 3, 4))
     except TypeError:
         pass
     assert bench.topic.publications[1].end < 2 ** 62

@@ -27,7 +27,9 @@ from collections import deque
 from collections.abc import Callable
 import threading
 from time import time_ns
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
+
+from msg_graph import TaskSet
 
 KEEP = 256
 """How many publications of a topic are remembered."""
@@ -50,33 +52,37 @@ class Origin(NamedTuple):
     vertex: int
 
 
-class Takes(Protocol):
-    """What a publisher takes from after it has published, for one executor."""
-
-    owner: Any
-
-    def take(self, begin: int, /) -> None:
-        """Take what was published since then (system time, ns)."""
+NO_ORIGIN = Origin(-1, -1, -1, -1)
 
 
 class PublisherState:
     """
     What is kept for each publisher: its topic, and how many messages it has published.
 
-    ``takes`` are the subscriptions that it takes from itself (see ``direct``).  ``noted_by`` and
-    ``notes`` remember of one attribution what it keeps of the topic.
+    :ivar deliver: called with the begin of each publication (system time, ns) when its message has
+        been sent: they take it from the subscriptions of this process (see ``inline``).
+    :ivar noted_by: the ``Jobs`` that ``notes`` is of: what is kept there of the topic.
     """
 
-    __slots__ = ('lock', 'topic', 'count', 'offset', 'takes', 'noted_by', 'notes')
+    __slots__ = ('lock', 'topic', 'count', 'offset', 'deliver', 'noted_by', 'notes', '_delivery')
 
     def __init__(self, topic: str) -> None:
         self.lock = threading.Lock()
         self.topic = topic
         self.count = 0
         self.offset = 0
-        self.takes: tuple[Takes, ...] = ()
-        self.noted_by: Attribution | None = None
+        self.deliver: tuple[Callable[[int], None], ...] = ()
+        self.noted_by: Jobs | None = None
         self.notes: _Topic | None = None
+        self._delivery: dict[object, Callable[[int], None]] = {}
+
+    def set_delivery(self, owner: object, deliver: Callable[[int], None] | None) -> None:
+        """Set what one executor's intake has called; a node's groups may be on several."""
+        with self.lock:
+            self._delivery.pop(owner, None)
+            if deliver is not None:
+                self._delivery[owner] = deliver
+            self.deliver = tuple(self._delivery.values())
 
 
 class Publication:
@@ -101,8 +107,8 @@ class _Topic:
         # The longest window of those kept; a maximum of two generations, so that it is forgotten.
         self.longest = 0
         self._longest_lately = 0
-        # told the header of each message, where other processes subscribe (see ``crossings``)
-        self.told: Callable[[Any, Origin], None] | None = None
+        # gets the stamp of each message, where other processes subscribe (see ``crossings``)
+        self.on_header: Callable[[int, Origin], None] | None = None
         self._count = 0
 
     def begun(self, publication: Publication) -> None:
@@ -140,15 +146,17 @@ class _Topic:
         return fits
 
 
-class Attribution:
+class Jobs:
     """
-    Notes publications and finds the one that a message comes from.
+    Notes publications, and finds the job that a message belongs to.
 
-    :param topics: the trigger topics, fully qualified.
+    :param task_set: the declaration; None: there is no job.
     """
 
-    def __init__(self, topics: set[str]) -> None:
+    def __init__(self, task_set: TaskSet | None) -> None:
+        topics = {t for c in task_set.callbacks for t in c.publishes} if task_set else set()
         self._topics = {t: _Topic() for t in topics}
+        self._release_from = [d.release_from for d in task_set.dags] if task_set else []
         self.unknown = 0
         self.doubtful = 0
 
@@ -163,8 +171,8 @@ class Attribution:
         if topic is None:
             send(publisher, msg)
             return
-        if topic.told is not None:
-            topic.told(msg, origin)
+        if topic.on_header is not None:
+            topic.on_header(header_stamp(msg), origin)
         publication = Publication(time_ns(), state, origin)
         topic.begun(publication)
         try:
@@ -172,10 +180,10 @@ class Attribution:
         finally:
             topic.ended(publication, time_ns())
 
-    def tell(self, told: Callable[[Any, Origin], None], topics: set[str]) -> None:
-        """Tell of each message on these topics, and no others, before it is published."""
+    def note_headers(self, on_header: Callable[[int, Origin], None], topics: set[str]) -> None:
+        """Have ``on_header`` called for each message on these topics, before it is published."""
         for name, topic in self._topics.items():
-            topic.told = told if name in topics else None
+            topic.on_header = on_header if name in topics else None
 
     def find(self, topic: str, stamp: int, sequence: int | None) -> Origin | None:
         """
@@ -198,3 +206,36 @@ class Attribution:
             return matches[0].origin
         self.doubtful += 1
         return None
+
+    def release(
+        self, dag: int, message: Any, source_timestamp: int, now: int
+    ) -> tuple[int, int]:
+        """
+        Return the release of the job that a source's message starts, on the trace's clock.
+
+        :param now: the time on the trace's clock.
+        :return: the release, and the header's stamp where it comes from that, else -1.
+        """
+        kind = self._release_from[dag]
+        stamp = header_stamp(message) if kind == 'header_stamp' else -1
+        if kind == 'arrival' or (kind == 'header_stamp' and stamp < 0):
+            return now, -1  # raw, without a header, or not stamped: only its arrival is known
+        if kind == 'source_timestamp':
+            return steady_time(source_timestamp, now), -1
+        return steady_time(stamp, now), stamp
+
+
+def steady_time(system_time: int, now: int) -> int:
+    """Return a time of the system's clock on the trace's clock, which reads ``now``."""
+    return now - time_ns() + system_time
+
+
+def header_stamp(message: Any) -> int:
+    """Return the stamp of a message's header (or of a Header), system time in ns; -1 for none."""
+    stamp = getattr(getattr(message, 'header', message), 'stamp', None)
+    if stamp is None:
+        return -1
+    try:
+        return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or -1
+    except (AttributeError, TypeError, ValueError):
+        return -1  # something else is called so

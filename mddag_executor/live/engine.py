@@ -1,0 +1,476 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The engine of a live run: the core, and the work that waits in it.
+
+Theory of operation
+-------------------
+The engine is told what happens, with the time of it, and says what to run.  It has no thread,
+lock or clock and knows nothing of rclpy; ``pool`` has all of these, and tells the engine under its
+lock, so that times never decrease.  Nobody else reads or changes the core's state.
+
+1.  *What becomes ready* (``timer_due``, ``arrived``, ``ready``) is work for a job of a declared
+    DAG, or for none.  Messages of known publications go to the job of these (``jobs``), others
+    may enter from another process (``crossings``), and what fits nothing runs as undeclared.
+2.  *A queue holds as many messages as its QoS says*; of more than that the oldest go, and are
+    counted.  What no DAG declares runs in the order of becoming ready, so that nobody starves.
+    For that the turn is the callback's and not the message's: where a queue overflows all the
+    time, none of its messages waits for long, and it would have its turn after everybody who has
+    waited longer.  So the next message takes the place of the one that goes.
+3.  *What to run* (``next_on``, ``next_for_idle``) and *what became of it* (``finished``,
+    ``suspended``, ``refused``, …) is the core's decision, see ``core.rules``.
+4.  *What the core decides beside* (verdicts, ends of jobs, what an abort drops) is counted,
+    recorded and told to the user (``verdicts``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from threading import get_native_id
+from typing import TYPE_CHECKING
+
+from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core.jobs import is_judged, judge_from
+from mddag_executor.core.state import IDLE, N_HOLDING, N_IDLE, OPEN, SUSPENDED
+from mddag_executor.live.crossings import Crossings
+from mddag_executor.live.entity import Entity, TIMER
+from mddag_executor.live.jobs import Jobs, NO_ORIGIN, Origin
+from mddag_executor.live.verdicts import DeadlineMiss, Record, Verdicts
+from mddag_executor.trace.groups import EXECUTION
+from msg_graph import TaskSet
+
+if TYPE_CHECKING:
+    from mddag_executor.live.work import Work
+
+MOST_MISSED = 1000
+"""After a long stop (a suspended machine) at most so many releases are judged one by one."""
+
+
+class Engine:
+    """
+    Turns what became ready into executions of the core, and its decisions into work.
+
+    All times are ns on the trace's clock and do not decrease from call to call.
+
+    :param record: where trace events go; None records nothing.
+    :param on_miss: gets every miss (see ``Verdicts``).
+    :param fail: gets what ``on_miss`` raises.
+    """
+
+    def __init__(
+        self, task_set: TaskSet | None, n_workers: int, policy: str, *, default_deadline: int,
+        max_active_jobs: int, expire_after: int, record: Record | None = None,
+        on_miss: Callable[[DeadlineMiss], None] | None = None,
+        fail: Callable[[BaseException], None] = lambda error: None,
+    ) -> None:
+        self.tables = Tables.build(
+            task_set, legs=True, groups=False, default_deadline=default_deadline,
+            max_active_jobs=max_active_jobs, expire_after=expire_after)
+        self.scheduler = Scheduler(self.tables, n_workers, policy, propagate=False)
+        self.verdicts = Verdicts(task_set, self.tables, record, on_miss, fail)
+        self.jobs = Jobs(task_set)
+        self.crossings = Crossings.of(task_set, self.tables, self.scheduler, self.jobs)
+        self.dag_names = [d.name for d in task_set.dags] if task_set else []
+        self.n_workers = n_workers
+        self.record = record
+        self.undeclared = 0
+        # how often a callback group did not let something run, and what waits for that
+        self.refusals = 0
+        self._refused: list[Entity] = []
+        self._state = self.scheduler.state
+        self._work: dict[int, Work] = {}
+        self._next_job = [0] * self.tables.n_dags
+        self._finished = False
+
+    # --- what became ready -----------------------------------------------------------------------
+
+    def timer_due(self, entity: Entity, work: Work, due: int, now: int) -> None:
+        """Take in a timer that became due at ``due``."""
+        if entity.removed or self._finished:
+            return
+        if entity.depth and len(entity.waiting) >= entity.depth:
+            entity.skipped += 1
+            if entity.source >= 0:
+                self._skip_job(entity, due, now)
+        elif entity.source >= 0:
+            self._start_job(work, max(entity.since, min(due, now)), now)
+        else:
+            self._start_undeclared(work, now)
+
+    def timer_missed(self, entity: Entity, due: int, period: int, count: int, now: int) -> None:
+        """
+        Take in that ``count`` periods after that of ``due`` were missed: they are late.
+
+        But not those before the executor began to look after the timer.
+        """
+        if entity.removed or self._finished:
+            return
+        early = min(count, max(0, (entity.since - due - 1) // period))
+        due, count = due + early * period, count - early
+        entity.skipped += count
+        if entity.source >= 0:
+            for i in range(max(1, count - MOST_MISSED + 1), count + 1):
+                self._skip_job(entity, min(due + i * period, now), now)
+
+    def arrived(
+        self, work: Work, origin: Origin | None, release: int, stamp: int, now: int
+    ) -> None:
+        """
+        Take in a message.
+
+        :param origin: the publication that it comes from, where one was found.
+        :param release: the release of the job that it starts, if it starts one.
+        :param stamp: that of its header where it says which job it belongs to, else -1.
+        """
+        entity = work.entity
+        if entity.removed or self._finished:
+            return
+        if entity.depth and len(entity.waiting) >= entity.depth:
+            if entity.callback is None:
+                self._replace_oldest(work, now)
+                return
+            self._drop(entity, next(iter(entity.waiting)), 'qos_depth', now)
+        if entity.source >= 0:
+            self._start_job(work, max(entity.since, min(release, now)), now)
+            if stamp >= 0 and self.crossings is not None and work.origin is not None:
+                self.crossings.note(stamp, work.origin)
+            return
+        if origin is None and stamp >= 0:
+            origin = self._enter(entity, stamp, min(release, now), now)
+        if origin is None or not self._start_successor(work, origin, now):
+            if entity.callback is not None:
+                entity.unattributed += 1
+            self._start_undeclared(work, now)
+
+    def ready(self, work: Work, now: int) -> None:
+        """Take in anything that no DAG declares: requests, guard conditions, waitables, tasks."""
+        if not work.entity.removed and not self._finished:
+            self._start_undeclared(work, now)
+
+    def ran_at_once(self, entity: Entity) -> None:
+        """Count an undeclared callback that ran where it was taken."""
+        entity.ready += 1
+        entity.ran += 1
+        self.undeclared += 1
+
+    def _start_job(self, work: Work, release: int, now: int) -> None:
+        dag = self.tables.dag_of[work.entity.source]
+        slot = self._release(dag, release, now)
+        self._start(work, self.scheduler.source(slot), Origin(
+            slot, dag, self._state.job_index[slot], work.entity.source), now)
+
+    def _enter(self, entity: Entity, stamp: int, release: int, now: int) -> Origin | None:
+        """Find or start the job of a message from another process (see ``crossings``)."""
+        if self.crossings is None or not entity.enters:
+            return None
+        dag = self.tables.dag_of[entity.enters[0]]
+        job = self.crossings.find(dag, stamp)
+        if job is None:
+            slot = self._release(dag, release, now)
+            job = Origin(slot, dag, self._state.job_index[slot], entity.enters[0])
+            self.crossings.note(stamp, job)
+        # Of a sync: the first of its legs that nothing has come for yet.
+        return job._replace(vertex=next(
+            (v for v in entity.enters if self._is_idle(job, *entity.targets[v])),
+            entity.enters[0]))
+
+    def _is_idle(self, job: Origin, vertex: int, leg: int) -> bool:
+        return self._state.x_state[self.scheduler.execution(job.slot, vertex, leg)] == IDLE
+
+    def _skip_job(self, entity: Entity, release: int, now: int) -> None:
+        """Account for a release whose source does not run: the job expires at once."""
+        slot = self._release(self.tables.dag_of[entity.source], release, now)
+        self.scheduler.expire(slot, now)
+        self._decided(now)
+
+    def _release(self, dag: int, release: int, now: int) -> int:
+        job = self._next_job[dag]
+        self._next_job[dag] = job + 1
+        slot = self.scheduler.release(dag, job, release, now)
+        if self._state.decisions:
+            self._decided(now)
+        self.verdicts.released(dag, job, release, now, is_judged(self._state, slot))
+        return slot
+
+    def _start_successor(self, work: Work, origin: Origin, now: int) -> bool:
+        """Make the vertex ready that a message of a known publication starts."""
+        entity = work.entity
+        target = entity.targets.get(origin.vertex)
+        if target is None:
+            return False
+        state = self._state
+        slot, dag, job, _ = origin
+        vertex, leg = target
+        if (state.job_dag[slot] != dag or state.job_index[slot] != job
+                or state.job_state[slot] != OPEN):
+            if not self.verdicts.was_aborted(dag, job):
+                return False
+            entity.ready += 1
+            self.verdicts.dropped(entity, Origin(slot, dag, job, vertex), 'aborted', now)
+            return True
+        x = state.job_base[slot] + self.tables.region_offset[vertex] + leg
+        if state.x_state[x] != IDLE:
+            return False  # a second message for the same vertex of the same job
+        self._start(work, x, Origin(slot, dag, job, vertex), now)
+        return True
+
+    def _start_undeclared(self, work: Work, now: int) -> None:
+        self.undeclared += 1
+        entity = work.entity
+        self._note_ready(work, self.scheduler.undeclared(
+            entity.ready, entity.group, now, entity.habit.holds), now)
+
+    def _start(self, work: Work, x: int, origin: Origin, now: int) -> None:
+        entity, state = work.entity, self._state
+        state.x_group[x] = entity.group
+        state.x_holds[x] = entity.habit.holds
+        work.origin = origin
+        self.scheduler.ready(x, now)
+        self._note_ready(work, x, now)
+
+    def _note_ready(self, work: Work, x: int, now: int) -> None:
+        work.x = x
+        work.ready_ns = now
+        work.entity.ready += 1
+        work.entity.waiting[x] = None
+        self._work[x] = work
+
+    # --- what does not run -----------------------------------------------------------------------
+
+    def _replace_oldest(self, work: Work, now: int) -> None:
+        """Keep QoS for a callback that no DAG declares: whose turn it is stays as it was."""
+        entity = work.entity
+        places = iter(entity.waiting)
+        first, second = next(places), next(places, -1)
+        oldest = self._work[first]
+        if second < 0:
+            oldest.x = -1
+            self.undeclared += 1
+            self.verdicts.dropped(entity, NO_ORIGIN, 'qos_depth', now)
+            self._note_ready(work, first, now)
+            return
+        heir = self._work[second]
+        self._work[first], self._work[second] = heir, oldest
+        heir.x, oldest.x = first, second
+        self._drop(entity, second, 'qos_depth', now)
+        self._start_undeclared(work, now)
+
+    def _drop(self, entity: Entity, x: int, reason: str, now: int) -> None:
+        del entity.waiting[x]
+        work = self._work.pop(x)
+        work.x = -1
+        self.scheduler.drop(x, now)
+        self.verdicts.dropped(entity, work.origin or NO_ORIGIN, reason, now)
+        self._decided(now)
+
+    def remove(self, entity: Entity, now: int) -> None:
+        """Forget a destroyed entity: what waits of it never runs."""
+        entity.removed = True
+        for x in list(entity.waiting):
+            self._drop(entity, x, 'destroyed', now)
+
+    # --- what to run -----------------------------------------------------------------------------
+
+    @property
+    def has_waiting(self) -> bool:
+        """Return whether anything waits that a worker may be able to run."""
+        state = self._state
+        return bool(state.ready or state.unpolled or state.held_back)
+
+    @property
+    def holds_back(self) -> bool:
+        """Return whether anything waits for the interpreter (rule 11 of ``core.rules``)."""
+        return bool(self._state.held_back)
+
+    @property
+    def idle_workers(self) -> int:
+        """Return how many workers run nothing."""
+        return self._state.scalars[N_IDLE]
+
+    @property
+    def idle_worker(self) -> int:
+        """Return the first worker that runs nothing, -1 where there is none."""
+        return self._state.worker_x.index(-1) if self._state.scalars[N_IDLE] else -1
+
+    def next_for_idle(self, now: int) -> Work | None:
+        """Dispatch one execution on an idle worker (``Work.worker``); None: nothing may run."""
+        state = self._state
+        if not (state.ready or state.held_back or state.unpolled) or not state.scalars[N_IDLE]:
+            return None
+        return self._dispatched(self.scheduler.schedule(now), now)
+
+    def next_on(self, worker: int, now: int) -> Work | None:
+        """Dispatch the next execution on a worker that runs nothing; None: nothing may run."""
+        return self._dispatched(self.scheduler.take(worker, now), now)
+
+    def _dispatched(self, x: int, now: int) -> Work | None:
+        if self._state.decisions:
+            self._decided(now)
+        if x < 0:
+            return None
+        work = self._work.pop(x)
+        work.entity.waiting.pop(x, None)
+        work.worker = self._state.x_worker[x]
+        return work
+
+    def interpreter_holder(self) -> tuple[int, int]:
+        """Return the most urgent execution that holds the interpreter, and its worker; or -1."""
+        state = self._state
+        if state.scalars[N_HOLDING] == 0:
+            return -1, -1
+        x = min((x for x in state.worker_x if x >= 0 and state.x_holds[x]),
+                key=lambda x: state.x_key[x])
+        return x, state.x_worker[x]
+
+    def stop_holding(self, x: int) -> None:
+        """Give the interpreter back for an execution that does not need it now."""
+        self.scheduler.stop_holding(x)
+
+    def lend(self, work: Work) -> None:
+        """Free the worker of an execution that goes on without one."""
+        self.scheduler.lend(work.x)
+
+    def resume(self, work: Work) -> None:
+        """Make a suspended execution ready to go on; nothing happens when it is not suspended."""
+        if work.x >= 0 and self._state.x_state[work.x] == SUSPENDED:
+            self.scheduler.resume(work.x)
+
+    def leave_group(self, work: Work) -> None:
+        """Take in that an execution's callback group has let it run (see ``gates``)."""
+        self.scheduler.leave_group(work.x)
+
+    def ask_again(self) -> None:
+        """Make ready again what a callback group did not let run."""
+        refused, self._refused = self._refused, []
+        for entity in refused:
+            x = next(iter(entity.waiting), -1)
+            if x >= 0 and self._state.x_state[x] == SUSPENDED:
+                self.scheduler.resume(x)
+
+    @property
+    def has_refused(self) -> bool:
+        """Return whether there is anything to ask again."""
+        return bool(self._refused)
+
+    # --- what became of it -----------------------------------------------------------------------
+
+    def finished(
+        self, work: Work, start: int, end: int, now: int, vtid: int, worker: int,
+        failed: bool = False,
+    ) -> None:
+        """
+        End an execution that ran from ``start`` to ``end``; ``now`` is not before these.
+
+        :param vtid: the thread that it ran in; ``worker`` is -1 where that has lent its worker.
+        :param failed: whether its callback has let an exception out.
+        """
+        x, work.x = work.x, -1
+        entity = work.entity
+        entity.ran += 1
+        entity.failed += failed
+        end_it = self.scheduler.fail if failed else self.scheduler.complete
+        if self.record is None:
+            end_it(x, end)
+        elif work.origin is None:
+            self._record_run(work, start, end, vtid, worker)
+            end_it(x, end)
+        else:
+            tables, state = self.tables, self._state
+            slot, dag, job, vertex = work.origin
+            deadline = state.job_release[slot] + tables.rad_offset[vertex]
+            leg = x - state.job_base[slot] - tables.region_offset[vertex]
+            whole = end_it(x, end)
+            if failed:  # told first, or its completion would count
+                self.record('fail', now, vtid, dag, tables.index_in_dag[vertex], job)
+            self.record(
+                EXECUTION, start, vtid, entity.address, dag, tables.index_in_dag[vertex],
+                job, worker, work.ready_ns, deadline, end, now, whole, leg)
+        if self._state.decisions:
+            self._decided(now)
+
+    def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
+        """Take a running execution off its worker until ``resume``."""
+        if self.record is not None:
+            self._record_run(work, start, end, vtid, worker)
+        self.scheduler.suspend(work.x)
+        self._work[work.x] = work
+
+    def refused(self, work: Work, now: int) -> None:
+        """Put an execution back that its callback group does not let run now (see ``gates``)."""
+        entity, x = work.entity, work.x
+        if entity.removed:
+            self.destroyed(work, now)
+            return
+        self.scheduler.refuse(x)
+        self._work[x] = work
+        entity.waiting = {x: None, **entity.waiting}
+        self._refused.append(entity)
+        self.refusals += 1
+        if 0 < entity.depth < len(entity.waiting) and entity.kind != TIMER:
+            self._drop(entity, x, 'qos_depth', now)  # a newer one has come meanwhile
+
+    def left_open(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
+        """Take an execution off its worker that could not do its work: its context has ended."""
+        if self.record is not None:
+            self._record_run(work, start, end, vtid, worker)
+        self.scheduler.lend(work.x)
+        work.x = -1
+        work.entity.ran += 1
+
+    def destroyed(self, work: Work, now: int) -> None:
+        """End a dispatched execution that must not run: its job cannot complete any more."""
+        x, work.x = work.x, -1
+        if work.origin is not None:
+            self.scheduler.expire_open(work.origin.slot, now)
+        self.scheduler.complete(x, now)
+        self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'destroyed', now)
+        self._decided(now)
+
+    def _record_run(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
+        """Record that a callback has run which no DAG declares, or which goes on later."""
+        record = self.record
+        assert record is not None
+        _, dag, job, vertex = work.origin or NO_ORIGIN
+        index, deadline = -1, 0
+        if dag >= 0:
+            index = self.tables.index_in_dag[vertex]
+            deadline = self.release_of(work) + self.tables.rad_offset[vertex]
+        address = work.entity.address
+        record(
+            'dispatch', start, vtid, address, dag, index, job, worker, work.ready_ns, deadline)
+        record('callback_start', start, vtid, address, False)
+        record('callback_end', end, vtid, address)
+
+    def release_of(self, work: Work) -> int:
+        """Return the release of the job that a declared execution belongs to; it is not over."""
+        assert work.origin is not None
+        return self._state.job_release[work.origin.slot]
+
+    def _decided(self, now: int) -> None:
+        """Carry out what the core has decided since the last call."""
+        decisions = self.scheduler.decisions()
+        if self._finished:  # it was judged already, and the trace is closed
+            return
+        for x in self.verdicts.add(decisions, now):
+            work = self._work.pop(x, None)
+            if work is not None:  # the core dropped it: what is left of an aborted job
+                work.entity.waiting.pop(x, None)
+                work.x = -1
+                self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'aborted', now)
+
+    def set_judging(self, judging: bool, now: int) -> None:
+        """Give verdicts about jobs that are released from now on, or about none for now."""
+        release = now if judging else NEVER
+        judge_from(self._state, release)
+        if self.record is not None:
+            self.record('judge_from', now, get_native_id(), release)
+
+    # --- the end ---------------------------------------------------------------------------------
+
+    def finish(self, now: int) -> None:
+        """Judge what is open, once, when the run ends."""
+        self.scheduler.expire_idle(now)
+        self._decided(now)
+        self.scheduler.finish(now)
+        self._decided(now)
+        self._finished = True

@@ -1,0 +1,127 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""The unit of work: one execution of a callback."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import types
+from typing import Any
+
+from mddag_executor.live.compat import awaited
+from mddag_executor.live.entity import Entity, TIMER
+from mddag_executor.live.jobs import Origin
+from rclpy.exceptions import InvalidHandle
+
+
+class AtOnce:
+    """
+    A future's done callback that takes no time, and never fails.
+
+    A future hands its callbacks to its executor as tasks; this one is called at once instead.
+    """
+
+    __slots__ = ('_function',)
+
+    def __init__(self, function: Callable[[], Any]) -> None:
+        self._function = function
+
+    def __call__(self, _: Any = None) -> None:
+        """Call the function."""
+        self._function()
+
+
+class Destroyed(Exception):
+    """
+    The entity was destroyed after its execution had become ready: it must not run.
+
+    Or it is a timer that was cancelled.
+    """
+
+
+class Work:
+    """
+    One execution of a callback: what to call, for which job, and where it stands.
+
+    :param function: what to call, with ``args``; ``then`` gets what it returns.
+    :ivar x: the execution in the core; -1 before it is ready and after it has ended.
+    :ivar origin: the vertex and job that it executes; None where no DAG declares it.
+    :ivar worker: where it runs, or has run last.
+    :ivar ready_ns: when it became ready, on the trace's clock.
+    """
+
+    __slots__ = (
+        'entity', 'x', 'function', 'args', 'then', 'coroutine', 'origin', 'worker', 'ready_ns')
+
+    def __init__(
+        self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...],
+        then: Callable[[Any], None] | None = None,
+    ) -> None:
+        self.entity = entity
+        self.x = -1
+        self.function = function
+        self.args = args
+        self.then = then
+        self.coroutine: Any = None
+        self.origin: Origin | None = None
+        self.worker = -1
+        self.ready_ns = 0
+
+    def step(self) -> Any:
+        """
+        Run, or go on running; return None when it has finished, else what it waits for.
+
+        :raises Destroyed: where it must not run any more.
+        :raises BaseException: whatever the callback raises.
+        """
+        if self.coroutine is None:
+            handle = self.entity.handle
+            if handle is not None:
+                try:
+                    with handle:
+                        # One more may have become due before it was cancelled in its callback.
+                        if self.entity.kind == TIMER and self.entity.rclpy.is_canceled():
+                            raise Destroyed
+                except InvalidHandle:
+                    raise Destroyed from None
+            result = self.function(*self.args)
+            if type(result) is not types.CoroutineType:
+                if self.then is not None:
+                    self.then(result)
+                return None
+            self.coroutine = result
+        try:
+            yielded = self.coroutine.send(None)
+        except StopIteration as stop:
+            if self.then is not None:
+                self.then(stop.value)
+            return None
+        return yielded if yielded is not None else awaited(self.coroutine)
+
+    def close(self) -> None:
+        """Close what will never run on."""
+        if self.coroutine is not None:
+            self.coroutine.close()
+
+
+def _nothing() -> None:
+    pass
+
+
+class TaskWork(Work):
+    """An execution of an rclpy ``Task``; exceptions are the task's."""
+
+    __slots__ = ()
+
+    def step(self) -> Any:
+        """Run the task once; return None when it is done."""
+        task: Any = self.function
+        task.waits_for = None
+        task()
+        if task.done() or task.cancelled():
+            self.function = _nothing  # whoever else holds on to the task does so: see ``tasks``
+            if self.then is not None:
+                self.then(task)
+            del task
+            return None
+        return awaited(self.coroutine) if task.waits_for is None else task.waits_for

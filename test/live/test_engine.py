@@ -1,0 +1,120 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""The engine by itself: a list of events, without threads, clocks and rclpy."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from hypothesis import assume, given
+from mddag_executor.core import NEVER, POLICIES
+from mddag_executor.live.engine import Engine
+from mddag_executor.live.entity import Entity
+from mddag_executor.live.jobs import Origin
+from mddag_executor.live.work import Work
+from msg_graph import TaskSet
+
+from ..core.task_sets import Case, cases, Event, examples, TICK
+
+HORIZON = 60
+PLAIN = tuple(name for name, policy in POLICIES.items() if not policy.polling)
+
+
+def entity_of(engine: Engine, task_set: TaskSet, dag: int, index: int) -> Entity:
+    """Return an entity that one vertex is bound to, with one leg for all of its messages."""
+    vertex = task_set.dags[dag].vertices[index]
+    entity = Entity('waitable', None, vertex.callback.node, vertex.callback, -1, 0, '')
+    first = engine.tables.first_vertex[dag]
+    if index == task_set.dags[dag].source:
+        entity.source = first + index
+    entity.targets = {first + before: (first + index, 0) for before in vertex.predecessors}
+    return entity
+
+
+class Driver:
+    """Plays a case as the pool would: virtual time, and executions of the case's lengths."""
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+        self.engine = Engine(
+            case.task_set, case.workers, case.policy, default_deadline=1, max_active_jobs=NEVER,
+            expire_after=NEVER)
+        self.tables = self.engine.tables
+        self.entities = {
+            self.tables.first_vertex[dag.index] + vertex.index:
+            entity_of(self.engine, case.task_set, dag.index, vertex.index)
+            for dag in case.task_set.dags for vertex in dag.vertices}
+        self.running: dict[int, tuple[int, Work]] = {}
+        self.log: list[Event] = []
+
+    def note(self, now: int, kind: str, work: Work) -> None:
+        assert work.origin is not None
+        _, dag, job, vertex = work.origin
+        self.log.append(
+            (now // TICK, kind, work.worker, dag, self.tables.index_in_dag[vertex], job))
+
+    def run(self) -> None:
+        load = self.case.load(HORIZON)
+        releases = list(zip(load.times, load.dags))
+        for now in range(0, HORIZON * TICK + 1, TICK):
+            for worker in sorted(w for w, (end, _) in self.running.items() if end == now):
+                self.complete(self.running.pop(worker)[1], now)
+            if now == HORIZON * TICK:
+                return
+            while releases and releases[0][0] == now:
+                source = self.entities[self.tables.source[releases.pop(0)[1]]]
+                self.engine.timer_due(source, Work(source, print, ()), now, now)
+            while (work := self.engine.next_for_idle(now)) is not None:
+                self.note(now, 'start', work)
+                assert work.origin is not None
+                _, dag, _, vertex = work.origin
+                ticks = self.case.ticks[dag][self.tables.index_in_dag[vertex]]
+                self.running[work.worker] = now + ticks * TICK, work
+
+    def complete(self, work: Work, now: int) -> None:
+        self.note(now, 'end', work)
+        assert work.origin is not None
+        slot, dag, job, vertex = work.origin
+        self.engine.finished(work, now, now, now, 0, work.worker)
+        tables = self.tables
+        for i in range(tables.first_successor[vertex], tables.first_successor[vertex + 1]):
+            after = self.entities[tables.successors[i]]
+            self.engine.arrived(
+                Work(after, print, ()), Origin(slot, dag, job, vertex), -1, -1, now)
+
+
+@examples(150)
+@given(cases(policies=PLAIN, groups=False, bounds=False))
+def test_the_same_events_give_the_same_answers_as_the_simulator(case: Case) -> None:
+    # A sync is one execution for each message here, and one in all there.
+    assume(all(len(v.predecessors) <= 1 for d in case.task_set.dags for v in d.vertices))
+    case = Case(case.task_set, case.ticks, case.workers, case.policy, preemptive=False)
+    driver = Driver(case)
+    driver.run()
+    run = case.run(HORIZON)
+    assert driver.log == case.events(run)
+    driver.engine.finish(HORIZON * TICK)
+    verdicts = driver.engine.verdicts.tally.result()
+    assert verdicts['dags'] == run.result()['dags']
+
+
+def test_a_full_queue_drops_the_oldest_and_counts_it() -> None:
+    engine = Engine(None, 1, 'rad', default_deadline=100, max_active_jobs=64, expire_after=NEVER)
+    entity = Entity('waitable', None, '/n', None, -1, 2, '/t')
+    works = [Work(entity, print, (number,)) for number in range(5)]
+    for now, work in enumerate(works):
+        engine.arrived(work, None, -1, -1, now)
+    ran = []
+    while (ready := engine.next_for_idle(10)) is not None:
+        ran.append(ready.args[0])
+        engine.finished(ready, 10, 11, 11, 0, ready.worker)
+    assert (ran, entity.dropped, entity.ran) == ([3, 4], 3, 2)
+
+
+def test_it_needs_no_rclpy_and_no_thread() -> None:
+    program = (
+        'import sys; sys.modules["rclpy"] = None\n'
+        'import mddag_executor.live.engine as engine\n'
+        'engine.Engine(None, 7, "rad", default_deadline=1, max_active_jobs=1, expire_after=1)\n')
+    assert subprocess.run([sys.executable, '-c', program], check=False).returncode == 0
