@@ -392,8 +392,10 @@ def test_two_processes_share_a_graph_and_the_sink_judges(
     assert counts['/second:relay']['unattributed'] == 0
     sink = chain['sinks']['/last:sink']
     judged = counts['/last:sink']['ran'] - counts['/last:sink']['unattributed']
-    # what expires while its sink waits, on a busy machine, runs and is not judged
-    assert judged - chain['ends']['expired'] <= sink['completed'] <= judged <= chain['jobs']
+    # what expires while its sink waits, on a busy machine, runs and is not judged; nor is what was
+    # released before the run began
+    assert judged - chain['ends']['expired'] - 5 <= sink['completed'] <= judged
+    assert sink['completed'] <= chain['jobs']
     assert 0.8 * chain['jobs'] <= sink['completed']
     if late:
         assert sink['late'] == sink['completed'] and lower['deadline_missed']

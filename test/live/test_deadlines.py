@@ -483,7 +483,8 @@ def test_a_leg_that_two_publishers_feed_waits_for_both(make_executor, make_node,
         executor.wake()
         assert wait_for(lambda: len(slow) >= 10)
         timer.cancel()
-        assert wait_for(lambda: sinks(executor)['/sink:join']['completed'] == len(slow))
+        assert wait_for(lambda: is_idle(executor) and (
+            sinks(executor)['/sink:join']['completed'] == len(slow)))
     statistics = executor.statistics()
     assert statistics['undeclared'] == 0
     assert statistics['callbacks']['/sink:join']['ran'] == 3 * len(slow)
