@@ -74,10 +74,10 @@ class CompiledJudge:
         self._load = Lent(load._replace(
             cost_base=[built.first_vertex[dag.index] for dag in task_set.dags]))
 
-    def warm_up(self) -> None:
-        """Compile, or load what was compiled before."""
+    def warm_up(self, waiting: Callable[[], None] = lambda: None) -> None:
+        """Compile, and call ``waiting`` now and then, or load what was compiled before."""
         if keeps_entries(()) and not cached():
-            compile_elsewhere(__name__)
+            compile_elsewhere(__name__, waiting)
         none = np.ones((0, self._columns), dtype=np.int64)
         self(Settings(preemptive=False, judge='completions'), none)
 

@@ -28,6 +28,7 @@ and ends.
 from __future__ import annotations
 
 from collections.abc import Callable
+import contextlib
 from functools import cache
 import hashlib
 from importlib.util import find_spec
@@ -191,19 +192,28 @@ def _bound(function: Any, space: dict[str, Any], file: str | None = None) -> Fun
     return FunctionType(code, space, function.__name__, function.__defaults__)
 
 
-def compile_elsewhere(module: str) -> None:
+def compile_elsewhere(module: str, waiting: Callable[[], None] = lambda: None) -> None:
     """
     Have a process compile what a module needs; if it fails, this one does when it needs it.
 
     :param module: has ``compile_here``.
+    :param waiting: called now and then meanwhile.
     """
     program = f'from {module} import compile_here; compile_here()'
     path = os.pathsep.join(each or os.getcwd() for each in sys.path)
     try:
-        done = subprocess.run(
+        process = subprocess.Popen(
             [sys.executable, '-c', program], env={**os.environ, 'PYTHONPATH': path},
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     except OSError:
         return
-    if done.returncode == -signal.SIGINT:  # Ctrl-C went to both
+    try:
+        while process.poll() is None:
+            waiting()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(0.2)
+    finally:  # after Ctrl-C, too
+        process.kill()
+        process.wait()
+    if process.returncode == -signal.SIGINT:  # Ctrl-C went to both
         raise KeyboardInterrupt

@@ -10,7 +10,7 @@ interpreter's lock; without it they are processes.  ``cluster`` has those of oth
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 import multiprocessing
 import signal
@@ -79,10 +79,7 @@ class ThreadPool(_LocalPool):
 
     def start(self, compiling: Callable[[], None]) -> None:
         """Compile the core, if that is what the evaluator uses."""
-        future = self._executor.submit(self._evaluator.prepare)
-        while not wait((future,), timeout=0.2).done:
-            compiling()
-        future.result()
+        self._evaluator.prepare(compiling)
 
     def submit(self, first: int, count: int) -> Future[Chunk]:
         """Let a thread do runs."""

@@ -198,6 +198,25 @@ def test_interrupted(graph: Path, tmp_path: Path) -> None:
     assert f"{result['runs']} runs in" in out
 
 
+def test_interrupted_while_the_core_is_compiled(graph: Path, tmp_path: Path) -> None:
+    """Nobody waits until it is."""
+    pytest.importorskip('numba')
+    with subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'evaluate', str(graph), '--runs', '5000000',
+         '--core', 'compiled'], stderr=subprocess.PIPE, text=True, cwd=tmp_path,
+        env={**os.environ, 'XDG_CACHE_HOME': str(tmp_path)},
+    ) as process:
+        threads = Path(f'/proc/{process.pid}/task')
+        while not any(each.read_text() for each in threads.glob('*/children')):
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=120)
+    assert (process.returncode, err) == (
+        130, 'warning: interrupted: 0 of 5000000 runs are done\n')
+    assert not list(tmp_path.glob('**/*.nbc'))
+
+
 def group_seconds(group: int) -> float:
     """Return the processor time that the processes of a group have taken so far."""
     total = 0.0

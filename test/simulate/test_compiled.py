@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-import signal
 import subprocess
 import sys
 
@@ -193,8 +192,10 @@ def test_an_interrupted_compilation_is_not_begun_anew(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
-    interrupted = subprocess.CompletedProcess([], -signal.SIGINT)
-    monkeypatch.setattr(compiling.subprocess, 'run', lambda *_, **__: interrupted)
+    interrupted = tmp_path / 'python'
+    interrupted.write_text('#!/bin/sh\nkill -INT $$\n')
+    interrupted.chmod(0o755)
+    monkeypatch.setattr(sys, 'executable', str(interrupted))
     judge = compiled.CompiledJudge(load(CONFIG / 'autoware.yaml'), 10 ** 9)
     with pytest.raises(KeyboardInterrupt):
         judge.warm_up()
