@@ -18,7 +18,9 @@ what CARET could not find out and nobody filled in.
    a queue edge on that callback if another one takes it, and on the topic if no callback does. The
    other contexts (``callback_chain``, ``inherit_unique_stamp``) say what variable passings say.
 4. A mutually exclusive callback group counts where it has several callbacks.
-5. Keys that are not used here are not looked at: the format grows.
+5. In 2021 files had ``type`` for ``callback_type``, one ``callback_name`` for each topic that is
+   published, and paths that list callbacks (``path_name_aliases``).
+6. Keys that are not used here are not looked at: the format grows.
 """
 
 from __future__ import annotations
@@ -63,6 +65,7 @@ def read_architecture(text: str, file: str) -> Draft:
     reader = _Reader(file)
     nodes = [reader.node(each) for each in reader.mappings(tree, 'nodes')]
     paths = [reader.path(each) for each in reader.mappings(tree, 'named_paths')]
+    paths += [reader.alias(each) for each in reader.mappings(tree, 'path_name_aliases')]
     return Draft(
         f'the CARET architecture file {file}', [node for node in nodes if node.callbacks], paths)
 
@@ -133,7 +136,8 @@ class _Reader:
         full = self.text(tree, 'callback_name')
         name = full[len(node) + 1:] if full.startswith(f'{node}/') else full.rpartition('/')[2]
         self.name(tree, 'callback_name', CALLBACK, name)
-        kind = self.text(tree, 'callback_type').removesuffix('_callback')
+        key = 'type' if 'type' in tree.entries else 'callback_type'
+        kind = self.text(tree, key).removesuffix('_callback')
         if kind == 'timer':
             period = self.text(tree, 'period_ns')
             if not (period.isascii() and period.isdecimal() and 0 < int(period[:19]) < 2 ** 62):
@@ -144,7 +148,7 @@ class _Reader:
         if kind == 'service':
             service = self.name(tree, 'service_name', SERVICE)
             return DraftCallback(node, name, kind, [service])
-        raise self.error(tree, f"'callback_type' {shown(kind)} is not known")
+        raise self.error(tree, f"'{key}' {shown(kind)} is not known")
 
     def _group(self, node: DraftNode, tree: Mapping) -> None:
         members = [node.callbacks[name] for name in self.texts(tree, 'callback_names')
@@ -160,6 +164,8 @@ class _Reader:
     def _publisher(self, node: DraftNode, tree: Mapping) -> None:
         topic = self.name(tree, 'topic_name', TOPIC)
         names = self.texts(tree, 'callback_names')
+        if 'callback_name' in tree.entries:
+            names.append(self.text(tree, 'callback_name'))
         known = [node.callbacks[name] for name in names if name in node.callbacks]
         if not known and len(node.callbacks) == 1:
             known = list(node.callbacks.values())
@@ -191,6 +197,11 @@ class _Reader:
                           self.text(each, 'subscribe_topic_name'),
                           self.text(each, 'publish_topic_name')))
         return DraftPath(self.text(tree, 'path_name'), steps)
+
+    def alias(self, tree: Mapping) -> DraftPath:
+        pairs = [text.rpartition('/') for text in self.texts(tree, 'callbacks')]
+        return DraftPath(
+            self.text(tree, 'path_name'), [], [f'{node}:{name}' for node, _, name in pairs])
 
 
 def _read(reader: DraftCallback, what: str) -> None:

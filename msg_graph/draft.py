@@ -75,10 +75,11 @@ class DraftNode:
 
 @dataclass
 class DraftPath:
-    """A named path: node, subscribed and published topic of each step."""
+    """A named path: node, subscribed and published topic of each step, or keys of callbacks."""
 
     name: str
     steps: list[tuple[str, str, str]]
+    keys: list[str] = field(default_factory=list)
 
 
 @dataclass

@@ -213,11 +213,14 @@ class _Writer:
                 yield '    callbacks:'
                 yield from (f"      - '{key}'" for key in keys)
             else:
-                chain = ' -> '.join(node for node, _, _ in path.steps)
+                chain = ' -> '.join([*path.keys, *(node for node, _, _ in path.steps)])
                 yield printable(f'# {MARK}: path {path.name}: which callbacks? {chain}')
 
     def _path_keys(self, path: DraftPath) -> list[str]:
-        keys = []
+        keys = [callback.key for key in path.keys for callback in self._callbacks
+                if callback.key == key]
+        if len(keys) < len(path.keys):
+            return []
         for node, taken, published in path.steps:
             fits = [c for c in self._callbacks if c.node == node
                     and (taken == UNDEFINED or taken in c.starts or taken in c.reads)

@@ -134,6 +134,40 @@ def test_message_contexts_become_queue_edges() -> None:
         ('/b:callback_1', None, ('/b:callback_0',)), ('/b:callback_1', '/y', ('/c:callback_0',))]
 
 
+OF_2021 = """\
+path_name_aliases:
+- path_name: whole
+  callbacks: [/a/timer_callback_0, /b/subscription_callback_0, /b/timer_callback_0]
+- path_name: lost
+  callbacks: [/a/timer_callback_0, /b/gone]
+nodes:
+- node_name: /a
+  callbacks:
+  - {callback_name: timer_callback_0, type: timer_callback, period_ns: 20000000, symbol: s}
+  publishes:
+  - {topic_name: /x, callback_name: timer_callback_0}
+- node_name: /b
+  callbacks:
+  - {callback_name: subscription_callback_0, type: subscription_callback, topic_name: /x}
+  - {callback_name: timer_callback_0, type: timer_callback, period_ns: 50000000, symbol: s}
+  variable_passings:
+  - {callback_name_write: subscription_callback_0, callback_name_read: timer_callback_0}
+  publishes:
+  - {topic_name: /y, callback_name: timer_callback_0}
+"""
+
+
+def test_a_file_of_2021() -> None:
+    text = declaration_from_caret(OF_2021, 'arch.yaml')
+    assert (f'# {MARK}: path lost: which callbacks? /a:timer_callback_0 -> /b:gone'
+            in text.splitlines())
+    task_set = loads(accepted(text))
+    assert [c.publishes for c in task_set.callbacks] == [('/x',), (), ('/y',)]
+    assert [path.name for path in task_set.paths] == ['whole']
+    whole = ['/a:timer_callback_0', '/b:subscription_callback_0', '/b:timer_callback_0']
+    assert [c.key for c in task_set.callbacks] == whole
+
+
 @pytest.mark.parametrize(('text', 'problem'), [
     ('', 'this is no architecture file'),
     ('[1]', 'this is no architecture file'),
