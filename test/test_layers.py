@@ -195,9 +195,11 @@ def derived(texts: list[str]) -> frozenset[str]:
     found: set[str] = set(BASES)
     kinds = [node for text in texts for node in ast.walk(ast.parse(text))
              if isinstance(node, ast.ClassDef)]
-    for _ in kinds:
-        found |= {kind.name for kind in kinds
-                  if any(isinstance(base, ast.Name) and base.id in found for base in kind.bases)}
+    while more := {
+        kind.name for kind in kinds if kind.name not in found
+        and any(isinstance(base, ast.Name) and base.id in found for base in kind.bases)
+    }:
+        found |= more
     return frozenset(found)
 
 

@@ -35,11 +35,10 @@ import threading
 from typing import Any, TYPE_CHECKING
 import weakref
 
+from mddag_executor.live.compat.events_executor import events_executor_modules
 from mddag_executor.live.loading import LoadingError
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
-import rclpy.experimental
-import rclpy.experimental.events_executor
 from rclpy.node import Node
 import rclpy.utilities
 
@@ -83,8 +82,7 @@ class Interception:
             (rclpy, 'spin', self._spin),
             (rclpy, 'spin_once', self._spin_once),
             (rclpy, 'spin_until_future_complete', self._spin_until),
-            (rclpy.experimental, 'EventsExecutor', _stand_in),
-            (rclpy.experimental.events_executor, 'EventsExecutor', _stand_in),
+            *((place, 'EventsExecutor', _stand_in) for place in events_executor_modules()),
             (signal, 'signal', self._signal(signal.signal)),
         ]
         methods: dict[str, Callable[..., Any]] = {

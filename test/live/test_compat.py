@@ -9,12 +9,14 @@ import time
 from typing import Any
 import weakref
 
+from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.live import compat
-from mddag_executor.live.compat.events_executor import is_available
+from mddag_executor.live.compat.events_executor import events_executor_modules, is_available
 import pytest
 import rclpy
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 from rclpy.task import Future
 from rclpy.waitable import NumberOfEntities, Waitable
 from std_msgs.msg import String
@@ -310,3 +312,16 @@ def test_names_of_services(pair):
 
 def test_the_native_executor_is_there():
     assert is_available()
+    assert all(hasattr(module, 'EventsExecutor') for module in events_executor_modules())
+
+
+def test_without_a_native_executor_there_is_the_wait_set(monkeypatch, ros_context, make_node):
+    monkeypatch.delattr(implementation, 'EventsExecutor')
+    assert not is_available() and not events_executor_modules()
+    node, ran = make_node(), []
+    node.create_timer(0.01, lambda: ran.append(1))
+    executor = MultiDeadlineExecutor(context=ros_context)
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: ran)
+    assert spinning.error is None

@@ -38,6 +38,7 @@ crash it when they are removed, and it refuses guard conditions: it gets none of
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from importlib import import_module
 from itertools import chain
 from operator import length_hint, methodcaller
 from types import SimpleNamespace
@@ -371,6 +372,12 @@ class NativeExecutor:
         self._node.withdraw()
 
 
+def events_executor_modules() -> list[Any]:
+    """Return the modules that offer rclpy's ``EventsExecutor`` to users; the same holds for it."""
+    names = ('rclpy.experimental', 'rclpy.experimental.events_executor')
+    return [import_module(name) for name in names] if is_available() else []
+
+
 def is_available() -> bool:
-    """Return whether this rclpy has a native EventsExecutor: the first ones of 7.1 had none."""
+    """Return whether this rclpy has a native EventsExecutor. The first ones of 7.1 had none."""
     return hasattr(_rclpy, 'EventsExecutor')
