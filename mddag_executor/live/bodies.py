@@ -8,7 +8,7 @@ What the callbacks of synthetic nodes do: execute, pass the release on, join, ke
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import deque, OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 import threading
@@ -65,8 +65,8 @@ class Role:
     execution_ns: int
     publishers: list[Publisher]
     emulate: Emulate
-    durations: list[int]
-    completions: list[tuple[int, int]] | None
+    durations: deque[int]
+    completions: deque[tuple[int, int]] | None
     clock_offset_ns: int
 
     def execute(self, message: Header, release: int) -> None:

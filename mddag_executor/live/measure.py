@@ -25,6 +25,7 @@ that do not complete the join are not counted as callbacks: their cost is overhe
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 import time
 from typing import Any
@@ -56,16 +57,19 @@ class Ledger:
     body started after its release.  ``misattributed`` takes (vertex name, release by the message,
     release by the executor) where these differ, ``unattributed`` the names of vertices that ran as
     no job.
+
+    :param keep: how much of each to keep, the last; None: all.
     """
 
-    def __init__(self, task_set: TaskSet) -> None:
+    def __init__(self, task_set: TaskSet, keep: int | None = None) -> None:
         self.task_set = task_set
-        self.durations: list[list[list[int]]] = [[[] for _ in d.vertices] for d in task_set.dags]
-        self.completions: list[list[list[tuple[int, int]]]] = [
-            [[] for _ in d.vertices] for d in task_set.dags]
-        self.delays: list[list[int]] = [[] for _ in task_set.dags]
-        self.misattributed: list[tuple[str, int, int]] = []
-        self.unattributed: list[str] = []
+        self.durations: list[list[deque[int]]] = [
+            [deque(maxlen=keep) for _ in d.vertices] for d in task_set.dags]
+        self.completions: list[list[deque[tuple[int, int]]]] = [
+            [deque(maxlen=keep) for _ in d.vertices] for d in task_set.dags]
+        self.delays: list[deque[int]] = [deque(maxlen=keep) for _ in task_set.dags]
+        self.misattributed: deque[tuple[str, int, int]] = deque(maxlen=keep)
+        self.unattributed: deque[str] = deque(maxlen=keep)
         self.first_release: list[int | None] = [None for _ in task_set.dags]
         self.clock_offset_ns = epoch_offset_ns()
         #: Executions up to this long were emulated busily, longer ones by sleep.
@@ -108,7 +112,7 @@ def measure(
         'missing': totals['missing'],
         'on_time_ratio': totals['on_time'] / due if due else None,
         **_throughput(ledger, plan, start, end),
-        'source_delay_us': quantiles_us([d for delays in ledger.delays for d in delays]),
+        'source_delay_us': quantiles_us([d for delays in ledger.delays for d in list(delays)]),
         'attribution': {
             'wrong': len(ledger.misattributed), 'none': len(ledger.unattributed)},
         'dags': dags}

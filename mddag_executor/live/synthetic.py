@@ -39,6 +39,7 @@ release is lost to discovery; the DAGs' first releases are one period after that
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 import threading
@@ -112,17 +113,18 @@ class SyntheticWorkload:
     :param current_job: ``mddag_executor.live.current_job`` under our executor; leave it out under
         others.
     :param context: where the nodes belong to; None is rclpy's default context.
-    :ivar timers: each with the DAG that it releases.
+    :param keep: how much of each series the ledger keeps; None: all.
+    :ivar timers: by the DAG that they release.
     """
 
     def __init__(
         self, task_set: TaskSet, plan: ExecutionPlan, *, current_job: CurrentJob = no_job,
-        context: Context | None = None,
+        context: Context | None = None, keep: int | None = None,
     ) -> None:
         self.task_set = task_set
         self.plan = plan
-        self.ledger = Ledger(task_set)
-        self.joins: list[Join] = []
+        self.ledger = Ledger(task_set, keep)
+        self._joins: dict[str, list[Join]] = {}
         self._current_job = current_job
         self._context = context
         self._emulate = emulator(plan.mode)
@@ -132,14 +134,20 @@ class SyntheticWorkload:
         self._nodes: dict[str, Node] = {}
         self._sensor_node: Node | None = None
         self._publishers: dict[tuple[str, str], Publisher] = {}
-        self._n_subscribers: dict[str, int] = {}
-        self._groups: dict[tuple[str, str], CallbackGroup] = {}
-        self.timers: list[tuple[int, Timer]] = []
+        self._n_subscribers = Counter(t for c in task_set.callbacks for t in c.topics)
+        self._vertices: dict[str, list[Vertex]] = {}
+        for vertex in task_set.vertices:
+            self._vertices.setdefault(vertex.callback.key, []).append(vertex)
+        self.timers: dict[int, Timer] = {}
         self._grids: dict[int, Grid] = {}
-        self._sensors: dict[tuple[str, ...], Sensor] = {}
+        self._sensors: dict[str, Sensor] = {}
         self._sensor_thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._build()
+        for name in dict.fromkeys(callback.node for callback in task_set.callbacks):
+            self.make(name)
+        for vertex in task_set.vertices:
+            if not vertex.predecessors and vertex.callback.kind != 'timer':
+                self._add_sensor(vertex)
 
     @property
     def nodes(self) -> list[Node]:
@@ -149,7 +157,7 @@ class SyntheticWorkload:
     @property
     def evicted_joins(self) -> int:
         """Tell how many joins were dropped incomplete."""
-        return sum(join.evicted for join in self.joins)
+        return sum(join.evicted for joins in self._joins.values() for join in joins)
 
     def unmatched(self) -> list[str]:
         """Return the topics whose publishers and subscriptions have not all met yet."""
@@ -157,7 +165,7 @@ class SyntheticWorkload:
         found = set()
         for (_, topic), publisher in self._publishers.items():
             n_publishers[topic] = n_publishers.get(topic, 0) + 1
-            if publisher.get_subscription_count() < self._n_subscribers.get(topic, 0):
+            if publisher.get_subscription_count() < self._n_subscribers[topic]:
                 found.add(topic)
         for node in self._nodes.values():
             for subscription in node.subscriptions:
@@ -173,9 +181,8 @@ class SyntheticWorkload:
         :param wake: wakes the executor: a wait set that waits already does not see a timer start.
         """
         first = self.ledger.first_release
-        for dag, timer in self.timers:
-            timer.reset()
-            self._grids[dag] = Grid(timer, self.ledger.clock_offset_ns)
+        for dag in self.timers:
+            self.start_timer(dag)
             first[dag] = self._grids[dag].first_release
         wake()
         if self._sensors:
@@ -186,6 +193,11 @@ class SyntheticWorkload:
             self._sensor_thread = threading.Thread(
                 target=self._run_sensors, name='mddag_sensors', daemon=True)
             self._sensor_thread.start()
+
+    def start_timer(self, dag: int) -> None:
+        """Start the timer that releases a DAG, one period from now."""
+        self.timers[dag].reset()
+        self._grids[dag] = Grid(self.timers[dag], self.ledger.clock_offset_ns)
 
     def stop(self) -> None:
         """
@@ -216,23 +228,26 @@ class SyntheticWorkload:
             sensors[index].send(release)
             due[index] = (release + sensors[index].period_ns, index)
 
-    def _build(self) -> None:
-        vertices: dict[str, list[Vertex]] = {}
-        for vertex in self.task_set.vertices:
-            vertices.setdefault(vertex.callback.key, []).append(vertex)
+    def make(self, name: str) -> Node:
+        """Make a declared node with its entities, perhaps again; its timers have not started."""
+        node = self._nodes[name] = quiet_node(name, self._context)
+        for key in [key for key in self._publishers if key[0] == name]:
+            del self._publishers[key]
+        groups: dict[str, CallbackGroup] = {}
         for callback in self.task_set.callbacks:
-            node = self._nodes.get(callback.node)
-            if node is None:
-                node = self._nodes[callback.node] = quiet_node(
-                    callback.node, self._context)
+            if callback.node != name:
+                continue
+            kind = MutuallyExclusiveCallbackGroup if callback.group else ReentrantCallbackGroup
+            group = groups.setdefault(callback.group or '', kind())
             publishers = [self._publisher(node, topic) for topic in callback.publishes]
-            roles = [self._role(v, publishers) for v in vertices.get(callback.key, ())]
+            roles = [self._role(v, publishers) for v in self._vertices.get(callback.key, ())]
             if callback.kind == 'timer':
-                self._add_timer(node, callback, roles[0])
+                self._add_timer(node, group, callback, roles[0])
             elif callback.kind == 'service':
-                self._add_service(node, callback, roles[0])
+                self._add_service(node, group, callback, roles[0])
             else:
-                self._add_subscriptions(node, callback, roles)
+                self._add_subscriptions(node, group, callback, roles)
+        return node
 
     def _publisher(self, node: Node, topic: str) -> Publisher:
         # Callbacks of a node that publish the same topic share the publisher, as members do.
@@ -240,13 +255,6 @@ class SyntheticWorkload:
         if key not in self._publishers:
             self._publishers[key] = node.create_publisher(Header, topic, QOS)
         return self._publishers[key]
-
-    def _group(self, callback: Callback) -> CallbackGroup:
-        key = (callback.node, callback.group or '')
-        if key not in self._groups:
-            kind = MutuallyExclusiveCallbackGroup if callback.group else ReentrantCallbackGroup
-            self._groups[key] = kind()
-        return self._groups[key]
 
     def _role(self, vertex: Vertex, publishers: list[Publisher]) -> Role:
         name = self.task_set.dags[vertex.dag].name
@@ -261,7 +269,9 @@ class SyntheticWorkload:
             completions=completions if vertex.deadline_ns is not None else None,
             clock_offset_ns=self.ledger.clock_offset_ns)
 
-    def _add_timer(self, node: Node, callback: Callback, role: Role) -> None:
+    def _add_timer(
+        self, node: Node, group: CallbackGroup, callback: Callback, role: Role
+    ) -> None:
         dag = role.vertex.dag
         grids, current_job, offset = self._grids, self._current_job, role.clock_offset_ns
         delays = self.ledger.delays[dag]
@@ -274,13 +284,15 @@ class SyntheticWorkload:
             role.execute(stamped(release), release)
 
         timer = node.create_timer(
-            (callback.timer_period_ns or 0) / 1e9, on_timer, callback_group=self._group(callback),
+            (callback.timer_period_ns or 0) / 1e9, on_timer, callback_group=group,
             clock=self._clock, autostart=False)
         # Once more, exactly: seconds as a float may lose a nanosecond.
         timer.timer_period_ns = callback.timer_period_ns or 0
-        self.timers.append((dag, timer))
+        self.timers[dag] = timer
 
-    def _add_service(self, node: Node, callback: Callback, role: Role) -> None:
+    def _add_service(
+        self, node: Node, group: CallbackGroup, callback: Callback, role: Role
+    ) -> None:
         current_job = self._current_job
 
         def on_request(
@@ -291,51 +303,46 @@ class SyntheticWorkload:
             role.execute(stamped(release), release)
             return response
 
-        name = callback.service or ''
         node.create_service(
-            ListParameters, name, on_request, callback_group=self._group(callback))
-        client = self._sensors_node().create_client(ListParameters, name)
+            ListParameters, callback.service or '', on_request, callback_group=group)
+
+    def _add_subscriptions(
+        self, node: Node, group: CallbackGroup, callback: Callback, roles: list[Role]
+    ) -> None:
+        if callback.kind == 'sync':
+            joins = self._joins[callback.key] = [Join(role) for role in roles]
+            on_message = sync_callback(joins, self.ledger, self._current_job)
+        else:
+            on_message = plain_callback(roles, self.ledger, self._current_job)
+        for topic in callback.topics:
+            node.create_subscription(Header, topic, on_message, QOS, callback_group=group)
+
+    def _add_sensor(self, source: Vertex) -> None:
+        """Make what starts a DAG whose source is no timer."""
+        callback = source.callback
+        if self._sensor_node is None:
+            self._sensor_node = quiet_node(SENSORS_NODE, self._context)
+        # One message on a topic releases all DAGs that wait for it.  (Of two periods the shorter
+        # one sets the pace.)
+        start = callback.service or callback.topics[0]
+        if start not in self._sensors:
+            send = self._requests(start) if callback.service else self._messages(start)
+            self._sensors[start] = Sensor([], callback.period_ns or 0, send)
+        sensor = self._sensors[start]
+        sensor.period_ns = min(sensor.period_ns, callback.period_ns or 0)
+        sensor.dags.append(source.dag)
+
+    def _messages(self, topic: str) -> Callable[[int], None]:
+        assert self._sensor_node is not None
+        publisher = self._publisher(self._sensor_node, topic)
+        return lambda release: publisher.publish(stamped(release, SENSOR + topic))
+
+    def _requests(self, service: str) -> Callable[[int], None]:
+        assert self._sensor_node is not None
+        client = self._sensor_node.create_client(ListParameters, service)
 
         def send(release: int) -> None:
             future = client.call_async(ListParameters.Request(depth=release))
             client.remove_pending_request(future)  # nobody waits for the answer
 
-        self._add_sensor(callback, role, send)
-
-    def _add_subscriptions(self, node: Node, callback: Callback, roles: list[Role]) -> None:
-        if callback.kind == 'sync':
-            joins = [Join(role) for role in roles]
-            self.joins.extend(joins)
-            on_message = sync_callback(joins, self.ledger, self._current_job)
-        else:
-            on_message = plain_callback(roles, self.ledger, self._current_job)
-        for topic in callback.topics:
-            self._n_subscribers[topic] = self._n_subscribers.get(topic, 0) + 1
-            node.create_subscription(
-                Header, topic, on_message, QOS, callback_group=self._group(callback))
-        for role in roles:
-            if not role.vertex.predecessors:
-                self._add_topic_sensor(callback, role)
-
-    def _add_topic_sensor(self, callback: Callback, role: Role) -> None:
-        publishers = [(t, self._publisher(self._sensors_node(), t)) for t in callback.topics]
-
-        def send(release: int) -> None:
-            for topic, publisher in publishers:
-                publisher.publish(stamped(release, SENSOR + topic))
-
-        self._add_sensor(callback, role, send)
-
-    def _add_sensor(self, callback: Callback, role: Role, send: Callable[[int], None]) -> None:
-        # One message on a topic releases all DAGs that wait for it.  (Of two periods the shorter
-        # one sets the pace.)
-        key = callback.topics or (callback.service or '',)
-        period = callback.period_ns or 0
-        sensor = self._sensors.setdefault(key, Sensor([], period, send))
-        sensor.period_ns = min(sensor.period_ns, period)
-        sensor.dags.append(role.vertex.dag)
-
-    def _sensors_node(self) -> Node:
-        if self._sensor_node is None:
-            self._sensor_node = quiet_node(SENSORS_NODE, self._context)
-        return self._sensor_node
+        return send

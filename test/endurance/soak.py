@@ -7,8 +7,7 @@ Endurance: a declared workload under one executor for as long as it takes, with 
 
 Theory of operation
 -------------------
-The nodes are made from the declaration, much as ``synthetic`` makes them, but each can be
-destroyed and made again by itself, and nothing is kept for each message.  After a warm-up there is
+The nodes are synthetic ones, each destroyed and made again by itself.  After a warm-up there is
 one fault after the other, chosen at random, and after each of them a second to recover and a
 *clean* window:
 
@@ -50,6 +49,7 @@ from mddag_executor.live.executor import MultiDeadlineExecutor
 from msg_graph import load, TaskSet
 import rclpy
 from rclpy.executors import ExternalShutdownException
+from rclpy.timer import Timer
 from rclpy.utilities import try_shutdown
 from soak_memory import in_use, kept_by_middleware, resident
 from soak_nodes import SimulatedTime, SoakFault, SoakNodes
@@ -175,8 +175,9 @@ class Soak:
             self.executor.add_node(node)
         self._thread.start()
         end = time.monotonic() + MATCH_S
-        while not self.nodes.matched() and time.monotonic() < end:
+        while self.nodes.workload.unmatched() and time.monotonic() < end:
             time.sleep(0.05)
+        self.nodes.workload.start(self.executor.wake)
         begin = time.monotonic()
         warm_up = min(60.0, self._seconds / 3)
         time.sleep(warm_up)
@@ -199,7 +200,7 @@ class Soak:
             if fault != 'burst':
                 self._inject(fault, 0.1)
         time.sleep(RECOVERY_S)  # a timer made anew is known by its period: that is not altered yet
-        self._burst(FAULT_S, self.nodes.sources())
+        self._burst(FAULT_S, list(self.nodes.workload.timers.values()))
         time.sleep(RECOVERY_S)
 
     def _one_fault(self) -> None:
@@ -222,7 +223,7 @@ class Soak:
         self.nodes.nodes[name].destroy_node()
         self.executor.remove_node(self.nodes.nodes[name])
         time.sleep(seconds / 4)
-        self.executor.add_node(self.nodes.make(name))
+        self.executor.add_node(self.nodes.make_again(name))
         time.sleep(seconds * 3 / 4)
 
     def _raise(self, seconds: float) -> None:
@@ -230,15 +231,14 @@ class Soak:
         time.sleep(seconds)
 
     def _stop(self, seconds: float) -> None:
-        timer = self.nodes.timers[self._random.choice(self.nodes.sources())]
+        timer = self._random.choice(list(self.nodes.workload.timers.values()))
         timer.cancel()
         time.sleep(seconds)
         timer.reset()
         self.executor.wake()
 
-    def _burst(self, seconds: float, sources: list[str] | None = None) -> None:
-        sources = sources or [self._random.choice(self.nodes.sources())]
-        timers = [self.nodes.timers[source] for source in sources]
+    def _burst(self, seconds: float, timers: list[Timer] | None = None) -> None:
+        timers = timers or [self._random.choice(list(self.nodes.workload.timers.values()))]
         periods = [timer.timer_period_ns for timer in timers]
         for timer, period in zip(timers, periods):
             timer.timer_period_ns = max(1_000_000, period // BURST)
@@ -259,7 +259,7 @@ class Soak:
         ticks = self._simulated.ticks
         time.sleep(2.0)
         simulated_goes_on = self._simulated.ticks > ticks
-        for timer in self.nodes.timers.values():
+        for timer in self.nodes.workload.timers.values():
             timer.cancel()
         time.sleep(DRAIN_S)
         n_open = list(self.executor._dispatcher.scheduler.state.n_open)
@@ -268,8 +268,7 @@ class Soak:
         self._thread.join(10.0)
         statistics = self.executor.statistics()
         self._simulated.stop()
-        for node in self.nodes.nodes.values():
-            node.destroy_node()
+        self.nodes.workload.destroy()
         self._stalls.stop()
         # what is released last in a window runs on beyond it, and may wait for what was before
         judged = [(start, stop) for start, stop, _ in self._clean if not self._stalls.within(

@@ -75,14 +75,13 @@ def measure(graph: str, remade: int, seed: int = 0) -> float:
         for _ in range(times):
             name = chosen.choice(names)
             nodes.nodes[name].destroy_node()
-            nodes.make(name)
+            nodes.make_again(name)
         time.sleep(1.0)  # for the middleware's threads
         return in_use()
 
     before = make_again(WARM_UP_REMADE)
     after = make_again(remade)
-    for node in nodes.nodes.values():
-        node.destroy_node()
+    nodes.workload.destroy()
     return (after - before) / remade
 
 

@@ -42,7 +42,7 @@ def run_declared(spec: Spec) -> dict[str, Any]:
     starts = Starts()
     # before an executor learns of them
     starts.watch(workload.nodes,
-                 {timer: workload.ledger.delays[dag] for dag, timer in workload.timers})
+                 {timer: workload.ledger.delays[dag] for dag, timer in workload.timers.items()})
     for node in workload.nodes:
         executor.add_node(node)
     session = UnfinishedSession(executor, spec)

@@ -10,6 +10,7 @@ tuple for each start; appending is one indivisible step in CPython, so there is 
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
 import inspect
 import time
@@ -35,7 +36,7 @@ class Starts:
 
     def __init__(self) -> None:
         self.messages: list[Start] = []
-        self._timers: list[tuple[list[int], list[int]]] = []
+        self._timers: list[tuple[list[int], deque[int]]] = []
 
     def noting(self, callback: Callable[[Any], None] = _nothing) -> Callable[..., None]:
         """Return a subscription's callback that notes its start and calls another one."""
@@ -55,7 +56,7 @@ class Starts:
             for name in ('message', 'info')])
         return on_message
 
-    def watch_timer(self, timer: Timer, delays: list[int]) -> None:
+    def watch_timer(self, timer: Timer, delays: deque[int]) -> None:
         """
         Note the starts of a timer.
 
@@ -71,7 +72,7 @@ class Starts:
         timer.callback = on_timer
         self._timers.append((starts, delays))
 
-    def watch(self, nodes: Iterable[Node], delays: dict[Timer, list[int]]) -> None:
+    def watch(self, nodes: Iterable[Node], delays: dict[Timer, deque[int]]) -> None:
         """Note the starts of all subscriptions and timers of nodes."""
         for node in nodes:
             for subscription in node.subscriptions:
@@ -90,5 +91,5 @@ class Starts:
         for starts, delays in self._timers if timers else ():
             # One of each for every call.  Calls of one timer that overlap may come in another
             # order here than there, which can matter only at the edges of the window.
-            found += [late for at, late in zip(list(starts), delays) if begin <= at <= end]
+            found += [late for at, late in zip(list(starts), list(delays)) if begin <= at <= end]
         return found
