@@ -28,7 +28,12 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.live import hooks
-from mddag_executor.live.compat import BareExecutor, is_called_by_spin, RCL_ERRORS
+from mddag_executor.live.compat import (
+    BareExecutor,
+    is_called_by_spin,
+    RCL_ERRORS,
+    TASKS_NEWEST_FIRST,
+)
 from mddag_executor.live.diagnostics import Diagnostics
 from mddag_executor.live.endings import call_at_shutdown, halt_at_exit, is_over
 from mddag_executor.live.engine import Engine
@@ -291,9 +296,10 @@ class MultiDeadlineExecutor(BareExecutor):
         return Future(executor=self)
 
     def _submit_tasks(self) -> None:
-        """Have the tasks run that were created while nobody spun: the newest first (rclpy)."""
+        """Have the tasks run that were created while nobody spun, in rclpy's order."""
+        take = self._new_tasks.pop if TASKS_NEWEST_FIRST else self._new_tasks.popleft
         while self._new_tasks:
-            self._pool.tell(self._engine.ready, self._new_tasks.pop())
+            self._pool.tell(self._engine.ready, take())
 
     # --- spinning --------------------------------------------------------------------------------
 

@@ -236,6 +236,10 @@ def awaited(coroutine: Any) -> Any:
 
 # --- executors and nodes -------------------------------------------------------------------------
 
+TASKS_NEWEST_FIRST = TimerInfo is None
+"""Whether tasks that wait run in the reverse of their order: in all of 7.1, but not in 9.1."""
+
+
 class BareExecutor(Executor):
     """rclpy's executor, without its own way of running things."""
 
