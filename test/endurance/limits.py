@@ -32,6 +32,7 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.core import quantile
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.live import current_job
@@ -97,14 +98,14 @@ class Lateness:
 
     def __init__(self) -> None:
         self.late: list[int] = []
-        self.clock: Callable[[], int] = time.time_ns
+        self._offset_ns = epoch_offset_ns()
         self.node = Node('limits', enable_rosout=False, start_parameter_services=False)
         self.node.create_timer(PERIOD_S, self._tick, ReentrantCallbackGroup())
 
     def _tick(self) -> None:
         job = current_job()
         if job is not None:
-            self.late.append(self.clock() - job.release_ns)
+            self.late.append(time.monotonic_ns() + self._offset_ns - job.release_ns)
 
     def result(self) -> dict[str, float]:
         """Return quantiles in us."""
@@ -166,8 +167,6 @@ def lateness(
     watched = Lateness()
     try:
         with spinning(graph=loads(GRAPH), num_workers=workers, **arguments) as executor:
-            watched.clock = executor._dispatcher.now
-
             def run() -> None:
                 assert body is not None
                 body()

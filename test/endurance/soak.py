@@ -262,7 +262,7 @@ class Soak:
         for timer in self.nodes.workload.timers.values():
             timer.cancel()
         time.sleep(DRAIN_S)
-        n_open = list(self.executor._dispatcher.scheduler.state.n_open)
+        n_open = list(self.executor._engine.scheduler.state.n_open)
         self._ending = True
         ended = self.executor.shutdown(10.0)
         self._thread.join(10.0)
