@@ -174,7 +174,8 @@ def peek(t: Tables, s: State, now: int) -> int:
     """
     again = True
     while True:
-        queue = next_queue(s)
+        plain = s.scalars[N_STALE] == 0 and len(s.held_back) == 0
+        queue = s.ready if plain else next_queue(s)
         while queue:
             entry = queue[0]
             x = entry[4]
@@ -209,19 +210,6 @@ def peek(t: Tables, s: State, now: int) -> int:
         poll(t, s)
 
 
-def _start(s: State, x: int, worker: int, now: int) -> None:
-    heappop(s.ready if len(s.ready) > 0 and s.ready[0][4] == x else s.held_back)
-    s.x_state[x] = RUNNING
-    s.x_worker[x] = worker
-    s.scalars[N_HOLDING] += s.x_holds[x]
-    s.x_started[x] = now
-    s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]
-    s.worker_x[worker] = x
-    s.scalars[N_IDLE] -= 1
-    if s.x_group[x] >= 0:
-        s.group_owner[s.x_group[x]] = x
-
-
 def admit(s: State, x: int, now: int) -> None:
     """Start an execution as it was recorded: past the ready queue, its group and the workers."""
     s.job_active[s.x_slot[x]] += 1
@@ -233,8 +221,18 @@ def admit(s: State, x: int, now: int) -> None:
 def take(t: Tables, s: State, worker: int, now: int) -> int:
     """Dispatch the next execution on this idle worker and return it, or -1 (rule 5)."""
     x = peek(t, s, now)
-    if x >= 0:
-        _start(s, x, worker, now)
+    if x < 0:
+        return -1
+    heappop(s.ready if len(s.ready) > 0 and s.ready[0][4] == x else s.held_back)
+    s.x_state[x] = RUNNING
+    s.x_worker[x] = worker
+    s.scalars[N_HOLDING] += s.x_holds[x]
+    s.x_started[x] = now
+    s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]
+    s.worker_x[worker] = x
+    s.scalars[N_IDLE] -= 1
+    if s.x_group[x] >= 0:
+        s.group_owner[s.x_group[x]] = x
     return x
 
 
@@ -244,18 +242,15 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
 
     A driver calls this until it answers -1.
     """
-    if s.scalars[POLLING] != 0 and s.scalars[N_IDLE] == 0:
-        return -1  # only a worker that is free looks, and polls
-    x = peek(t, s, now)
-    if x < 0:
-        return -1
     if s.scalars[N_IDLE] > 0:
         worker = 0
         while s.worker_x[worker] >= 0:
             worker += 1
-        _start(s, x, worker, now)
-        return x
-    if s.scalars[PREEMPTIVE] == 0:
+        return take(t, s, worker, now)
+    if s.scalars[POLLING] != 0:
+        return -1  # only a worker that is free looks, and polls
+    x = peek(t, s, now)
+    if x < 0 or s.scalars[PREEMPTIVE] == 0:
         return -1
     worker = 0
     largest = s.x_key[s.worker_x[0]][0]
@@ -268,7 +263,7 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
     victim = s.worker_x[worker]
     _leave_worker(s, victim)
     s.x_left[victim] += s.scalars[SWITCH_OVERHEAD] - (now - s.x_started[victim])
-    _start(s, x, worker, now)
+    x = take(t, s, worker, now)
     _enqueue(t, s, key, victim)
     return x
 
@@ -327,7 +322,12 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
 
     :return: whether its vertex has completed: False only for a leg that did not make it whole.
     """
-    _leave_worker(s, x)
+    worker = s.x_worker[x]
+    if worker >= 0:  # not _leave_worker: a call less for each execution
+        s.worker_x[worker] = -1
+        s.x_worker[x] = -1
+        s.scalars[N_HOLDING] -= s.x_holds[x]
+        s.scalars[N_IDLE] += 1
     s.x_state[x] = DONE
     group = s.x_group[x]
     if group >= 0 and s.group_owner[group] == x:

@@ -92,17 +92,13 @@ class Scheduler:
         """Return the execution of the source of the job in a slot."""
         return self.execution(slot, self.tables.source[self.state.job_dag[slot]])
 
-    def undeclared(self, job: int, group: int, now: int, holds: int = 0) -> int:
-        """Make a callback that no DAG declares ready; return its execution."""
+    def undeclared(self, job: int, now: int) -> int:
+        """Return an execution for a callback that no DAG declares; to be made ready at once."""
         slot = jobs.open_undeclared(self.tables, self.state, job, now)
         if slot < 0:
             add_slot(self.tables, self.state, self.tables.n_dags)
             slot = jobs.open_undeclared(self.tables, self.state, job, now)
-        x = self.state.job_base[slot]
-        self.state.x_group[x] = group
-        self.state.x_holds[x] = holds
-        self.ready(x, now)
-        return x
+        return self.state.job_base[slot]
 
     def admit(self, x: int, now: int) -> None:
         """Start an execution as it was recorded; it takes no worker and no callback group."""

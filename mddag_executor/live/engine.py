@@ -17,7 +17,7 @@ lock, so that times never decrease.  Nobody else reads or changes the core's sta
     For that the turn is the callback's and not the message's: where a queue overflows all the
     time, none of its messages waits for long, and it would have its turn after everybody who has
     waited longer.  So the next message takes the place of the one that goes.
-3.  *What to run* (``next_on``, ``next_for_idle``) and *what became of it* (``finished``,
+3.  *What to run* (``next``) and *what became of it* (``finished``,
     ``suspended``, ``refused``, …) is the core's decision, see ``core.rules``.
 4.  *What the core decides beside* (verdicts, ends of jobs, what an abort drops) is counted,
     recorded and told to the user (``verdicts``).
@@ -156,8 +156,8 @@ class Engine:
     def _start_job(self, work: Work, release: int, now: int) -> None:
         dag = self.tables.dag_of[work.entity.source]
         slot = self._release(dag, release, now)
-        self._start(work, self.scheduler.source(slot), Origin(
-            slot, dag, self._state.job_index[slot], work.entity.source), now)
+        work.origin = Origin(slot, dag, self._state.job_index[slot], work.entity.source)
+        self._start(work, self.scheduler.source(slot), now)
 
     def _enter(self, entity: Entity, stamp: int, release: int, now: int) -> Origin | None:
         """Find or start the job of a message from another process (see ``crossings``)."""
@@ -211,28 +211,23 @@ class Engine:
         x = state.job_base[slot] + self.tables.region_offset[vertex] + leg
         if state.x_state[x] != IDLE:
             return False  # a second message for the same vertex of the same job
-        self._start(work, x, Origin(slot, dag, job, vertex), now)
+        work.origin = Origin(slot, dag, job, vertex)
+        self._start(work, x, now)
         return True
 
     def _start_undeclared(self, work: Work, now: int) -> None:
         self.undeclared += 1
-        entity = work.entity
-        self._note_ready(work, self.scheduler.undeclared(
-            entity.ready, entity.group, now, entity.habit.holds), now)
+        self._start(work, self.scheduler.undeclared(work.entity.ready, now), now)
 
-    def _start(self, work: Work, x: int, origin: Origin, now: int) -> None:
+    def _start(self, work: Work, x: int, now: int) -> None:
         entity, state = work.entity, self._state
         state.x_group[x] = entity.group
         state.x_holds[x] = entity.habit.holds
-        work.origin = origin
         self.scheduler.ready(x, now)
-        self._note_ready(work, x, now)
-
-    def _note_ready(self, work: Work, x: int, now: int) -> None:
         work.x = x
         work.ready_ns = now
-        work.entity.ready += 1
-        work.entity.waiting[x] = None
+        entity.ready += 1
+        entity.waiting[x] = None
         self._work[x] = work
 
     # --- what does not run -----------------------------------------------------------------------
@@ -247,7 +242,10 @@ class Engine:
             oldest.x = -1
             self.undeclared += 1
             self.verdicts.dropped(entity, NO_ORIGIN, 'qos_depth', now)
-            self._note_ready(work, first, now)
+            work.x = first
+            work.ready_ns = now
+            entity.ready += 1
+            self._work[first] = work
             return
         heir = self._work[second]
         self._work[first], self._work[second] = heir, oldest
@@ -287,30 +285,27 @@ class Engine:
         """Return how many workers run nothing."""
         return self._state.scalars[N_IDLE]
 
-    @property
-    def idle_worker(self) -> int:
-        """Return the first worker that runs nothing, -1 where there is none."""
-        return self._state.worker_x.index(-1) if self._state.scalars[N_IDLE] else -1
+    def next(self, now: int, worker: int = -1) -> Work | None:
+        """
+        Dispatch the next execution on a worker that runs nothing; None: nothing may run.
 
-    def next_for_idle(self, now: int) -> Work | None:
-        """Dispatch one execution on an idle worker (``Work.worker``); None: nothing may run."""
+        :param worker: -1: the idle one with the lowest number, if there is any.
+        """
         state = self._state
-        if not (state.ready or state.held_back or state.unpolled) or not state.scalars[N_IDLE]:
+        if not (state.ready or state.held_back or state.unpolled):
             return None
-        return self._dispatched(self.scheduler.schedule(now), now)
-
-    def next_on(self, worker: int, now: int) -> Work | None:
-        """Dispatch the next execution on a worker that runs nothing; None: nothing may run."""
-        return self._dispatched(self.scheduler.take(worker, now), now)
-
-    def _dispatched(self, x: int, now: int) -> Work | None:
-        if self._state.decisions:
+        if worker < 0:
+            if not state.scalars[N_IDLE]:
+                return None
+            worker = state.worker_x.index(-1)
+        x = self.scheduler.take(worker, now)
+        if state.decisions:
             self._decided(now)
         if x < 0:
             return None
         work = self._work.pop(x)
         work.entity.waiting.pop(x, None)
-        work.worker = self._state.x_worker[x]
+        work.worker = worker
         return work
 
     def interpreter_holder(self) -> tuple[int, int]:

@@ -40,24 +40,21 @@ class Guess:
 
     :param limit_ns: what is short.
     :param first: how many times it must have been short before it is expected.
+    :ivar debt: it is expected to be short where there is none.
     """
 
-    __slots__ = ('_limit_ns', '_debt')
+    __slots__ = ('limit_ns', 'debt')
 
     def __init__(self, limit_ns: int, first: int) -> None:
-        self._limit_ns = limit_ns
-        self._debt = first
-
-    def is_expected(self) -> bool:
-        """Return whether it is expected to be short."""
-        return self._debt <= 0
+        self.limit_ns = limit_ns
+        self.debt = first
 
     def took(self, ns: int) -> None:
         """Learn how long it was."""
-        if ns > self._limit_ns:
-            self._debt = min(MOST_DEBT, self._debt + DOUBT * ns // self._limit_ns)
-        elif self._debt > 0:
-            self._debt -= 1
+        if ns > self.limit_ns:
+            self.debt = min(MOST_DEBT, self.debt + DOUBT * ns // self.limit_ns)
+        elif self.debt > 0:
+            self.debt -= 1
 
 
 class Entity:

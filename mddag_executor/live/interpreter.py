@@ -80,9 +80,8 @@ class Interpreter:
 
     # --- measuring -------------------------------------------------------------------------------
 
-    def begins(self, seat: Seat, habit: Habit, start: int) -> None:
+    def begins(self, seat: Seat, habit: Habit) -> None:
         """Take note, in its thread, that a seat's execution begins."""
-        seat.began_ns = start
         seat.reading = None
         clock = seat.cpu_clock
         if clock is not None and habit.is_to_be_measured():

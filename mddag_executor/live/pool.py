@@ -39,6 +39,7 @@ from typing import Any
 from mddag_executor.clocks import TraceClock
 from mddag_executor.live.compat import UNKNOWN
 from mddag_executor.live.engine import Engine
+from mddag_executor.live.entity import BRIEF_NS
 from mddag_executor.live.gates import Refused
 from mddag_executor.live.interpreter import Interpreter
 from mddag_executor.live.seat import current, Seat
@@ -262,10 +263,12 @@ class Pool:
         engine = self.engine
         chosen = None
         while self.running and not self._batches:
-            work = engine.next_for_idle(now)
+            work = engine.next(now)
             if work is None:
+                if engine.holds_back:
+                    self._interpreter.watch()
                 break
-            if own is not None and chosen is None and work.entity.is_brief.is_expected():
+            if own is not None and chosen is None and not work.entity.is_brief.debt:
                 chosen = own
                 own.worker = work.worker
                 own.work = work
@@ -273,8 +276,6 @@ class Pool:
             seat = self._seats[work.worker]
             seat.work = work
             seat.wake.release()
-        if engine.holds_back and self.running:
-            self._interpreter.watch()
         return chosen
 
     def _hand_out_now(self) -> None:
@@ -285,11 +286,10 @@ class Pool:
         ran = False
         while not ran:
             with self.lock:
-                worker = self.engine.idle_worker
-                work = self.engine.next_on(worker, self.tick()) if worker >= 0 else None
+                work = self.engine.next(self.tick())
                 if work is None:
                     return False
-                seat = self._new_seat(worker)
+                seat = self._new_seat(work.worker)
                 seat.work = work
             seat.vtid = threading.get_native_id()
             ran = self._execute(seat)
@@ -301,74 +301,81 @@ class Pool:
 
         :return: False when its callback group did not let it run.
         """
-        work = seat.work
+        work, engine = seat.work, self.engine
         assert work is not None
         entity = work.entity
         before, current.running = current.running, seat
-        raised: BaseException | None = None
         waits_for: Any = None
-        outcome: Any = None
+        raised: BaseException | None = None
         start = monotonic_ns() + self.clock.offset_ns
-        self._interpreter.begins(seat, entity.habit, start)
+        seat.began_ns = start
+        if seat.cpu_clock is not None:
+            self._interpreter.begins(seat, entity.habit)
         try:
             waits_for = work.step() if entity.gate is None else entity.gate.step(work)
-        except (Destroyed, Refused) as told:
-            outcome = type(told)
         except BaseException as error:
             raised = error
         end = monotonic_ns() + self.clock.offset_ns
         current.running = before
-        if outcome is not Refused:
-            self._interpreter.ended(seat, entity.habit, start, end)
+        if seat.published:
             seat.callback_ended()
+        if entity.is_brief.debt or end - start > BRIEF_NS:
             entity.is_brief.took(end - start)
+        if seat.reading is not None or entity.habit.holds:
+            self._interpreter.ended(seat, entity.habit, start, end)
         with self.lock:
-            now = self._last = max(end, self._last)
-            self._tell_outcome(seat, work, outcome, waits_for, raised, start, end, now)
-            self._take_next(seat, now)
-        if raised is not None:  # now, when its job has failed for whoever catches it
-            self._fail(raised)
-            raised = None   # it refers to this frame
+            now = self._last = end if end > self._last else self._last
+            if raised is None and waits_for is None:
+                entity.busy_ns += end - start
+                engine.finished(work, start, end, now, seat.vtid, seat.worker)
+            else:
+                self._tell_outcome(seat, work, waits_for, raised, start, end, now)
+            if engine.has_refused and type(raised) is not Refused:
+                engine.ask_again()
+            seat.work = None
+            if seat.thread is not None:
+                self._take_next(seat, now)
+            if engine.has_waiting:
+                self._hand_out(now)
+        let_run = type(raised) is not Refused
         if waits_for is not None:
             self._resume_when_done(work, waits_for)
-        if self.engine.verdicts.misses:
-            self.engine.verdicts.report_misses()
-        return outcome is not Refused
+        elif raised is not None:  # now, when its job has failed for whoever catches it
+            if not isinstance(raised, (Destroyed, Refused)):
+                self._fail(raised)
+            raised = None   # it refers to this frame
+        if engine.verdicts.misses:
+            engine.verdicts.report_misses()
+        return let_run
 
     def _tell_outcome(
-        self, seat: Seat, work: Work, outcome: Any, waits_for: Any,
-        raised: BaseException | None, start: int, end: int, now: int,
+        self, seat: Seat, work: Work, waits_for: Any, raised: BaseException | None, start: int,
+        end: int, now: int,
     ) -> None:
-        """Tell the engine what became of an execution."""
+        """Tell the engine what became of an execution that has not simply ended."""
         engine = self.engine
-        if outcome is Refused:
+        if isinstance(raised, Refused):
             engine.refused(work, now)
             return
         work.entity.busy_ns += end - start
-        if outcome is Destroyed:
+        if isinstance(raised, Destroyed):
             engine.destroyed(work, now)
         elif waits_for is not None:
             engine.suspended(work, start, end, seat.vtid, seat.worker)
-        elif raised is not None and self._context_ended():
+        elif self._context_ended():
             engine.left_open(work, start, end, seat.vtid, seat.worker)
         else:
-            engine.finished(work, start, end, now, seat.vtid, seat.worker, raised is not None)
-        if engine.has_refused:
-            engine.ask_again()
+            engine.finished(work, start, end, now, seat.vtid, seat.worker, True)
 
     def _take_next(self, seat: Seat, now: int) -> None:
-        """Leave a worker's next execution in its seat; wake others for the rest."""
-        seat.work = None
-        if seat.thread is not None:
-            if self._closed:
-                seat.ended = True
-            elif seat.worker < 0:
-                self._lenders.remove(seat)
-                self._spares.append(seat)
-            elif self.running:
-                seat.work = self.engine.next_on(seat.worker, now)
-        if self.engine.has_waiting:
-            self._hand_out(now)
+        """Leave a thread's next execution in its seat."""
+        if self._closed:
+            seat.ended = True
+        elif seat.worker < 0:
+            self._lenders.remove(seat)
+            self._spares.append(seat)
+        elif self.running:
+            seat.work = self.engine.next(now, seat.worker)
 
     # --- waiting ---------------------------------------------------------------------------------
 

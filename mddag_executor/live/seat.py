@@ -44,12 +44,13 @@ class Seat:
     :ivar work: the execution that it runs, or is to run when it is woken.
     :ivar thread: its thread where that is one of the pool's own.
     :ivar waits: whether its callback waits for a service, and has lent its worker.
+    :ivar published: when the callback that runs published first (monotonic ns); 0: not yet.
     :ivar relieved: whether another thread does what it, an intake's, would do otherwise.
     """
 
     __slots__ = (
         'worker', 'wake', 'work', 'ended', 'thread', 'vtid', 'cpu_clock', 'waits', 'relieved',
-        'reading', 'began_ns', 'computed_before', '_engine', '_clock', '_lend', '_published')
+        'reading', 'began_ns', 'computed_before', '_engine', '_clock', '_lend', 'published')
 
     def __init__(
         self, engine: Engine, clock: TraceClock, worker: int,
@@ -73,8 +74,7 @@ class Seat:
         self._engine = engine
         self._clock = clock
         self._lend = lend
-        # when the callback that runs published first (0: not yet)
-        self._published = 0
+        self.published = 0
 
     def publish(self, send: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
         """Publish on behalf of the callback that runs; the caller holds the publisher's lock."""
@@ -86,20 +86,19 @@ class Seat:
         if state.topic not in work.entity.publishes:
             work.entity.publishes.add(state.topic)
         engine.jobs.publish(send, publisher, msg, state, work.origin or NO_ORIGIN)
-        if not self._published:
-            self._published = monotonic_ns()
+        if not self.published:
+            self.published = monotonic_ns()
 
     def is_about_to_end(self, engine: Engine) -> bool:
         """Return whether its callback, which is this engine's, has published and ends soon."""
-        return (self._published != 0 and self._engine is engine and self.work is not None
-                and self.work.entity.ends_soon.is_expected())
+        return (self.published != 0 and self._engine is engine and self.work is not None
+                and not self.work.entity.ends_soon.debt)
 
     def callback_ended(self) -> None:
         """Note how soon after publishing its callback has ended."""
-        if self._published:
-            assert self.work is not None
-            self.work.entity.ends_soon.took(monotonic_ns() - self._published)
-            self._published = 0
+        assert self.work is not None
+        self.work.entity.ends_soon.took(monotonic_ns() - self.published)
+        self.published = 0
 
     def lend(self) -> AbstractContextManager[None]:
         """Lend its worker while entered: the callback waits for a service."""

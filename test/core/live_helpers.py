@@ -41,3 +41,12 @@ def start_job(scheduler: Scheduler, job: int = 0, now: int = 0, dag: int = 0) ->
     slot = scheduler.release(dag, job, now, now)
     assert run_one(scheduler, scheduler.source(slot), now)
     return slot
+
+
+def undeclared(scheduler: Scheduler, job: int, group: int, now: int, holds: int = 0) -> int:
+    """Make a callback that no DAG declares ready; return its execution."""
+    x = scheduler.undeclared(job, now)
+    scheduler.state.x_group[x] = group
+    scheduler.state.x_holds[x] = holds
+    scheduler.ready(x, now)
+    return x

@@ -23,7 +23,7 @@ from mddag_executor.core.state import (
 )
 from msg_graph import TaskSet
 
-from .live_helpers import J, live, start_job, US, X
+from .live_helpers import J, live, start_job, undeclared, US, X
 from .task_sets import declaration
 
 
@@ -96,7 +96,7 @@ def test_what_fails_after_the_end_of_its_job_changes_nothing() -> None:
 
 def test_an_undeclared_callback_that_fails_is_judged_by_nobody() -> None:
     scheduler = live()
-    x = scheduler.undeclared(0, -1, 1)
+    x = undeclared(scheduler, 0, -1, 1)
     assert scheduler.take(0, 1) == x
     rules.fail(scheduler.tables, scheduler.state, scheduler.policy.key, x, 2)
     assert scheduler.decisions() == [] and scheduler.state.job_state[0] == FREE
@@ -225,7 +225,7 @@ def test_a_blocked_callback_does_not_abort_its_job() -> None:
     """Only what would go next shows that a job is late; what waits for its group does not."""
     scheduler = live(aborting(), workers=2)
     group = scheduler.new_group()
-    busy = scheduler.undeclared(0, group, 0)
+    busy = undeclared(scheduler, 0, group, 0)
     scheduler.take(0, 0)
     slot = start_job(scheduler)
     y = scheduler.execution(slot, 2)
@@ -252,7 +252,7 @@ def test_the_end_of_the_run_judges_what_is_open() -> None:
 def test_a_recorded_execution_goes_past_queue_workers_and_groups() -> None:
     scheduler = live(workers=1)
     group = scheduler.new_group()
-    busy = scheduler.undeclared(0, group, 0)
+    busy = undeclared(scheduler, 0, group, 0)
     assert scheduler.take(0, 0) == busy
     slot = scheduler.release(0, 0, 0, 0)
     source = scheduler.source(slot)

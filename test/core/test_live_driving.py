@@ -39,6 +39,7 @@ from mddag_executor.core.state import (
     SINK_EXPIRED,
 )
 
+from .live_helpers import undeclared
 from .task_sets import examples, task_sets, TICK
 
 WAITING, RUNNING, SUSPENDED, DONE, DROPPED = 'waiting', 'running', 'suspended', 'done', 'dropped'
@@ -147,7 +148,7 @@ class LiveDriver(RuleBasedStateMachine):
     def undeclared(self, group: int) -> None:
         self.counter['undeclared'] += 1
         index = self.counter['undeclared']
-        x = self.scheduler.undeclared(index, self.groups[group], self.now)
+        x = undeclared(self.scheduler, index, self.groups[group], self.now)
         self.note(Run(x, (self.tables.n_dags, index), self.tables.n_vertices, 0,
                       self.groups[group], self.state.x_key[x][0]))
 

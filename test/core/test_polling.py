@@ -13,6 +13,7 @@ from mddag_executor.core.queues import SWEEP_AT
 from mddag_executor.simulate import Settings, simulate, SimulationError
 import pytest
 
+from .live_helpers import undeclared
 from .task_sets import Case, cases, declaration, examples
 from .test_by_hand import after, case, log, single, source, starts
 
@@ -200,14 +201,14 @@ def test_legs_are_entities_of_their_own() -> None:
 
 def test_each_undeclared_callback_is_an_entity() -> None:
     core = scheduler(workers=4)
-    undeclared = [core.undeclared(i, -1, 0) for i in range(3)]
+    others = [undeclared(core, i, -1, 0) for i in range(3)]
     slot = core.release(1, 0, 0, 0)
     core.ready(core.source(slot), 0)
     assert core.take(0, 1) == core.source(slot)
     late = core.source(core.release(1, 1, 1, 1))
     core.ready(late, 1)
-    assert [core.take(worker, 1) for worker in (1, 2, 3)] == undeclared  # before the timer
-    core.complete(undeclared[0], 2)
+    assert [core.take(worker, 1) for worker in (1, 2, 3)] == others  # before the timer
+    core.complete(others[0], 2)
     assert core.take(1, 2) == late
 
 
@@ -217,7 +218,7 @@ def test_dropped_ones_leave_the_queues() -> None:
     slot = core.release(1, 0, 0, 0)
     kept = core.source(slot)
     for i in range(3 * SWEEP_AT):
-        core.drop(core.undeclared(i, -1, 0), 0)
+        core.drop(undeclared(core, i, -1, 0), 0)
     core.ready(kept, 1)
     assert core.queue_length == 1
     assert sum(map(len, core.state.entity_queue)) <= SWEEP_AT + 2

@@ -19,7 +19,7 @@ from mddag_executor.core.state import (
 )
 import pytest
 
-from .live_helpers import J, JOIN, live, run_one, start_job, US, X, Y
+from .live_helpers import J, JOIN, live, run_one, start_job, undeclared, US, X, Y
 
 
 def test_an_unknown_policy_is_refused_with_the_list() -> None:
@@ -69,16 +69,16 @@ def test_completions_make_no_edge_true() -> None:
 
 def test_the_worker_that_asks_gets_the_work() -> None:
     scheduler = live(workers=3)
-    x = scheduler.undeclared(0, -1, 0)
+    x = undeclared(scheduler, 0, -1, 0)
     assert scheduler.take(2, 0) == x
     assert scheduler.state.worker_x == [-1, -1, x]
     assert scheduler.idle_workers == 2
-    y = scheduler.undeclared(1, -1, 0)
+    y = undeclared(scheduler, 1, -1, 0)
     assert scheduler.schedule(0) == y
     assert scheduler.state.worker_x == [y, -1, x]
     assert scheduler.schedule(0) == -1
-    scheduler.undeclared(2, -1, 0)
-    scheduler.undeclared(3, -1, 0)
+    undeclared(scheduler, 2, -1, 0)
+    undeclared(scheduler, 3, -1, 0)
     assert scheduler.schedule(0) >= 0
     assert scheduler.schedule(0) == -1, 'no worker is idle, and nobody preempts'
     assert scheduler.queue_length == 1
@@ -89,8 +89,8 @@ def test_undeclared_callbacks_have_the_default_deadline() -> None:
     scheduler = Scheduler(tables, 1, propagate=False)
     slot = scheduler.release(0, 0, 0, 0)        # RAD 50 us
     scheduler.ready(scheduler.source(slot), 0)
-    early = scheduler.undeclared(0, -1, 0)      # 40 us
-    later = scheduler.undeclared(1, -1, 11 * US)  # 51 us
+    early = undeclared(scheduler, 0, -1, 0)      # 40 us
+    later = undeclared(scheduler, 1, -1, 11 * US)  # 51 us
     assert [scheduler.take(0, 11 * US), scheduler.complete(early, 12 * US),
             scheduler.take(0, 12 * US), scheduler.complete(scheduler.source(slot), 12 * US),
             scheduler.take(0, 12 * US)] == [early, True, scheduler.source(slot), True, later]
@@ -99,7 +99,7 @@ def test_undeclared_callbacks_have_the_default_deadline() -> None:
 
 def test_without_declaration_everything_is_undeclared() -> None:
     scheduler = live(None)
-    x = scheduler.undeclared(0, -1, 5)
+    x = undeclared(scheduler, 0, -1, 5)
     assert scheduler.take(0, 5) == x
     assert scheduler.complete(x, 6)
     scheduler.expire_idle(NEVER)
@@ -110,10 +110,10 @@ def test_without_declaration_everything_is_undeclared() -> None:
 def test_lending_frees_the_worker_but_not_the_group() -> None:
     scheduler = live(workers=1)
     group = scheduler.new_group()
-    x = scheduler.undeclared(0, group, 0)
+    x = undeclared(scheduler, 0, group, 0)
     assert scheduler.take(0, 0) == x
-    blocked = scheduler.undeclared(1, group, 0)
-    other = scheduler.undeclared(2, -1, 0)
+    blocked = undeclared(scheduler, 1, group, 0)
+    other = undeclared(scheduler, 2, -1, 0)
     assert scheduler.idle_workers == 0
     scheduler.lend(x)
     assert scheduler.idle_workers == 1
@@ -127,13 +127,13 @@ def test_lending_frees_the_worker_but_not_the_group() -> None:
 def test_a_suspended_callback_keeps_its_group_and_its_key() -> None:
     scheduler = live(workers=1)
     group = scheduler.new_group()
-    x = scheduler.undeclared(0, group, 0)
+    x = undeclared(scheduler, 0, group, 0)
     scheduler.take(0, 0)
     scheduler.suspend(x)
     assert scheduler.idle_workers == 1
-    blocked = scheduler.undeclared(1, group, 1)
+    blocked = undeclared(scheduler, 1, group, 1)
     assert scheduler.take(0, 2) == -1
-    later = scheduler.undeclared(2, -1, 3)
+    later = undeclared(scheduler, 2, -1, 3)
     scheduler.resume(x)
     assert scheduler.queue_length == 3
     assert scheduler.take(0, 4) == x, 'its deadline is still the first'
@@ -150,7 +150,7 @@ def test_what_is_refused_keeps_its_place_and_what_may_run_lets_the_next_be_asked
     scheduler = live(workers=2)
     group = scheduler.new_group()
     first, second, other = (
-        scheduler.undeclared(i, place, i) for i, place in enumerate((group, group, -1)))
+        undeclared(scheduler, i, place, i) for i, place in enumerate((group, group, -1)))
     assert scheduler.take(0, 3) == first
     scheduler.refuse(first)
     assert scheduler.take(0, 4) == other
@@ -168,16 +168,16 @@ def test_what_is_refused_keeps_its_place_and_what_may_run_lets_the_next_be_asked
     assert scheduler.take(0, 10) == first
     scheduler.drop(second, 11)
     assert scheduler.queue_length == 0
-    third = scheduler.undeclared(3, group, 12)
+    third = undeclared(scheduler, 3, group, 12)
     assert scheduler.take(1, 12) == third
 
 
 def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits() -> None:
     scheduler = live(workers=1)
     first, second = scheduler.new_group(), scheduler.new_group()
-    running = scheduler.undeclared(0, second, 0)
+    running = undeclared(scheduler, 0, second, 0)
     scheduler.take(0, 0)
-    waiting = scheduler.undeclared(1, second, 1)
+    waiting = undeclared(scheduler, 1, second, 1)
     assert scheduler.take(0, 1) == -1
     scheduler.free_group(second)
     assert scheduler.new_group() not in (first, second), 'its owner runs'
@@ -195,9 +195,9 @@ def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits() -> Non
 def test_what_waits_for_a_group_comes_in_order_of_its_key() -> None:
     scheduler = live(workers=2)
     group = scheduler.new_group()
-    busy = scheduler.undeclared(0, group, 0)
+    busy = undeclared(scheduler, 0, group, 0)
     assert scheduler.take(0, 0) == busy
-    waiting = [scheduler.undeclared(i, group, i) for i in (1, 2, 3)]
+    waiting = [undeclared(scheduler, i, group, i) for i in (1, 2, 3)]
     assert scheduler.take(1, 4) == -1
     assert scheduler.queue_length == 3
     slot = scheduler.release(0, 0, 4, 4)
@@ -216,12 +216,12 @@ def test_what_waits_for_a_group_comes_in_order_of_its_key() -> None:
 
 def test_what_is_dropped_never_runs_and_frees_its_place() -> None:
     scheduler = live()
-    x = scheduler.undeclared(7, -1, 0)
+    x = undeclared(scheduler, 7, -1, 0)
     scheduler.drop(x, 1)
     assert scheduler.decisions() == [(DROP, 1, 4, 7, x, 1)]
     assert scheduler.queue_length == 0
     assert scheduler.state.n_open == [0, 0]
-    assert scheduler.undeclared(8, -1, 2) == x, 'its slot is free'
+    assert undeclared(scheduler, 8, -1, 2) == x, 'its slot is free'
     assert scheduler.queue_length == 1
     assert scheduler.take(0, 2) == x
     assert scheduler.take(1, 2) == -1
@@ -245,9 +245,9 @@ def test_a_job_with_a_dropped_message_expires_when_its_time_is_over() -> None:
 def test_a_group_goes_on_when_one_that_waits_for_it_is_dropped(dropped: int) -> None:
     scheduler = live(workers=1)
     group = scheduler.new_group()
-    busy = scheduler.undeclared(0, group, 0)
+    busy = undeclared(scheduler, 0, group, 0)
     scheduler.take(0, 0)
-    waiting = [scheduler.undeclared(i, group, i) for i in (1, 2, 3)]
+    waiting = [undeclared(scheduler, i, group, i) for i in (1, 2, 3)]
     scheduler.lend(busy)
     assert scheduler.take(0, 4) == -1        # all three wait for the group now
     scheduler.complete(busy, 5)              # the first of them is back in the ready queue
@@ -262,10 +262,10 @@ def test_a_group_goes_on_when_one_that_waits_for_it_is_dropped(dropped: int) -> 
 def test_the_entry_of_a_dropped_execution_is_not_taken_for_its_successor() -> None:
     # rm: the undeclared come last; the stale entry stands in the queue while x is in use again.
     scheduler = live(workers=1, policy_name='rm')
-    first = scheduler.undeclared(0, -1, 0)
-    keep = scheduler.undeclared(1, -1, 0)
+    first = undeclared(scheduler, 0, -1, 0)
+    keep = undeclared(scheduler, 1, -1, 0)
     scheduler.drop(first, 1)
-    assert scheduler.undeclared(2, -1, 2) == first
+    assert undeclared(scheduler, 2, -1, 2) == first
     assert scheduler.queue_length == 2
     assert scheduler.take(0, 3) == keep
     scheduler.complete(keep, 4)
@@ -280,14 +280,14 @@ def test_queues_stay_bounded_when_what_waits_longest_is_dropped_for_ever(grouped
     """As with a topic of QoS depth 5 behind a callback that never ends."""
     scheduler = live(workers=1, policy_name='rm')
     group = scheduler.new_group() if grouped else -1
-    busy = scheduler.undeclared(0, group, 0)
+    busy = undeclared(scheduler, 0, group, 0)
     assert scheduler.take(0, 0) == busy
     scheduler.lend(busy)
     waiting: list[int] = []
     for i in range(3_000):
         if len(waiting) == 5:
             scheduler.drop(waiting.pop(0), i)
-        waiting.append(scheduler.undeclared(i, group, i))
+        waiting.append(undeclared(scheduler, i, group, i))
         if grouped:
             assert scheduler.take(0, i) == -1
         assert scheduler.queue_length == len(waiting)
