@@ -97,7 +97,8 @@ def _percent(entry: Entry, count: int) -> tuple[float, ...]:
         return tuple(100.0 * i / (count - 1) for i in range(count)) if count > 1 else (50.0,)
     if len(percent) != count:
         raise entry.error(
-            'percent', f'{len(percent)} shares for {count} quantiles', 'give one for each')
+            'percent', f'the number of shares is {len(percent)}, that of quantiles {count}',
+            'give one for each')
     if percent[0] < 0 or percent[-1] > 100:
         raise entry.error('percent', 'a share is not within 0 and 100', 'write percentages')
     if any(after <= before for before, after in zip(percent, percent[1:])):

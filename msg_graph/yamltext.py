@@ -56,13 +56,12 @@ class Scalar:
 class Sequence:
     """A list of trees."""
 
-    __slots__ = ('line', 'items', 'size', 'closed')
+    __slots__ = ('line', 'items', 'size')
 
     def __init__(self, line: int) -> None:
         self.line = line
         self.items: list[Tree] = []
         self.size = 1
-        self.closed = False
 
     def with_items(self, items: list[Tree]) -> Sequence:
         """Return a list in the same place with as many other items."""
@@ -74,14 +73,13 @@ class Sequence:
 class Mapping:
     """Trees by key, in file order, and the line of each key."""
 
-    __slots__ = ('line', 'entries', 'key_lines', 'size', 'closed')
+    __slots__ = ('line', 'entries', 'key_lines', 'size')
 
     def __init__(self, line: int) -> None:
         self.line = line
         self.entries: dict[str, Tree] = {}
         self.key_lines: dict[str, int] = {}
         self.size = 1
-        self.closed = False
 
     def with_entries(self, entries: dict[str, Tree]) -> Mapping:
         """Return a mapping in the same place with other values of its keys."""
@@ -215,7 +213,7 @@ class _Builder:
         if tree is None:
             raise self._error(
                 event, f'the alias {name} has no anchor', 'define the anchor before it')
-        if not isinstance(tree, Scalar) and not tree.closed:
+        if any(tree is each for each in self._stack):
             raise self._error(
                 event, f'the alias {name} stands inside of its own anchor', 'write the value out')
         self._attach(event, tree, tree.size)
@@ -232,7 +230,6 @@ class _Builder:
 
     def _close(self, event: Any) -> None:
         tree = self._stack.pop()
-        tree.closed = True
         self._keys.pop()
         if self._stack:
             self._grow(event, self._stack[-1], tree.size)

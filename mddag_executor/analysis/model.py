@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from mddag_executor.core import Tables
 from mddag_executor.errors import MddagError
+from mddag_executor.text import counted
 from msg_graph import Dag, ExecutionTime, TaskSet
 from msg_graph.analysis import path_lengths, topological_order
 
@@ -87,7 +88,7 @@ def _costs(task_set: TaskSet, dag: Dag, budget: str) -> list[int]:
 def _unknown(task_set: TaskSet) -> AnalysisError:
     missing = [callback for callback in task_set.callbacks if callback.execution_time is None]
     first, others = missing[0], len(missing) - 1
-    also = f' (and {others} more callbacks)' if others else ''
+    also = f' (and {counted(others, "more callback")})' if others else ''
     place = f'{first.file or task_set.file}:{first.line}'
     return AnalysisError(f'{place}: {first.key}{also} declares no execution_time: add one')
 

@@ -14,9 +14,18 @@ from mddag_executor.analysis import (
     Verdict,
 )
 from mddag_executor.analysis.necessary import largest_demand
-from mddag_executor.analysis.sufficient import graham, workload
+from mddag_executor.analysis.sufficient import (
+    graham,
+    own_jobs,
+    own_urgent,
+    rad,
+    urgent,
+    workload,
+)
 from msg_graph import loads
 import pytest
+
+from .test_against_simulation import missed
 
 MS = 1_000_000
 FORK = """\
@@ -27,6 +36,16 @@ nodes:
       - {name: t, timer: 100ms, publishes: [/a], execution_time: 1ms}
       - {name: x, subscription: /a, deadline: 3ms, execution_time: 2ms}
       - {name: y, subscription: /a, deadline: 50ms, execution_time: 40ms}
+"""
+
+WIDE = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: t, timer: 10ms, publishes: [/a], execution_time: 1ms}
+      - {name: x, subscription: /a, deadline: 10ms, execution_time: 3ms}
+      - {name: y, subscription: /a, deadline: 10ms, execution_time: 5ms}
 """
 
 
@@ -120,10 +139,10 @@ def test_workload() -> None:
 def test_only_rad_puts_the_urgent_first() -> None:
     found = verdicts(timers('100ms 14ms 2ms', '100ms 100ms 4ms', '100ms 100ms 3ms'), 1)
     assert found['response time, any policy'].verdict == NOTHING
-    rad = found['response time, RAD without preemption']
-    assert rad.verdict == HOLDS
+    bound = found['response time, RAD without preemption']
+    assert bound.verdict == HOLDS
     # 2 of its own, a job of each other one that may be urgent, and the longest that had begun.
-    assert rad.details['/n0: /n0:t'] == {'deadline_ns': 14 * MS, 'response_bound_ns': 13 * MS}
+    assert bound.details['/n0: /n0:t'] == {'deadline_ns': 14 * MS, 'response_bound_ns': 13 * MS}
 
 
 def test_response_times_with_others() -> None:
@@ -165,3 +184,57 @@ def test_a_bound_on_open_jobs_that_could_end_one() -> None:
 def test_deadlines_of_very_many_periods_take_no_time() -> None:
     found = verdicts(timers('1ms 1000s 0.2ms', '1s 1000s 1ms'), 2)
     assert found['utilisation'].verdict == HOLDS
+
+
+def test_a_long_callback_that_has_begun_is_part_of_the_bound() -> None:
+    # 2 ms of its own, 4 ms of a job of the other with an earlier RAD, 4 ms of one with a later.
+    tasks = tasks_of(loads(timers('100ms 50ms 2ms', '1s 1s 4ms')))
+    assert [bound.response for bound in rad(tasks, 1)] == [10 * MS, 6 * MS]
+    # On two workers both of these go on beside each other, and each callback of a chain waits.
+    wide = tasks_of(loads(WIDE.replace('10ms, publishes', '100ms, publishes').replace(
+        'deadline: 10ms', 'deadline: 50ms')
+        + timers('1s 1s 4ms', '1s 1s 2ms').partition('nodes:\n')[2].replace('/n', '/m')))
+    first = rad(wide, 2)[0]
+    # To x: 4 + (5 + urgent 4 + 2 + the lesser of 2 * (4 + 2) and what there is, 6 more) / 2.
+    assert first.response == (4 + (5 + 6 + 6) / 2) * MS
+
+
+def test_without_preemption_less_is_proven() -> None:
+    text = timers('100ms 5.999ms 2ms', '100ms 100ms 4ms')
+    times, late = [[2 * MS], [4 * MS]], [100, 0]  # ns after the blocking one
+    assert missed(loads(text), times, 'rad', False, 1, late)
+    assert verdicts(text, 1)['response time, RAD without preemption'].verdict == NOTHING
+    assert not missed(loads(text), times, 'rad', True, 1, late)
+
+
+def test_jobs_before_and_after() -> None:
+    task, = tasks_of(loads(timers('10ms 25ms 4ms')))
+    # Earlier: 15 and 5 ms into the window, later: 2 ms of it are left, for 2 workers.
+    assert own_jobs(task, 12 * MS, 2) == (4 + 4 + 4) * MS
+    assert own_jobs(task, 11 * MS, 2) == (4 + 4 + 2) * MS
+    assert own_jobs(task, 10 * MS, 2) == (4 + 4) * MS
+
+
+def test_urgent_work() -> None:
+    task, = tasks_of(loads(timers('10ms 25ms 4ms')))
+    assert urgent(task, 25 * MS) == 12 * MS
+    assert urgent(task, 22 * MS) == (4 + 4 + 2) * MS
+    assert urgent(task, 3 * MS) == 3 * MS
+    # RADs 25, 15, 5 ms of this job and of those before; 35 ms of the next one.
+    assert own_urgent(task, 25 * MS) == 12 * MS
+    assert own_urgent(task, 35 * MS) == 16 * MS
+    assert own_urgent(task, 24 * MS) == 8 * MS
+
+
+@pytest.mark.parametrize('budget', ['max', 'mean'])
+def test_all_that_is_missing_is_counted(budget: str) -> None:
+    text = WIDE.replace(', execution_time: 3ms', '').replace(', execution_time: 5ms', '')
+    with pytest.raises(AnalysisError, match=r'g:6: /n:x \(and 1 more callback\) declares no'):
+        analyse(loads(text, 'g'), 2, budget)
+
+
+def test_words_and_assumptions() -> None:
+    for verdict in analyse(loads(WIDE), 2).verdicts:
+        assert verdict.verdict in (HOLDS, FAILS, NOTHING)
+        assert verdict.kind == 'necessary' or verdict.verdict != FAILS
+        assert verdict.name and verdict.assumption and verdict.figure and verdict.reason

@@ -249,7 +249,7 @@ def test_node_without_callbacks() -> None:
     (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, 1e12]}} {MARK}'],
      ['makes no sense']),
     (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, 2], percent: [1]}} {MARK}'],
-     ['1 shares for 2 quantiles']),
+     ['the number of shares is 1, that of quantiles 2']),
     (['name: t', 'timer: 1ms',
       f'execution_time: {{quantiles_us: [1, 2], percent: [5, 5]}} {MARK}'], ['do not rise']),
     (['name: t', 'timer: 1ms',
