@@ -48,7 +48,7 @@ from mddag_executor.live.receiver import Receiver
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 from mddag_executor.live.settings import (
-    call_back,
+    check_callable,
     check_context,
     check_thresholds,
     diagnostics_period_ns,
@@ -56,7 +56,7 @@ from mddag_executor.live.settings import (
     resolve,
     thread_setting,
     Thresholds,
-    whole,
+    whole_number,
 )
 from mddag_executor.live.statistics import statistics
 from mddag_executor.live.stepping import Stepper
@@ -151,8 +151,8 @@ class MultiDeadlineExecutor(BareExecutor):
             graph, num_workers, default_deadline, intake)
         prepare = thread_setting(worker_policy, worker_priority, worker_cpus)
         every_ns = diagnostics_period_ns(diagnostics_period)
-        max_active_jobs = whole('max_active_jobs', max_active_jobs, MOST_JOBS)
-        call_back('on_deadline_miss', on_deadline_miss)
+        max_active_jobs = whole_number('max_active_jobs', max_active_jobs, MOST_JOBS)
+        check_callable('on_deadline_miss', on_deadline_miss)
         find_policy(policy)
         check_context(context)
         thresholds = check_thresholds(thresholds)

@@ -25,7 +25,7 @@ MOST_WORKERS = 4096
 MOST_JOBS = 1_000_000
 
 
-def whole(name: str, value: Any, most: int, unit: str = '') -> int:
+def whole_number(name: str, value: Any, most: int, unit: str = '') -> int:
     """
     Return a whole number from 1 up.
 
@@ -45,7 +45,7 @@ def whole(name: str, value: Any, most: int, unit: str = '') -> int:
     return number
 
 
-def call_back(name: str, value: Any) -> None:
+def check_callable(name: str, value: Any) -> None:
     """
     Look at something that is to be called.
 
@@ -108,7 +108,7 @@ class Thresholds:
             if not isinstance(value, (int, float)) or not 0.0 < value <= 1.0:
                 raise UsageError(f'{field}: {value} is no share: give more than 0, at most 1')
         for field in ('warn_burst', 'window', 'stale_periods'):
-            whole(field, getattr(self, field), MOST_JOBS)
+            whole_number(field, getattr(self, field), MOST_JOBS)
 
 
 def diagnostics_period_ns(period: int | str | None) -> int | None:
@@ -122,7 +122,7 @@ def diagnostics_period_ns(period: int | str | None) -> int | None:
         period = parse_duration(period)
     if period is None or period == 0:
         return None
-    period = whole('diagnostics_period', period, DAY, ' ns')
+    period = whole_number('diagnostics_period', period, DAY, ' ns')
     if period < SHORTEST_DIAGNOSTICS_NS:
         raise UsageError(
             f'diagnostics_period: {period} ns is too short: give at least '
@@ -146,10 +146,10 @@ def resolve(
                          'or None')
     if num_workers is None:
         num_workers = workers(None, task_set)
-    num_workers = whole('num_workers', num_workers, MOST_WORKERS)
+    num_workers = whole_number('num_workers', num_workers, MOST_WORKERS)
     if isinstance(default_deadline, str):
         default_deadline = parse_duration(default_deadline)
-    default_deadline = whole('default_deadline', default_deadline, DAY, ' ns')
+    default_deadline = whole_number('default_deadline', default_deadline, DAY, ' ns')
     if intake not in INTAKES:
         raise UsageError(f"intake: '{intake}' is unknown: give {', '.join(INTAKES[:-1])} or "
                          f'{INTAKES[-1]}')
@@ -175,7 +175,7 @@ def thread_setting(
     if not hasattr(os, 'sched_setscheduler'):
         raise UsageError('worker_policy: this system has none: leave it out')
     if priority is not None and priority != 0:  # 0: the one of SCHED_OTHER
-        whole('worker_priority', priority, 99)
+        whole_number('worker_priority', priority, 99)
     if cpus is not None:
         cpus = _cpus(cpus)
 
