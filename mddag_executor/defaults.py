@@ -14,6 +14,8 @@ POLICIES = ('rad', 'rm', 'wc', 'fifo')
 """Those that an evaluation compares."""
 DURATION_NS = 3_000_000_000
 """Virtual time of a simulated run."""
+BUDGETS = ('max', 'p99', 'mean')
+"""What of a declared execution time an analysis may count."""
 LIVE_SEED = 2
 """Of the execution times of live runs: each deadline of the Autoware workload leaves room."""
 

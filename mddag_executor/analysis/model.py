@@ -6,13 +6,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mddag_executor import defaults
 from mddag_executor.core import Tables
 from mddag_executor.errors import MddagError
 from mddag_executor.text import counted
 from msg_graph import Dag, ExecutionTime, TaskSet
 from msg_graph.analysis import path_lengths, topological_order
-
-BUDGETS = ('max', 'p99', 'mean')
 
 
 class AnalysisError(MddagError):
@@ -101,7 +100,7 @@ def _budget(time: ExecutionTime, budget: str) -> int:
     if budget == 'mean':
         return time.mean_ns
     raise AnalysisError(
-        f"budget '{budget}': there is no such budget: choose one of {', '.join(BUDGETS)}")
+        f"budget '{budget}': there is no such budget: choose one of {', '.join(defaults.BUDGETS)}")
 
 
 def _latest(dag: Dag, costs: list[int]) -> list[int]:

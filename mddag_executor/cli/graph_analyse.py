@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     options.add_graph(parser)
     parser.add_argument(
-        '--budget', choices=('max', 'p99', 'mean'), default='max',
+        '--budget', choices=defaults.BUDGETS, default='max',
         help='what of each execution time counts: its maximum (default), 99 %% quantile or mean')
     options.add_workers(parser)
     parser.add_argument(

@@ -35,7 +35,6 @@ reported with its confidence interval, number of runs and seed; after a search w
 took no part in it."""
 
 _TARGET = 0.95
-_BUDGETS = ('mean', 'p99', 'max')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='with --by path: the longest deadline of a DAG by that base (default: 1)')
     add('--target', type=options.positive_float, metavar='RATIO',
         help=f'with --by search: the least acceptance ratio (default: {_TARGET})')
-    add('--budget', choices=_BUDGETS, default='p99',
+    add('--budget', choices=defaults.BUDGETS, default='p99',
         help='what of each execution time makes the critical path (default: %(default)s)')
     add('--policy', default='rad', metavar='P', help='to simulate (default: %(default)s)')
     options.add_workers(parser)

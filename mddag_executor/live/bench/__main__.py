@@ -6,13 +6,12 @@ Make one measurement in this process and print it as JSON.
     python -m mddag_executor.live.bench '{"load": "topics", "executor": "multi", "topics": 20}'
 
 The process ends without destroying anything: rclpy's executors cannot be stopped in an orderly way
-while callbacks wait for their pool.  With ``--tied`` it also ends when its standard input does, so
-that it cannot outlive the process that started it, even when that was killed.
+while callbacks wait for their pool.  It also ends when its standard input does, so that it cannot
+outlive the process that started it, even when that was killed.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -40,18 +39,12 @@ def _end_with_stdin() -> None:
     os._exit(1)
 
 
-def main() -> int:
-    """Run the program; return its exit status."""
-    parser = argparse.ArgumentParser(
-        prog='python -m mddag_executor.live.bench', description=(__doc__ or '').split('\n')[1])
-    parser.add_argument('spec')
-    parser.add_argument('--tied', action='store_true')
-    args = parser.parse_args()
-    if args.tied:
-        threading.Thread(target=_end_with_stdin, daemon=True).start()
+def main(text: str) -> int:
+    """Make the measurement that a text says; return the exit status."""
+    threading.Thread(target=_end_with_stdin, daemon=True).start()
     output = _take_stdout()
     try:
-        result = run(Spec.from_json(args.spec))
+        result = run(Spec.from_json(text))
     except (MddagError, GraphError) as error:
         print(error, file=sys.stderr)
         return 2
@@ -77,6 +70,6 @@ def _take_stdout() -> TextIO:
 
 if __name__ == '__main__':
     # Not even an exception may end in the interpreter's exit, which joins the executor's threads.
-    status = main()
+    status = main(sys.argv[1])
     sys.stderr.flush()
     os._exit(status)

@@ -47,7 +47,7 @@ def measure(
     """
     # Of this machine only: it must not find another one's nodes, nor be found by them.
     environment = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ}
-    command = [sys.executable, '-m', 'mddag_executor.live.bench', spec.to_json(), '--tied']
+    command = [sys.executable, '-m', 'mddag_executor.live.bench', spec.to_json()]
     limit = spec.seconds + spec.warm_up_s + patience_s + spec.idle * 0.05
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         # Not communicate(), which would close standard input: that ends the process.
