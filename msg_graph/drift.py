@@ -54,6 +54,10 @@ class Releases:
         self.last = max(self.last, release)
         self.count += 1
 
+    def mean_ns(self, lost: int = 0) -> int:
+        """Return the mean time between two, of which some were not seen; there are two or more."""
+        return (self.last - self.first) // (self.count + lost - 1)
+
 
 @dataclass
 class Observed:
@@ -158,7 +162,7 @@ def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift |
     releases = observed.releases.get(callback.key, Releases())
     if releases.count < LEAST:
         return None
-    mean = (releases.last - releases.first) // (releases.count - 1)
+    mean = releases.mean_ns()
     if abs(mean - period) <= TOLERANCE * period:
         return None
     return Drift('rate', callback.key, None, period, mean,

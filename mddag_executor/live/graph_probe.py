@@ -32,6 +32,7 @@ from typing import Any
 
 from mddag_executor.live.compat import message_taker
 from msg_graph.draft import Draft, DraftCallback, DraftNode
+from msg_graph.drift import Releases
 from msg_graph.names import is_background, NODE, SERVICE, TOPIC
 import rclpy
 from rclpy.context import Context
@@ -57,34 +58,29 @@ class Endpoints:
 
 
 @dataclass
-class Seen:
+class Seen(Releases):
     """
-    The messages of a topic: how many, and their first and last source timestamp, ns.
+    The messages of a topic by their source timestamps.
 
     :ivar lost: how many were published between them and did not come.
     """
 
-    count: int = 0
-    first: int = 0
-    last: int = 0
     lost: int = 0
     _number: int | None = None
 
     def message(self, stamp: int, number: int | None = None) -> None:
         """Count a message; its number is its publisher's, and several publishers tell nothing."""
-        self.first = min(self.first, stamp) if self.count else stamp
-        self.last = max(self.last, stamp)
-        self.count += 1
+        self.add(stamp)
         if number is not None and self._number is not None and number > self._number:
             self.lost += number - self._number - 1
         self._number = number
 
     def interval_ns(self, publishers: int = 1) -> int | None:
         """Return the mean time between two messages; None with too few of them."""
-        count = self.count + (self.lost if publishers == 1 else 0)
-        if self.count < 2 or count < _LEAST_MESSAGES or self.last <= self.first:
+        lost = self.lost if publishers == 1 else 0
+        if self.count < 2 or self.count + lost < _LEAST_MESSAGES or self.last <= self.first:
             return None
-        return (self.last - self.first) // (count - 1)
+        return self.mean_ns(lost)
 
 
 @dataclass
@@ -226,9 +222,9 @@ def draft_of(found: Probe) -> Draft:
     """Return what is known of the system, and what is supposed (rules 1 and 2)."""
     nodes = []
     for name, endpoints in sorted(found.nodes.items()):
-        starts = [*(('subscription', topic) for topic in endpoints.subscribes),
-                  *(('service', service) for service in endpoints.serves)]
-        published = list(endpoints.publishes)
+        starts = [*(('subscription', topic) for topic in sorted(endpoints.subscribes)),
+                  *(('service', service) for service in sorted(endpoints.serves))]
+        published = sorted(endpoints.publishes)
         callbacks = [DraftCallback(name, f'callback_{i}', kind, [start], maybe=list(published))
                      for i, (kind, start) in enumerate(starts)]
         if not callbacks:

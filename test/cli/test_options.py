@@ -9,7 +9,6 @@ from collections.abc import Callable
 import importlib
 
 from mddag_executor import defaults
-from mddag_executor.analysis import BUDGETS
 from mddag_executor.cli import main as program
 from mddag_executor.cli import options
 from mddag_executor.core import POLICIES, PolicyError
@@ -70,7 +69,6 @@ def test_the_number_of_workers() -> None:
 
 @pytest.mark.parametrize(('verb', 'option', 'known'), [
     ('simulate', '--judge', JUDGES), ('evaluate', '--judge', JUDGES),
-    ('graph_analyse', '--budget', BUDGETS), ('graph_assign_deadlines', '--budget', BUDGETS),
     ('evaluate', '--core', CORES),
 ])
 def test_choices_are_those_of_the_program(verb: str, option: str, known: tuple[str, ...]) -> None:

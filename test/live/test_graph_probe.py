@@ -57,7 +57,7 @@ def test_what_is_supposed() -> None:
          for c in node.callbacks.values()] for node in draft.nodes)
     # What is seen of it is its name: it may have timers.
     assert empty == [('timer', [], True, [], [], None)]
-    assert source == [('timer', [], True, ['/in', '/slow', '/mute'], [], 10 * MS)]
+    assert source == [('timer', [], True, ['/in', '/mute', '/slow'], [], 10 * MS)]
     assert work == [('subscription', ['/in'], False, [], ['/out'], None),
                     ('service', ['/serve'], False, [], ['/out'], None)]
     # Two publish it, so each every 10 ms.
