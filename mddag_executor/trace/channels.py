@@ -25,10 +25,11 @@ from typing import Any
 
 from mddag_executor.trace import cdr
 from mddag_executor.trace.cdr import FieldType
+from mddag_executor.trace.events import Event
 from mddag_executor.trace.records import Cursor
 from mddag_executor.trace.schema import EVENTS, PREAMBLE
+import numpy as np
 
-Event = tuple[Any, ...]
 Decoder = tuple[Event, Callable[[bytes], Event]]
 
 _TOPIC = re.compile(r'/trace/([A-Za-z][A-Za-z0-9_]*)/([A-Za-z][A-Za-z0-9_]*)')
@@ -62,10 +63,9 @@ class Channels:
         self.topics: dict[int, str] = {}
         #: Channels whose messages are not wanted.
         self.passed_over: set[int] = set()
-        #: Channels whose messages have one fixed layout: the beginning of their events, the size
-        #: of a message's fields, and what returns the rest of the event from data and the offset
-        #: of the fields there.
-        self.fast: dict[int, tuple[Event, int, Callable[[bytes, int], Event]]] = {}
+        #: Channels whose messages have one fixed layout: the beginning of their events, and the
+        #: structure of the rest.
+        self.fixed: dict[int, tuple[Event, Any]] = {}
         #: The fields of the events met, by full name.
         self.fields: dict[str, tuple[str, ...]] = {}
         self._decoders: dict[int, Decoder | str] = {}       # or the reason why there is none
@@ -151,8 +151,12 @@ class Channels:
         self._decoders[number] = head, decode
         fixed = cdr.fixed_layout(types)
         if fixed is not None and places == list(range(len(names))):
-            unpacker = struct.Struct('<' + fixed)
-            self.fast[number] = head, unpacker.size, unpacker.unpack_from
+            ends = [struct.calcsize('<' + fixed[:i + 1])
+                    for i, code in enumerate(fixed) if code != 'x']
+            formats = ['<' + code for code in fixed if code != 'x']
+            self.fixed[number] = head, np.dtype({
+                'names': names, 'formats': formats, 'itemsize': struct.calcsize('<' + fixed),
+                'offsets': [end - struct.calcsize(code) for end, code in zip(ends, formats)]})
 
     def _fields_of(self, schema: int) -> dict[str, FieldType]:
         if schema not in self._schemas:

@@ -8,11 +8,11 @@ The reading itself, with its orders and what it does on damage, is in `reading`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 import os
 import stat
-from typing import Any, BinaryIO, TYPE_CHECKING
+from typing import Any, BinaryIO
 import warnings
 
 from mddag_executor.text import counted
@@ -25,13 +25,11 @@ from mddag_executor.trace.blocks import (
     used_once,
     what_was_used,
 )
-from mddag_executor.trace.channels import Channels, Event
+from mddag_executor.trace.channels import Channels
 from mddag_executor.trace.errors import TraceError, TraceWarning
+from mddag_executor.trace.events import Event, Events
 from mddag_executor.trace.reading import Reading
 from mddag_executor.trace.records import LIBRARY
-
-if TYPE_CHECKING:
-    from mddag_executor.trace.columns import Columns
 
 _TASK_SET = 'mddag:task_set'
 _PROCESS = 'mddag:process'
@@ -149,7 +147,8 @@ class TraceReader:
         :param sorted: whether to yield in the order of time instead of that of the file
         :raises TraceError: where the file can no longer be read, or is too unordered to be sorted
         """
-        return self._read(Channels(None if names is None else set(names), True), sorted)
+        for batch in self._read(Channels(None if names is None else set(names), True), sorted):
+            yield from batch
 
     def layout_events(self, names: Iterable[str] | None) -> Iterator[Event]:
         """
@@ -157,25 +156,14 @@ class TraceReader:
 
         They have the fields that the file has, not those of the table.
         """
-        return self._read(Channels(None if names is None else set(names), False), True)
+        for batch in self._read(Channels(None if names is None else set(names), False), True):
+            yield from batch
 
-    def columns(self, names: Iterable[str], kinds: Mapping[str, int], scan: Any
-                ) -> Iterator[Columns]:
-        """
-        Yield what ``events`` yields in the order of time, as rows of numbers, for compiled code.
+    def batches(self, names: Iterable[str]) -> Iterator[Events]:
+        """Yield what ``events`` yields in the order of time, many at once."""
+        return self._read(Channels(set(names), True), True)
 
-        :param kinds: see ``columns.ColumnReading``, as for `scan`.
-        """
-        from mddag_executor.trace.columns import ColumnReading
-        channels = Channels(set(names), True)
-        reading = ColumnReading(self.path, channels, kinds, scan)
-        self.fields = channels.fields
-        twice: list[int] = []
-        with open_trace(self.path) as (stream, size):
-            yield from reading.columns(stream, self._blocks(stream, size, twice))
-        self._warn(reading, size, twice)
-
-    def _read(self, channels: Channels, in_time_order: bool) -> Iterator[Event]:
+    def _read(self, channels: Channels, in_time_order: bool) -> Iterator[Events]:
         reading = Reading(self.path, channels)
         self.fields = channels.fields
         twice: list[int] = []

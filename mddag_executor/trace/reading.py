@@ -5,15 +5,16 @@ One pass over a trace file, in the order of the file or of time.
 
 Theory of operation:
 
-1. The file is read block by block (`blocks`), and a block's events are decoded some thousand at a
-   time; what is in memory is one chunk, whatever the file's length.
+1. The file is read block by block (`blocks`).  Where a block's messages begin, its message indexes
+   tell, if they fit what is there; else the records are walked over.  What is in memory is some
+   chunks, whatever the file's length.
 2. In the order of the file the events of one thread are in order, those of different threads are
    not: each thread appends an event after it took its time, whenever it gets to run.
-3. In the order of time, chunks are loaded by the least time that their heads state, and an event
-   is given out once no chunk that is still to be loaded can hold an earlier one. That is exact for
-   any disorder; it takes memory only for chunks that overlap in time, and there is a limit to it.
-   A head that states a time after its chunk's first event would break the order: that is damage.
-   Events of equal time come in the order of the file.
+3. In the order of time, chunks are loaded by the least time that their heads state, some at a
+   time, and an event is given out once no chunk that is still to be loaded can hold an earlier
+   one. That is exact for any disorder; it takes memory only for chunks that overlap in time, and
+   there is a limit to it. A head that states a time after its chunk's first event would break the
+   order: that is damage. Events of equal time come in the order of the file.
 4. In both orders a block is used only when everything before it in the file is sound, so what
    damage leaves is always the beginning of the recording. It is kept in `damage`, not raised.
 5. In the order of time an event at a time that cannot be (`times`) is left out and counted.
@@ -22,30 +23,43 @@ Theory of operation:
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
-from operator import itemgetter
 import struct
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from mddag_executor.text import counted
 from mddag_executor.trace import records
 from mddag_executor.trace.blocks import Block, Damage, load
 from mddag_executor.trace.cdr import ENCAPSULATION
-from mddag_executor.trace.channels import Channels, Event
+from mddag_executor.trace.channels import Channels
 from mddag_executor.trace.errors import TraceError
-from mddag_executor.trace.times import Times
+from mddag_executor.trace.events import Event, Events, Ints, OTHER, rows_at
+from mddag_executor.trace.times import plain, Times
+import numpy as np
 
-_SOME = 4096                     # events decoded at a time
+_BATCH = 16                     # blocks that are loaded at a time in the order of time
 _PENDING_LIMIT = 2_000_000      # events in memory while putting them into the order of time
 
-# Opcode, length, channel; then, behind sequence and times, how the message is encoded.
-_HEAD = struct.Struct('<BQH20xH')
+# The beginning of a message's record, and where the fields of its content begin.
+_HEAD = np.dtype({
+    'names': ['opcode', 'length', 'channel', 'encapsulation'], 'itemsize': 33,
+    'formats': ['u1', '<u8', '<u2', '<u2'], 'offsets': [0, 1, 9, 31]})
 _CONTENT = records.RECORD.size
 _FIELDS = _CONTENT + records.MESSAGE_HEAD.size + 4      # 4: the encapsulation header
 _LITTLE_ENDIAN = 0x0100         # plain CDR, little endian, as _HEAD reads it
-_time_of = itemgetter(1)
+_CHANNEL = np.dtype({'names': ['channel'], 'formats': ['<u2'], 'offsets': [9], 'itemsize': 11})
+_INDEX_ENTRY = np.dtype([('time', '<u8'), ('offset', '<u8')])
+
+
+class _Loaded(NamedTuple):
+    """What is left of a block: its events in the order of time (of the file, with `by_file`)."""
+
+    data: bytes
+    times: Ints
+    channels: Any
+    positions: Ints
+    others: list[Event]
 
 
 class Reading:
@@ -61,47 +75,69 @@ class Reading:
         self._channels = channels
         self._undecoded: Counter[str] = Counter()       # by topic and reason
         self._times = Times()
+        self._sizes = np.full(1 << 16, 1 << 62, dtype=np.uint64)
+        self._met = (0, 0)
 
-    def by_file(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Event]:
+    def by_file(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Events]:
         """Yield the events in the order of the file."""
         try:
             for block in blocks:
-                for events in self._decode(self._load(stream, block), block):
-                    yield from events
+                yield self._events([self._decode(stream, block)])
         except Damage as damage:
             self._keep(damage)
 
-    def by_time(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Event]:
+    def by_time(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Events]:
         """
         Yield the events in the order of time.
 
         :raises TraceError: where too many chunks overlap in time
         """
-        for events in self._by_time(stream, blocks):
-            yield from events
-
-    def _by_time(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Any]:
-        """Yield what ``_take`` makes of what ``_in_order`` returns, in the order of time."""
         known = self._scan(blocks)
         order = sorted(range(len(known)), key=lambda number: known[number].start_time)
-        starts = [known[number].start_time for number in order]
         sound = 0                       # blocks before this one have been found sound,
         usable = len(known)             # those from this one on have not and are not used
-        loaded: dict[int, Any] = {}
-        for number, next_start in zip(order, (*starts[1:], None)):
+        loaded: dict[int, _Loaded] = {}
+        for place, number in enumerate(order, 1):
             if number < usable:
                 try:
                     while sound < number:
                         # This pass counts nothing: the block's turn is still to come.
-                        Reading(self._path, self._channels)._in_order(stream, known[sound], 0)
+                        Reading(self._path, self._channels)._in_order(stream, known[sound])
                         sound += 1
-                    pending = sum(map(len, loaded.values()))
-                    loaded[number] = self._in_order(stream, known[number], pending)
+                    loaded[number] = self._in_order(stream, known[number])
                     sound = max(sound, number + 1)
                 except Damage as damage:
                     self._keep(damage)
                     usable = min(sound, number)
-            yield self._take(loaded, next_start)
+            if place == len(order):
+                yield self._events(_taken(loaded, None))
+            elif place % _BATCH == 0 or _pending(loaded) > _PENDING_LIMIT // 2:
+                yield self._events(_taken(loaded, known[order[place]].start_time))
+                if _pending(loaded) > _PENDING_LIMIT:
+                    raise TraceError(
+                        self._path, 'holds too much in disorder to put it into order of time',
+                        'sort it first, as with `mcap sort`')
+
+    def _events(self, parts: list[_Loaded]) -> Events:
+        """Return parts, which are in the order of the file, as one batch."""
+        fixed = self._channels.fixed
+        if len(parts) == 1:
+            part = parts[0]
+            return Events(part.data, part.channels, part.positions, part.others, fixed)
+        if not parts:
+            return Events(b'', np.empty(0, np.uint16), np.empty(0, np.int64), [], fixed)
+        positions, others, length = [], [], 0
+        for part in parts:
+            other = part.channels == OTHER
+            positions.append(np.where(other, len(others), length) + part.positions)
+            others += part.others
+            length += len(part.data)
+        # stable, so that what has the same time stays in the order of the file
+        order = np.argsort(np.concatenate([part.times for part in parts]), kind='stable')
+        return Events(
+            b''.join(part.data for part in parts),
+            np.concatenate([part.channels for part in parts])[order],
+            np.concatenate(positions)[order], others, fixed)
 
     def _keep(self, damage: Damage) -> None:
         self.damage = damage.with_traceback(None)       # which would keep the chunk in memory
@@ -115,87 +151,139 @@ class Reading:
             self._keep(damage)
         return known
 
-    def _take(self, loaded: dict[int, Any], before: int | None) -> Any:
-        return _take(loaded, before)
-
-    def _in_order(self, stream: BinaryIO, block: Block, pending: int) -> Any:
+    def _in_order(self, stream: BinaryIO, block: Block) -> _Loaded:
         """Return the events of a block in the order of time."""
-        room = self._room(pending)
-        events: list[Event] = []
-        for some in self._decode(self._load(stream, block), block):
-            events += some
-            if len(events) > room:
-                raise self._too_unordered()
-        self._leave_out(events)
-        events.sort(key=_time_of)
-        if events and events[0][1] < block.start_time:
+        found = self._decode(stream, block)
+        times = found.times
+        if not len(times):
+            return found
+        if not plain(int(times.min()), int(times.max())):
+            kept = np.ones(len(times), dtype=np.bool_)
+            kept[self._times.impossible(times.tolist())] = False
+            found = found._replace(times=times[kept], channels=found.channels[kept],
+                                   positions=found.positions[kept])
+            times = found.times
+        if (times[1:] < times[:-1]).any():
+            order = np.argsort(times, kind='stable')
+            found = found._replace(times=times[order], channels=found.channels[order],
+                                   positions=found.positions[order])
+        if len(times) and found.times[0] < block.start_time:
             raise Damage('a chunk holds an event from before the time in its head', block.offset)
-        return events
+        return found
 
-    def _load(self, stream: BinaryIO, block: Block) -> bytes:
+    def _load(self, stream: BinaryIO, block: Block) -> tuple[bytes, Block]:
+        """Return a block's records, and the block that they are of: it, or its copy."""
         try:
-            return load(stream, block)
+            return load(stream, block), block
         except Damage:
             if block.copy is None:
                 raise
         self.restored = True
-        return load(stream, block.copy)
+        return load(stream, block.copy), block.copy
 
-    def _leave_out(self, events: list[Event]) -> None:
-        """Take those at an impossible time out of events in the order of the file."""
-        for place in reversed(self._times.impossible([event[1] for event in events])):
-            del events[place]
-
-    def _room(self, pending: int) -> int:
-        """Return how many events may be loaded beside those that are."""
-        return _PENDING_LIMIT - pending
-
-    def _too_unordered(self) -> TraceError:
-        return TraceError(
-            self._path, 'holds too much in disorder to put it into order of time',
-            'sort it first, as with `mcap sort`')
-
-    def _decode(self, data: bytes, block: Block) -> Iterator[list[Event]]:
-        """Yield the events of a block's records, some at a time; raise Damage where malformed."""
-        fast, passed_over = self._channels.fast, self._channels.passed_over
-        unpack_head, find, message = _HEAD.unpack_from, fast.get, records.MESSAGE
+    def _decode(self, stream: BinaryIO, block: Block) -> _Loaded:
+        """Return the events of a block in the order of the file; raise Damage where malformed."""
+        data, source = self._load(stream, block)
         end = len(data)
-        data += bytes(_HEAD.size)       # a head can be read at any record, however short
-        position = 0
-        messages = 0
-        events: list[Event] = []
-        add = events.append
+        data += bytes(_HEAD.itemsize)       # a head can be read at any record, however short
+        starts = self._indexed(stream, source, data, end)
+        if starts is None:
+            starts = self._walk(data, 0, end, block, True)
+        self.messages += len(starts) * block.copies
+        self.chunks += block.chunk * block.copies
+        sizes = self._least_sizes()
+        least = sizes[rows_at(data, _CHANNEL, starts)['channel']]
+        wanted = least != 0
+        if not wanted.all():
+            starts, least = starts[wanted], least[wanted]
+        heads = rows_at(data, _HEAD, starts)
+        channels = heads['channel']
+        fixed = (heads['encapsulation'] == _LITTLE_ENDIAN) & (least <= heads['length'])
+        others: list[Event] = []
+        positions = starts + _FIELDS
+        if not fixed.all():
+            channels, known = channels.copy(), np.ones(len(starts), dtype=np.bool_)
+            for place in np.flatnonzero(~fixed).tolist():
+                start, before = int(starts[place]), len(others)
+                after = start + _CONTENT + int(heads['length'][place])
+                self._add_any(others, int(channels[place]), data[start:after])
+                known[place] = len(others) > before
+                channels[place], positions[place] = OTHER, before
+            channels, positions = channels[known], positions[known]
+        times = np.empty(len(positions), dtype=np.int64)
+        other = channels == OTHER
+        times[~other] = rows_at(data, np.dtype('<i8'), positions[~other])
+        times[other] = [event[1] for event in others]
+        return _Loaded(data, times, channels, positions, others)
+
+    def _least_sizes(self) -> Any:
+        """Return by channel the least length of its messages, 0 for those passed over."""
+        channels = self._channels
+        met = len(channels.passed_over), len(channels.fixed)
+        if met != self._met:
+            self._met = met
+            self._sizes[:] = 1 << 62
+            self._sizes[list(channels.passed_over)] = 0
+            for number, (_, kind) in channels.fixed.items():
+                self._sizes[number] = kind.itemsize + _FIELDS - _CONTENT
+        return self._sizes
+
+    def _indexed(self, stream: BinaryIO, block: Block, data: bytes, end: int) -> Any:
+        """Return where a chunk's messages begin by its indexes; None where these are not sound."""
+        if not block.chunk:
+            return None
+        parts = []
+        stream.seek(block.end)
+        while True:
+            head = stream.read(_CONTENT)
+            if len(head) < _CONTENT or head[0] != records.MESSAGE_INDEX:
+                break
+            length = records.RECORD.unpack(head)[1]
+            if length % _INDEX_ENTRY.itemsize != 6 or length > 16 * end:
+                return None
+            content = stream.read(length)
+            if len(content) < length:
+                return None
+            parts.append(np.frombuffer(content, _INDEX_ENTRY, offset=6)['offset'])
+        if not parts:
+            return None
+        starts = np.sort(np.concatenate(parts).astype(np.int64))
+        if not len(starts) or starts[0] < 0 or starts[-1] > end - _CONTENT:
+            return None
+        lengths = np.minimum(rows_at(data, np.dtype('<u8'), starts + 1), end).astype(np.int64)
+        befores, afters = np.empty(len(starts) + 1, np.int64), np.empty(len(starts) + 1, np.int64)
+        befores[0], afters[-1] = 0, end
+        befores[1:] = starts + _CONTENT + lengths
+        afters[:-1] = starts
+        if (rows_at(data, np.dtype('u1'), starts) != records.MESSAGE).any():
+            return None
+        # what is between messages are definitions
+        gaps = np.flatnonzero(befores != afters).tolist()
+        if any(befores[gap] > afters[gap] for gap in gaps):
+            return None
+        found = [self._walk(data, int(befores[gap]), int(afters[gap]), block, False)
+                 for gap in gaps]
+        if any(map(len, found)):
+            return None
+        for gap in gaps:
+            self._walk(data, int(befores[gap]), int(afters[gap]), block, True)
+        return starts
+
+    def _walk(self, data: bytes, position: int, end: int, block: Block, define: bool) -> Ints:
+        """Return where messages begin between two records; take in what is defined there."""
+        unpack = records.RECORD.unpack_from
+        starts = []
         while position < end:
-            opcode, length, channel, encapsulation = unpack_head(data, position)
+            opcode, length = unpack(data, position)
             after = position + _CONTENT + length
             if after > end:
-                yield events
                 raise Damage('the records of a chunk do not fit into it', block.offset)
-            if opcode == message:
-                messages += 1
-                decoder = find(channel)
-                if decoder is not None:
-                    head, size, unpack = decoder
-                    fields = position + _FIELDS
-                    if encapsulation == _LITTLE_ENDIAN and fields + size <= after:
-                        add(head + unpack(data, fields))
-                    else:
-                        self._add_any(events, channel, data[position:after])
-                elif channel not in passed_over:
-                    self._add_any(events, channel, data[position:after])
-                if not messages % _SOME:
-                    yield events
-                    events = []
-                    add = events.append
-            elif opcode in (records.SCHEMA, records.CHANNEL):
-                yield events
-                events = []
-                add = events.append
+            if opcode == records.MESSAGE:
+                starts.append(position)
+            elif define and opcode in (records.SCHEMA, records.CHANNEL):
                 self._define(opcode, data[position + _CONTENT:after], block)
             position = after
-        self.messages += messages * block.copies
-        self.chunks += block.chunk * block.copies
-        yield events
+        return np.array(starts, dtype=np.int64)
 
     def _add_any(self, events: list[Event], channel: int, message: bytes) -> None:
         """Add the event in a message record; count it where it cannot be decoded."""
@@ -231,16 +319,23 @@ class Reading:
                 f'most of them ({count}) of {reason}')
 
 
-def _take(loaded: dict[int, list[Event]], before: int | None) -> list[Event]:
-    """Take out the events before a time (None: all), in the order of time, then of the file."""
+def _pending(loaded: dict[int, _Loaded]) -> int:
+    """Count the events that are loaded and not given out."""
+    return sum(len(part.times) for part in loaded.values())
+
+
+def _taken(loaded: dict[int, _Loaded], before: int | None) -> list[_Loaded]:
+    """Take out the events before a time (None: all), in the order of the file."""
     taken = []
     for number in sorted(loaded):
-        events = loaded[number]
-        count = len(events) if before is None else bisect_left(events, before, key=_time_of)
+        part = loaded[number]
+        count = len(part.times) if before is None else int(np.searchsorted(part.times, before))
+        columns = part.times, part.channels, part.positions
         if count:
-            taken += events[:count]
-            loaded[number] = events[count:]
-        if not loaded[number]:
+            taken.append(part._replace(**dict(zip(part._fields[1:4], (c[:count] for c in columns)))))
+        if count == len(part.times):
             del loaded[number]
-    taken.sort(key=_time_of)
+        elif count:
+            loaded[number] = part._replace(
+                **dict(zip(part._fields[1:4], (c[count:] for c in columns))))
     return taken
