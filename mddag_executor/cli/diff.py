@@ -119,7 +119,7 @@ def _results(
 
 
 def _has_declaration(trace: Trace) -> bool:
-    from mddag_executor.replay.following import is_own
+    from mddag_executor.replay.run import is_own
     return not recorded.is_bag(trace[0]) and is_own(*trace)
 
 
@@ -132,7 +132,7 @@ def _result(
     if reschedule or recorded.is_bag(path):
         outcome = recorded.rescheduled(args, path, name, task_set)
     else:
-        outcome, _ = recorded.as_recorded(
+        outcome = recorded.as_recorded(
             path, name, task_set, doing=f'replaying {name}', skip=args.skip)
     for warning in outcome.warnings:
         warn(warning)

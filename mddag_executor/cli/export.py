@@ -78,16 +78,15 @@ def _export(
     args: argparse.Namespace, path: str, name: str, task_set: TaskSet | None, target: Target
 ) -> list[str]:
     """Write what a recording holds; return what is missing or doubtful of it."""
-    from mddag_executor.report.export import export_schedule, Exporter
-    from mddag_executor.report.timeline_log import of_rescheduled
+    from mddag_executor.report.export import Exporter
+    exporter = Exporter(target)
     if args.reschedule or recorded.is_bag(path):
         computed = recorded.rescheduled(args, path, name, task_set)
-        export_schedule(of_rescheduled(computed), target)
+        exporter.of_computed(computed.computed())
         return computed.warnings
     if args.rows == 'jobs' and task_set is None:
         recorded.check_declared(path, name)
-    exporter = Exporter(target)
-    outcome, _ = recorded.as_recorded(path, name, task_set, exporter, doing='exporting')
+    outcome = recorded.as_recorded(path, name, task_set, exporter.of, doing='exporting')
     exporter.finish()
     return outcome.warnings
 

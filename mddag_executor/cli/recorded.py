@@ -11,6 +11,7 @@ only be rescheduled.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from mddag_executor.cli import bags, options
@@ -22,8 +23,7 @@ from mddag_executor.errors import UsageError
 if TYPE_CHECKING:
     from mddag_executor.replay import Replay, Reschedule
     from mddag_executor.replay.bags_reschedule import BagReschedule
-    from mddag_executor.replay.batches import Watcher
-    from mddag_executor.replay.recording import Recording
+    from mddag_executor.replay.happenings import Observer
     from msg_graph import TaskSet
 
 _ONLY_RESCHEDULED = ('workers', 'policy', 'preemptive', 'overheads', 'execution_times')
@@ -87,28 +87,25 @@ def check_declared(path: str, name: str) -> None:
     """
     if is_bag(path):
         raise bags.no_graph(name)
-    from mddag_executor.replay.following import check_declared as check_it
-    check_it(path, name)
+    from mddag_executor.replay.run import open_run
+    open_run(path, None, name, needs_declaration=True)
 
 
 def as_recorded(
-    path: str, name: str, task_set: TaskSet | None, watcher: Watcher | None = None,
-    own: type[Recording] | None = None, doing: str = 'replaying', skip: int = 0,
-) -> tuple[Replay, Recording | None]:
+    path: str, name: str, task_set: TaskSet | None,
+    more: Callable[[Replay], Sequence[Observer]] | None = None, doing: str = 'replaying',
+    skip: int = 0,
+) -> Replay:
     """
-    Replay a recorded run; return what came of it, and the recording where it is of this executor.
+    Replay a recorded run.
 
-    :param own: what to make of a recording of this executor.
+    :param more: who else is told of the run.
     :raises mddag_executor.errors.MddagError: where that cannot be
     """
-    from mddag_executor.replay.as_recorded import replay_recording
-    from mddag_executor.replay.following import open_recording
-    from mddag_executor.replay.recording import Recording
+    from mddag_executor.replay import replay
     with Progress(doing) as line:
-        recording = open_recording(path, name, own or Recording)
-        outcome = replay_recording(
-            recording, task_set, line.events, watcher, skip=skip)
-    return outcome, recording if isinstance(recording, Recording) else None
+        return replay(
+            path, task_set, name=name, progress=line.events, more=more, skip=skip)
 
 
 def rescheduled(

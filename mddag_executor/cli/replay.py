@@ -22,8 +22,6 @@ from mddag_executor.errors import UsageError
 if TYPE_CHECKING:
     from mddag_executor.replay import Replay, Reschedule
     from mddag_executor.replay.bags_reschedule import BagReschedule
-    from mddag_executor.report.html import Watch
-    from msg_graph import TaskSet
     from msg_graph.drift import Drift
 
 EXAMPLE = """\
@@ -72,7 +70,9 @@ def main(args: argparse.Namespace) -> int:
         if args.reschedule or recorded.is_bag(path):
             outcome = recorded.rescheduled(args, path, name, task_set)
         else:
-            outcome = _replay(path, name, task_set, watch, drift, args.skip)
+            outcome = recorded.as_recorded(
+                path, name, task_set, None if watch is None else watch.of, skip=args.skip)
+            drift = outcome.drift()
     for warning in outcome.warnings:
         warn(warning)
     result = outcome.result()
@@ -94,21 +94,6 @@ def _check_arguments(args: argparse.Namespace) -> None:
     if args.trace == '-' and args.graph == '-':
         raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
     recorded.check(args, args.trace, args.graph)
-
-
-def _replay(
-    path: str, name: str, task_set: TaskSet | None, watch: Watch | None, drift: list[Drift],
-    skip: int,
-) -> Replay:
-    from mddag_executor.replay.drift import drift_of_import, WatchedRecording
-    outcome, recording = recorded.as_recorded(
-        path, name, task_set, watch, WatchedRecording, skip=skip)
-    if isinstance(recording, WatchedRecording):
-        drift.extend(recording.drift(outcome.task_set))
-    elif task_set is not None:
-        from mddag_executor.replay.drafting import System
-        drift.extend(drift_of_import(System(path, name).census, task_set))
-    return outcome
 
 
 def _show(args: argparse.Namespace, result: dict[str, Any]) -> None:

@@ -210,14 +210,6 @@ def peek(t: Tables, s: State, now: int) -> int:
         poll(t, s)
 
 
-def admit(s: State, x: int, now: int) -> None:
-    """Start an execution as it was recorded: past the ready queue, its group and the workers."""
-    s.job_active[s.x_slot[x]] += 1
-    s.x_state[x] = RUNNING
-    s.x_worker[x] = -1
-    s.x_started[x] = now
-
-
 def take(t: Tables, s: State, worker: int, now: int) -> int:
     """Dispatch the next execution on this idle worker and return it, or -1 (rule 5)."""
     x = peek(t, s, now)
@@ -349,6 +341,12 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
             _complete_vertex(t, s, key, slot, vertex, now)
     deactivate(s, slot)
     return whole
+
+
+def record(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
+    """End an execution as it was recorded: past the ready queue, its group and the workers."""
+    s.job_active[s.x_slot[x]] += 1
+    return complete(t, s, key, x, now)
 
 
 def fail(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:

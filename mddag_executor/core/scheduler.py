@@ -100,9 +100,9 @@ class Scheduler:
             slot = jobs.open_undeclared(self.tables, self.state, job, now)
         return self.state.job_base[slot]
 
-    def admit(self, x: int, now: int) -> None:
-        """Start an execution as it was recorded; it takes no worker and no callback group."""
-        rules.admit(self.state, x, now)
+    def record(self, x: int, now: int) -> bool:
+        """End an execution as it was recorded, past the ready queue; see ``complete``."""
+        return rules.record(self.tables, self.state, self._key, x, now)
 
     def fail_open(self, slot: int, now: int) -> None:
         """Fail the job in a slot unless it has ended already."""

@@ -4,109 +4,115 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+import gc
 import os
 from typing import Any
 
-from mddag_executor.replay.batches import BatchWatcher, Watcher
-from mddag_executor.replay.drift import WatchedRecording
-from mddag_executor.replay.fast_compile import worth_it
-from mddag_executor.replay.follower import Follower, Observer
-from mddag_executor.replay.following import (
-    AnyFollower,
-    AnyMapping,
-    AnyRecording,
-    make_follower,
-    map_recording,
-    merged,
-    open_recording,
-)
+from mddag_executor.replay.communications import Communications
+from mddag_executor.replay.drift import ImportedDrift, OwnDrift
 from mddag_executor.replay.groups import RecordedGroups
-from mddag_executor.replay.imported import ImportedRecording
-from mddag_executor.replay.imported_jobs import ImportedFollower
+from mddag_executor.replay.happenings import Observer
+from mddag_executor.replay.imported_run import ImportedPaths, ImportedRun
 from mddag_executor.replay.judge import Judge
-from mddag_executor.replay.mapping import Mapping
 from mddag_executor.replay.names import CallbackNames
 from mddag_executor.replay.own_paths import OwnPaths
-from mddag_executor.replay.path_flows import Flows
 from mddag_executor.replay.path_results import path_results
-from mddag_executor.replay.paths import PathBook
-from mddag_executor.replay.recording import Recording
-from mddag_executor.replay.seen import Seen
+from mddag_executor.replay.run import open_run, Run
 from mddag_executor.replay.usage import share, Usage
 from mddag_executor.replay.waits import GroupWaits
-from mddag_executor.simulate.compiled import available
 from mddag_executor.text import counted
 from msg_graph import TaskSet
+from msg_graph.drift import Drift
 
 Progress = Callable[[int], None]
 
 
 class Replay:
     """
-    What came of a recorded run.
+    Plays a recorded run, and tells what came of it.
 
+    :param more: makes further observers, who are told after the judge.
+    :param paths: whether to follow the declared paths, and to look for drift.
     :ivar warnings: what is missing or doubtful, one line each.
     """
 
     def __init__(
-        self, recording: AnyRecording, mapping: AnyMapping, judge: Judge, usage: Usage,
-        follower: AnyFollower, paths: PathBook | Flows | None = None,
-        seen: Seen | None = None,
+        self, run: Run, skip: int = 0, progress: Progress | None = None,
+        more: Callable[[Replay], Sequence[Observer]] | None = None, paths: bool = True,
     ) -> None:
-        self._paths = paths
-        self._seen = seen
-        self._recording = recording
-        self._judge = judge
-        self._usage = usage
-        self._follower = follower
-        self.task_set = mapping.task_set
-        self.tally = judge.tally
-        self.warnings = [*recording.warnings, *mapping.warnings, *follower.warnings()]
-        if judge.contradictions:
+        self.run = run
+        self.task_set = run.task_set
+        self.groups = RecordedGroups()
+        waits = GroupWaits(self.groups)
+        self.judge = Judge(run.task_set, run.same, waits, skip)
+        self.usage = Usage(run.task_set, waits)
+        self.names = CallbackNames()
+        self.tally = self.judge.tally
+        self._seen = Communications() if isinstance(run, ImportedRun) else None
+        self._paths: ImportedPaths | OwnPaths | None = None
+        self._drift: ImportedDrift | OwnDrift | None = None
+        if paths and isinstance(run, ImportedRun):
+            self._paths, self._drift = ImportedPaths(run), ImportedDrift(run)
+        elif paths:
+            self._paths, self._drift = OwnPaths(run.task_set), OwnDrift(run)
+        observers = [waits, self.judge, self.usage, self._paths, self._drift, self._seen,
+                     *(more(self) if more is not None else ()), self.names]
+        collects = gc.isenabled()
+        gc.disable()    # there are no cycles to find, and many tuples to look through
+        try:
+            run.play([each for each in observers if each is not None], progress)
+        finally:
+            if collects:
+                gc.enable()
+        self.warnings = run.warnings
+        if self.judge.contradictions:
             self.warnings.append(
-                f'{recording.name}: left out: {counted(judge.contradictions, "event")} that '
+                f'{run.name}: left out: {counted(self.judge.contradictions, "event")} that '
                 'contradict earlier ones')
-        differences = judge.differences() if follower.shut_down else None
+        differences = self.judge.differences() if run.shut_down else None
         if differences is not None:
-            self.warnings.append(f'{recording.name}: {differences}')
+            self.warnings.append(f'{run.name}: {differences}')
+
+    def drift(self) -> list[Drift]:
+        """Return where the run and the declaration disagree."""
+        return [] if self._drift is None else self._drift.drift(self.task_set)
 
     @property
     def duration_ns(self) -> int:
         """Return the time from the first release (or execution) to the end of the run."""
-        start = self._follower.start
-        return 0 if start is None else max(0, self._follower.end - start)
+        start = self.run.start
+        return 0 if start is None else max(0, self.run.end - start)
 
     def result(self) -> dict[str, Any]:
         """Return the result format of ``replay --json``."""
-        head = self._recording.head
+        head = self.run.head
         duration = self.duration_ns
         result = {
             'policy': head.policy, 'workers': head.workers, 'preemptive': head.preemptive,
             'duration_ns': duration,
-            'utilisation': share(self._usage.busy, head.workers, duration),
+            'utilisation': share(self.usage.busy, head.workers, duration),
             **self.tally.result()}
         for dag in self.task_set.dags:
             sinks = result['dags'][dag.name]['sinks']
-            first = self._judge.tables.first_vertex[dag.index]
+            first = self.judge.tables.first_vertex[dag.index]
             for local in dag.sinks:
                 sink = sinks[dag.vertices[local].name]
-                sink['breakdown'] = self._judge.chains.result(self.task_set, first + local)
+                sink['breakdown'] = self.judge.chains.result(self.task_set, first + local)
                 sink['slack_ns'] = slack(sink)
-            if isinstance(self._follower, ImportedFollower):
-                withdrawn = self._follower.doubts.withdrawn
-                result['dags'][dag.name]['unjudged'] = withdrawn.get(dag.index, 0)
+            if isinstance(self.run, ImportedRun):
+                result['dags'][dag.name]['unjudged'] = self.run.unjudged.get(dag.index, 0)
         return {
-            **result, 'rescheduled': False, 'skip_ns': self._judge.skip,
-            'callbacks': self._usage.callbacks(),
-            'undeclared': self._usage.undeclared.result(),
-            'worker_use': self._usage.workers(head.workers, duration),
-            'dropped': dict(sorted(self._follower.dropped.items())),
-            'paths': {} if self._paths is None else path_results(self._paths),
+            **result, 'rescheduled': False, 'skip_ns': self.judge.skip,
+            'callbacks': self.usage.callbacks(),
+            'undeclared': self.usage.undeclared.result(),
+            'worker_use': self.usage.workers(head.workers, duration),
+            'dropped': dict(sorted(self.run.dropped.items())),
+            'paths': {} if self._paths is None else path_results(self._paths.book),
             **({} if self._seen is None else {
                 'recorded_callbacks': self._seen.callbacks(),
                 'communications': self._seen.communications()}),
-            'recording': recording_result(self._recording, self._follower),
+            'recording': recording_result(self.run),
             'warnings': self.warnings}
 
 
@@ -123,12 +129,11 @@ def slack(sink: dict[str, Any]) -> dict[str, int] | None:
         ('min', 'max'), ('p1', 'p99'), ('median', 'median'), ('max', 'min'))}
 
 
-def recording_result(recording: AnyRecording, follower: AnyFollower) -> dict[str, Any]:
+def recording_result(run: Run) -> dict[str, Any]:
     """Return the part of a result that tells of the trace itself."""
     return {
-        'trace': recording.name, 'declaration': recording.head.file,
-        'start_ns': follower.start, 'end_ns': follower.end, 'shut_down': follower.shut_down,
-        'lost': follower.lost}
+        'trace': run.name, 'declaration': run.head.file, 'start_ns': run.start,
+        'end_ns': run.end, 'shut_down': run.shut_down, 'lost': run.lost}
 
 
 def replay(
@@ -137,8 +142,7 @@ def replay(
     *,
     name: str | None = None,
     progress: Progress | None = None,
-    watcher: Watcher | None = None,
-    compiled: bool | None = None,
+    more: Callable[[Replay], Sequence[Observer]] | None = None,
     skip: int = 0,
 ) -> Replay:
     """
@@ -151,91 +155,10 @@ def replay(
     :param task_set: the declaration that judges; None: the one in the trace, if it has one.
     :param name: what messages call the trace, where that is not its path.
     :param progress: told now and then how many events have been read.
-    :param watcher: who else is told of the run.
-    :param compiled: whether to use compiled code where that can be; None: for long traces.
+    :param more: who else is told of the run; see ``Replay``.
     :param skip: how long after the first release jobs are not judged (a warm-up), ns.
     :raises mddag_executor.trace.TraceError: when it is no trace.
     :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, or none of
         the declaration's callbacks.
     """
-    return replay_recording(
-        open_recording(path, name), task_set, progress, watcher, compiled, skip)
-
-
-def replay_recording(
-    recording: AnyRecording, task_set: TaskSet | None, progress: Progress | None = None,
-    watcher: Watcher | None = None, compiled: bool | None = None, skip: int = 0,
-) -> Replay:
-    """
-    Replay an open recording as recorded; see ``replay``.
-
-    Only a trace of this executor is replayed in compiled code, and only where whoever watches can
-    be told in batches.
-    """
-    mapping = map_recording(recording, task_set)
-    batches = watcher if isinstance(watcher, BatchWatcher) else None
-    if watcher is batches and isinstance(recording, Recording) and (
-            worth_it(recording.message_count) if compiled is None else compiled and available()):
-        found = replay_compiled(recording, mapping, progress, batches, skip)
-        if found is not None:
-            return found
-    parts = _Parts(recording, mapping, watcher, skip)
-    follower = parts.follower
-    follower.run(progress)
-    if isinstance(follower, ImportedFollower):
-        return Replay(recording, mapping, parts.judge, parts.usage, follower, follower.paths,
-                      parts.seen)
-    return Replay(recording, mapping, parts.judge, parts.usage, follower, parts.paths.book)
-
-
-def replay_compiled(
-    recording: Recording, mapping: AnyMapping, progress: Progress | None = None,
-    watcher: BatchWatcher | None = None, skip: int = 0,
-) -> Replay | None:
-    """Replay a recording in compiled code; None where that can only be done in Python."""
-    from mddag_executor.replay.fast import FastReplay
-    from mddag_executor.replay.fast_arrays import Declined
-    assert isinstance(mapping, Mapping)
-    parts = _Parts(recording, mapping, watcher, skip, in_batches=True)
-    follower = parts.follower
-    assert isinstance(follower, Follower)
-    try:
-        FastReplay(recording, mapping, parts.judge, parts.usage, follower, parts.paths,
-                   parts.groups, watcher).run(progress)
-    except Declined:
-        if isinstance(recording, WatchedRecording):
-            recording.forget()
-        return None
-    return Replay(recording, mapping, parts.judge, parts.usage, follower, parts.paths.flows)
-
-
-class _Parts:
-    """All that is told of a run."""
-
-    def __init__(
-        self, recording: AnyRecording, mapping: AnyMapping,
-        watcher: Watcher | None, skip: int, in_batches: bool = False,
-    ) -> None:
-        self.groups = RecordedGroups()
-        waits = GroupWaits(self.groups)
-        self.judge = Judge(mapping.task_set, mapping.same, waits, skip)
-        self.usage = Usage(mapping.task_set, waits)
-        observers: list[Observer] = [waits, self.judge, self.usage]
-        self.paths = OwnPaths(mapping.task_set)
-        handlers = [self.groups.handlers()]
-        if self.paths.book and not isinstance(recording, ImportedRecording):
-            observers.append(self.paths)
-            handlers.append(self.paths.handlers())
-        if watcher is not None:
-            if isinstance(watcher, BatchWatcher) and in_batches:
-                watcher.begin(mapping.task_set, self.judge, self.usage)
-            else:
-                observers.extend(watcher.observers(mapping.task_set, self.judge))
-            names = CallbackNames()
-            watcher.name_by(names)
-            handlers.append(names.handlers())
-        self.seen = Seen()
-        self.follower = make_follower(
-            recording, mapping, observers, merged(*handlers), [self.seen])
-        if not isinstance(self.follower, ImportedFollower):
-            self.paths.follower = self.follower
+    return Replay(open_run(path, task_set, name), skip, progress, more)

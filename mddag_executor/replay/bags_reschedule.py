@@ -28,6 +28,7 @@ from mddag_executor.core import policy as find_policy
 from mddag_executor.core.jobs import finish
 from mddag_executor.core.state import Decision, JUDGE_FROM, new_state
 from mddag_executor.replay.bags import Bag, BagError, UNKNOWN
+from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.timed import busy_times, Engine, Transports
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
@@ -185,6 +186,11 @@ class BagReschedule:
     def duration_ns(self) -> int:
         """Return the time from the first to the last message of the bag."""
         return self.end - self.start
+
+    def computed(self) -> ComputedRun:
+        """Return the schedule, to be played to observers."""
+        return ComputedRun(self.task_set, self.load, self.log, self.decisions, self.end, self.end,
+                           judge_from=self.judge_from)
 
     def worker_busy(self) -> list[int]:
         """Return for each worker how long it was busy, ns."""

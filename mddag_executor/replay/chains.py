@@ -28,8 +28,16 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of, NEVER, Tables
-from mddag_executor.replay.follower import Execution
+from mddag_executor.replay.happenings import (
+    Batch,
+    COMPLETED,
+    Execution,
+    Ints,
+    STARTED,
+    sums,
+)
 from msg_graph import TaskSet
+import numpy as np
 
 
 class Breakdown(NamedTuple):
@@ -57,6 +65,10 @@ class Step(NamedTuple):
     group: int = 0
 
 
+# Columns of a link: a step while it is only counted.
+_L_VERTEX, _L_LEG, _L_READY, _L_START, _L_END, _L_BUSY, _L_GROUP, _N_LINK = range(8)
+
+
 class Worst(NamedTuple):
     """The job with a sink's longest response time."""
 
@@ -75,104 +87,152 @@ class Worst(NamedTuple):
 class SinkTimes:
     """Where the time of a sink's completed jobs went: sums, and the worst job."""
 
-    __slots__ = ('completed', 'sums', 'group', 'worst')
+    __slots__ = ('completed', 'sums', 'group', 'longest', 'worst')
 
     def __init__(self) -> None:
         self.completed = 0
         self.sums = [0] * len(Breakdown._fields)
         self.group = 0
+        self.longest = -1
         self.worst: Worst | None = None
-
-    def add(self, worst: Worst) -> None:
-        """Take in a completed job."""
-        self.completed += 1
-        for i, part in enumerate(worst.breakdown):
-            self.sums[i] += part
-        self.group += worst.group
-        before = self.worst
-        if (before is None
-                or worst.completed - worst.release > before.completed - before.release):
-            self.worst = worst
 
 
 class Chains:
     """
     The chains of open jobs, and what came of those of completed ones.
 
+    Links are counted in a batch: those that were kept of the batches before, then what completed,
+    then what was started.
+
     :param tables: tables of the task set, with legs.
     """
 
     def __init__(self, task_set: TaskSet, tables: Tables) -> None:
-        self._tables = tables
         #: By global vertex and leg: the vertex whose message it is.
         self.before = [
             [first + before for _, before in legs_of(vertex, dag.vertices)]
             for dag, first in zip(task_set.dags, tables.first_vertex) for vertex in dag.vertices]
-        self._release: dict[int, int] = {}
-        self._done: dict[int, dict[int, Step]] = {}
+        self._offset = tables.region_offset
+        self._region = tables.n_region
+        self._is_source = np.array([not each for each in self.before])
         self.sinks = {vertex: SinkTimes() for vertex in tables.sinks}
+        #: As the core's columns of executions: the link of each vertex of the open jobs, or -1.
+        self.links: list[int] = []
+        self._kept = np.empty((0, _N_LINK), dtype=np.int64)
+        # of the sinks that have completed in this batch: vertex, job, release, completion; and
+        # their chains one after the other, from the end on, and how long each is
+        self._sinks: list[tuple[int, int, int, int]] = []
+        self._chains: list[int] = []
+        self._lengths: list[int] = []
 
-    def begin(self, slot: int, release: int) -> None:
-        """Begin a job; what was known of the slot's last one is forgotten."""
-        self._release[slot] = release
-        self._done[slot] = {}
+    def begin_batch(self, batch: Batch) -> tuple[int, int]:
+        """Take in what completes and starts; return the numbers of the first links of each."""
+        completed, started = batch.columns(COMPLETED), batch.columns(STARTED)
+        first = len(self._kept)
+        table = np.zeros((first + len(completed) + len(started), _N_LINK), dtype=np.int64)
+        table[:first] = self._kept
+        table[first:first + len(completed), :_L_GROUP] = completed[:, (1, 3, 6, 7, 8, 9)]
+        running = table[first + len(completed):]
+        running[:, _L_VERTEX], running[:, _L_READY:_L_END] = started[:, 1], started[:, 3:5]
+        running[:, _L_LEG], running[:, _L_END:_L_GROUP] = -1, NEVER
+        self._table = table
+        vertex, leg, ready, start, end = table[:, :_L_BUSY].T.tolist()
+        self.ready, self.first = ready, first
+        self._columns = vertex, leg, ready, start, end
+        self.waited: dict[int, int] = {}
+        return first, first + len(completed)
 
-    def started(self, slot: int, vertex: int, ready: int, start: int) -> None:
-        """Take in an execution that has begun, or a coroutine that went on."""
-        before = self._done[slot].get(vertex)
-        if before is None or before.execution.ready != ready:
-            self._done[slot][vertex] = Step(vertex, -1, Execution(ready, start, NEVER, NEVER))
+    def begin(self, base: int, dag: int) -> None:
+        """Begin a job whose executions have these numbers; the last one there is forgotten."""
+        links, n = self.links, self._region[dag]
+        if len(links) < base + n:
+            links.extend([-1] * (base + n - len(links)))
+        links[base:base + n] = [-1] * n
 
-    def completed(
-        self, slot: int, vertex: int, leg: int, execution: Execution, group: int = 0
-    ) -> None:
-        """Take in the execution that completed a vertex, and its waiting for its group."""
-        self._done[slot][vertex] = Step(vertex, leg, execution, group)
-
-    def sink(self, slot: int, vertex: int, job: int, completed: int) -> None:
+    def sink(self, base: int, vertex: int, job: int, release: int, completed: int) -> None:
         """Take in that a sink has completed."""
-        release = self._release[slot]
-        chain = self._chain(self._done[slot], vertex)
-        breakdown = self._split(chain, release, completed)
-        self.sinks[vertex].add(Worst(job, release, completed, chain, breakdown))
+        links, offset, chain, before = self.links, self._offset, self._chains, self.before
+        at, legs, ready, start, end = self._columns
+        length = len(chain)
+        link = links[base + offset[vertex]]
+        while link >= 0:
+            chain.append(link)
+            publishers = before[at[link]]
+            if not publishers:
+                break
+            since, leg = ready[link], legs[link]
+            if leg >= 0:
+                link = links[base + offset[publishers[leg]]]
+                if link >= 0 and start[link] > since:
+                    break
+                continue
+            link = -1
+            for publisher in publishers:
+                other = links[base + offset[publisher]]
+                if other >= 0 and start[other] <= since and (link < 0 or end[other] > end[link]):
+                    link = other
+        self._sinks.append((vertex, job, release, completed))
+        self._lengths.append(len(chain) - length)
 
-    def _chain(self, done: dict[int, Step], vertex: int) -> list[Step]:
-        chain: list[Step] = []
-        step = done.get(vertex)
-        while step is not None:
-            chain.append(step)
-            publishers = self.before[step.vertex]
-            if step.leg >= 0 and publishers:
-                publishers = [publishers[step.leg]]
-            ready = step.execution.ready
-            candidates = [
-                done[v] for v in publishers if v in done and done[v].execution.start <= ready]
-            step = max(candidates, key=lambda s: s.execution.end, default=None)
-        chain.reverse()
-        return chain
+    def end_batch(self) -> None:
+        """Add up where the time went, and keep what open jobs have."""
+        table = self._table
+        for link, waited in self.waited.items():
+            table[link, _L_GROUP] = waited
+        if self._sinks:
+            self._split(table)
+            self._sinks, self._chains, self._lengths = [], [], []
+        links = np.array(self.links, dtype=np.int64)
+        held = np.flatnonzero(links >= 0)
+        self._kept = table[links[held]]
+        links[held] = np.arange(len(held))
+        self.links = links.tolist()
 
-    def _split(self, chain: list[Step], release: int, completed: int) -> Breakdown:
-        if not chain:
-            return Breakdown(unknown_ns=completed - release)
-        before = chain[0].execution.ready - release
-        waiting = executing = suspended = transport = 0
-        for step, after in zip(chain, [*chain[1:], None]):
-            ready, start, end, busy = step.execution
-            waiting += start - ready
-            published = completed if after is None else min(end, after.execution.ready)
-            pause = end - start - busy
-            if step.leg < 0:
-                pause = 0  # it still runs: nothing more is known
-            # Where in the execution a pause was is not kept: it counts as far as there is room.
-            pause = max(0, min(pause, published - start))
-            suspended += pause
-            executing += published - start - pause
-            if after is not None:
-                transport += after.execution.ready - published
-        whole = not self.before[chain[0].vertex]
-        return Breakdown(
-            before if whole else 0, waiting, executing, suspended, transport,
-            0 if whole else before)
+    def _split(self, table: Ints) -> None:
+        vertex, job, release, completed = np.array(self._sinks, dtype=np.int64).T
+        lengths = np.array(self._lengths, dtype=np.int64)
+        chain = table[np.array(self._chains, dtype=np.int64)]
+        first = np.cumsum(lengths) - lengths
+        of = np.repeat(np.arange(len(lengths)), lengths)
+        at, leg, ready, start, end, busy, group = chain.T
+        is_last = np.zeros(len(chain), dtype=np.bool_)      # of its chain: it is told first
+        is_last[first[lengths > 0]] = True
+        after = np.r_[0, ready[:-1]]
+        published = np.where(is_last, completed[of], np.minimum(end, after))
+        # Where in the execution a pause was is not kept: it counts as far as there is room.
+        # Of what still runs nothing more is known.
+        pause = np.where(
+            leg < 0, 0, np.maximum(0, np.minimum(end - start - busy, published - start)))
+        parts = np.zeros((len(Breakdown._fields) + 1, len(lengths)), dtype=np.int64)
+        for part, times in enumerate((
+                start - ready, published - start - pause, pause,
+                np.where(is_last, 0, after - published)), 1):
+            np.add.at(parts[part], of, times)
+        np.add.at(parts[-1], of, group)
+        # what was before the chain
+        parts[5] = completed - release
+        some = lengths > 0
+        begin = (first + lengths - 1)[some]
+        lag = ready[begin] - release[some]
+        whole = self._is_source[at[begin]]
+        parts[0, some], parts[5, some] = np.where(whole, lag, 0), np.where(whole, 0, lag)
+        sinks, place = np.unique(vertex, return_inverse=True)
+        totals = [sums(place, part, len(sinks)) for part in parts]
+        response = completed - release
+        for number, sink in enumerate(sinks.tolist()):
+            times = self.sinks[sink]
+            mine = np.flatnonzero(place == number)
+            times.completed += len(mine)
+            times.sums = [before + more[number] for before, more in zip(times.sums, totals)]
+            times.group += totals[-1][number]
+            worst = int(mine[response[mine].argmax()])
+            if response[worst] > times.longest:
+                times.longest = int(response[worst])
+                links = chain[first[worst]:first[worst] + lengths[worst]][::-1].tolist()
+                times.worst = Worst(
+                    *(int(column[worst]) for column in (job, release, completed)),
+                    [Step(link[0], link[1], Execution(*link[2:6]), link[6]) for link in links],
+                    Breakdown(*parts[:-1, worst].tolist()))
 
     def result(self, task_set: TaskSet, vertex: int) -> dict[str, Any] | None:
         """Return a sink's part of the result: means over completed jobs, and the worst job."""
@@ -191,7 +251,7 @@ class Chains:
 
 
 def _step_result(task_set: TaskSet, step: Step) -> dict[str, Any]:
-    ready, start, end, busy = step.execution
+    ready, start, end, busy, _ = step.execution
     known = step.leg >= 0
     return {
         'vertex': task_set.vertices[step.vertex].name, 'ready_ns': ready, 'start_ns': start,

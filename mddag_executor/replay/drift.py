@@ -5,8 +5,7 @@ What the drift rules need to know of a recorded run, collected while it is repla
 
 Theory of operation
 -------------------
-``WatchedRecording`` is a recording that looks at its own events as they pass to whoever replays
-it, so that a trace is read only once. The rules are in ``msg_graph.drift``.
+``OwnDrift`` observes a run of this executor.  The rules are in ``msg_graph.drift``.
 
 A callback's declared key is that of the vertices that it was dispatched as, and where it never ran
 as a vertex (its messages fitted nothing), what the declaration has for its node and what starts
@@ -16,104 +15,110 @@ it (``msg_graph.binding``). Runs in another declaration's terms are matched by t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-import os
 
-from mddag_executor.replay.recording import Recording, TASK_SET
-from mddag_executor.trace.census import Address, Census, Event
+from mddag_executor.replay.happenings import (
+    ADDRESS,
+    Batch,
+    Event,
+    FIELD,
+    Handlers,
+    Ints,
+    NOW,
+    Observer,
+    PROCESS,
+)
+from mddag_executor.replay.imported_run import ImportedRun
+from mddag_executor.replay.linker import LinkObserver
+from mddag_executor.replay.own import OwnRun
+from mddag_executor.trace.census import Address, Census
 from msg_graph import TaskSet
 from msg_graph.binding import Binder, Entity
 from msg_graph.drift import Drift, drift, Observed, Releases
+import numpy as np
 
 _RELEASE, _DISPATCH, _DROP = 'mddag:job_release', 'mddag:dispatch', 'mddag:drop'
+_THREADS = (
+    'ros2:callback_start', 'ros2:callback_end', 'ros2:rclcpp_publish', 'ros2:rcl_publish')
 
 
-class WatchedRecording(Recording):
-    """A recording that can tell, once its events have passed, what drifted."""
+class OwnDrift(Observer):
+    """Collects, while a trace of this executor is played, what tells where it drifted."""
 
-    def __init__(self, path: str | os.PathLike[str], name: str | None = None) -> None:
-        super().__init__(path, name)
-        self._sources = [dag.vertices[dag.source].callback.key for dag in self.task_set.dags]
-        self._keys = [[v.callback.key for v in dag.vertices] for dag in self.task_set.dags]
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget all events that have passed."""
+    def __init__(self, run: OwnRun) -> None:
+        self._run = run
+        self._sources = [dag.vertices[dag.source].callback.key for dag in run.recorded_set.dags]
+        self._keys = [[v.callback.key for v in dag.vertices] for dag in run.recorded_set.dags]
         self._census = Census()
         self._observed = Observed()
         self._key: dict[Address, str] = {}
         self._executions: Counter[Address] = Counter()
         self._dropped: Counter[Address] = Counter()
         self._first: int | None = None
-        self._last = 0
+        # by process and thread, what runs there: the innermost callback last
+        self._running: dict[tuple[int, int], list[int]] = {}
 
-    def events(self, names: Iterable[str]) -> Iterator[Event]:
-        """Yield the named events in the order of time; look at these and at others."""
-        wanted = set(names)
-        for event in super().events({*wanted, *self.names()}):
-            name = event[0]
-            if None not in event:
-                self.take(event)
-                if name != TASK_SET and event[1] > self._last:
-                    self._last = event[1]
-            if name in wanted:
-                yield event
+    def handlers(self) -> Handlers:
+        """Return what takes in who there is, and what is dropped."""
+        return {**self._census.who, _DROP: self._drop}
 
-    def names(self) -> set[str]:
-        """Return the full names of the events that it looks at."""
-        return {*self._census.handlers, _RELEASE, _DISPATCH, _DROP}
+    def _drop(self, event: Event) -> None:
+        self._dropped[event[2], event[4]] += 1
 
-    def take(self, event: Event) -> None:
-        """Look at an event that has all its fields."""
-        name = event[0]
-        handler = self._census.handlers.get(name)
-        if handler is not None:
-            handler(event)
-        elif name == _RELEASE:
-            self._released(event)
-        elif name == _DISPATCH:
-            self._dispatched(event)
-        elif name == _DROP:
-            self._dropped[event[2], event[4]] += 1
+    def take(self, batch: Batch) -> None:
+        """Count releases, dispatches and who publishes what."""
+        first = []
+        if _RELEASE in batch.events:
+            places, rows = batch.events[_RELEASE]
+            known = (rows[:, FIELD] >= 0) & (rows[:, FIELD] < len(self._sources))
+            for dag in np.unique(rows[known, FIELD]).tolist():
+                mine = rows[rows[:, FIELD] == dag, FIELD + 2]
+                releases = self._observed.releases.setdefault(self._sources[dag], Releases())
+                releases.add(int(mine.min()))
+                releases.add(int(mine.max()))
+                releases.count += len(mine) - 2
+            first += zip(places[known][:1].tolist(), rows[known][:1, NOW].tolist())
+        if _DISPATCH in batch.events:
+            places, rows = batch.events[_DISPATCH]
+            for pid in np.unique(rows[:, PROCESS]).tolist():
+                self._dispatched(pid, rows[rows[:, PROCESS] == pid, FIELD:FIELD + 3])
+            first += zip(places[:1].tolist(), rows[:1, NOW].tolist())
+        if first and self._first is None:
+            self._first = min(first)[1]
+        self._publish(batch)
 
-    def published(self, callback: Address, publisher: Address) -> None:
-        """Take in that a callback has published, which no event has told."""
-        self._census.published(callback, publisher)
+    def _dispatched(self, pid: int, rows: Ints) -> None:
+        callbacks, counts = np.unique(rows[:, 0], return_counts=True)
+        for callback, count in zip(callbacks.tolist(), counts.tolist()):
+            self._executions[pid, callback & ADDRESS] += count
+        dag, vertex = rows[:, 1], rows[:, 2]
+        sizes = np.array([len(keys) for keys in self._keys] + [0])
+        known = (dag >= 0) & (dag < len(self._keys)) & (vertex >= 0)
+        known &= vertex < sizes[np.where(known, dag, -1)]
+        latest = rows[known][::-1]
+        _, last = np.unique(latest[:, 0], return_index=True)
+        for callback, of, place in latest[last].tolist():
+            self._key[pid, callback & ADDRESS] = self._keys[of][place]
 
-    def counted(
-        self, executions: Mapping[Address, int], vertices: Mapping[Address, tuple[int, int]],
-        releases: Sequence[Sequence[int]], first: int, last: int,
-    ) -> None:
-        """
-        Take in what was counted of releases and dispatches, which no event has told.
-
-        :param vertices: DAG and vertex that a callback was dispatched as.
-        :param releases: of each DAG their number, the first and the last.
-        :param first: when the first of them was recorded, -1 for none; `last`: the last event.
-        """
-        self._executions.update(executions)
-        for callback, (dag, vertex) in vertices.items():
-            self._key[callback] = self._keys[dag][vertex]
-        for source, each in zip(self._sources, releases):
-            if each[0]:
-                self._observed.releases[source] = Releases(*each)
-        self._first = first if first >= 0 else None
-        self._last = max(self._last, last)
-
-    def _released(self, event: Event) -> None:
-        dag = event[4]
-        if 0 <= dag < len(self._sources):
-            self._observed.releases.setdefault(self._sources[dag], Releases()).add(event[6])
-            if self._first is None:
-                self._first = event[1]
-
-    def _dispatched(self, event: Event) -> None:
-        callback, dag, vertex = (event[2], event[4]), event[5], event[6]
-        self._executions[callback] += 1
-        if 0 <= dag < len(self._keys) and 0 <= vertex < len(self._keys[dag]):
-            self._key[callback] = self._keys[dag][vertex]
-        if self._first is None:
-            self._first = event[1]
+    def _publish(self, batch: Batch) -> None:
+        """Note which callbacks publish what: the innermost that runs in the thread."""
+        none = np.empty(0, dtype=np.int64), np.empty((0, FIELD + 1), dtype=np.int64)
+        places, rows = zip(*(batch.events.get(name, none) for name in _THREADS))
+        kind = np.repeat((0, 1, 2, 2), [len(each) for each in places])
+        order = np.argsort(np.concatenate(places))
+        kind = kind[order]
+        pid, thread, what = np.concatenate(
+            [each[:, PROCESS:FIELD + 1] for each in rows])[order].T
+        found: set[tuple[int, int, int]] = set()
+        for process in np.unique(pid).tolist():
+            threads = thread[pid == process]
+            for one in np.unique(threads).tolist():
+                mine = np.flatnonzero((pid == process) & (thread == one))
+                stack = self._running.setdefault((process, one), [])
+                found.update((process, *pair) for pair in _published(
+                    kind[mine], what[mine], stack))
+        for process, callback, publisher in found:
+            self._census.published(
+                (process, callback & ADDRESS), (process, publisher & ADDRESS))
 
     def drift(self, judge: TaskSet) -> list[Drift]:
         """
@@ -122,19 +127,54 @@ class WatchedRecording(Recording):
         :param judge: the declaration, the recorded one or another.
         """
         observed, publishes = self._observed, dict[str, set[str]]()
-        keys = {**declared_keys(self._census, self.task_set), **self._key}
+        keys = {**declared_keys(self._census, self._run.recorded_set), **self._key}
         got, ran = Counter[str](), Counter[str]()
         for callback, key in keys.items():
             ran[key] += self._executions[callback]
             got[key] += self._executions[callback] + self._dropped[callback]
             runs = self._census.runs.get(callback)
             publishes.setdefault(key, set()).update(runs.publishes if runs else ())
-        observed.duration_ns = 0 if self._first is None else max(0, self._last - self._first)
+        observed.duration_ns = 0 if self._first is None else max(
+            0, self._run.last - self._first)
         observed.got, observed.ran = dict(got), dict(ran)
         observed.publishes = dict(publishes)
         observed.nodes = set(self._census.publishers) or None
         observed.undeclared = _undeclared(self._census, judge)
         return drift(judge, observed)
+
+
+def _published(kind: Ints, what: Ints, stack: list[int]) -> set[tuple[int, int]]:
+    """
+    Return which callbacks have published with what in a thread.
+
+    :param kind: of its events: start (0), end (1), publication (2); ``what`` the callback's or
+        the publisher's address.
+    :param stack: the callbacks that run there, the innermost last; it is brought up to date.
+    """
+    runs = np.flatnonzero(kind != 2)
+    kept = len(stack)
+    callbacks = np.r_[np.array(stack, dtype=np.int64), what[runs]]
+    ends = np.r_[np.zeros(kept, dtype=np.int64), kind[runs]]
+    pairs = len(ends) // 2 * 2
+    if kept < 2 and not ends[::2].any() and ends[1::2].all() and (
+            callbacks[:pairs:2] == callbacks[1::2]).all():      # one after the other
+        publications = np.flatnonzero(kind == 2)
+        before = np.searchsorted(runs, publications) + kept
+        within = before % 2 == 1
+        stack[:] = callbacks[pairs:].tolist()
+        return set(zip(callbacks[before[within] - 1].tolist(),
+                       what[publications[within]].tolist()))
+    found = set()
+    for each, address in zip(kind.tolist(), what.tolist()):
+        if each == 0:
+            stack.append(address)
+        elif each == 2:
+            if stack:
+                found.add((stack[-1], address))
+        else:
+            while stack and stack.pop() != address:
+                pass
+    return found
 
 
 def declared_keys(census: Census, task_set: TaskSet) -> dict[Address, str]:
@@ -154,6 +194,28 @@ def _undeclared(census: Census, judge: TaskSet) -> list[Entity]:
     declared = declared_keys(census, judge)
     return [Entity(e.node, e.kind, e.start, e.period_ns) for e in census.entities()
             if e.callback not in declared]
+
+
+class ImportedDrift(LinkObserver):
+    """
+    Collects, while an imported run is played, what tells where it drifted.
+
+    Such a recording has no jobs; the starts of a source's callback count as its releases.
+    """
+
+    def __init__(self, run: ImportedRun) -> None:
+        self._census = Census()
+        self._declared = bool(run.task_set.dags)
+
+    def raw_handlers(self) -> Handlers:
+        """Return what takes in who there is, and what callbacks do."""
+        return dict.fromkeys(self._census.handlers, self._census.take) if self._declared else {}
+
+    def drift(self, judge: TaskSet) -> list[Drift]:
+        """Return where the run and a declaration disagree."""
+        if not self._declared:
+            return []
+        return drift_of_import(self._census, judge)
 
 
 def drift_of_import(census: Census, judge: TaskSet) -> list[Drift]:

@@ -356,3 +356,10 @@ def fields_of(event: tuple[Any, ...]) -> Fields:
     """Return an event of ``TraceReader.layout_events`` as a dict, as ``read_events`` has it."""
     return {'_timestamp': event[1], '_vpid': event[2], '_vtid': event[3],
             **dict(zip(event[0].fields, event[4:]))}
+
+
+def as_table(event: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return an event of ``TraceReader.layout_events`` with the table's fields, None if not there."""
+    values = dict(zip(event[0].fields, event[4:]))
+    wanted = EVENTS[event[0].name].fields if event[0].name in EVENTS else ()
+    return (event[0].name, *event[1:4], *(values.get(field) for field, _ in wanted))

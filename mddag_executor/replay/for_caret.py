@@ -30,8 +30,8 @@ from collections.abc import Iterator
 import os
 from typing import Any
 
-from mddag_executor.replay.imported import open_recording
-from mddag_executor.replay.recording import Recording
+from mddag_executor.replay.own import OwnRun
+from mddag_executor.replay.run import open_run
 from mddag_executor.trace import read_events
 
 _ROS2 = (
@@ -75,11 +75,11 @@ def caret_events(path: str | os.PathLike[str]) -> Iterator[Event]:
     :raises mddag_executor.trace.TraceError: when it is no trace.
     :raises mddag_executor.replay.ReplayError: when no run is recorded in it.
     """
-    recording = open_recording(path)
-    if not isinstance(recording, Recording):
+    run = open_run(path)
+    if not isinstance(run, OwnRun):
         yield from read_events(path, CARET_EVENTS)
         return
-    filler = _Filler(recording, _stamps(path))
+    filler = _Filler(run, _stamps(path))
     for event in read_events(path, (CARET_EVENTS | {_DISPATCH}) - {'ros2:rmw_take'}):
         yield from filler.take(event)
 
@@ -122,10 +122,10 @@ class _Filler:
     """Adds what CARET's tracer would have seen."""
 
     def __init__(
-        self, recording: Recording, stamps: dict[str, list[tuple[int, int]]]
+        self, run: OwnRun, stamps: dict[str, list[tuple[int, int]]]
     ) -> None:
         self._stamps = stamps
-        self._dags = recording.task_set.dags
+        self._dags = run.recorded_set.dags
         self._topic_of: dict[int, str] = {}     # by handle of publisher, subscription, callback
         self._running: dict[int, tuple[int, int, int]] = {}     # by thread: DAG, vertex, job
         # by job, of what was published: source timestamp and address, by vertex and topic

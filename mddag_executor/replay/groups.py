@@ -9,10 +9,10 @@ declaration than the recorded one goes before.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Iterable
 
 from mddag_executor.core import Tables
+from mddag_executor.replay.happenings import Event, Handlers
 
 
 class RecordedGroups:
@@ -24,7 +24,7 @@ class RecordedGroups:
         self._callbacks_of: dict[int, list[int]] = {}
         self._by_callback: dict[int, int] | None = None     # None: something new has come
 
-    def handlers(self) -> dict[str, Callable[[tuple[Any, ...]], None]]:
+    def handlers(self) -> Handlers:
         """Return what takes in the events, by full name."""
         return {
             'ros2_caret:add_callback_group': self._group,
@@ -37,15 +37,15 @@ class RecordedGroups:
             'ros2:rclcpp_service_callback_added': self._callback,
         }
 
-    def _group(self, event: tuple[Any, ...]) -> None:
+    def _group(self, event: Event) -> None:
         self._exclusive[event[5]] = event[6] == 'mutually_exclusive'
         self._by_callback = None
 
-    def _entity(self, event: tuple[Any, ...]) -> None:
+    def _entity(self, event: Event) -> None:
         self._group_of_entity[event[5]] = event[4]
         self._by_callback = None
 
-    def _callback(self, event: tuple[Any, ...]) -> None:
+    def _callback(self, event: Event) -> None:
         # also from a subscription's handle to the subscription, which the callback belongs to
         self._callbacks_of.setdefault(event[4], []).append(event[5])
         self._by_callback = None
@@ -60,6 +60,11 @@ class RecordedGroups:
                     found[callback] = number
             self._by_callback = found
         return self._by_callback
+
+    def numbers(self) -> dict[int, int]:
+        """Return the same by the callback's number with a sign, as columns have it."""
+        return {callback - 2 ** 64 if callback >= 2 ** 63 else callback: number
+                for callback, number in self.by_callback().items()}
 
     def _reachable(self, entity: int) -> Iterable[int]:
         seen = {entity: None}

@@ -18,13 +18,13 @@ missing in the trace or wrong in this program, and ``differences`` says so.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.jobs import is_judged, judge_from
+from mddag_executor.core.rules import record
 from mddag_executor.core.state import (
-    Decision,
     DROP,
     IDLE,
     JOB_END,
@@ -39,16 +39,30 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tables import CONTINUE
 from mddag_executor.replay.chains import Chains
-from mddag_executor.replay.follower import Execution, Observer, Piece
+from mddag_executor.replay.happenings import (
+    Batch,
+    COMPLETED,
+    ENDED,
+    FAILED,
+    Ints,
+    MISSED,
+    Observer,
+    PUBLISHED,
+    RAN,
+    RELEASED,
+    STARTED,
+    WITHDRAWN,
+)
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.waits import GroupWaits
 from mddag_executor.text import counted
 from msg_graph import TaskSet
+import numpy as np
 
 KEEP_RESPONSES = 1_000_000
 """How many response times are kept for each sink: beyond that, quantiles are of the last ones."""
 
-_KEEP_WAITED = 4096
+_LARGE = 1 << 40
 _MISSES = {SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, SINK_FAILED}
 
 
@@ -79,7 +93,7 @@ class Judge(Observer):
     ) -> None:
         self._waits = waits
         # by DAG, vertex, job and ready time: how long an execution waited for its group, ns
-        self._waited: dict[tuple[int, int, int, int], int] = {}
+        self._waited: dict[tuple[int, ...], int] = {}
         tables = Tables.build(task_set, legs=True, groups=False)
         n = tables.n_dags + 1
         self.tables = tables._replace(
@@ -88,12 +102,15 @@ class Judge(Observer):
         self.chains = Chains(task_set, self.tables)
         #: Events that contradict those before them.
         self.contradictions = 0
-        #: Who else is told what the core decides.
-        self.listeners: list[Callable[[Sequence[Decision]], None]] = []
         self._scheduler = Scheduler(self.tables, 1, propagate=False)
         self._scheduler.state.scalars[SKIP] = self.skip = skip
         self._scheduler.state.scalars[JUDGE_FROM] = judge_from
-        self._slots: dict[tuple[int, int], int] = {}
+        self._key = self._scheduler.policy.key
+        # by job, as one number
+        self._slots: dict[int, int] = {}
+        self._others: dict[int, Any] = {
+            RELEASED: self.released, ENDED: self.ended, WITHDRAWN: self.withdrawn,
+            FAILED: self.failed, MISSED: self.missed}
         self._newest: dict[int, int] = {}
         #: Whether recorded misses must equal those found.
         self.compare = compare
@@ -116,113 +133,147 @@ class Judge(Observer):
         """Return the first release that is judged."""
         return self._scheduler.state.scalars[JUDGE_FROM]
 
-    @property
-    def expected(self) -> dict[str, list[int]]:
-        """Return the columns of the core's state that tell what is expected here."""
-        state = self._scheduler.state
-        return {'partial': state.partial, 'expected': state.expected}
+    def take(self, batch: Batch) -> None:
+        """Feed the core what happened."""
+        self._keep_waits(batch)
+        order = batch.order
+        places = np.flatnonzero((order != RAN) & (order != PUBLISHED))
+        kinds = order[places].tolist()
+        completed, started = self.chains.begin_batch(batch)
+        n_dags, slots, region = self.tables.n_dags, self._slots, self.tables.region_offset
+        state, links, ready = self._scheduler.state, self.chains.links, self.chains.ready
+        t, key_of = self.tables, self._key
+        x_state, job_base, decided = state.x_state, state.job_base, state.decisions
+        completions = _keyed(batch.columns(COMPLETED), (0, 2), n_dags, (1, 3, 5, 10))
+        starts = _keyed(batch.columns(STARTED), (0, 2), n_dags, (1,))
+        others = {kind: iter(batch.rows(kind)) for kind in self._others}
+        for place, kind in zip(places.tolist(), kinds):
+            if kind == COMPLETED:
+                key, vertex, leg, end, number = next(completions)
+                slot = slots.get(key, -1)
+                link, completed = completed, completed + 1
+                waited = self._take_waited(batch, link) if number >= 0 and self._waited else 0
+                if slot < 0:
+                    self._not_open(key)
+                    continue
+                head = job_base[slot] + region[vertex]
+                x = head + leg
+                if x_state[x] != IDLE:
+                    self.contradictions += 1
+                    continue
+                if record(t, state, key_of, x, end) and number >= 0:
+                    links[head] = link
+                    if waited:
+                        self.chains.waited[link] = waited
+            elif kind == STARTED:
+                key, vertex = next(starts)
+                slot = slots.get(key, -1)
+                if slot >= 0:
+                    head = job_base[slot] + region[vertex]
+                    before = links[head]
+                    if before < 0 or ready[before] != ready[started]:
+                        links[head] = started
+                started += 1
+                continue
+            else:
+                slot = self._others[kind](*next(others[kind]))
+            if decided:
+                self._decided(batch, place, slot)
+        self.chains.end_batch()
+        self.tally.add(batch.decisions)
 
-    def released(self, dag: int, job: int, release: int, now: int) -> None:
+    def _keep_waits(self, batch: Batch) -> None:
+        """Keep what pieces waited for their groups."""
+        waits = self._waits.found if self._waits is not None else np.empty(0)
+        if waits.any():
+            pieces = batch.columns(RAN)
+            chosen = np.flatnonzero((waits != 0) & (pieces[:, 2] >= 0))
+            for key, waited in zip(
+                    pieces[chosen][:, (1, 2, 3, 5)].tolist(), waits[chosen].tolist()):
+                self._waited[tuple(key)] = waited
+
+    def _take_waited(self, batch: Batch, link: int) -> int:
+        """Return what an execution waited for its group, which is told once."""
+        dag, vertex, job, _, _, _, ready, *_ = batch.rows(COMPLETED)[link - self.chains.first]
+        return self._waited.pop((dag, vertex, job, ready), 0)
+
+    def _not_open(self, key: int) -> None:
+        """Count what completes in a job that has not been released."""
+        if key > self._newest.get(key % self.tables.n_dags, -1):
+            self.contradictions += 1
+
+    def _key_of_job(self, dag: int, job: int) -> int:
+        return job * self.tables.n_dags + dag
+
+    def released(self, dag: int, job: int, release: int, now: int) -> int:
         """Open the job."""
-        self._newest[dag] = job
         slot = self._scheduler.release(dag, job, release, now)
-        self._slots[(dag, job)] = slot
+        key = self._newest[dag] = self._key_of_job(dag, job)
+        self._slots[key] = slot
         if is_judged(self._scheduler.state, slot):
             self.tally.released(dag)
-        self.chains.begin(slot, release)
+        self.chains.begin(self._scheduler.state.job_base[slot], dag)
+        return slot
 
-    def started(self, dag: int, vertex: int, job: int, ready: int, start: int) -> None:
-        """Note that a vertex of an open job runs."""
-        slot = self._slots.get((dag, job))
-        if slot is not None:
-            self.chains.started(slot, vertex, ready, start)
-
-    def ran(self, piece: Piece) -> None:
-        """Keep what a piece waited for."""
-        if self._waits is not None and piece.vertex >= 0 and self._waits.last:
-            self._waited[(piece.dag, piece.vertex, piece.job, piece.ready)] = self._waits.last
-            if len(self._waited) > _KEEP_WAITED:
-                del self._waited[next(iter(self._waited))]
-
-    def completed(
-        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
-        execution: Execution | None,
-    ) -> None:
-        """Complete an execution of an open job; later ones are not judged."""
-        waited = 0
-        if execution is not None and self._waited:
-            waited = self._waited.pop((dag, vertex, job, execution.ready), 0)
-        slot = self._slots.get((dag, job))
-        if slot is None:
-            if job > self._newest.get(dag, -1):
-                self.contradictions += 1
-            return
-        scheduler = self._scheduler
-        x = scheduler.execution(slot, vertex, leg)
-        if scheduler.state.x_state[x] != IDLE:
-            self.contradictions += 1
-            return
-        scheduler.admit(x, end)
-        if scheduler.complete(x, end) and execution is not None:
-            self.chains.completed(slot, vertex, leg, execution, waited)
-        self._decided(slot)
-
-    def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
+    def ended(self, dag: int, job: int, aborted: bool, now: int) -> int:
         """End an open job as it was recorded."""
-        slot = self._slots.get((dag, job))
-        if slot is None:
+        slot = self._slots.get(self._key_of_job(dag, job), -1)
+        if slot < 0:
             # under another declaration it may have completed before
             self.contradictions += self.compare
         elif aborted:
             self._scheduler.abort(slot, now)
-            self._decided(slot)
         else:
             self._scheduler.expire(slot, now)
-            self._decided(slot)
+        return slot
 
-    def withdrawn(self, dag: int, job: int) -> None:
+    def withdrawn(self, dag: int, job: int) -> int:
         """Close a job that is open without a verdict."""
-        slot = self._slots.pop((dag, job), None)
-        if slot is not None:
+        slot = self._slots.pop(self._key_of_job(dag, job), -1)
+        if slot >= 0:
             self._scheduler.withdraw(slot)
+        return -1
 
-    def failed(self, dag: int, vertex: int, job: int, now: int) -> None:
+    def failed(self, dag: int, vertex: int, job: int, now: int) -> int:
         """Fail an open job."""
-        slot = self._slots.get((dag, job))
-        if slot is not None:
+        slot = self._slots.get(self._key_of_job(dag, job), -1)
+        if slot >= 0:
             self._scheduler.fail_open(slot, now)
-            self._decided(slot)
+        return slot
 
-    def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
+    def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> int:
         """Compare a recorded miss."""
         if self.compare:
             self.n_recorded += 1
             self.differ(Miss(dag, vertex, job, deadline, completed), -1)
+        return -1
 
-    def finished(self, now: int) -> None:
+    def finished(self, now: int, batch: Batch) -> None:
         """Judge what is open."""
         self._scheduler.finish(now)
-        self._decided(-1)
+        if self._scheduler.state.decisions:
+            self._decided(batch, 0, -1)
 
-    def _decided(self, slot: int) -> None:
-        """Count what the core has decided (about the job in a slot, except at the end)."""
-        if not self._scheduler.state.decisions:
-            return
-        decisions = self._scheduler.decisions()
-        self.tally.add(decisions)
-        for listener in self.listeners:
-            listener(decisions)
-        for kind, dag, vertex, job, deadline, time in decisions:
+    def _decided(self, batch: Batch, place: int, slot: int) -> None:
+        """Keep what the core has decided (about the job in a slot, except at the end)."""
+        state = self._scheduler.state
+        for decision in state.decisions:
+            kind, dag, vertex, job, deadline, time = decision
+            batch.decisions.append(decision)
+            batch.decided_at.append(place)
             if kind == JOB_END:
-                del self._slots[(dag, job)]
+                del self._slots[job * self.tables.n_dags + dag]
             elif kind in SINK_COMPLETED:
-                self.chains.sink(slot, vertex, job, time)
+                self.chains.sink(
+                    state.job_base[slot], vertex, job,
+                    deadline - self.tables.sink_deadline[vertex], time)
                 if kind == SINK_LATE and self.compare:
                     self.differ(Miss(dag, vertex, job, deadline, time), 1)
             elif kind in _MISSES and self.compare:
                 self.differ(Miss(dag, vertex, job, deadline, time), 1)
             else:
                 assert kind != DROP, 'nothing waits in this core, so nothing can be dropped'
+        state.decisions.clear()
 
     def differ(self, miss: Miss, side: int) -> None:
         """Take in a miss that was found here (side 1) or recorded (-1)."""
@@ -249,3 +300,15 @@ class Judge(Observer):
         recorded_misses = counted(self.n_recorded, 'recorded miss', 'recorded misses')
         return (f'the replay does not find {len(recorded)} of {recorded_misses}, and it finds '
                 f'{len(found)} that were not recorded: the first is job {example.job} at {name}')
+
+
+def _keyed(
+    columns: Ints, of: tuple[int, int], n_dags: int, others: Sequence[int]
+) -> Iterator[tuple[int, ...]]:
+    """Yield rows of a job's number, of which two columns tell DAG and job, and other columns."""
+    dag, job = (columns[:, column] for column in of)
+    if len(job) and max(-int(job.min()), int(job.max())) >= _LARGE:     # damage
+        keys = [j * n_dags + d for d, j in zip(dag.tolist(), job.tolist())]
+    else:
+        keys = (job * n_dags + dag).tolist()
+    return zip(keys, *(columns[:, column].tolist() for column in others))

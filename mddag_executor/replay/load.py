@@ -37,7 +37,7 @@ from typing import NamedTuple
 
 from mddag_executor.core import legs_of, quantile, Tables
 from mddag_executor.replay.dispatches import Dispatches
-from mddag_executor.replay.follower import Execution, Observer, Piece
+from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.groups import RecordedGroups
 from mddag_executor.replay.timed import edge_numbers, edges_of, Transports
 from mddag_executor.simulate import Load
@@ -126,7 +126,7 @@ class LoadBuilder(Observer):
         # (time when ready, what it took, its dispatch or -1): undeclared callbacks, and legs that
         # completed nothing
         self._others: list[tuple[int, int, int]] = []
-        self._leg: tuple[Execution, tuple[int, int, int]] | None = None
+        self._leg: tuple[int, tuple[int, int, int]] | None = None
         self._untaken: tuple[int, int, int] | None = None
         self._dispatches = Dispatches(n_workers)
         self._failed: set[tuple[int, int]] = set()
@@ -143,13 +143,15 @@ class LoadBuilder(Observer):
             number = len(self._rounds) - 1
         self._jobs[dag].add(job, release, now, number)
 
-    def ran(self, piece: Piece) -> None:
+    def ran(
+        self, callback: int, dag: int, vertex: int, job: int, worker: int, ready: int, start: int,
+        end: int, first: int,
+    ) -> None:
         """Find out how late a piece was dispatched; keep what is undeclared."""
-        callback, dag, vertex, job, worker, ready, start, end, first = piece
         row = -1 if vertex < 0 else self._jobs[dag].row.get(job, -1)
         if row >= 0 and not self._edges_into[vertex]:
             ready = max(ready, self._round_end(self._jobs[dag], row))
-        group: int | None = self._groups.by_callback().get(callback, _UNTOLD)
+        group: int | None = self._groups.numbers().get(callback, _UNTOLD)
         if group == _UNTOLD and vertex >= 0 and self._declared_group[vertex] >= 0:
             group = _UNTOLD - 1 - self._declared_group[vertex]
         if group in (_NO_GROUP, _UNTOLD):
@@ -168,34 +170,34 @@ class LoadBuilder(Observer):
         return _UNKNOWN if number < 0 else self._rounds[number]
 
     def completed(
-        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
-        execution: Execution | None,
+        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, ready: int,
+        start: int, ended: int, busy: int, number: int,
     ) -> None:
         """Note an execution's times."""
         jobs = self._jobs[dag]
         row = jobs.row.get(job)
-        if execution is None or row is None:
+        if number < 0 or row is None:
             self._untaken = dag, vertex, job    # a leg that a simulator notes before it runs
             return
-        same = self._leg is not None and self._leg[0] is execution
+        same = self._leg is not None and self._leg[0] == number
         several = same or self._untaken == (dag, vertex, job)
         if self._leg is not None and not same:
             self._others.append(self._leg[1])
         self._leg = None
         edges = self._edges_into[vertex]
         if leg < len(edges):
-            jobs.arrived[row * jobs.n_edges + edges[leg]] = execution.ready
+            jobs.arrived[row * jobs.n_edges + edges[leg]] = ready
         if not whole:
-            self._leg = execution, (execution.ready, execution.busy, -1)
+            self._leg = number, (ready, busy, -1)
             return
         place = row * jobs.size + vertex - self._first[dag]
-        jobs.took[place] = execution.busy
-        jobs.start[place] = execution.start
-        jobs.end[place] = execution.end
+        jobs.took[place] = busy
+        jobs.start[place] = start
+        jobs.end[place] = ended
         if several:
             self._all_at_once(jobs, row, edges)
-        if not edges and execution.ready >= jobs.release[row]:
-            jobs.noticed[row] = execution.ready
+        if not edges and ready >= jobs.release[row]:
+            jobs.noticed[row] = ready
 
     def _all_at_once(self, jobs: _Jobs, row: int, edges: list[int]) -> None:
         """Where one execution stands for all legs, only the last message's time is known."""

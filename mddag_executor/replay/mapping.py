@@ -23,7 +23,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from mddag_executor.core import legs_of
-from mddag_executor.replay.recording import Recording, ReplayError
+from mddag_executor.replay.recording import ReplayError
 from mddag_executor.text import counted, listed
 from msg_graph import Callback, Dag, TaskSet, Vertex
 from msg_graph.binding import entities_of, Entity, meant
@@ -35,19 +35,20 @@ class Mapping:
     """
     Where the recorded DAGs and vertices are in the declaration that judges.
 
+    :param name: what messages call the trace.
+    :param recorded: the declaration that it was recorded with.
     :param judge: the declaration that judges; None: the recorded one.
     :raises ReplayError: when none of its callbacks is in the trace.
     """
 
-    def __init__(self, recording: Recording, judge: TaskSet | None) -> None:
-        recorded = recording.task_set
+    def __init__(self, name: str, recorded: TaskSet, judge: TaskSet | None) -> None:
         self.task_set = recorded if judge is None else judge
         #: Whether the declaration that judges is the one that the run itself was judged by.
         self.same = judge is None or judge.text == recorded.text
         self.warnings: list[str] = []
         first = _first_vertices(self.task_set)
         if judge is not None and not self.same:
-            self._compare(recording, judge)
+            self._compare(name, recorded, judge)
         by_source = {dag.vertices[dag.source].callback.key: dag for dag in self.task_set.dags}
         #: By recorded DAG: the DAG that it stands for, or -1.
         self.dag: list[int] = []
@@ -87,24 +88,24 @@ class Mapping:
             return _ORPHAN
         return self.dag[dag], target, legs[leg]
 
-    def _compare(self, recording: Recording, judge: TaskSet) -> None:
+    def _compare(self, name: str, recorded: TaskSet, judge: TaskSet) -> None:
         """Find out which callbacks of the graph the trace does not have."""
-        known = {callback.key for callback in recording.task_set.callbacks}
+        known = {callback.key for callback in recorded.callbacks}
         absent = [c for c in judge.callbacks if c.key not in known]
         missing = [c.key for c in absent]
         if not missing:
             return
         wanted = {callback.key for callback in judge.callbacks}
-        others = [each for callback in recording.task_set.callbacks if callback.key not in wanted
+        others = [each for callback in recorded.callbacks if callback.key not in wanted
                   for each in entities_of(callback)]
         if len(missing) == len(judge.callbacks):
             raise ReplayError(
-                recording.name, f'none of the callbacks of {judge.file} is in it: it has '
-                f'{listed([c.key for c in recording.task_set.callbacks])}',
+                name, f'none of the callbacks of {judge.file} is in it: it has '
+                f'{listed([c.key for c in recorded.callbacks])}',
                 first_meant(absent, others) or
                 'give the graph of the nodes that were recorded, or none')
         self.warnings.append(
-            f'{recording.name}: not in it: {len(missing)} of the {len(judge.callbacks)} callbacks '
+            f'{name}: not in it: {len(missing)} of the {len(judge.callbacks)} callbacks '
             f'of {judge.file}, which count as never completed: {listed(missing)}'
             + asked(absent, others))
 

@@ -4,21 +4,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from mddag_executor.replay.follower import Event
+from mddag_executor.replay.happenings import ADDRESS, Event, Handlers, Observer
 from mddag_executor.trace.census import Census
 
 
-class CallbackNames:
+class CallbackNames(Observer):
     """Tells the name of a callback by its address (of an imported one: its number)."""
 
     def __init__(self) -> None:
         self._census = Census()
         self._known: dict[int, str] | None = None
 
-    def handlers(self) -> dict[str, Callable[[Event], None]]:
-        """Return what the follower is to tell: who there is."""
+    def handlers(self) -> Handlers:
+        """Return what takes in who there is."""
         return dict.fromkeys(self._census.who, self._take)
 
     def _take(self, event: Event) -> None:
@@ -29,7 +27,8 @@ class CallbackNames:
         """Return a callback's name."""
         if self._known is None:
             self._known = self._census.names()
-        return self._known.get(callback, 'a callback whose start is not recorded')
+        return self._known.get(
+            callback & ADDRESS, 'a callback whose start is not recorded')
 
 
 def no_names(callback: int) -> str:

@@ -16,146 +16,184 @@ pieces (a coroutine) is one, from its first start to its last end.
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable as Function
-from typing import Any
-
-from mddag_executor.replay.follower import Follower, Observer, Piece
-from mddag_executor.replay.path_flows import Flows
-from mddag_executor.replay.paths import PathBook, Places
+from mddag_executor.replay.happenings import (
+    ADDRESS,
+    Batch,
+    Event,
+    Handlers,
+    Ints,
+    Observer,
+    PUBLISHED,
+    RAN,
+    STARTED,
+)
+from mddag_executor.replay.path_forest import NONE
+from mddag_executor.replay.paths import by_column, PathBook, S_MESSAGE, S_TOPIC, S_VERTEX
 from msg_graph import TaskSet
+import numpy as np
 
-_KEEP_JOBS = 4096
-
-Event = tuple[Any, ...]
-
-
-class _Job:
-    """What the executions of a job have published, and their places in paths."""
-
-    __slots__ = ('runs', 'messages')
-
-    def __init__(self) -> None:
-        self.runs: dict[tuple[int, int], Places] = {}       # by vertex and ready time
-        self.messages: dict[tuple[int, str], Places] = {}   # by vertex and topic
+_MIX = 0x9E3779B97F4A7C1
 
 
 class OwnPaths(Observer):
     """
-    Collects the flows while a follower tells what happened.
+    Collects the flows along the paths of a run.
 
     :param task_set: the declaration that judges.
     """
 
     def __init__(self, task_set: TaskSet) -> None:
-        self.book = PathBook(task_set)
-        self.follower: Follower | None = None
-        self._vertices = task_set.vertices
-        self._before = [
-            [v - vertex.index + p for p in vertex.predecessors]
-            for v, vertex in enumerate(task_set.vertices)]
-        self._jobs: OrderedDict[tuple[int, int], _Job] = OrderedDict()
-        #: By address: node and topic.
-        self.publishers: dict[int, tuple[str, str]] = {}
-        #: What a compiled replay has found instead of the book.
-        self.flows: Flows | None = None
+        self.book = _Book(task_set)
+        self._n_dags = max(1, len(task_set.dags))
+        book, vertices = self.book, task_set.vertices
+        # by vertex; the last stands for none
+        self._callback = np.array([
+            *(book.callbacks[v.callback.key] if v.callback.key in book.on_path else NONE
+              for v in vertices), NONE])
+        self._takes_topics = np.array([*(bool(v.callback.topics) for v in vertices), False])
+        self._publishes = [[book.topics[topic] for topic in v.callback.publishes
+                            if topic in book.topics] for v in vertices]
+        #: By address: number of the topic, and the node.
+        self._publishers: dict[int, tuple[int, int]] = {}
         self._node: dict[int, str] = {}
-        #: By handle, then by callback.
-        self.topic_of: dict[int, str] = {}
-        #: Whether what is published is recorded.
-        self.any_published = False
+        # by handle, then by callback: the topic; and its number
+        self._topic_of: dict[int, str] = {}
+        # whether what is published is recorded
+        self._any_published = False
 
-    def handlers(self) -> dict[str, Function[[Event], None]]:
-        """Return what takes in further events, by full name."""
+    def handlers(self) -> Handlers:
+        """Return what takes in who publishes and takes what."""
         if not self.book:
             return {}
         return {
             'ros2:rcl_node_init': self._node_init,
             'ros2:rcl_publisher_init': self._publisher_init,
             'ros2:rcl_subscription_init': self._subscription_init,
-            'ros2:rclcpp_subscription_callback_added': self._callback_added,
-            'ros2:rclcpp_publish': self._publish}
-
-    # --- who is who ------------------------------------------------------------------------------
+            'ros2:rclcpp_subscription_callback_added': self._callback_added}
 
     def _node_init(self, event: Event) -> None:
         self._node[event[4]] = f'{event[7].rstrip("/")}/{event[6]}'
 
     def _publisher_init(self, event: Event) -> None:
-        self.any_published = True
-        self.publishers[event[4]] = self._node.get(event[5], ''), event[7]
+        self._any_published = True
+        self._publishers[_signed(event[4])] = (
+            self.book.topics.get(event[7], NONE),
+            self.book.nodes.get(self._node.get(event[5], ''), NONE))
 
     def _subscription_init(self, event: Event) -> None:
-        self.topic_of[event[4]] = event[7]
+        self._topic_of[_signed(event[4])] = event[7]
 
     def _callback_added(self, event: Event) -> None:
-        topic = self.topic_of.get(event[4])
+        topic = self._topic_of.get(_signed(event[4]))
         if topic is not None:
-            self.topic_of[event[5]] = topic
+            self._topic_of[_signed(event[5])] = topic
 
-    # --- what happened ---------------------------------------------------------------------------
+    def take(self, batch: Batch) -> None:
+        """Take in what callbacks on paths did."""
+        if not self.book:
+            return
+        started, ran = batch.columns(STARTED), batch.columns(RAN)
+        chosen = np.flatnonzero(self._callback[started[:, 1]] != NONE)
+        dag, vertex, job, ready, start, address = started[chosen].T
+        topics = np.where(self._takes_topics[vertex], self._number_of(address), NONE)
+        begun = np.column_stack((
+            batch.places(STARTED)[chosen], self._callback[vertex],
+            self._run(vertex, job, ready), start, topics, job * self._n_dags + dag, vertex))
+        chosen = np.flatnonzero(self._callback[ran[:, 2]] != NONE)
+        ran = ran[chosen]
+        vertex = ran[:, 2]
+        ended = np.column_stack((
+            batch.places(RAN)[chosen], self._callback[vertex],
+            self._run(vertex, ran[:, 3], ran[:, 5]), ran[:, 7]))
+        if not self._any_published:
+            sent = self._at_ends(ended, ran)
+        else:
+            sent = self._published(batch)
+        self.book.tell(len(batch.order) + 1, begun, ended, sent)
 
-    def _job(self, dag: int, job: int) -> _Job:
-        key = (dag, job)
-        found = self._jobs.get(key)
-        if found is None:
-            found = self._jobs[key] = _Job()
-            if len(self._jobs) > _KEEP_JOBS:
-                self._jobs.popitem(last=False)
+    def _run(self, vertex: Ints, job: Ints, ready: Ints) -> Ints:
+        return (vertex * _MIX + job) * _MIX + ready
+
+    def _number_of(self, callbacks: Ints) -> Ints:
+        """Return the numbers of the topics of callbacks: -2 of one that no path leads over."""
+        different, which = np.unique(callbacks, return_inverse=True)
+        topics = [self._topic_of.get(callback, '') for callback in different.tolist()]
+        return np.array([self.book.topics.get(topic, -2) if topic else NONE
+                         for topic in topics], dtype=np.int64)[which]
+
+    def _at_ends(self, ended: Ints, ran: Ints) -> Ints:
+        """Return what is published when a callback ends, of which nothing is recorded."""
+        parts = []
+        rows = np.column_stack((ended, ran))
+        for vertex, mine in by_column(rows, ended.shape[1] + 2).items():
+            place, callback, run, time, _, dag, _, job = mine[:, :8].T
+            parts += [self._sent(place, callback, NONE, run, topic, dag, job, vertex, time)
+                      for topic in self._publishes[vertex]]
+        found = np.concatenate(parts) if parts else np.empty((0, 7), dtype=np.int64)
+        return found[np.argsort(found[:, 0], kind='stable')]
+
+    def _sent(
+        self, place: Ints, callback: Ints, node: Ints | int, run: Ints, topic: Ints | int,
+        dag: Ints, job: Ints, vertex: Ints | int, time: Ints,
+    ) -> Ints:
+        message = self.book.message(job * self._n_dags + dag, vertex, topic)
+        return np.column_stack(np.broadcast_arrays(
+            place, callback, node, run, topic, message, time))
+
+    def _published(self, batch: Batch) -> Ints:
+        """Return what is published on topics that paths lead over."""
+        published = batch.columns(PUBLISHED)
+        different, which = np.unique(published[:, 0], return_inverse=True)
+        known = [self._publishers.get(address, (NONE, NONE)) for address in different.tolist()]
+        topic, node = np.array(known, dtype=np.int64).reshape(-1, 2)[which].T
+        vertex = published[:, 3]
+        callback = np.where(published[:, 2] < 0, NONE, self._callback[vertex])
+        chosen = np.flatnonzero(
+            (topic != NONE) & ((callback != NONE) | (published[:, 2] < 0)))
+        _, _, dag, vertex, job, ready, now = published[chosen].T
+        sent = self._sent(
+            batch.places(PUBLISHED)[chosen], callback[chosen], node[chosen],
+            self._run(vertex, job, ready), topic[chosen], dag, job, vertex, now)
+        sent[dag < 0, 5] = NONE
+        return sent
+
+
+class _Book(PathBook):
+    """The paths; messages are told by their job, and the vertex and topic that published them."""
+
+    def __init__(self, task_set: TaskSet) -> None:
+        super().__init__(task_set)
+        self._n_vertices, self._n_topics = len(task_set.vertices), len(self.topics) + 1
+        # by place and vertex: the vertices of the callback before it that lead to it; by vertex
+        # its topics
+        self._before: list[dict[int, list[int]]] = []
+        self._topics_of = [[self.topics[topic] for topic in v.callback.topics
+                            if topic in self.topics] for v in task_set.vertices]
+        for path in self.paths:
+            for before, after in zip((None, *path.callbacks), path.callbacks):
+                self._before.append({
+                    v: [v - vertex.index + p for p in vertex.predecessors
+                        if task_set.vertices[v - vertex.index + p].callback.key == before]
+                    for v, vertex in enumerate(task_set.vertices) if vertex.callback.key == after})
+
+    def message(self, job: Ints, vertex: Ints | int, topic: Ints | int) -> Ints:
+        """Return the numbers of messages."""
+        return (job * self._n_vertices + vertex) * self._n_topics + topic
+
+    def messages_of(self, place: int, started: Ints) -> list[Ints]:
+        """Return what the vertices before executions may have published for them."""
+        found: list[Ints] = []
+        for vertex in np.unique(started[:, S_VERTEX]).tolist():
+            mine = started[:, S_VERTEX] == vertex
+            topics, job = started[:, S_TOPIC], started[:, S_MESSAGE]
+            for before in self._before[place].get(vertex, ()):
+                for topic in self._topics_of[vertex]:
+                    fits = mine & ((topics == topic) | (topics == NONE))
+                    found.append(np.where(fits, self.message(job, before, topic), NONE))
         return found
 
-    def started(self, dag: int, vertex: int, job: int, ready: int, start: int) -> None:
-        """Take in an execution that has begun, or a coroutine that went on."""
-        callback = self._vertices[vertex].callback
-        if not self.book.concerns(callback.key):
-            return
-        self.book.tidy()
-        found = self._job(dag, job)
-        if (vertex, ready) in found.runs:
-            return
-        topic = ''
-        if self.follower is not None and callback.topics:
-            topic = self.topic_of.get(self.follower.starting, '')
-        message = Places()
-        for before in self._before[vertex]:
-            for of_topic in (topic,) if topic else callback.topics:
-                message.update(found.messages.get((before, of_topic), ()))
-        places = found.runs[(vertex, ready)] = Places()
-        self.book.started(callback.key, places, start, message, topic)
 
-    def _publish(self, event: Event) -> None:
-        known = self.publishers.get(event[4])
-        if known is None or known[1] not in self.book.topics or self.follower is None:
-            return
-        node, topic = known
-        running = self.follower.running_in(event[3])
-        times = (event[1], event[1], 0)
-        if running is None or running[2] < 0:
-            self.book.published(topic, node, None, None, Places(), times)
-            return
-        _, dag, vertex, job, ready = running
-        self._published(dag, vertex, job, ready, topic, times)
-
-    def _published(self, dag: int, vertex: int, job: int, ready: int, topic: str,
-                   times: tuple[int, int, int]) -> None:
-        callback = self._vertices[vertex].callback
-        if not self.book.concerns(callback.key):
-            return
-        found = self._job(dag, job)
-        message = found.messages.setdefault((vertex, topic), Places())
-        self.book.published(
-            topic, callback.node, callback.key, found.runs.get((vertex, ready)), message, times)
-
-    def ran(self, piece: Piece) -> None:
-        """Take in that an execution (or a piece of it) has ended."""
-        if piece.vertex < 0:
-            return
-        callback = self._vertices[piece.vertex].callback
-        if not self.book.concerns(callback.key):
-            return
-        places = self._job(piece.dag, piece.job).runs.get((piece.vertex, piece.ready)) or Places()
-        if not self.any_published:
-            for topic in callback.publishes:
-                self._published(piece.dag, piece.vertex, piece.job, piece.ready, topic,
-                                (piece.end, 0, 0))
-        self.book.ended(callback.key, places, piece.end)
+def _signed(address: int) -> int:
+    """Return an address as columns have it."""
+    address &= ADDRESS
+    return address - 2 ** 64 if address >= 2 ** 63 else address

@@ -98,8 +98,10 @@ def settle(steps: Steps, held: Mask) -> Settled:
     above = np.flatnonzero(live)
     while len(above):
         above = parent[above]
-        above = np.unique(above[above != NONE])
-        above = above[~live[above]]
+        above = above[above != NONE]
+        fresh = np.zeros(n, dtype=np.bool_)
+        fresh[above] = True
+        above = np.flatnonzero(fresh & ~live)
         live[above] = True
     over = ~inner & ~live
     keep = live.copy()

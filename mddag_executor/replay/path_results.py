@@ -6,11 +6,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from mddag_executor.replay.path_flows import Flows
 from mddag_executor.replay.paths import PathBook
 
 
-def path_results(book: PathBook | Flows) -> dict[str, Any]:
+def path_results(book: PathBook) -> dict[str, Any]:
     """
     Return by path its figures, all times in ns.
 

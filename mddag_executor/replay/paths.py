@@ -20,48 +20,45 @@ of executions, or by another leg of a sync callback, belongs to the execution th
 before it (CARET: use_latest_message).
 
 A *flow* is what became of one publication of the first callback; with each execution that reads a
-value again it branches.  Its columns are those of CARET's path records: the times of each
-publication and of the start of each execution that a message started.  A flow that arrives nowhere
-has empty columns from there on; it is left out where another branch of the same execution went on.
+value again it branches.  A flow that arrives nowhere is left out where another branch of the same
+execution went on.
 
 By default, as in CARET, a path's time runs from the first publication to the start of the last
 callback's execution; ``whole`` figures run from the start of the first callback's execution to the
 end of the last one's.
 
-Flows that are over are counted and forgotten (see ``path_forest`` and ``path_stream``).
+A *place* is a position in a path, a *step* an execution or a publication there.  Steps are made for
+many events at once: place by place along each path, as what a place needs is known once the place
+before it is done.  Flows that are over are counted and forgotten (see ``path_forest`` and
+``path_stream``).
 """
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Iterator
-import copy
 from typing import Any, Literal, NamedTuple
-import weakref
 
-from mddag_executor.replay.path_forest import Bounds, bounds, NEVER, settle, Steps
+from mddag_executor.replay.happenings import Ints
+from mddag_executor.replay.path_forest import Bounds, bounds, NEVER, NONE, settle, Steps
 from mddag_executor.replay.path_stream import PathFigures
 from mddag_executor.replay.spread import KEEP_EXACT
 from msg_graph import Callback, Path, TaskSet
 import numpy as np
 
 HopKind = Literal['trigger', 'topic', 'variable']
-Place = tuple[int, int]         # path, position in it
 
-SETTLE = 65_536
-"""Steps of a path from which on flows that are over are taken out."""
+SETTLE = 1 << 18
+"""Events from which on steps are made of them, and flows that are over are taken out."""
 LAG_NS = 1_000_000_000
 """Nothing is told later than this after it happened."""
-_NONE = -1
+_ORDER = 40     # bits of an event's number in the order
 
-
-class Places(dict[Place, int]):
-    """The steps that an execution or a message has in paths; kept for as long as they count."""
-
-    __slots__ = ('__weakref__',)
-
-
-_NOWHERE = Places()
+# Columns of what is told; all begin with the place in the order and the callback's number.
+S_RUN, S_TIME, S_TOPIC, S_MESSAGE, S_VERTEX, _N_STARTED = range(2, 8)
+_E_RUN, _E_TIME, _N_ENDED = range(2, 5)
+_U_NODE, _U_RUN, _U_TOPIC, _U_MESSAGE, _U_TIME, _N_PUBLISHED = range(2, 8)
+_T_RUN, _T_MESSAGE, _N_TOOK = range(2, 5)
+# Columns of a step.
+_PARENT, _PATH, _POSITION, _IS_RUN, _TIME, _END, _MARKS, _N_STEP = range(8)
 
 
 class Hop(NamedTuple):
@@ -71,252 +68,297 @@ class Hop(NamedTuple):
     topics: frozenset[str]
 
 
-class Flow(NamedTuple):
-    """
-    A row of a path's records.
+class _Place:
+    """A position in a path, and what is known there from one round to the next."""
 
-    :ivar columns: for each position the times of its publication (rclcpp, rcl and DDS; None where
-        that is not recorded or it did not arrive so far) and the start of its execution.
-    :ivar begin: start of the first callback's execution, None where none published.
-    :ivar end: end of the last callback's execution, None where it did not arrive or end.
-    """
-
-    columns: list[tuple[int | None, int | None, int | None, int | None]]
-    begin: int | None
-    end: int | None
-
-
-class _Book:
-    """The flows of one path: a forest of steps, each an execution or a publication."""
-
-    def __init__(
-        self, number: int, path: Path, hops: list[Hop], legs: list[bool], settle_at: int,
-        keep: int,
-    ) -> None:
+    def __init__(self, number: int, position: int, callback: int, node: int, sync: bool) -> None:
         self.number = number
-        self.path = path
-        self.hops = hops
-        self.sync = legs
-        n = len(path.callbacks)
-        self.parent = array('q')
-        self.position = array('q')
-        self.is_run = bytearray()
-        # start and end of an execution, or times of a publication
-        self.times = array('q')
-        self.started = [_NONE] * n
-        self.done = [_NONE] * n
-        self.published = [_NONE] * n
-        #: What is known of children that are gone.
-        self.marks = bytearray()
-        self.figures = PathFigures(keep)
-        #: Who refers to steps, besides `started`, `done` and `published`.
-        self.holders: list[weakref.ref[Places]] = []
-        self.settled = False
-        self.full = self._least_full = settle_at
-
-    def add(self, position: int, parent: int, is_run: bool, times: tuple[int, int, int]) -> int:
-        self.parent.append(parent)
-        self.position.append(position)
-        self.is_run.append(is_run)
-        self.times.extend(times)
-        self.marks.append(0)
-        return len(self.parent) - 1
-
-    def hold(self, places: Places, position: int, step: int) -> None:
-        """Let a step be referred to by what has it."""
-        places[self.number, position] = step
-        self.holders.append(weakref.ref(places))
-
-    def steps(self) -> Steps:
-        """Return all steps as columns."""
-        n = len(self.parent)
-        position = np.array(self.position, dtype=np.int64)
-        times = np.array(self.times, dtype=np.int64).reshape(-1, 3)
-        is_run = np.frombuffer(bytes(self.is_run), dtype=np.bool_)
-        return Steps(
-            np.array(self.parent, dtype=np.int64), np.zeros(n, dtype=np.int64), position == 0,
-            position == len(self.path.callbacks) - 1, is_run, times[:, 0],
-            np.where(is_run, times[:, 1], _NONE),
-            np.frombuffer(bytes(self.marks), dtype=np.uint8))
-
-    def tidy(self) -> None:
-        """Count the flows that are over, and forget their steps."""
-        steps = self.steps()
-        self.holders = [ref for ref in self.holders if ref() is not None]
-        places = [each for each in (ref() for ref in self.holders) if each is not None]
-        every = [each for each in (
-            *self.started, *self.done, *self.published,
-            *(step for each in places for (path, _), step in each.items()
-              if path == self.number)) if each != _NONE]
-        held = np.zeros(len(self.parent), dtype=np.bool_)
-        held[every] = True
-        found = settle(steps, held)
-        now = max(0, int(max(steps.time.max(), steps.end.max())) - LAG_NS)
-        self.figures.add(found.flows, bounds(steps, found.keep, now)[0])
-        self._forget(steps, found.keep, found.marks, found.numbers(), places)
-        self.settled = True
-        self.full = max(self._least_full, 2 * len(self.parent))
-
-    def _forget(self, steps: Steps, keep: Any, marks: Any, numbers: Any,
-                places: list[Places]) -> None:
-        """Keep some of the steps only."""
-        parent = steps.parent[keep]
-        self.parent = array('q', np.where(parent == _NONE, _NONE, numbers[parent]).tobytes())
-        self.position = array('q', np.array(self.position, dtype=np.int64)[keep].tobytes())
-        self.is_run = bytearray(steps.is_run[keep].tobytes())
-        times = np.array(self.times, dtype=np.int64).reshape(-1, 3)
-        self.times = array('q', times[keep].tobytes())
-        self.marks = bytearray(marks[keep].tobytes())
-        renumbered = [*numbers.tolist(), _NONE]     # the last is of no step
-        for steps_of in (self.started, self.done, self.published):
-            steps_of[:] = [renumbered[step] for step in steps_of]
-        for each in {id(each): each for each in places}.values():
-            for place, step in each.items():
-                if place[0] == self.number:
-                    each[place] = renumbered[step]
+        self.position = position
+        self.callback = callback
+        self.node = node
+        self.sync = sync
+        self.hop: Hop | None = None             # to it
+        self.hop_topics = self.topics = np.empty(0, dtype=np.int64)     # of it, and behind it
+        # the last steps that were started, done and published
+        self.last = np.full(3, NONE, dtype=np.int64)
+        # runs and messages with their steps
+        self.runs = np.empty((0, 2), dtype=np.int64)
+        self.messages = np.empty((0, 3), dtype=np.int64)    # message, place in the order, step
 
 
 class PathBook:
     """
     Collects the flows along the declared paths while it is told what happened, in order of time.
 
-    Executions and publications are told by their ``places``, empty ones for each at first, which
-    their owner keeps for as long as they may be referred to.  Before he looks at what is in them
-    he calls ``tidy``, which may renumber the steps there.
+    Callbacks, topics and nodes are told by their numbers, executions and messages by any that
+    tell them apart; -1 stands for none.
 
-    :param settle_at: how many steps of a path there are when those of flows that are over go.
+    :param settle_at: how many events are collected before steps are made of them.
     :param keep: up to how many response times quantiles are exact.
+    :param kept: how many executions and messages of a place may still be referred to.
     """
 
     def __init__(
-        self, task_set: TaskSet, settle_at: int = SETTLE, keep: int = KEEP_EXACT
+        self, task_set: TaskSet, settle_at: int = SETTLE, keep: int = KEEP_EXACT,
+        kept: int = 4096,
     ) -> None:
-        self._books = [
-            _Book(number, path, hops(task_set, path),
-                  [task_set.callback(key).kind == 'sync' for key in path.callbacks], settle_at,
-                  keep)
-            for number, path in enumerate(task_set.paths)]
-        # by callback: its places in paths
-        self._at: dict[str, list[Place]] = {}
-        for number, path in enumerate(task_set.paths):
-            for position, key in enumerate(path.callbacks):
-                self._at.setdefault(key, []).append((number, position))
-        self._node_of = {c.key: c.node for c in task_set.callbacks}
+        self.paths: list[Path] = list(task_set.paths)
+        self.hops = [hops(task_set, path) for path in self.paths]
+        self.callbacks = {c.key: i for i, c in enumerate(task_set.callbacks)}
+        self.nodes = {node: i for i, node in enumerate(
+            dict.fromkeys(c.node for c in task_set.callbacks))}
         #: The topics that paths lead over; publications on others need not be told.
-        self.topics = frozenset(
-            topic for book in self._books for hop in book.hops for topic in hop.topics)
+        self.topics = {topic: i for i, topic in enumerate(sorted(
+            {topic for path in self.hops for hop in path for topic in hop.topics}))}
+        self.on_path = {key for path in self.paths for key in path.callbacks}
+        self._figures = [PathFigures(keep) for _ in self.paths]
+        self._places = [self._place(task_set, number, position)
+                        for number, path in enumerate(self.paths)
+                        for position in range(len(path.callbacks))]
+        self._settle_at, self._kept = settle_at, kept
+        self._told: list[list[Ints]] = [[], [], [], []]
+        self._order = 1     # 0: in a round before
+        self._waiting = 0
+        self._steps = np.empty((1024, _N_STEP), dtype=np.int64)
+        self._n = 0
+        self._results: list[dict[str, Any]] | None = None
 
     def __bool__(self) -> bool:
         """Tell whether there is any path."""
-        return bool(self._books)
+        return bool(self.paths)
 
-    def tidy(self) -> None:
-        """Forget flows that are over, where there are many steps; to be called now and then."""
-        for book in self._books:
-            if len(book.parent) >= book.full:
-                book.tidy()
+    def _place(self, task_set: TaskSet, number: int, position: int) -> _Place:
+        path_hops, key = self.hops[number], self.paths[number].callbacks[position]
+        callback = task_set.callback(key)
+        place = _Place(number, position, self.callbacks[key], self.nodes[callback.node],
+                       callback.kind == 'sync')
+        if position:
+            place.hop = path_hops[position - 1]
+            place.hop_topics = np.array(
+                [self.topics[topic] for topic in place.hop.topics], dtype=np.int64)
+        if position < len(path_hops):
+            place.topics = np.array(
+                [self.topics[topic] for topic in path_hops[position].topics], dtype=np.int64)
+        return place
 
-    def concerns(self, key: str) -> bool:
-        """Tell whether a callback is on a path."""
-        return key in self._at
+    # --- what is told ----------------------------------------------------------------------------
 
-    def started(self, key: str, places: Places, start: int, message: Places | None,
-                topic: str = '') -> None:
-        """
-        Take in an execution of a callback.
-
-        :param places: its own, to be filled.
-        :param message: places of the message that started it, None where that is not known.
-        :param topic: that message's topic; empty: any.
-        """
-        for number, position in self._at.get(key, ()):
-            book = self._books[number]
-            parent = _NONE
-            if position > 0:
-                hop = book.hops[position - 1]
-                if hop.kind == 'trigger':
-                    if topic and topic not in hop.topics:
-                        continue        # another leg of a sync callback
-                    parent = (message or _NOWHERE).get((number, position - 1), _NONE)
-                elif hop.kind == 'variable':
-                    parent = book.done[position - 1]
-                else:
-                    parent = book.published[position - 1]
-                if parent == _NONE:
-                    book.started[position] = _NONE
-                    continue
-            step = book.add(position, parent, True, (start, _NONE, 0))
-            book.hold(places, position, step)
-            book.started[position] = step
-
-    def took(self, key: str, places: Places, message: Places) -> None:
-        """Take in that a running callback took a message itself (a queue edge)."""
-        for number, position in self._at.get(key, ()):
-            book = self._books[number]
-            step = places.get((number, position))
-            if position and step is not None and book.hops[position - 1].kind == 'topic':
-                book.parent[step] = message.get((number, position - 1), _NONE)
-
-    def ended(self, key: str, places: Places, end: int) -> None:
-        """Take in that an execution has ended."""
-        for place in self._at.get(key, ()):
-            book = self._books[place[0]]
-            step = places.get(place, _NONE)
-            if step != _NONE:
-                book.times[3 * step + 1] = end
-                book.done[place[1]] = step
-            elif not book.sync[place[1]]:
-                book.done[place[1]] = _NONE
-
-    def published(
-        self, topic: str, node: str, key: str | None, run: Places | None, message: Places,
-        times: tuple[int, int, int],
+    def tell(
+        self, length: int, started: Ints, ended: Ints, published: Ints,
+        took: Ints | None = None,
     ) -> None:
         """
-        Take in a publication.
+        Take in a stretch of what happened; the first column tells the places in its order.
 
-        :param node: of the publisher.
-        :param key: the callback that published it; None: published outside of executions.
-        :param run: places of the execution that published it.
-        :param message: its own places, to be filled.
-        :param times: of rclcpp, rcl and DDS; what is not recorded is 0.
+        :param length: how many places there are.
+        :param started: executions: callback, run, start, the topic that started it, the message
+            (or what ``message_of`` makes it of), the vertex.
+        :param ended: callback, run, end.
+        :param published: the callback (-1: outside of executions), its node, run, topic,
+            message, time.
+        :param took: messages that running callbacks took themselves: callback, run, message.
         """
-        candidates = [key] if key is not None else [
-            k for k in self._at if self._node_of[k] == node]
-        for candidate in candidates:
-            for number, position in self._at.get(candidate, ()):
-                book = self._books[number]
-                if position >= len(book.hops) or topic not in book.hops[position].topics:
-                    continue
-                parent = (run or _NOWHERE).get((number, position), _NONE)
-                if parent == _NONE and (key is None or book.sync[position]):
-                    parent = book.started[position]
-                if parent == _NONE and position:
-                    book.published[position] = _NONE
-                    continue
-                step = book.add(position, parent, False, times)
-                book.hold(message, position, step)
-                book.published[position] = step
+        if took is None:
+            took = np.empty((0, _N_TOOK), dtype=np.int64)
+        for told, rows in zip(self._told, (started, ended, published, took)):
+            if len(rows):
+                rows = rows.copy()
+                rows[:, 0] += self._order
+                told.append(rows)
+                self._waiting += len(rows)
+        self._order += length
+        if self._waiting >= self._settle_at:
+            self._round()
+            self._settle(False)
 
-    def flows(self, number: int) -> list[Flow]:
-        """Return the flows along a path, by the time of their beginning; none may be forgotten."""
-        book = self._books[number]
-        assert not book.settled
-        return sorted((_flow(book, leaf) for leaf in _leaves(book)), key=_order)
+    def messages_of(self, place: int, started: Ints) -> list[Ints]:
+        """Return what may have started executions at a place; what is known later counts."""
+        return [started[:, S_MESSAGE]]
+
+    # --- steps -----------------------------------------------------------------------------------
+
+    def _round(self) -> None:
+        """Make steps of what was told."""
+        told = [np.concatenate(each) if each else np.empty((0, width), dtype=np.int64)
+                for each, width in zip(
+                    self._told, (_N_STARTED, _N_ENDED, _N_PUBLISHED, _N_TOOK))]
+        self._told = [[], [], [], []]
+        self._order, self._waiting = 1, 0
+        columns = (1, 1, _U_TOPIC, 1)
+        sorted_out = [by_column(rows, column) for rows, column in zip(told, columns)]
+        before: list[tuple[Ints, Ints]] = []
+        for number, place in enumerate(self._places):
+            before = self._at(number, place, before, *(
+                [rows.get(key, none[:0]) for key in keys] for rows, none, keys in zip(
+                    sorted_out, told, ([place.callback], [place.callback], place.topics.tolist(),
+                                       [place.callback]))))
+
+    def _at(
+        self, number: int, place: _Place, before: list[tuple[Ints, Ints]],
+        started: list[Ints], ended: list[Ints], published: list[Ints], took: list[Ints],
+    ) -> list[tuple[Ints, Ints]]:
+        """
+        Make the steps of a place; return what was done and published there when.
+
+        :param before: the same of the place before it.
+        :param started: by the callback; so ``ended`` and ``took``, but ``published`` by topic.
+        """
+        rows, = started
+        if place.hop is not None and place.hop.kind == 'trigger':
+            # else another leg of a sync callback
+            rows = rows[(rows[:, S_TOPIC] == NONE) | np.isin(rows[:, S_TOPIC], place.hop_topics)]
+        # a coroutine that goes on is started already
+        rows = rows[np.sort(np.unique(rows[:, S_RUN], return_index=True)[1])]
+        rows = rows[~np.isin(rows[:, S_RUN], place.runs[:, 0])]
+        parent = np.full(len(rows), NONE, dtype=np.int64)
+        if place.hop is not None:
+            last = self._places[number - 1]
+            if place.hop.kind == 'trigger':
+                for messages in self.messages_of(number, rows):
+                    found = _message(last.messages, messages, rows[:, 0])
+                    parent = np.where(found != NONE, found, parent)
+            else:
+                which = int(place.hop.kind == 'topic')
+                parent = _as_of(*before[which], rows[:, 0])
+        steps = self._add(place, parent, True, rows[:, S_TIME])
+        begun = _timeline(place, 0, rows[:, 0], steps)
+        place.runs = np.concatenate([place.runs, np.column_stack((rows[:, S_RUN], steps))])
+        order = np.argsort(place.runs[:, 0], kind='stable')
+        runs = place.runs[order]
+        if place.hop is not None and place.hop.kind == 'topic':
+            rows, = took
+            step = _step_of(runs, rows[:, _T_RUN])
+            rows, step = rows[step != NONE], step[step != NONE]
+            self._steps[step, _PARENT] = _message(
+                self._places[number - 1].messages, rows[:, _T_MESSAGE], rows[:, 0])
+
+        rows, = ended
+        step = _step_of(runs, rows[:, _E_RUN])
+        self._steps[step[step != NONE], _END] = rows[step != NONE, _E_TIME]
+        counts = (step != NONE) | (not place.sync)
+        done = _timeline(place, 1, rows[counts, 0], step[counts])
+
+        if not published:
+            return [done]
+        rows = published[0] if len(published) == 1 else np.concatenate(published)
+        rows = rows[(rows[:, 1] == place.callback)
+                    | (rows[:, 1] == NONE) & (rows[:, _U_NODE] == place.node)]
+        if len(published) > 1:
+            rows = rows[np.argsort(rows[:, 0], kind='stable')]
+        parent = np.where(rows[:, 1] == NONE, NONE, _step_of(runs, rows[:, _U_RUN]))
+        latest = (parent == NONE) & (place.sync | (rows[:, 1] == NONE))
+        parent[latest] = _as_of(*begun, rows[latest, 0])
+        steps = self._add(place, parent, False, rows[:, _U_TIME])
+        sent = _timeline(place, 2, rows[:, 0], steps)
+        known = (steps != NONE) & (rows[:, _U_MESSAGE] != NONE)
+        place.messages = np.concatenate([place.messages, np.column_stack(
+            (rows[known, _U_MESSAGE], rows[known, 0], steps[known]))])
+        return [done, sent]
+
+    def _add(self, place: _Place, parent: Ints, is_run: bool, times: Ints) -> Ints:
+        """Add steps, where there is a parent or the path begins; return their numbers."""
+        wanted = (parent != NONE) | (place.position == 0)
+        count = int(wanted.sum())
+        while self._n + count > len(self._steps):
+            self._steps = np.concatenate([self._steps, np.empty_like(self._steps)])
+        rows = self._steps[self._n:self._n + count]
+        rows[:, _PARENT], rows[:, _TIME] = parent[wanted], times[wanted]
+        rows[:, _PATH], rows[:, _POSITION] = place.number, place.position
+        rows[:, _IS_RUN], rows[:, _END], rows[:, _MARKS] = is_run, NONE, 0
+        numbers = np.where(wanted, self._n + np.cumsum(wanted) - 1, NONE)
+        self._n += count
+        return numbers
+
+    # --- flows -----------------------------------------------------------------------------------
+
+    def _settle(self, at_end: bool) -> None:
+        """Count the flows that are over, and forget their steps."""
+        table = self._steps[:self._n]
+        if not len(table) and not at_end:
+            return
+        length = np.array([len(path.callbacks) - 1 for path in self.paths])
+        steps = Steps(
+            table[:, _PARENT].copy(), table[:, _PATH].copy(), table[:, _POSITION] == 0,
+            table[:, _POSITION] == length[table[:, _PATH]], table[:, _IS_RUN] != 0,
+            table[:, _TIME].copy(), table[:, _END].copy(), table[:, _MARKS].astype(np.uint8))
+        held = np.zeros(len(table), dtype=np.bool_)
+        if not at_end:
+            for place in self._places:
+                place.runs = place.runs[-self._kept:]
+                place.messages = place.messages[-self._kept:]
+                for numbers in (place.last, place.runs[:, 1], place.messages[:, 2]):
+                    held[numbers[numbers != NONE]] = True
+        found = settle(steps, held)
+        to_come = [Bounds(NEVER, NEVER, NEVER)] * len(self.paths)
+        if not at_end:
+            now = max(0, int(max(steps.time.max(), steps.end.max())) - LAG_NS)
+            to_come[:] = bounds(steps, found.keep, now) + [Bounds(0, 0, 0)] * len(self.paths)
+        for number, figures in enumerate(self._figures):
+            mine = found.flows.path == number
+            figures.add(found.flows._replace(**{
+                name: column[mine] for name, column in found.flows._asdict().items()}),
+                to_come[number])
+        numbers = np.r_[found.numbers(), NONE]      # the last is of no step
+        rest = table[found.keep]
+        rest[:, _PARENT], rest[:, _MARKS] = numbers[rest[:, _PARENT]], found.marks[found.keep]
+        self._steps[:len(rest)] = rest
+        self._n = len(rest)
+        for place in self._places:
+            place.last = numbers[place.last]
+            place.runs[:, 1] = numbers[place.runs[:, 1]]
+            place.messages[:, 1] = 0
+            place.messages[:, 2] = numbers[place.messages[:, 2]]
 
     def figures(self) -> list[dict[str, Any]]:
-        """Return the figures of each path, as if no more flows came."""
-        return [_finished(book).result() for book in self._books]
+        """Return the figures of each path, once everything has been told."""
+        if self._results is None:
+            self._round()
+            self._settle(True)
+            self._results = [figures.result() for figures in self._figures]
+        return self._results
 
-    @property
-    def paths(self) -> list[Path]:
-        """Return the declared paths."""
-        return [book.path for book in self._books]
 
-    @property
-    def hops(self) -> list[list[Hop]]:
-        """Return the hops of each path."""
-        return [book.hops for book in self._books]
+def by_column(rows: Ints, column: int) -> dict[int, Ints]:
+    """Return rows by what stands in a column, in order."""
+    if not len(rows):
+        return {}
+    rows = rows[np.argsort(rows[:, column].astype(np.int16), kind='stable')]
+    begins = np.flatnonzero(np.r_[True, rows[1:, column] != rows[:-1, column]])
+    return dict(zip(rows[begins, column].tolist(), np.split(rows, begins[1:])))
+
+
+def _timeline(place: _Place, which: int, order: Ints, steps: Ints) -> tuple[Ints, Ints]:
+    """Return when which step was the last one, with that of the round before."""
+    steps = np.concatenate([place.last[which:which + 1], steps])
+    place.last[which] = steps[-1]
+    return np.concatenate([np.zeros(1, dtype=np.int64), order]), steps
+
+
+def _as_of(order: Ints, steps: Ints, when: Ints) -> Ints:
+    """Return the last step before each place in the order."""
+    return steps[np.searchsorted(order, when) - 1]
+
+
+def _step_of(runs: Ints, wanted: Ints) -> Ints:
+    """Return the steps of runs, of which there is a sorted table."""
+    if not len(runs):
+        return np.full(len(wanted), NONE, dtype=np.int64)
+    at = np.minimum(np.searchsorted(runs[:, 0], wanted), len(runs) - 1)
+    return np.where(runs[at, 0] == wanted, runs[at, 1], NONE)
+
+
+def _message(table: Ints, wanted: Ints, when: Ints) -> Ints:
+    """Return the last step of each message before a place in the order."""
+    known, number = np.unique(table[:, 0], return_inverse=True)
+    if not len(known):
+        return np.full(len(wanted), NONE, dtype=np.int64)
+    place = number << _ORDER | table[:, 1]
+    order = np.argsort(place, kind='stable')
+    place, steps = place[order], table[order, 2]
+    of = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
+    at = np.searchsorted(place, of << _ORDER | when) - 1
+    return np.where((known[of] == wanted) & (at >= 0) & (place[at] >> _ORDER == of),
+                    steps[at], NONE)
 
 
 def hops(task_set: TaskSet, path: Path) -> list[Hop]:
@@ -332,54 +374,3 @@ def _hop(before: Callback, after: Callback) -> Hop:
     if before.node == after.node and before.name in after.reads:
         return Hop('variable', frozenset())
     return Hop('topic', frozenset(before.publishes).intersection(after.reads))
-
-
-def _leaves(book: _Book) -> Iterator[int]:
-    """Yield where flows end, without the dead ends beside a branch that went on."""
-    steps = book.steps()
-    has_child = np.zeros(len(steps.parent), dtype=np.bool_)
-    has_child[steps.parent[steps.parent != _NONE]] = True
-    # executions that another execution reads, one of which went on
-    went_on = {book.parent[step] for step in np.flatnonzero(has_child & steps.is_run).tolist()}
-    last = len(book.path.callbacks) - 1
-    for step in np.flatnonzero(~has_child).tolist():
-        parent = book.parent[step]
-        if not (parent != _NONE and book.is_run[step] and book.position[step] < last
-                and parent in went_on):
-            yield step
-
-
-def _flow(book: _Book, leaf: int) -> Flow:
-    empty = (None, None, None, None)
-    columns: list[tuple[int | None, int | None, int | None, int | None]] = [
-        empty for _ in book.path.callbacks]
-    end = None
-    begin = None
-    step = leaf
-    while step != _NONE:
-        position = book.position[step]
-        first, second, third = book.times[3 * step:3 * step + 3]
-        rclcpp, rcl, dds, start = columns[position]
-        if book.is_run[step]:
-            columns[position] = rclcpp, rcl, dds, first
-            if position == len(columns) - 1 and second != _NONE:
-                end = second
-            if position == 0:
-                begin = first
-        else:
-            columns[position] = first or None, second or None, third or None, start
-        step = book.parent[step]
-    return Flow(columns, begin, end)
-
-
-def _finished(book: _Book) -> PathFigures:
-    """Return the figures of a path when all flows are over; the book stays as it is."""
-    figures = copy.deepcopy(book.figures)
-    steps = book.steps()
-    flows = settle(steps, np.zeros(len(steps.parent), dtype=np.bool_)).flows
-    figures.add(flows, Bounds(*(NEVER,) * 3))
-    return figures
-
-
-def _order(flow: Flow) -> tuple[int, ...]:
-    return tuple(time or 0 for column in flow.columns for time in column[:3] + column[3:])

@@ -1,20 +1,16 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""A trace of this executor: what its head says, and its events in the order of time."""
+"""The head of a trace: whether it is of this executor, and with what it was recorded."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
-import os
-from typing import Any, NamedTuple, TYPE_CHECKING
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
 
 from mddag_executor.errors import InputError
 from mddag_executor.trace import TraceError, TraceReader
 from msg_graph import GraphError, loads, TaskSet
-
-if TYPE_CHECKING:
-    from mddag_executor.trace.columns import Columns
 
 TASK_SET = 'mddag:task_set'
 _RECORD = 'record a run with mddag run GRAPH … --trace'
@@ -37,75 +33,41 @@ class Head(NamedTuple):
     preemptive: bool
 
 
-class Recording:
+def read_head(reader: TraceReader) -> Head | None:
     """
-    A recorded run.
+    Return what the executor wrote at the beginning; None where the trace is not of this executor.
 
-    :param path: the trace.
-    :param name: what messages call it, where that is not its path (standard input).
-    :raises mddag_executor.trace.TraceError: when it is no trace.
-    :raises ReplayError: when no run of this executor is recorded in it.
-    :raises msg_graph.GraphError: when the recorded declaration is wrong.
+    :raises ReplayError: when it is, but nothing of it can be used.
     """
-
-    def __init__(self, path: str | os.PathLike[str], name: str | None = None) -> None:
-        self.path = os.fspath(path)
-        self.name = name or self.path
-        with self._named():
-            self._reader = TraceReader(self.path)
-            self.head = self._read_head()
-        #: The DAG tasks that the trace was recorded with; its events refer to them by index.
-        self.task_set = self._declared()
-
-    def _read_head(self) -> Head:
-        for event in self._reader.events({TASK_SET}):
-            if None in event:
-                continue  # written by something else: fields are missing
+    if not reader.may_have(TASK_SET):
+        return None
+    of_this = False
+    for event in reader.events({TASK_SET}):
+        if event[4] is None and not of_this:
+            return None
+        of_this = True
+        if None not in event:       # else written by something else: fields are missing
             return Head(event[1], *event[4:])
-        raise no_run(self._reader)
+    if of_this:
+        raise no_run(reader)
+    return None
 
-    def _declared(self) -> TaskSet:
-        if not self.head.yaml.strip():
-            raise ReplayError(
-                self.name, 'it was recorded without a declaration, so there are no jobs', _RECORD)
-        try:
-            return loads(self.head.yaml, self.head.file or self.name)
-        except GraphError as error:
-            raise ReplayError(
-                self.name, f'the declaration that it was recorded with is wrong ({error})',
-                'record the run anew') from None
 
-    @property
-    def message_count(self) -> int | None:
-        """Return how many messages the trace is said to hold, None where that is not known."""
-        return self._reader.message_count
+def declared(head: Head, name: str) -> TaskSet:
+    """
+    Return the declaration that a run was recorded with.
 
-    @property
-    def warnings(self) -> list[str]:
-        """Return what is missing of the trace, once ``events`` has come to its end."""
-        return [self._rename(text) for text in self._reader.warnings]
-
-    def events(self, names: Iterable[str]) -> Iterator[tuple[Any, ...]]:
-        """
-        Yield the named events in the order of time; see ``TraceReader.events``.
-
-        :raises mddag_executor.trace.TraceError: when the file can no longer be read.
-        """
-        with self._named():
-            yield from self._reader.events(names, sorted=True)
-
-    def columns(
-        self, names: Iterable[str], kinds: Mapping[str, int], scan: Any
-    ) -> Iterator[Columns]:
-        """Yield the named events in the order of time as rows; see ``TraceReader.columns``."""
-        with self._named():
-            yield from self._reader.columns(names, kinds, scan)
-
-    def _named(self) -> AbstractContextManager[None]:
-        return named_errors(self.path, self.name)
-
-    def _rename(self, text: str) -> str:
-        return self.name + text[len(self.path):] if text.startswith(self.path) else text
+    :raises ReplayError: when there is none, or it is wrong.
+    """
+    if not head.yaml.strip():
+        raise ReplayError(
+            name, 'it was recorded without a declaration, so there are no jobs', _RECORD)
+    try:
+        return loads(head.yaml, head.file or name)
+    except GraphError as error:
+        raise ReplayError(
+            name, f'the declaration that it was recorded with is wrong ({error})',
+            'record the run anew') from None
 
 
 def no_run(reader: TraceReader) -> ReplayError:

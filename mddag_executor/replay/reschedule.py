@@ -19,20 +19,14 @@ from mddag_executor.core.jobs import finish
 from mddag_executor.core.state import Decision, JUDGE_FROM, new_state
 from mddag_executor.errors import UsageError
 from mddag_executor.replay.as_recorded import Progress, recording_result, Replay
-from mddag_executor.replay.following import (
-    AnyFollower,
-    AnyRecording,
-    make_follower,
-    map_recording,
-    open_declared,
-)
-from mddag_executor.replay.groups import RecordedGroups, with_groups
-from mddag_executor.replay.judge import Judge
+from mddag_executor.replay.computed import ComputedRun
+from mddag_executor.replay.groups import with_groups
 from mddag_executor.replay.load import LoadBuilder, RecordedLoad
 from mddag_executor.replay.recording import Head, ReplayError
-from mddag_executor.replay.timed import busy_times, Engine
+from mddag_executor.replay.run import open_run
+from mddag_executor.replay.timed import busy_times, edge_numbers, Engine
 from mddag_executor.replay.tolerances import MissTally
-from mddag_executor.replay.usage import share, Usage
+from mddag_executor.replay.usage import share
 from mddag_executor.simulate import LogEntry
 from mddag_executor.text import counted, listed
 from msg_graph import TaskSet
@@ -51,12 +45,9 @@ class Reschedule:
     """
 
     def __init__(
-        self, recording: AnyRecording, follower: AnyFollower, recorded: Replay, work: RecordedLoad,
-        tables: Tables, policy: str, workers: int, preemptive: bool, overheads: bool,
+        self, recorded: Replay, work: RecordedLoad, tables: Tables, policy: str, workers: int, preemptive: bool, overheads: bool,
         dispatch_overhead: int = 0, judge_from: int = -NEVER, skip: int = 0,
     ) -> None:
-        self._recording = recording
-        self._follower = follower
         self._work = work
         self.recorded = recorded
         self.task_set = recorded.task_set
@@ -80,7 +71,7 @@ class Reschedule:
             self.tables, self.workers, preemptive=policy.mode(self.preemptive), propagate=2,
             dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
         state.scalars[JUDGE_FROM] = self.judge_from
-        load, end = self._work.load, self._follower.end
+        load, end = self._work.load, self.recorded.run.end
         engine = Engine(
             self.tables, state, policy.key, load, self._work.transports, self._work.failed)
         engine.run(end)
@@ -100,7 +91,20 @@ class Reschedule:
     @property
     def end_ns(self) -> int:
         """Return when the run ended, on the trace's clock."""
-        return self._follower.end
+        return self.recorded.run.end
+
+    def computed(self) -> ComputedRun:
+        """Return the schedule, to be played to observers."""
+        transports, edges = self._work.transports, edge_numbers(self.tables)
+
+        def delay(dag: int, job: int, before: int, after: int) -> int:
+            return int(transports.delays[
+                transports.base[dag] + job * transports.stride[dag] + edges[before, after]])
+
+        end = self.end_ns
+        return ComputedRun(
+            self.task_set, self._work.load, self.log, self.decisions, end, end, True,
+            self._work.jobs, delay, self.judge_from, self._work.failed)
 
     def recorded_job(self, dag: int, job: int) -> int:
         """Return the recorded index of a job of the log or tally."""
@@ -108,7 +112,7 @@ class Reschedule:
 
     def worker_busy(self) -> list[int]:
         """Return for each worker how long it was busy, ns."""
-        return busy_times(self.log, self.workers, self._follower.end)
+        return busy_times(self.log, self.workers, self.recorded.run.end)
 
     def result(self) -> dict[str, Any]:
         """Return the result format of ``replay --json``, with the recorded run beside it."""
@@ -133,9 +137,9 @@ class Reschedule:
                 'busy_ns': {str(w): took for w, took in enumerate(busy)},
                 'use': share(sum(busy), self.workers, duration)},
             'recorded': {
-                'policy': self._recording.head.policy, 'workers': self._recording.head.workers,
+                'policy': self.recorded.run.head.policy, 'workers': self.recorded.run.head.workers,
                 **self.recorded.tally.result()},
-            'recording': recording_result(self._recording, self._follower),
+            'recording': recording_result(self.recorded.run),
             'warnings': self.warnings}
 
 
@@ -175,31 +179,31 @@ def reschedule(
         find_policy(policy).mode(preemptive)
     if workers is not None and not 1 <= workers <= MAX_WORKERS:
         raise UsageError(f'workers: {workers} is out of range: give 1 to {MAX_WORKERS}')
-    recording = open_declared(path, name, task_set)
-    policy, workers = _settings(recording.head, recording.name, policy, workers)
-    mapping = map_recording(recording, task_set)
-    head = recording.head
+    run = open_run(path, task_set, name, needs_declaration=True)
+    policy, workers = _settings(run.head, run.name, policy, workers)
+    head = run.head
     bound = head.max_active_jobs if head.max_active_jobs > 0 else NEVER
     tables = Tables.build(
-        mapping.task_set, default_deadline=head.default_deadline, max_active_jobs=bound)
-    judge = Judge(mapping.task_set, compare=mapping.same, skip=skip)
-    usage = Usage(mapping.task_set)
-    groups = RecordedGroups()
-    builder = LoadBuilder(mapping.task_set, tables, groups, head.workers)
-    follower = make_follower(recording, mapping, [judge, usage, builder], groups.handlers())
-    follower.run(progress)
-    recorded = Replay(recording, mapping, judge, usage, follower)
+        run.task_set, default_deadline=head.default_deadline, max_active_jobs=bound)
+    builders: list[LoadBuilder] = []
+
+    def build(recorded: Replay) -> list[LoadBuilder]:
+        builders.append(LoadBuilder(run.task_set, tables, recorded.groups, head.workers))
+        return builders
+
+    recorded = Replay(run, skip, progress, build, paths=False)
+    builder, = builders
     work = builder.build(overheads)
     if work.unknown:
         raise ReplayError(
-            recording.name, f'{counted(len(work.unknown), "callback")} did not complete in it, '
+            run.name, f'{counted(len(work.unknown), "callback")} did not complete in it, '
             f'and no execution_time is declared: {listed(work.unknown)}',
             'give a GRAPH that declares it')
     tables = with_groups(
-        tables, builder.callback_of, groups.by_callback(), declared_first=not mapping.same)
+        tables, builder.callback_of, recorded.groups.numbers(), declared_first=not run.same)
     return Reschedule(
-        recording, follower, recorded, work, tables, policy, workers, preemptive, overheads,
-        dispatch_overhead, judge.judge_from, skip)
+        recorded, work, tables, policy, workers, preemptive, overheads, dispatch_overhead,
+        recorded.judge.judge_from, skip)
 
 
 def _settings(

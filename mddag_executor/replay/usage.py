@@ -7,11 +7,10 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from mddag_executor.replay.follower import Execution, Observer, Piece
+from mddag_executor.replay.happenings import Batch, COMPLETED, Ints, Observer, RAN, sums
 from mddag_executor.replay.waits import GroupWaits
 from msg_graph import TaskSet
 import numpy as np
-import numpy.typing as npt
 
 
 class CallbackUse:
@@ -50,20 +49,8 @@ class PoolUse:
         self.step = self.FIRST_STEP_NS
         self._busy: dict[int, int] = {}
 
-    def add(self, start: int, end: int) -> None:
-        """Add an execution."""
-        while end // self.step - start // self.step > self.MOST_STEPS:
-            self._double()
-        while start < end:
-            number = start // self.step
-            until = min(end, (number + 1) * self.step)
-            self._busy[number] = self._busy.get(number, 0) + until - start
-            start = until
-        while len(self._busy) > self.MOST_STEPS:
-            self._double()
-
-    def add_many(self, starts: npt.NDArray[np.int64], ends: npt.NDArray[np.int64]) -> None:
-        """Add executions: as ``add`` does, one after the other."""
+    def add(self, starts: Ints, ends: Ints) -> None:
+        """Add executions, in the order of their ends."""
         while len(starts) and int((ends // self.step - starts // self.step).max()
                                   ) > self.MOST_STEPS:
             self._double()
@@ -110,63 +97,59 @@ class Usage(Observer):
 
     def __init__(self, task_set: TaskSet, waits: GroupWaits | None = None) -> None:
         self._waits = waits
-        self._by_key = {c.key: CallbackUse() for c in task_set.callbacks}
-        self._by_vertex = [self._by_key[v.callback.key] for v in task_set.vertices]
+        self._uses = {c.key: CallbackUse() for c in task_set.callbacks}
+        places = {key: place for place, key in enumerate(self._uses)}
+        # by global vertex the place of its callback, at last that of all undeclared ones
+        self._place = np.array([*(places[v.callback.key] for v in task_set.vertices), len(places)])
         self.undeclared = CallbackUse()
         self.by_worker: Counter[int] = Counter()
         self.pool = PoolUse()
-        self._counted: Execution | None = None
+        self._counted = -1
 
-    def ran(self, piece: Piece) -> None:
-        """Add a piece of an execution."""
-        took = piece.end - piece.start
-        self.by_worker[piece.worker] += took
-        self.pool.add(piece.start, piece.end)
-        if piece.vertex >= 0:
-            use = self._by_vertex[piece.vertex]
-        else:
-            use = self.undeclared
-            use.executions += piece.first
-            use.longest = max(use.longest, took)
-        use.busy += took
-        if piece.first:
-            waited = piece.start - piece.ready
-            use.waiting += waited
-            if self._waits is not None:
-                use.group += self._waits.last
-            if waited > use.longest_wait:
-                use.longest_wait = waited
+    def take(self, batch: Batch) -> None:
+        """Add what ran and what completed."""
+        every = [*self._uses.values(), self.undeclared]
+        pieces = batch.columns(RAN)
+        if len(pieces):
+            self._ran(pieces, every)
+        done = batch.columns(COMPLETED)
+        done = done[done[:, -1] >= 0]
+        if len(done):
+            numbers = done[:, -1]
+            done = done[np.r_[self._counted, numbers[:-1]] != numbers]   # not one leg more
+            self._counted = int(numbers[-1])
+            place = self._place[done[:, 1]]
+            _count(place, every)
+            _longest(place, done[:, 9], every, 'longest')
 
-    def completed(
-        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
-        execution: Execution | None,
-    ) -> None:
-        """Count an execution, if it is in the trace and not one leg more of the last one."""
-        if execution is None or execution is self._counted:
-            return
-        self._counted = execution
-        use = self._by_vertex[vertex]
-        use.executions += 1
-        if execution.busy > use.longest:
-            use.longest = execution.busy
+    def _ran(self, pieces: Ints, every: list[CallbackUse]) -> None:
+        took, place = pieces[:, 7] - pieces[:, 6], self._place[pieces[:, 2]]
+        workers, which = np.unique(pieces[:, 4], return_inverse=True)
+        for worker, total in zip(workers.tolist(), sums(which, took, len(workers))):
+            self.by_worker[worker] += total
+        self.pool.add(pieces[:, 6], pieces[:, 7])
+        for use, total in zip(every, sums(place, took, len(every))):
+            use.busy += total
+        first = pieces[:, 8] != 0
+        undeclared = pieces[:, 2] < 0
+        _count(place[undeclared & first], every)
+        _longest(place[undeclared], took[undeclared], every, 'longest')
+        place, waited = place[first], (pieces[:, 6] - pieces[:, 5])[first]
+        for use, total in zip(every, sums(place, waited, len(every))):
+            use.waiting += total
+        _longest(place, waited, every, 'longest_wait')
+        if self._waits is not None and self._waits.found.any():
+            for use, total in zip(every, sums(place, self._waits.found[first], len(every))):
+                use.group += total
 
     @property
     def busy(self) -> int:
         """Return how long declared callbacks ran altogether, ns."""
-        return sum(use.busy for use in self._by_key.values())
-
-    def every(self) -> list[CallbackUse]:
-        """Return the use of each declared callback, in file order, then of the undeclared."""
-        return [*self._by_key.values(), self.undeclared]
-
-    def number_by_vertex(self) -> list[int]:
-        """Return for each global vertex the place of its callback in ``every``."""
-        numbers = {id(use): number for number, use in enumerate(self._by_key.values())}
-        return [numbers[id(use)] for use in self._by_vertex]
+        return sum(use.busy for use in self._uses.values())
 
     def callbacks(self) -> dict[str, dict[str, int]]:
         """Return what each declared callback used, in file order."""
-        return {key: use.result() for key, use in self._by_key.items()}
+        return {key: use.result() for key, use in self._uses.items()}
 
     def workers(self, count: int, duration: int) -> dict[str, Any]:
         """Return how busy the workers were; ``lent`` is what ran beside them (blocking calls)."""
@@ -177,6 +160,20 @@ class Usage(Observer):
             'lent_ns': sum(took for w, took in self.by_worker.items() if w < 0),
             'use': share(total, count, duration),
             'over_time': self.pool.result()}
+
+
+def _count(places: Ints, every: list[CallbackUse]) -> None:
+    """Count executions of callbacks at these places."""
+    for use, count in zip(every, np.bincount(places, minlength=len(every)).tolist()):
+        use.executions += count
+
+
+def _longest(places: Ints, times: Ints, every: list[CallbackUse], what: str) -> None:
+    """Keep the longest times of callbacks at these places."""
+    longest = np.full(len(every), -1, dtype=np.int64)
+    np.maximum.at(longest, places, times)
+    for use, most in zip(every, longest.tolist()):
+        setattr(use, what, max(getattr(use, what), most))
 
 
 def share(busy: int, workers: int, duration: int) -> float | None:

@@ -5,9 +5,11 @@
 from __future__ import annotations
 
 from collections import deque
+from itertools import islice
 
-from mddag_executor.replay.follower import Observer, Piece
 from mddag_executor.replay.groups import RecordedGroups
+from mddag_executor.replay.happenings import Batch, Handlers, Ints, Observer, RAN
+import numpy as np
 
 _KEEP = 256
 
@@ -16,25 +18,49 @@ class GroupWaits(Observer):
     """
     Finds out how much of each wait was for the callback group: while another of it ran.
 
-    Told before those who ask it for ``last``.
+    Told before those who ask it.
+
+    :ivar found: of the batch that was told last: by piece, how long its group was busy, ns.
     """
 
     def __init__(self, groups: RecordedGroups) -> None:
         self._groups = groups
+        # by group what ran in it last: start and end
         self._busy: dict[int, deque[tuple[int, int]]] = {}
-        #: Of the piece that was told last: how long its group was busy while it waited, ns.
-        self.last = 0
+        self.found: Ints = np.empty(0, dtype=np.int64)
 
-    def ran(self, piece: Piece) -> None:
-        """Take in a piece of an execution."""
-        self.last = 0
-        group = self._groups.by_callback().get(piece.callback, -1)
-        if group < 0:
+    def handlers(self) -> Handlers:
+        """Return what takes in the callback groups."""
+        return self._groups.handlers()
+
+    def take(self, batch: Batch) -> None:
+        """Take in pieces of executions."""
+        pieces = batch.columns(RAN)
+        self.found = np.zeros(len(pieces), dtype=np.int64)
+        number = self._groups.numbers()
+        if not len(pieces) or not number:
             return
-        busy = self._busy.setdefault(group, deque(maxlen=_KEEP))
-        if piece.first:
-            for start, end in reversed(busy):
-                if end <= piece.ready:
+        callbacks, which = np.unique(pieces[:, 0], return_inverse=True)
+        group = np.array([number.get(callback, -1) for callback in callbacks.tolist()])[which]
+        rows = np.flatnonzero(group >= 0)
+        rows = rows[np.argsort(group[rows], kind='stable')]
+        begins = np.flatnonzero(np.r_[True, group[rows][1:] != group[rows][:-1]])
+        for mine in np.split(rows, begins[1:]) if len(rows) else ():
+            self._take_group(int(group[mine[0]]), mine, pieces[mine])
+
+    def _take_group(self, group: int, rows: Ints, pieces: Ints) -> None:
+        """Take in the pieces of a group, in order."""
+        before = self._busy.setdefault(group, deque(maxlen=_KEEP))
+        n = len(before)
+        busy = [*before, *zip(pieces[:, 6].tolist(), pieces[:, 7].tolist())]
+        ready = pieces[:, 5]
+        ended = np.r_[before[-1][1] if before else -1, pieces[:-1, 7]]
+        # only where the one before ended after this one was ready
+        for i in np.flatnonzero((ended > ready) & (pieces[:, 8] != 0)).tolist():
+            since, start, waited = int(ready[i]), busy[n + i][0], 0
+            for begun, end in islice(reversed(busy[max(0, n + i - _KEEP):n + i]), _KEEP):
+                if end <= since:
                     break
-                self.last += max(0, min(end, piece.start) - max(start, piece.ready))
-        busy.append((piece.start, piece.end))
+                waited += max(0, min(end, start) - max(begun, since))
+            self.found[rows[i]] = waited
+        before.extend(busy[max(n, len(busy) - _KEEP):])

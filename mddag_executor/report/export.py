@@ -48,11 +48,12 @@ from mddag_executor.core.state import (
     SINK_MISSED,
 )
 from mddag_executor.errors import MddagError
-from mddag_executor.replay.follower import Execution, Observer, Piece
+from mddag_executor.replay import Replay
+from mddag_executor.replay.computed import ComputedRun
+from mddag_executor.replay.happenings import Observer, Piece
 from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.names import no_names
 from mddag_executor.report.text import printable
-from mddag_executor.report.timeline_log import Schedule, tell
 from msg_graph import TaskSet
 
 KEEP_ENDED = 4096
@@ -145,22 +146,27 @@ class Exporter(Observer):
         # by vertex, job and ready time: what has ended, until it is known what it completed
         self._held: dict[tuple[int, int, int], Ran] = {}
         self._legs: dict[tuple[int, int], tuple[int, ...]] = {}
-        self._completed: tuple[Execution, tuple[int, int, int]] | None = None
+        self._completed: tuple[int, tuple[int, int, int]] | None = None
         self._ended: deque[tuple[int, int]] = deque()
         self._origin: int | None = None
 
-    def observers(self, task_set: TaskSet, judge: Judge) -> Sequence[Observer]:
-        """Return what is told of the run, after the judge."""
+    def of(self, replay: Replay) -> list[Observer]:
+        """Export a replay: return what is told of the run, after the judge."""
+        self._name_of = replay.names
+        return self._begin(replay.task_set, replay.judge)
+
+    def of_computed(self, run: ComputedRun) -> None:
+        """Export a schedule that was computed."""
+        judge = Judge(run.task_set, compare=False, judge_from=run.judge_from)
+        run.play([judge, *self._begin(run.task_set, judge)])
+        self.finish()
+
+    def _begin(self, task_set: TaskSet, judge: Judge) -> list[Observer]:
         self._tables = judge.tables
         self._names = [vertex.name for vertex in task_set.vertices]
         self._dags = [dag.name for dag in task_set.dags]
-        judge.listeners.append(self._decided)
         self.target.begin(task_set, judge.tables)
         return [self]
-
-    def name_by(self, names: Callable[[int], str]) -> None:
-        """Take in what tells the names of callbacks that are not declared."""
-        self._name_of = names
 
     def released(self, dag: int, job: int, release: int, now: int) -> None:
         """Open a job."""
@@ -168,15 +174,16 @@ class Exporter(Observer):
         if self._origin is None:
             self._origin = release
 
-    def ran(self, piece: Piece) -> None:
+    def ran(self, *values: Any) -> None:
         """Take in an execution, and hand it out or hold it back."""
         self._hand_out_completed()
+        piece = Piece(*values)
         callback, dag, vertex, job, worker, ready, start, end, first = piece
         release = self._jobs.get((dag, job)) if vertex >= 0 else None
         reference = None if release is None else release + self._tables.rad_offset[vertex]
         row = ExecutionRow(
             self._dags[dag] if vertex >= 0 else None, job if vertex >= 0 else None,
-            self._names[vertex] if vertex >= 0 else self._name_of(callback), worker, first,
+            self._names[vertex] if vertex >= 0 else self._name_of(callback), worker, bool(first),
             self._seconds(start), release, ready, start, end, start - ready if first else None,
             end - start, reference, None if reference is None else reference - end)
         if vertex < 0:
@@ -189,22 +196,22 @@ class Exporter(Observer):
             self._hand_out(next(iter(self._held)))
 
     def completed(
-        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
-        execution: Execution | None,
+        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, ready: int,
+        start: int, ended: int, busy: int, number: int,
     ) -> None:
         """Note what an execution completed; one may complete several legs, one after the other."""
-        if self._completed is not None and self._completed[0] is not execution:
+        if self._completed is not None and self._completed[0] != number:
             self._hand_out_completed()
-        if execution is None:       # of a simulated sync callback, which runs once for all legs
+        if number < 0:      # of a simulated sync callback, which runs once for all legs
             self._legs[vertex, job] = (*self._legs.get((vertex, job), ()), leg)
             if len(self._legs) > MOST_HELD:
                 del self._legs[next(iter(self._legs))]
             return
-        key = (vertex, job, execution.ready)
+        key = (vertex, job, ready)
         ran = self._held.get(key)
         if ran is not None:
-            self._held[key] = ran._replace(legs=(*ran.legs, leg), whole=whole)
-            self._completed = (execution, key)
+            self._held[key] = ran._replace(legs=(*ran.legs, leg), whole=bool(whole))
+            self._completed = (number, key)
 
     def _hand_out_completed(self) -> None:
         if self._completed is not None:
@@ -227,7 +234,8 @@ class Exporter(Observer):
             self._origin = time
         return (time - self._origin) / 1e9
 
-    def _decided(self, decisions: Sequence[Decision]) -> None:
+    def decided(self, decisions: Sequence[Decision]) -> None:
+        """Hand out verdicts."""
         for kind, dag, vertex, job, deadline, time in decisions:
             if kind == JOB_END:
                 self._ended.append((dag, job))
@@ -245,14 +253,6 @@ class Exporter(Observer):
             self._dags[dag], job, self._names[vertex], self._seconds(release), release, deadline,
             completed, None if completed is None else completed - release,
             None if completed is None else deadline - completed, _VERDICTS[kind]), vertex)
-
-
-def export_schedule(schedule: Schedule, target: Target) -> None:
-    """Hand out the rows of a schedule that was computed."""
-    judge = Judge(schedule.task_set, compare=False, judge_from=schedule.judge_from)
-    exporter = Exporter(target)
-    tell(schedule, [judge, *exporter.observers(schedule.task_set, judge)])
-    exporter.finish()
 
 
 class Ordered:

@@ -9,7 +9,7 @@ The HTML report of a run: one file with tables and pictures that needs no networ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from html import escape
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -20,9 +20,10 @@ from mddag_executor.core.tally import total
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import Replay, Reschedule
 from mddag_executor.replay.bags_reschedule import BagReschedule
-from mddag_executor.replay.batches import Batch
-from mddag_executor.replay.follower import Observer
+from mddag_executor.replay.computed import ComputedRun
+from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.judge import Judge
+from mddag_executor.replay.names import no_names
 from mddag_executor.replay.usage import Usage
 from mddag_executor.report.html_data import (
     json_for_html,
@@ -40,7 +41,6 @@ from mddag_executor.report.html_tables import (
 from mddag_executor.report.tables import never_due_lines, verdicts_line
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import MOST_EXECUTIONS, Timeline
-from mddag_executor.report.timeline_log import of_rescheduled, Schedule, tell
 from mddag_executor.simulate import Load, Run
 from mddag_executor.text import counted
 from msg_graph import TaskSet
@@ -62,25 +62,23 @@ class Watch:
         self.judge: Judge
         self.usage: Usage
 
-    def begin(self, task_set: TaskSet, judge: Judge, usage: Usage) -> None:
-        """Take in what will have counted the run when it is over; ``take`` will be told of it."""
-        self.timeline = Timeline(self._most)
-        self.judge = judge
-        self.usage = usage
+    def of(self, replay: Replay) -> list[Observer]:
+        """Watch a replay: return what is told of the run, after the judge."""
+        return self._watch(replay.judge, replay.usage, replay.names)
 
-    def take(self, batch: Batch) -> None:
-        """Take in what happened."""
-        self.timeline.take(batch)
+    def _watch(
+        self, judge: Judge, usage: Usage, names: Callable[[int], str] = no_names
+    ) -> list[Observer]:
+        self.judge, self.usage = judge, usage
+        self.timeline = Timeline(self._most, names=names)
+        return [self.timeline]
 
-    def observers(self, task_set: TaskSet, judge: Judge) -> Sequence[Observer]:
-        """Return observers; they are told after the judge."""
-        self.begin(task_set, judge, Usage(task_set))
-        judge.listeners.append(self.timeline.decided)
-        return [self.timeline, self.usage]
-
-    def name_by(self, names: Callable[[int], str]) -> None:
-        """Take in what tells the names of callbacks that are not declared."""
-        self.timeline.name_by(names)
+    def of_computed(self, run: ComputedRun) -> Watch:
+        """Watch a schedule that was computed."""
+        judge = Judge(run.task_set, compare=False, judge_from=run.judge_from)
+        usage = Usage(run.task_set)
+        run.play([judge, usage, *self._watch(judge, usage)])
+        return self
 
     def data(
         self, title: str, facts: list[tuple[str, str]], task_set: TaskSet, workers: int,
@@ -129,7 +127,7 @@ def of_replay(outcome: Replay, watch: Watch) -> ReportData:
 
 def of_reschedule(outcome: Reschedule) -> ReportData:
     """Return the data of a report about a recorded run that was rescheduled."""
-    watch = _told(of_rescheduled(outcome))
+    watch = Watch().of_computed(outcome.computed())
     result = outcome.result()
     facts = [('recording', result['recording']['trace']), *_facts(result)]
     return watch.data('Replay, rescheduled', facts, outcome.task_set, outcome.workers,
@@ -138,7 +136,7 @@ def of_reschedule(outcome: Reschedule) -> ReportData:
 
 def of_bag(outcome: BagReschedule) -> ReportData:
     """Return the data of a report about an ordinary bag that was rescheduled."""
-    watch = _told(of_rescheduled(outcome))
+    watch = Watch().of_computed(outcome.computed())
     result = outcome.result()
     facts = [('bag', result['recording']['trace']), *_facts(result),
              *(('assumed', note) for note in outcome.notes)]
@@ -150,19 +148,11 @@ def of_run(task_set: TaskSet, load: Load, run: Run) -> ReportData:
     """Return the data of a report about a run that was simulated with its log."""
     stopped = run.settings.stop_at_first_miss and run.ended_ns < run.settings.duration_ns
     judged = run.settings.judge == 'horizon' and not stopped
-    watch = _told(Schedule(
+    watch = Watch().of_computed(ComputedRun(
         task_set, load, run.log, run.decisions, run.settings.duration_ns, run.ended_ns, judged))
     facts = [('declaration', task_set.file), *_facts(run.result())]
     return watch.data(
         'Simulation', facts, task_set, run.settings.workers, run.ended_ns, [], run.tally)
-
-
-def _told(schedule: Schedule) -> Watch:
-    """Return a watch that was told of a schedule."""
-    watch = Watch()
-    judge = Judge(schedule.task_set, compare=False, judge_from=schedule.judge_from)
-    tell(schedule, [judge, *watch.observers(schedule.task_set, judge)])
-    return watch
 
 
 def _facts(result: dict[str, Any]) -> list[tuple[str, str]]:

@@ -36,9 +36,7 @@ from mddag_executor.core.state import (
     SINK_LATE,
     SINK_MISSED,
 )
-from mddag_executor.replay import batches
-from mddag_executor.replay.batches import Batch, CALLBACK, VERTEX
-from mddag_executor.replay.follower import Observer, Piece
+from mddag_executor.replay.happenings import Batch, Observer, RAN, RELEASED
 from mddag_executor.replay.names import no_names
 import numpy as np
 import numpy.typing as npt
@@ -57,8 +55,8 @@ _KINDS = {
 
 _FIRST_WIDTH = 1 << 16      # of a bin, ns
 _ADDRESS = 2 ** 64 - 1
-STARTED, ENDED, BECAME_READY, WORKED_BY, DONE_FOR = (
-    batches.START, batches.END, batches.READY, batches.WORKER, batches.JOB)
+# Columns of a piece.
+CALLBACK, _, VERTEX, DONE_FOR, WORKED_BY, BECAME_READY, STARTED, ENDED = range(8)
 
 Ints = npt.NDArray[np.int64]
 
@@ -132,24 +130,8 @@ class Bins:
         for sums in (self.busy, self.lent, self.missed):
             sums[:] = [a + b for a, b in zip(sums[::2], sums[1::2])] + [0] * (BINS // 2)
 
-    def add(self, lent: bool, start: int, end: int) -> None:
-        """Add a stretch in which a worker was busy."""
-        sums = self.lent if lent else self.busy
-        if self.origin is None:
-            self.origin = start
-        last = (end - self.origin) // self.width
-        if last < self.used and self.origin <= self.origin + last * self.width <= start:
-            sums[last] += end - start       # mostly it is within one of the bins in use
-            return
-        start = max(start, self.origin)
-        last = self.place(end)      # first: it may change the width
-        for i in range(self.place(start), last + 1):
-            right = min(end, self.origin + (i + 1) * self.width)
-            sums[i] += max(0, right - start)
-            start = right
-
-    def add_many(self, lent: bool, starts: Ints, ends: Ints) -> None:
-        """Add stretches: as ``add`` does, one after the other; the origin is known."""
+    def add(self, lent: bool, starts: Ints, ends: Ints) -> None:
+        """Add stretches in which workers were busy; the origin is known."""
         if not len(starts):
             return
         assert self.origin is not None
@@ -173,10 +155,12 @@ class Timeline(Observer):
     Collects what ran when.
 
     :param most: how many executions are kept at most.
+    :param names: tells the names of callbacks that are not declared.
     :ivar n_executions: how many there were; ``n_missed`` the deadlines missed.
     """
 
-    def __init__(self, most: int = MOST_EXECUTIONS, block: int = BLOCK) -> None:
+    def __init__(self, most: int = MOST_EXECUTIONS, block: int = BLOCK,
+                 names: Callable[[int], str] = no_names) -> None:
         self.bins = Bins()
         self.n_executions = 0
         self.n_missed = 0
@@ -187,30 +171,9 @@ class Timeline(Observer):
         self._blocks: list[_Block] = [self._open]
         self._numbers = 1
         self._undeclared: dict[int, int] = {}
-        self._name_of: Callable[[int], str] = no_names
+        self._name_of = names
 
     # --- what is told ----------------------------------------------------------------------------
-
-    def released(self, dag: int, job: int, release: int, now: int) -> None:
-        """Keep a release."""
-        self._open.releases.extend((dag, job, release))
-
-    def ran(self, piece: Piece) -> None:
-        """Keep an execution, or a piece of one."""
-        callback, _, row, job, worker, ready, start, end, _ = piece
-        if row < 0:
-            row, job = self._undeclared_row(callback), -1
-        self.n_executions += 1
-        self.workers.add(worker)
-        self.bins.add(worker < 0, start, end)
-        block = self._open
-        block.executions.extend((row, job, worker, ready, start, end))
-        if len(block.executions) >= 6 * self._block_size:
-            self._next_block()
-
-    def decided(self, decisions: Sequence[Decision]) -> None:
-        """Keep verdicts; to be told what the judge's core decides."""
-        self._decided(decisions, len(self._open.executions) // 6)
 
     def _decided(self, decisions: Sequence[Decision], filled: int) -> None:
         """Keep verdicts; so many executions were in the open block then."""
@@ -229,17 +192,21 @@ class Timeline(Observer):
 
     def take(self, batch: Batch) -> None:
         """Keep what happened in a stretch of the run."""
-        pieces = batch.pieces
+        pieces = batch.columns(RAN)
         n = len(pieces)
-        self._find_origin(batch)
+        ended = np.cumsum(batch.order == RAN)       # how many had ended, with that one
+        decided_at = np.array(batch.decided_at, dtype=np.int64)
+        decided_after = ended[decided_at] if len(ended) else decided_at
+        self._find_origin(batch, decided_after)
         executions = self._rows_of(pieces)
         lent = pieces[:, WORKED_BY] < 0
         for which in (False, True):
             chosen = lent == which
-            self.bins.add_many(which, pieces[chosen, STARTED], pieces[chosen, ENDED])
+            self.bins.add(which, pieces[chosen, STARTED], pieces[chosen, ENDED])
         self.n_executions += n
         self.workers.update(np.unique(pieces[:, WORKED_BY]).tolist())
-        decided, released = batch.decided_after.tolist(), batch.released_after
+        decided, released = decided_after.tolist(), ended[batch.places(RELEASED)]
+        releases = batch.columns(RELEASED)[:, :3]
         at = decision = 0
         while True:
             filled = len(self._open.executions) // 6
@@ -247,7 +214,7 @@ class Timeline(Observer):
             full = filled + end - at == self._block_size
             # what comes with the last execution of a block belongs to the next block
             here = (released >= at) & ((released < end) | (not full))
-            self._open.releases.frombytes(batch.releases[here].tobytes())
+            self._open.releases.frombytes(releases[here].tobytes())
             while decision < len(decided) and (decided[decision] < end or not full):
                 self._decided([batch.decisions[decision]], filled + decided[decision] - at)
                 decision += 1
@@ -257,18 +224,18 @@ class Timeline(Observer):
             self._next_block()
             at = end
 
-    def _find_origin(self, batch: Batch) -> None:
+    def _find_origin(self, batch: Batch, decided_after: Ints) -> None:
         """Let the sums begin with what happened first."""
         if self.bins.origin is not None:
             return
         for (kind, *_, deadline, time), after in zip(
-                batch.decisions, batch.decided_after.tolist()):
+                batch.decisions, decided_after.tolist()):
             if after == 0 and kind not in (JOB_END, DROP) and (
                     kind != SINK_IN_TIME):
                 self.bins.place(max(time, deadline))
                 return
-        if len(batch.pieces):
-            self.bins.place(int(batch.pieces[0, STARTED]))
+        if len(batch.columns(RAN)):
+            self.bins.place(int(batch.columns(RAN)[0, STARTED]))
 
     def _rows_of(self, pieces: Ints) -> Ints:
         """Return executions as they are kept: ROW, JOB, WORKER, READY, START, END."""
@@ -284,10 +251,6 @@ class Timeline(Observer):
             row[undeclared], job[undeclared] = rows[which], -1
         return np.column_stack((row, job, pieces[:, WORKED_BY], pieces[:, BECAME_READY],
                                 pieces[:, STARTED], pieces[:, ENDED]))
-
-    def name_by(self, names: Callable[[int], str]) -> None:
-        """Take in what tells the names of callbacks that are not declared."""
-        self._name_of = names
 
     def _undeclared_row(self, callback: int) -> int:
         row = self._undeclared.get(callback)

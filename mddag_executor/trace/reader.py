@@ -31,7 +31,6 @@ from mddag_executor.trace.events import Event, Events
 from mddag_executor.trace.reading import Reading
 from mddag_executor.trace.records import LIBRARY
 
-_TASK_SET = 'mddag:task_set'
 _PROCESS = 'mddag:process'
 _REMEDY = 'check its name, that you may read it, and the disk it is on'
 
@@ -110,20 +109,10 @@ class TraceReader:
         """
         return self._summary.messages - self._copies if self._summary else None
 
-    @property
-    def task_set_text(self) -> str | None:
-        """
-        Return the declaration that the trace was recorded with (YAML), None where it has none.
-
-        :raises TraceError: where the file can no longer be read
-        """
-        topic = '/trace/' + _TASK_SET.replace(':', '/')
-        if self._summary and topic not in self._summary.topics:
-            return None
-        for event in self.events({_TASK_SET}):
-            text: str | None = event[4]
-            return text
-        return None
+    def may_have(self, name: str) -> bool:
+        """Tell whether there may be an event of that full name: where the summary names none."""
+        topic = '/trace/' + name.replace(':', '/')
+        return self._summary is None or topic in self._summary.topics
 
     def has_events(self) -> bool:
         """

@@ -78,8 +78,7 @@ class Part:
     def run(self, vertex: int, end: int) -> list[tuple[int, int]]:
         """Run a vertex; return the kinds of decisions, and vertex or the job's end."""
         x = self.scheduler.execution(self.slot, vertex)
-        self.scheduler.admit(x, end)
-        self.scheduler.complete(x, end)
+        self.scheduler.record(x, end)
         return self.decisions()
 
     def decisions(self) -> list[tuple[int, int]]:

@@ -6,7 +6,7 @@ What belongs together in a recording of CARET or ros2_tracing: executions and th
 Theory of operation
 -------------------
 Two stages go through the events in the order of time.  The first keeps what each thread does; the
-second, `LAG_NS` of recorded time later, tells the sink, also in the order of time: a subscriber
+second, `LAG_NS` of recorded time later, tells its observer, also in the order of time: a subscriber
 may run before the tracer has recorded the stamp of the message that it runs for.
 
 1. *Executions*: `callback_start` to the next `callback_end` of the same callback in the same
@@ -37,7 +37,7 @@ may run before the tracer has recorded the stamp of the message that it runs for
 5. `rmw_take` inside an execution is a message that the callback took itself (a queue edge).
 6. What does not fit (an end without a start, a start without an end, a message whose publication
    is not in the recording, a publisher's that lacks a tracepoint) is counted by callback or topic,
-   and the sink is told where nobody can tell what a callback ran for.
+   and the observer is told where nobody can tell what a callback ran for.
 
 Publications are kept until `KEEP` newer ones of their topic have come.
 """
@@ -49,7 +49,8 @@ from collections.abc import Callable as Function
 from typing import Any
 
 from mddag_executor.replay.entities import Callback, Entities, Publisher
-from mddag_executor.replay.linked import Losses, Publication, Run, Sink, Thread
+from mddag_executor.replay.happenings import Handlers, Observer
+from mddag_executor.text import counted
 from mddag_executor.trace.channels import Layout
 
 LAG_NS = 200_000_000
@@ -57,7 +58,152 @@ KEEP = 16_384
 _DEEPEST = 32
 
 Event = tuple[Any, ...]
+Thread = tuple[int, int]        # process and thread
 Handler = Function[[Event, Thread, '_Thread'], None]
+
+
+class Execution:
+    """
+    An execution of a callback.
+
+    :ivar thread: process and thread.
+    :ivar end: -1 while it runs, or where its end was lost.
+    :ivar stamp: source timestamp of the message that it runs for; 0: none is known.
+    :ivar stated: the message's header stamp, where the recording has it; else 0.
+    :ivar taken: when the message was taken, ns; 0: that is not recorded.
+    :ivar inner: when another one last began in its thread while it ran, ns; 0: none did.
+    :ivar ready: for those who use it: when it became ready, ns.
+    :ivar of: for those who use it: DAG, vertex and job that it belongs to.
+    :ivar leg: for those who use it: which leg of the vertex it is.
+    :ivar number: for those who use it: tells it from others.
+    """
+
+    __slots__ = ('callback', 'thread', 'start', 'end', 'stamp', 'stated', 'taken', 'message',
+                 'inner', 'ready', 'of', 'leg', 'number')
+
+    def __init__(self, callback: Callback, thread: Thread, start: int) -> None:
+        self.callback = callback
+        self.thread = thread
+        self.start = start
+        self.end = -1
+        self.stamp = 0
+        self.stated = 0
+        self.taken = 0
+        self.message: Publication | None = None
+        self.inner = 0
+        self.ready = start
+        self.of: tuple[int, int, int] | None = None
+        self.leg = 0
+        self.number = -1
+
+
+class Publication:
+    """
+    A message that was published; times in ns, 0 where they are not recorded.
+
+    :ivar run: the execution that published it, None: none did.
+    :ivar message: its address, and `written` that of what the middleware made of it.
+    :ivar number: for those who use it: tells it from others.
+    """
+
+    __slots__ = ('publisher', 'run', 'rclcpp', 'rcl', 'dds', 'stamp', 'message', 'written',
+                 'within', 'number')
+
+    def __init__(self, publisher: Publisher | None, run: Execution | None, message: int) -> None:
+        self.publisher = publisher
+        self.run = run
+        self.rclcpp = 0
+        self.rcl = 0
+        self.dds = 0
+        self.stamp = 0
+        self.message = message
+        self.written = 0
+        self.within = False     # so far only within the process
+        self.number = -1
+
+    @property
+    def time(self) -> int:
+        """Return when it was published."""
+        return self.rclcpp or self.rcl
+
+    @property
+    def topic(self) -> str:
+        """Return its topic, empty where that is not known."""
+        return self.publisher.topic if self.publisher is not None else ''
+
+
+class LinkObserver(Observer):
+    """Is told, in the order of time, what the linker finds; does nothing with it."""
+
+    def raw_handlers(self) -> Handlers:
+        """Return what takes in events as they were recorded, by full name."""
+        return {}
+
+    def began(self, run: Execution, message: Publication | None) -> None:
+        """Take in that an execution has begun, with the message that it runs for."""
+
+    def sent(self, message: Publication) -> None:
+        """Take in that a message was published."""
+
+    def took(self, run: Execution, message: Publication) -> None:
+        """Take in that a running callback took a message itself."""
+
+    def over(self, run: Execution) -> None:
+        """Take in that an execution has ended."""
+
+    def lost_sight(self, callback: Callback | None, run: Execution | None, time: int) -> None:
+        """
+        Take in that something is not recorded.
+
+        :param callback: it ran, nobody can tell for what; None: events were discarded.
+        :param run: its execution, where only the end is not recorded.
+        """
+
+
+class Losses:
+    """What was lost in a recording, by what it affects."""
+
+    def __init__(self) -> None:
+        self.ends: Counter[str] = Counter()
+        self.starts: Counter[str] = Counter()
+        self.messages: Counter[str] = Counter()
+        self.unlinked: Counter[str] = Counter()
+        self.untold: Counter[str] = Counter()
+        self.partial: Counter[str] = Counter()
+        self.ambiguous: Counter[str] = Counter()
+        self.overwritten: Counter[str] = Counter()
+        self.unknown: Counter[str] = Counter()
+        #: What the tracer itself says that it discarded.
+        self.discarded = 0
+
+    def lines(self) -> list[str]:
+        """Return what to say about it."""
+        said = (
+            (self.ends, 'execution', 'without an end in it (the event was lost)'),
+            (self.starts, 'execution', 'without a start in it (the event was lost): left out'),
+            (self.messages, 'execution', 'for a message whose publication is not in it: of no job '
+             'and no path'),
+            (self.unlinked, 'execution', 'for a message whose publication cannot be told (not all '
+             'of its topic have a source timestamp in it): of no job and no path'),
+            (self.untold, 'execution', 'of a subscription without a message in it (its taking is '
+             'not recorded): of no job and no path'),
+            (self.partial, 'publication', 'without the tracepoint rclcpp_publish that others of '
+             'the publisher have: counted from rcl_publish on'),
+            (self.ambiguous, 'execution', 'for a message with the topic and source timestamp of '
+             'another one: of no job and no path'),
+            (self.overwritten, 'message', 'overwritten in a ring buffer, never taken'),
+            (self.unknown, 'execution', 'of a callback whose initialisation is not in it'))
+        lines = [f'{counted(sum(counts.values()), noun)} {text}: {_most(counts)}'
+                 for counts, noun, text in said if counts]
+        if self.discarded:
+            lines.insert(0, f'the tracer discarded {counted(self.discarded, "event")} or more: '
+                         'executions and messages may be missing')
+        return lines
+
+
+def _most(counts: Counter[str]) -> str:
+    named = ', '.join(f'{name} ({n})' for name, n in counts.most_common(3))
+    return named + (f', … ({len(counts) - 3} more)' if len(counts) > 3 else '')
 
 
 class _Thread:
@@ -66,7 +212,7 @@ class _Thread:
     __slots__ = ('stack', 'last', 'take', 'fresh')
 
     def __init__(self) -> None:
-        self.stack: list[Run] = []
+        self.stack: list[Execution] = []
         self.last: Publication | None = None
         # (callback it names or None, its subscription's callbacks or None, stamp, stated, message,
         # time)
@@ -78,10 +224,10 @@ class _Thread:
 class Linker:
     """Links the events of a recording."""
 
-    def __init__(self, entities: Entities, sink: Sink) -> None:
+    def __init__(self, entities: Entities, observer: LinkObserver) -> None:
         self.losses = Losses()
         self._entities = entities
-        self._sink = sink
+        self._observer = observer
         self._threads: dict[Thread, _Thread] = {}
         self._queue: deque[tuple[int, Function[..., None], tuple[Any, ...]]] = deque()
         self._by_stamp: dict[str, dict[int, Publication | None]] = {}
@@ -150,7 +296,7 @@ class Linker:
             self.losses.partial[publisher.topic] += self._by_rcl.pop(publisher)
 
     @property
-    def running(self) -> list[Run]:
+    def running(self) -> list[Execution]:
         """Return what runs now."""
         return [run for state in self._threads.values() for run in state.stack]
 
@@ -173,7 +319,7 @@ class Linker:
                 self._without_end(run, now)
                 if run.callback is callback:
                     break
-        run = Run(callback, thread, now)
+        run = Execution(callback, thread, now)
         take, state.take = state.take, None
         if take is not None:
             named, possible, run.stamp, run.stated, run.message, run.taken = take
@@ -189,7 +335,7 @@ class Linker:
         state.last = None
         self._queue.append((now, self._tell_start, (run,)))
 
-    def _tell_start(self, run: Run) -> None:
+    def _tell_start(self, run: Execution) -> None:
         message, run.message = run.message, None
         if message is None and run.stamp:
             topic = run.callback.start
@@ -198,13 +344,13 @@ class Linker:
                 self._not_found(run, topic)
         elif message is None and run.callback.kind == 'subscription' and not run.taken:
             self.losses.untold[run.callback.label] += 1
-        self._sink.started(run, message)
+        self._observer.began(run, message)
 
-    def _not_found(self, run: Run, topic: str) -> None:
+    def _not_found(self, run: Execution, topic: str) -> None:
         losses = self.losses
         if run.stamp in self._by_stamp.get(topic, ()):
             losses.ambiguous[run.callback.label] += 1
-            self._sink.missing(run.callback, None, run.start)
+            self._observer.lost_sight(run.callback, None, run.start)
         elif self._unstamped.isdisjoint((topic, '')):
             losses.messages[run.callback.label] += 1
         else:
@@ -222,7 +368,7 @@ class Linker:
             # else it began before the recording did
             if not state.fresh or callback.made >= self._entities.begin:
                 self.losses.starts[callback.label] += 1
-                self._queue.append((now, self._sink.missing, (callback, None, now)))
+                self._queue.append((now, self._observer.lost_sight, (callback, None, now)))
             state.fresh = False
             return
         while True:
@@ -231,11 +377,11 @@ class Linker:
                 break
             self._without_end(run, now)
         run.end = now
-        self._queue.append((now, self._sink.ended, (run,)))
+        self._queue.append((now, self._observer.over, (run,)))
 
-    def _without_end(self, run: Run, now: int) -> None:
+    def _without_end(self, run: Execution, now: int) -> None:
         self.losses.ends[run.callback.label] += 1
-        self._queue.append((now, self._sink.missing, (run.callback, run, now)))
+        self._queue.append((now, self._observer.lost_sight, (run.callback, run, now)))
 
     # --- publications ----------------------------------------------------------------------------
 
@@ -254,7 +400,7 @@ class Linker:
     def _tell_published(self, message: Publication) -> None:
         if not message.stamp and not message.within:
             self._unstamped.add(message.topic)
-        self._sink.published(message)
+        self._observer.sent(message)
 
     def _intra_publish(self, event: Event, thread: Thread, state: _Thread) -> None:
         message = self._publication(event, thread, state)
@@ -348,10 +494,10 @@ class Linker:
             self._queue.append((event[1], self._tell_take, (state.stack[-1], topic, stamp)))
         state.take = None, callbacks, stamp, 0, None, event[1]
 
-    def _tell_take(self, run: Run, topic: str, stamp: int) -> None:
+    def _tell_take(self, run: Execution, topic: str, stamp: int) -> None:
         message = self._find(topic, stamp)
         if message is not None:
-            self._sink.took(run, message)
+            self._observer.took(run, message)
 
     def _dispatch_within(self, event: Event, thread: Thread, state: _Thread) -> None:
         callback = self._entities.callback(thread[0], self._get(event, 'callback'), event[1])
@@ -386,4 +532,4 @@ class Linker:
 
     def _lost(self, event: Event, thread: Thread, state: _Thread) -> None:
         self.losses.discarded += self._get(event, 'count')
-        self._queue.append((event[1], self._sink.missing, (None, None, event[1])))
+        self._queue.append((event[1], self._observer.lost_sight, (None, None, event[1])))

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A schedule that was computed, told to the observers of a replay as if it had been recorded.
+A schedule that was computed, played to observers as if it had been recorded.
 
 Theory of operation
 -------------------
@@ -22,13 +22,20 @@ from typing import NamedTuple
 
 from mddag_executor.core import legs_of, NEVER
 from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END
-from mddag_executor.replay import Reschedule
-from mddag_executor.replay.bags_reschedule import BagReschedule
-from mddag_executor.replay.follower import Execution, Observer, Piece
-from mddag_executor.replay.timed import edge_numbers
+from mddag_executor.replay.happenings import (
+    Batch,
+    COMPLETED,
+    ENDED,
+    FAILED,
+    Observer,
+    RAN,
+    RELEASED,
+    STARTED,
+)
 from mddag_executor.simulate import END, Load, LogEntry, START
 from msg_graph import TaskSet
 
+_BATCH = 16_384
 Delay = Callable[[int, int, int, int], int]
 """Time (ns) from the end of an execution to its message: DAG, job in the load, edge's ends."""
 
@@ -36,7 +43,7 @@ Id = tuple[int, int, int]
 """DAG, global vertex, job in the load."""
 
 
-class Schedule(NamedTuple):
+class ComputedRun(NamedTuple):
     """
     A schedule that was computed.
 
@@ -60,27 +67,9 @@ class Schedule(NamedTuple):
     judge_from: int = -NEVER
     failed: Set[tuple[int, int]] = frozenset()
 
-
-def of_rescheduled(outcome: Reschedule | BagReschedule) -> Schedule:
-    """Return the schedule of a recording or a bag that was rescheduled."""
-    if isinstance(outcome, BagReschedule):
-        return Schedule(outcome.task_set, outcome.load, outcome.log, outcome.decisions,
-                        outcome.end, outcome.end, judge_from=outcome.judge_from)
-    transports, edges = outcome.work.transports, edge_numbers(outcome.tables)
-
-    def delay(dag: int, job: int, before: int, after: int) -> int:
-        return int(transports.delays[
-            transports.base[dag] + job * transports.stride[dag] + edges[before, after]])
-
-    return Schedule(
-        outcome.task_set, outcome.work.load, outcome.log, outcome.decisions, outcome.end_ns,
-        outcome.end_ns, True, outcome.work.jobs, delay, outcome.judge_from,
-        outcome.work.failed)
-
-
-def tell(schedule: Schedule, observers: Sequence[Observer]) -> None:
-    """Tell observers of a schedule, in the order of time."""
-    _Teller(schedule, observers).run()
+    def play(self, observers: Sequence[Observer]) -> None:
+        """Tell the observers everything."""
+        _Teller(self, observers).run()
 
 
 class _Running(NamedTuple):
@@ -95,7 +84,7 @@ class _Running(NamedTuple):
 class _Teller:
     """Goes through a schedule once."""
 
-    def __init__(self, schedule: Schedule, observers: Sequence[Observer]) -> None:
+    def __init__(self, schedule: ComputedRun, observers: Sequence[Observer]) -> None:
         task_set = schedule.task_set
         self._schedule = schedule
         self._observers = observers
@@ -115,6 +104,9 @@ class _Teller:
         self._next_end = next(self._ends, None)
         self._ready: dict[Id, int] = {}
         self._running: dict[Id, _Running] = {}
+        self._order: list[int] = []
+        self._rows: dict[int, list[tuple[int, ...]]] = {}
+        self._finished = 0      # executions
 
     def run(self) -> None:
         schedule = self._schedule
@@ -122,10 +114,26 @@ class _Teller:
             # what ends at an instant does so before anything is released or given up there
             self._until(entry[0] - 1 if entry[1] == END else entry[0])
             self._change(entry)
+            if len(self._order) >= _BATCH:
+                self._flush()
         self._until(schedule.end)
+        self._flush()
         if schedule.judged:
+            batch = Batch((), {})
             for observer in self._observers:
-                observer.finished(schedule.end)
+                observer.finished(schedule.end, batch)
+                observer.take(batch)
+
+    def _tell(self, kind: int, *row: int) -> None:
+        self._order.append(kind)
+        self._rows.setdefault(kind, []).append(row)
+
+    def _flush(self) -> None:
+        """Tell the observers what happened so far."""
+        batch = Batch(self._order, self._rows)
+        self._order, self._rows = [], {}
+        for observer in self._observers:
+            observer.take(batch)
 
     def _number(self, dag: int, job: int) -> int:
         numbers = self._schedule.numbers
@@ -145,8 +153,7 @@ class _Teller:
                 release = now + 1
             end = self._next_end
             if end is not None and end[0] <= min(now, release):
-                for observer in self._observers:
-                    observer.ended(end[1], self._number(end[1], end[2]), end[3], end[0])
+                self._tell(ENDED, end[1], self._number(end[1], end[2]), int(end[3]), end[0])
                 self._next_end = next(self._ends, None)
             elif release <= now:
                 self._release(self._next, release)
@@ -162,8 +169,7 @@ class _Teller:
             return
         self._ready[dag, self._sources[dag], job] = now
         release = load.releases[i] if load.releases else now
-        for observer in self._observers:
-            observer.released(dag, self._number(dag, job), release, now)
+        self._tell(RELEASED, dag, self._number(dag, job), release, now)
 
     def _change(self, entry: LogEntry) -> None:
         now, kind, worker, dag, v, job = entry
@@ -176,37 +182,35 @@ class _Teller:
                 ready = min(now, self._ready.pop(what, now))
                 before = _Running(now, ready, now, 0)
             self._running[what] = before._replace(since=now)
-            for observer in self._observers if declared else ():
-                observer.started(dag, v, number, before.ready, now)
+            if declared:
+                self._tell(STARTED, dag, v, number, before.ready, now, self._callback[v])
             return
         assert before is not None, 'what ends has begun'
         busy = before.busy + now - before.since
         self._running[what] = before._replace(busy=busy)
-        piece = Piece(
-            self._callback[v] if declared else 0, dag if declared else -1, v if declared else -1,
-            number, worker, before.ready, before.since, now, before.busy == 0)
         if kind == END and (v, job) in self._schedule.failed:
-            for observer in self._observers:
-                observer.failed(dag, v, number, now)
+            self._tell(FAILED, dag, v, number, now)
         last = self._last_leg[v] if kind == END and declared else 0
         for leg in range(last):     # they took no time: the execution is the last one's
-            for observer in self._observers:
-                observer.completed(dag, v, number, leg, False, now, None)
-        for observer in self._observers:
-            observer.ran(piece)
+            self._tell(COMPLETED, dag, v, number, leg, 0, now, -1, -1, -1, -1, -1)
+        self._tell(
+            RAN, self._callback[v] if declared else 0, dag if declared else -1,
+            v if declared else -1, number, worker, before.ready, before.since, now,
+            int(before.busy == 0))
         if kind == END:
             del self._running[what]
             if declared:
-                self._complete(what, last, Execution(before.ready, before.first, now, busy))
+                self._complete(what, last, before, now, busy)
 
-    def _complete(self, what: Id, leg: int, execution: Execution) -> None:
+    def _complete(self, what: Id, leg: int, ran: _Running, now: int, busy: int) -> None:
         dag, v, job = what
-        vertex, number, now = self._vertices[v], self._number(dag, job), execution.end
-        for observer in self._observers:
-            observer.completed(dag, v, number, leg, True, now, execution)
+        vertex, number = self._vertices[v], self._number(dag, job)
+        self._finished += 1
+        self._tell(COMPLETED, dag, v, number, leg, 1, now, ran.ready, ran.first, now, busy,
+                   self._finished)
         delay = self._schedule.delay
         for local in vertex.successors:
             after = (dag, self._first[dag] + local, job)
             arrival = now if delay is None else \
-                max(execution.start, now + delay(dag, job, v, after[1]))
+                max(ran.first, now + delay(dag, job, v, after[1]))
             self._ready[after] = max(arrival, self._ready.get(after, arrival))

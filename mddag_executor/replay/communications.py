@@ -8,7 +8,7 @@ from array import array
 from typing import Any
 
 from mddag_executor.replay.entities import Callback, Publisher
-from mddag_executor.replay.linked import Publication, Run
+from mddag_executor.replay.linker import Execution, LinkObserver, Publication
 from mddag_executor.replay.spread import Spread
 import numpy as np
 
@@ -50,15 +50,15 @@ class _Latencies:
         self._last = array('q')
 
 
-class Seen:
-    """Collects while a linker tells what happened."""
+class Communications(LinkObserver):
+    """Collects callbacks and messages while an imported run is played."""
 
     def __init__(self) -> None:
         self._executions: dict[int, _Executions] = {}
         self._sent: dict[int, tuple[Publisher, int]] = {}
         self._arrived: dict[tuple[int, int], _Latencies] = {}
 
-    def started(self, run: Run, message: Publication | None) -> None:
+    def began(self, run: Execution, message: Publication | None) -> None:
         """Take in that an execution has begun."""
         callback = run.callback
         use = self._executions.get(callback.number)
@@ -72,7 +72,7 @@ class Seen:
                 found = self._arrived[key] = _Latencies(callback)
             found.add(run.start - message.time)
 
-    def ended(self, run: Run) -> None:
+    def over(self, run: Execution) -> None:
         """Take in that an execution has ended."""
         use = self._executions[run.callback.number]
         took = run.end - run.start
@@ -81,7 +81,7 @@ class Seen:
         use.finished += 1
         use.busy += took
 
-    def published(self, message: Publication) -> None:
+    def sent(self, message: Publication) -> None:
         """Take in that a message was published."""
         publisher = message.publisher
         if publisher is not None:

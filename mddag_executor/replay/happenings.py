@@ -1,0 +1,231 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What happened in a run, many things at once, and who is told of it.
+
+Theory of operation
+-------------------
+A run of any source (see ``run``) tells *batches* of what happened, in order.  Everything is in
+terms of the declaration that judges: DAG and vertex are -1 for what it does not declare, a vertex
+is counted over all DAGs.  Of each kind there are rows, and the same as columns for numpy; each is
+made of the other when it is asked for.
+
+One run of a callback in a thread is a *piece*.  An execution is one piece, or several where a
+coroutine was suspended in between; they have the same vertex, job and ready time.  A completion
+ends an execution of a declared callback; several in a row end the legs of a sync callback that ran
+only once (a simulator's).
+
+The judge (see ``judge``) is told first; what its core decides is put into the batch, for the
+others.  Who wants one thing after the other overrides the methods of ``Observer``; who can take
+them together, its ``take``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from mddag_executor.core.state import Decision
+import numpy as np
+import numpy.typing as npt
+
+Event = tuple[Any, ...]
+Handlers = dict[str, Callable[[Event], None]]
+Ints = npt.NDArray[np.int64]
+Row = Sequence[Any]
+Numbers = tuple[Ints, Ints]
+"""Places in a batch, and the columns of the events of a kind that stand there."""
+# Columns that all events have; the fields follow.
+NOW, PROCESS, THREAD, FIELD = range(4)
+ADDRESS = 2 ** 64 - 1
+"""Columns have addresses with a sign; this mask takes it away."""
+
+#: Kinds of what happens; ``Observer`` has a method for each, and says what is in a row.
+KINDS = ('released', 'started', 'ran', 'completed', 'ended', 'withdrawn', 'failed', 'missed',
+         'published')
+RELEASED, STARTED, RAN, COMPLETED, ENDED, WITHDRAWN, FAILED, MISSED, PUBLISHED = range(len(KINDS))
+_WIDTHS = (4, 6, 9, 11, 4, 2, 4, 5, 7)
+
+
+class Piece(NamedTuple):
+    """One run of a callback in a thread; `first` tells the first piece of an execution."""
+
+    callback: int
+    dag: int
+    vertex: int
+    job: int
+    worker: int
+    ready: int
+    start: int
+    end: int
+    first: bool
+
+
+class Execution(NamedTuple):
+    """
+    A whole execution: ready, first start, last end, and the time that its pieces took, ns.
+
+    :ivar number: tells it from others; -1: its times are not recorded.
+    """
+
+    ready: int
+    start: int
+    end: int
+    busy: int
+    number: int = 0
+
+
+class Batch:
+    """
+    What happened in a stretch of a run.
+
+    :param order: the kinds of what happened, in order.
+    :param rows: by kind its rows, or its columns as an array with a row for each.
+    :ivar decisions: what the core decided, and in ``decided_at`` at which place of the order.
+    :ivar events: of a trace of this executor, the numbers of its events by name.
+    """
+
+    def __init__(
+        self, order: Sequence[int] | Ints, rows: dict[int, Any],
+        events: dict[str, Numbers] | None = None,
+    ) -> None:
+        self.order = np.asarray(order, dtype=np.int64)
+        self._given = rows
+        self._rows: dict[int, list[Row]] = {}
+        self._columns: dict[int, Ints] = {}
+        self.events = events or {}
+        self.decisions: list[Decision] = []
+        self.decided_at: list[int] = []
+
+    def rows(self, kind: int) -> list[Row]:
+        """Return the rows of a kind."""
+        found = self._rows.get(kind)
+        if found is None:
+            given = self._given.get(kind, ())
+            found = given.tolist() if isinstance(given, np.ndarray) else list(given)
+            self._rows[kind] = found
+        return found
+
+    def columns(self, kind: int) -> Ints:
+        """Return the same as an array with a row for each."""
+        found = self._columns.get(kind)
+        if found is None:
+            given = self._given.get(kind, ())
+            found = given if isinstance(given, np.ndarray) else np.array(
+                given, dtype=np.int64).reshape(-1, _WIDTHS[kind])
+            self._columns[kind] = found
+        return found
+
+    def places(self, kind: int) -> Ints:
+        """Return the places of a kind's rows in the order."""
+        found: Ints = np.flatnonzero(self.order == kind)
+        return found
+
+
+class Observer:
+    """Is told what happened; does nothing with it."""
+
+    def handlers(self) -> Handlers:
+        """Return what takes in events that say who is who, by full name."""
+        return {}
+
+    def take(self, batch: Batch) -> None:
+        """Take in a batch; here: one thing after the other."""
+        tell: list[Any] = [None] * len(KINDS)
+        for kind, name in enumerate(KINDS):
+            if getattr(type(self), name) is not getattr(Observer, name):
+                tell[kind] = getattr(self, name), iter(batch.rows(kind))
+        at, decided = 0, batch.decided_at
+        wants = type(self).decided is not Observer.decided
+        if not wants and not any(tell):
+            return
+        for place, kind in enumerate(batch.order.tolist()):
+            if wants and at < len(decided) and decided[at] == place:
+                first = at
+                while at < len(decided) and decided[at] == place:
+                    at += 1
+                self.decided(batch.decisions[first:at])
+            if tell[kind] is not None:
+                method, rows = tell[kind]
+                method(*next(rows))
+        if wants and at < len(decided):
+            self.decided(batch.decisions[at:])
+
+    def hosted(self, dag: int, vertices: set[int]) -> None:
+        """Take in which (global) vertices of a DAG the process has from here on."""
+
+    def judging(self, release: int) -> None:
+        """Take in that from here on only jobs released at a time or later are judged."""
+
+    def released(self, dag: int, job: int, release: int, now: int) -> None:
+        """Take in the release of a job; `now` is when the executor noticed it."""
+
+    def started(
+        self, dag: int, vertex: int, job: int, ready: int, start: int, callback: int
+    ) -> None:
+        """Take in that an execution of a vertex was dispatched (or a coroutine went on)."""
+
+    def ran(self, *piece: Any) -> None:
+        """Take in that a callback ran; see ``Piece``."""
+
+    def completed(
+        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, *execution: int
+    ) -> None:
+        """
+        Take in that an execution of a vertex has completed.
+
+        :param whole: whether that completed the vertex, as the executor saw it.
+        :param execution: see ``Execution``; the same number again for further legs that one
+            execution completes.
+        """
+
+    def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
+        """Take in that a job was aborted or, else, has expired."""
+
+    def withdrawn(self, dag: int, job: int) -> None:
+        """Take in that nobody can tell what became of a job: it is not to be judged."""
+
+    def failed(self, dag: int, vertex: int, job: int, now: int) -> None:
+        """Take in that an execution of a vertex failed: its job does; told before it completes."""
+
+    def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
+        """Take in a miss as the executor saw it; `completed` is -1 where it never did."""
+
+    def published(
+        self, publisher: int, callback: int, dag: int, vertex: int, job: int, ready: int, now: int
+    ) -> None:
+        """Take in a publication; the DAG is -1 where no declared callback did it."""
+
+    def decided(self, decisions: Sequence[Decision]) -> None:
+        """Take in what the judge's core has decided."""
+
+    def finished(self, now: int, batch: Batch) -> None:
+        """
+        Take in that the run has ended; what it had begun may still complete.
+
+        :param batch: is told after it; the judge puts in what the core decides.
+        """
+
+
+def merged(several: Sequence[Handlers]) -> Handlers:
+    """Return handlers that tell all who want to know of an event, in order."""
+    every: dict[str, list[Callable[[Event], None]]] = {}
+    for handlers in several:
+        for name, handler in handlers.items():
+            every.setdefault(name, []).append(handler)
+    return {name: told[0] if len(told) == 1 else _teller(told) for name, told in every.items()}
+
+
+def _teller(told: list[Callable[[Event], None]]) -> Callable[[Event], None]:
+    def tell(event: Event) -> None:
+        for handler in told:
+            handler(event)
+
+    return tell
+
+
+def sums(places: Ints, values: Ints, length: int) -> list[int]:
+    """Return the sum of the values at each place, exact whatever the values are."""
+    low, high = values & 0x7FFFFFFF, values >> 31
+    return [int(upper) * (1 << 31) + int(lower) for upper, lower in zip(
+        *(np.bincount(places, each, length).tolist() for each in (high, low)))]

@@ -1,0 +1,511 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+An imported recording as a run: releases, executions, completions, ends of jobs.
+
+Theory of operation
+-------------------
+A first pass over the trace finds out who is who (``entities``) and which of them the declaration
+means (``matching``).  The second links executions and messages (``linker``); jobs are made from
+what is linked, and the observers are told.
+
+1. *Releases.*  A timer is due at t_init + n * period (rcl keeps that grid, also after it was late
+   by more than a period: it leaves out what it missed).  An execution's release is the last such
+   time at its start; because `rcl_timer_init` is recorded a little after the timer has read its
+   clock, one that starts up to `_SLACK_NS` before it has that release, too, then as of its start.
+   Where t_init is not recorded, or the execution before has that release already (the timer was
+   reset, or goes by another clock), it is released when it starts, and that is said.
+   A subscription or service that nobody in the graph feeds is released as declared: by the stamp
+   in the header or of the source, or when its message was taken.
+2. *Jobs.*  Any other execution belongs to the job of the execution that published its message, as
+   the successor of that one's vertex.  What ran for a message that is not in the recording, or of
+   a callback that published for no job, ran as an undeclared callback.
+3. *Ready* is a timer's release, else the source timestamp (the publication, within a process):
+   when a message has reached its reader is not recorded, so the way there counts as waiting.
+4. A job that has not completed `EXPIRE_AFTER_NS` past its latest deadline, and of which nothing
+   runs, is told to have expired, as the executor's core does it.  What is open at the end of the
+   recording is judged as of the last event.  A job of which nobody can tell what it did, because
+   of what is missing in the recording (see ``doubts``), is withdrawn instead: it is not judged.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable as Function
+from collections.abc import Sequence
+from typing import Any
+
+from mddag_executor.core import legs_of, NEVER
+from mddag_executor.replay.doubts import Doubts
+from mddag_executor.replay.entities import as_table, Callback, Entities, fields_of, INIT_EVENTS
+from mddag_executor.replay.happenings import (
+    Batch,
+    COMPLETED,
+    ENDED,
+    Handlers,
+    merged,
+    Observer,
+    RAN,
+    RELEASED,
+    STARTED,
+    WITHDRAWN,
+)
+from mddag_executor.replay.linker import (
+    Execution,
+    KEEP,
+    Linker,
+    LinkObserver,
+    Publication,
+)
+from mddag_executor.replay.matching import Matching, Target
+from mddag_executor.replay.paths import PathBook
+from mddag_executor.replay.recording import Head, named_errors, no_run
+from mddag_executor.text import counted, listed
+from mddag_executor.trace import TraceReader
+from mddag_executor.trace.times import credible
+from msg_graph import Dag, TaskSet
+import numpy as np
+
+EXPIRE_AFTER_NS = 1_000_000_000
+_SLACK_NS = 1_000_000
+_PROGRESS_STEP = 4096
+_KEEP_LEGS = 65_536
+_BATCH = 16_384
+_START = 'ros2:callback_start'
+_OWN = ('mddag:job_release', 'mddag:dispatch')
+_DEFAULT_DEADLINE = 100_000_000
+
+
+class ImportedRun(LinkObserver):
+    """
+    A recorded run of another executor.
+
+    :param reader: of the trace, which no declaration is in.
+    :param name: what messages call the trace.
+    :param task_set: the declaration that judges; None: there is none.
+    :raises mddag_executor.trace.TraceError: when it can no longer be read.
+    :raises ReplayError: when no callback runs in it, or none of the declaration's callbacks.
+    """
+
+    declared = False
+    same = False
+
+    def __init__(self, reader: TraceReader, name: str, task_set: TaskSet | None) -> None:
+        self._reader = reader
+        self.name = name
+        first: int | None = None
+        threads: set[tuple[int, int]] = set()
+        own = False
+        init: list[tuple[str, dict[str, Any]]] = []
+        for event in reader.layout_events(INIT_EVENTS | {_START, *_OWN}):
+            name_of_event = event[0].name
+            if name_of_event == _START:
+                threads.add(event[2:4])
+                first = event[1] if first is None else first
+            elif name_of_event in _OWN:
+                own = True      # of this executor, but what it ran is lost
+            else:
+                init.append((name_of_event, fields_of(event)))
+        if first is None or own:
+            raise no_run(reader)
+        #: Who is who in it.
+        self.entities = Entities(init)
+        # What another executor goes by is not recorded; it takes the place of the pool.
+        self.head = Head(first, '', '', 'ros2', len(threads), _DEFAULT_DEADLINE, 0, False)
+        self._matching = Matching(name, self.entities, threads, task_set)
+        #: The declaration that judges.
+        self.task_set = self._matching.task_set
+        self.targets = self._matching.target
+        #: The first release or the time at which the first execution became ready, ns.
+        self.start: int | None = None
+        #: The last event's time, ns.
+        self.end = min(max(0, first), NEVER - 1)
+        self.shut_down = False
+        self.jobs = 0
+        self.dropped: Counter[str] = Counter()
+        self._doubts = Doubts(self.task_set.dags)
+        self._linker = Linker(self.entities, self)
+        self._workers: dict[tuple[int, int], int] = {}
+        self._timers = _Timers()
+        self._fallbacks: Counter[str] = Counter()
+        self._order: list[int] = []
+        self._rows: dict[int, list[tuple[int, ...]]] = {}
+        self._number = 0
+        self._graph()
+
+    def _graph(self) -> None:
+        """Look up who starts whom: sources by callback, successors by vertex and callback."""
+        self._dags: tuple[Dag, ...] = self.task_set.dags
+        self._source: dict[str, tuple[int, int]] = {}
+        self._next: dict[tuple[int, str], int] = {}
+        self._sizes: dict[int, int] = {}
+        # by the vertices before and after, and the place of the topic
+        self._leg: dict[tuple[int, int, int], int] = {}
+        first = 0
+        for dag in self._dags:
+            source = dag.vertices[dag.source]
+            self._source[source.callback.key] = dag.index, first + dag.source
+            for vertex in dag.vertices:
+                legs = legs_of(vertex, dag.vertices)
+                self._sizes[first + vertex.index] = max(1, len(legs))
+                for leg, (topic, before) in enumerate(legs):
+                    self._leg[(first + before, first + vertex.index, topic)] = leg
+                for after in vertex.successors:
+                    key = dag.vertices[after].callback.key
+                    self._next[(first + vertex.index, key)] = first + after
+            first += len(dag.vertices)
+        self._newest = [-1] * len(self._dags)
+        self._open: list[deque[tuple[int, int]]] = [deque() for _ in self._dags]
+        self._active: Counter[tuple[int, int]] = Counter()
+        self._patience = [
+            EXPIRE_AFTER_NS + max(dag.vertices[s].deadline_ns or 0 for s in dag.sinks)
+            for dag in self._dags]
+        self._legs: dict[tuple[int, int], set[int]] = {}
+
+    @property
+    def lost(self) -> int:
+        """Return how many events the tracer says to have discarded."""
+        return self._linker.losses.discarded
+
+    @property
+    def unjudged(self) -> dict[int, int]:
+        """Return by DAG how many jobs there are of which nobody can tell what they did."""
+        return self._doubts.withdrawn
+
+    def play(
+        self, observers: Sequence[Observer], progress: Function[[int], None] | None = None
+    ) -> None:
+        """
+        Tell the observers everything.
+
+        They are told of callbacks and groups as a trace of this executor would, but with the
+        numbers of callbacks in place of addresses.
+
+        :param progress: told now and then how many events there have been.
+        """
+        self._observers = observers
+        self._links = [each for each in observers if isinstance(each, LinkObserver)]
+        self._tell_groups(merged([observer.handlers() for observer in observers]))
+        more = merged([observer.raw_handlers() for observer in self._links])
+        count = 0
+        take, linked = self._linker.take, self._linker.events
+        with named_errors(self._reader.path, self.name):
+            for event in self._reader.layout_events({*linked, *more}):
+                name = event[0].name
+                if name in more:
+                    more[name](as_table(event))
+                if name not in linked:
+                    continue
+                take(event)
+                count += 1
+                if event[1] > self.end:
+                    self.end = event[1]
+                if len(self._order) >= _BATCH:
+                    self._flush()
+                if progress is not None and count % _PROGRESS_STEP == 0:
+                    progress(count)
+        self._linker.finish()
+        for dag, jobs in enumerate(self._open):
+            for release, job in jobs:
+                self._close(dag, job, release)
+        self._flush()
+        batch = Batch((), {})
+        for observer in observers:
+            observer.finished(self.end, batch)
+            observer.take(batch)
+
+    def _tell(self, kind: int, *row: int) -> None:
+        self._order.append(kind)
+        self._rows.setdefault(kind, []).append(row)
+
+    def _flush(self) -> None:
+        """Tell the observers what happened so far."""
+        batch = Batch(self._order, self._rows)
+        self._order, self._rows = [], {}
+        for observer in self._observers:
+            observer.take(batch)
+
+    def _tell_groups(self, who: Handlers) -> None:
+        """Tell of callbacks and their groups, by numbers of callbacks."""
+        def tell(name: str, *fields: Any) -> None:
+            if name in who:
+                who[name]((name, self.head.time, 0, 0, *fields))
+
+        for callback in self.entities.every:
+            tell('ros2:rclcpp_callback_register', callback.number,
+                 callback.label or callback.description)
+            if callback.group is None or callback.kind not in (
+                    'timer', 'subscription', 'service'):
+                continue
+            kind = 'reentrant' if callback.group < 0 else 'mutually_exclusive'
+            tell('ros2_caret:add_callback_group', 0, callback.group, kind)
+            tell(f'ros2_caret:callback_group_add_{callback.kind}', callback.group,
+                 callback.number)
+
+    # --- executions ------------------------------------------------------------------------------
+
+    def began(self, run: Execution, message: Publication | None) -> None:
+        """Take in that an execution has begun."""
+        target = self.targets.get(run.callback.number)
+        run.ready = self._ready(run, message)
+        if target is not None:
+            self._assign(run, target, message)
+        if self.start is None or run.ready < self.start:
+            self.start = run.ready
+        for observer in self._links:
+            observer.began(run, message)
+        if target is not None and run.of is not None:
+            dag, vertex, job = run.of
+            self._active[(dag, job)] += 1
+            self._tell(STARTED, dag, vertex, job, run.ready, run.start, run.callback.number)
+
+    def _ready(self, run: Execution, message: Publication | None) -> int:
+        if run.callback.kind == 'timer':
+            return self._timers.release(run.callback, run.start)
+        stamp = run.stamp if credible(run.stamp, run.start) else 0
+        sent = stamp or (message.stamp or message.time if message is not None else 0)
+        return min(sent or run.taken or run.start, run.start)
+
+    def _assign(self, run: Execution, target: Target, message: Publication | None) -> None:
+        """Find the job that an execution belongs to."""
+        key = target.callback.key
+        if key in self._source:
+            dag, vertex = self._source[key]
+            job = self._newest[dag] = self._newest[dag] + 1
+            release = self._release(run, self._dags[dag], target)
+            if run.callback.kind != 'timer':
+                run.ready = max(run.ready, min(release, run.start))
+            run.of = dag, vertex, job
+            self._expire(run.start)
+            self.jobs += 1
+            self._doubts.opened(dag, job)
+            self._open[dag].append((release, job))
+            if self.start is None or release < self.start:
+                self.start = release
+            self._tell(RELEASED, dag, job, release, run.start)
+        elif message is None or message.run is None:
+            self._doubts.ran_for_unknown(key, run.start, message is not None or run.stamp != 0)
+        elif message.run.of is not None:
+            dag, before, job = message.run.of
+            after = self._next.get((before, key))
+            if after is not None:
+                run.of = dag, after, job
+                run.leg = self._leg.get((before, after, target.leg), 0)
+
+    def _release(self, run: Execution, dag: Dag, target: Target) -> int:
+        """Return the release of a source's execution."""
+        if run.callback.kind == 'timer':
+            return run.ready
+        wanted = dag.release_from
+        if wanted == 'header_stamp' and credible(run.stated, run.start):
+            return min(run.stated, run.start)
+        if wanted != 'arrival':
+            known = credible(run.stamp, run.start)
+            if not known or wanted == 'header_stamp':
+                self._fallbacks[f'{target.callback.key} ({wanted})'] += 1
+            if known:
+                return min(run.stamp, run.start)
+        return min(run.taken or run.start, run.start)
+
+    def over(self, run: Execution) -> None:
+        """Take in that an execution has ended."""
+        for observer in self._links:
+            observer.over(run)
+        dag, vertex, job = run.of if run.of is not None else (-1, -1, -1)
+        worker = self._workers.setdefault(run.thread, len(self._workers))
+        self._tell(RAN, run.callback.number, dag, vertex, job, worker, run.ready, run.start,
+                   run.end, 1)
+        if run.callback.number not in self.targets or dag < 0:
+            return
+        self._active[(dag, job)] -= 1
+        whole = self._is_whole(vertex, job, run.leg)
+        if whole:
+            self._doubts.done(dag, vertex, job)
+        self._number += 1
+        self._tell(COMPLETED, dag, vertex, job, run.leg, int(whole), run.end, run.ready,
+                   run.start, run.end, run.end - run.start, self._number)
+
+    def _is_whole(self, vertex: int, job: int, leg: int) -> bool:
+        """Tell whether an execution completes its vertex: of a sync's legs the last one does."""
+        if self._sizes[vertex] == 1:
+            return True
+        done = self._legs.setdefault((vertex, job), set())
+        done.add(leg)
+        if len(done) < self._sizes[vertex]:
+            if len(self._legs) > _KEEP_LEGS:
+                del self._legs[next(iter(self._legs))]
+            return False
+        del self._legs[(vertex, job)]
+        return True
+
+    def _expire(self, now: int) -> None:
+        for dag, jobs in enumerate(self._open):
+            while jobs and now - jobs[0][0] > self._patience[dag]:
+                if self._active[(dag, jobs[0][1])] > 0:
+                    break
+                release, job = jobs.popleft()
+                del self._active[(dag, job)]
+                if not self._close(dag, job, release):
+                    self._tell(ENDED, dag, job, 0, now)
+
+    def _close(self, dag: int, job: int, release: int) -> bool:
+        """Take a job that cannot be judged out of the run; tell whether it is one."""
+        doubted = self._doubts.close(dag, job, release)
+        if doubted:
+            self._tell(WITHDRAWN, dag, job)
+        return doubted
+
+    def lost_sight(self, callback: Callback | None, run: Execution | None, time: int) -> None:
+        """Take in that something is not recorded."""
+        if callback is None:
+            self._doubts.discarded(time)
+        elif (target := self.targets.get(callback.number)) is not None:
+            self._doubts.ran_for_unknown(target.callback.key, time)
+        if run is not None and run.of is not None:
+            dag, _, job = run.of
+            self._active[(dag, job)] -= 1
+
+    def sent(self, message: Publication) -> None:
+        """Take in that a message was published."""
+        of = None if message.run is None else message.run.of
+        if of is not None and (message.stamp or message.within):
+            self._doubts.sent(of[0], of[2], message.topic)
+        for observer in self._links:
+            observer.sent(message)
+
+    def took(self, run: Execution, message: Publication) -> None:
+        """Take in that a callback took a message itself."""
+        for observer in self._links:
+            observer.took(run, message)
+
+    # --- what to say -----------------------------------------------------------------------------
+
+    @property
+    def warnings(self) -> list[str]:
+        """Return what is missing or doubtful, one line each, once it has been played."""
+        name, path = self.name, self._reader.path
+        lines = [name + text[len(path):] if text.startswith(path) else text
+                 for text in self._reader.warnings]
+        if self.entities.incomplete:
+            lines.append(
+                f'{name}: left out: {counted(self.entities.incomplete, "event")} of the '
+                'initialisation without some of the fields')
+        lines += self._matching.warnings
+        lines += [f'{name}: {text}' for text in self._linker.losses.lines()]
+        if self._doubts.withdrawn:
+            dags = [f'{self._dags[dag].name} ({n})' for dag, n in self._doubts.withdrawn.items()]
+            lines.append(
+                f'{name}: not judged, because what is missing may be theirs: '
+                f'{counted(sum(self._doubts.withdrawn.values()), "job")}: {listed(dags)}')
+        lines.extend(f'{name}: {text}' for text in self._timers.lines())
+        if self._fallbacks:
+            lines.append(
+                f'{name}: {counted(sum(self._fallbacks.values()), "release")} by the next best '
+                'stamp, because the declared one is not recorded or '
+                'years away: '
+                f'{listed(list(self._fallbacks))}')
+        if self._dags and self.jobs == 0:
+            lines.append(f'{name}: no job was released in it')
+        return lines
+
+
+class _Timers:
+    """The releases of timers (rule 1)."""
+
+    def __init__(self) -> None:
+        self._last: dict[int, int] = {}
+        self._without: Counter[str] = Counter()
+        self._off: Counter[str] = Counter()
+        self._skipped: Counter[str] = Counter()
+
+    def release(self, timer: Callback, start: int) -> int:
+        """Return the release of an execution."""
+        if timer.grid is None or timer.period <= 0:
+            self._without[timer.label] += 1
+            return start
+        slack = min(_SLACK_NS, timer.period // 10)
+        n = (start - timer.grid + slack) // timer.period
+        last = self._last.get(timer.number)
+        if n < 1 or (last is not None and n <= last):
+            self._off[timer.label] += 1
+            return start
+        if last is not None and n > last + 1:
+            self._skipped[timer.label] += n - last - 1
+        self._last[timer.number] = n
+        return min(timer.grid + n * timer.period, start)
+
+    def lines(self) -> list[str]:
+        """Return what to say about them."""
+        said = (
+            (self._without, 'execution', 'of timers whose initialisation is not in it: released '
+             'when it started'),
+            (self._off, 'execution', 'of timers off the grid of the period (reset, or by another '
+             'clock): released when it started'),
+            (self._skipped, 'period', 'of timers passed without an execution (late by more than '
+             'one, or events were lost): without a job'))
+        return [f'{counted(sum(counts.values()), noun)} {text}: '
+                + listed([f'{name} ({n})' for name, n in counts.most_common()])
+                for counts, noun, text in said if counts]
+
+
+class ImportedPaths(LinkObserver):
+    """Collects the flows along the declared paths of an imported run."""
+
+    def __init__(self, run: ImportedRun) -> None:
+        self.book = PathBook(run.task_set, kept=KEEP)
+        self._target = run.targets
+        self._order = 0
+        self._told: list[list[tuple[int, ...]]] = [[], [], [], []]
+        self._number = 0
+
+    def take(self, batch: Batch) -> None:
+        """Hand over what was told since the last batch."""
+        self.book.tell(self._order + 1, *(
+            np.array(rows, dtype=np.int64).reshape(len(rows), width)
+            for rows, width in zip(self._told, (7, 4, 7, 4))))
+        self._order, self._told = 0, [[], [], [], []]
+
+    def _tell(self, what: int, run: Execution | None, *row: int) -> None:
+        """Note what a callback did, if it is on a path."""
+        target = None if run is None else self._target.get(run.callback.number)
+        if run is None or target is None or target.callback.key not in self.book.on_path:
+            return
+        self._order += 1
+        self._told[what].append(
+            (self._order, self.book.callbacks[target.callback.key], *row))
+
+    def began(self, run: Execution, message: Publication | None) -> None:
+        """Take in that an execution has begun."""
+        self._number += 1
+        run.number = self._number
+        target = self._target.get(run.callback.number)
+        topic = '' if target is None else target.topic
+        self._tell(0, run, run.number, run.start,
+                   self.book.topics.get(topic, -2) if topic else -1,
+                   -1 if message is None else message.number, -1)
+
+    def over(self, run: Execution) -> None:
+        """Take in that an execution has ended."""
+        self._tell(1, run, run.number, run.end)
+
+    def sent(self, message: Publication) -> None:
+        """Take in that a message was published."""
+        self._number += 1
+        message.number = self._number
+        publisher, run = message.publisher, message.run
+        if (publisher is None or publisher.node is None
+                or publisher.topic not in self.book.topics):
+            return
+        node, topic = publisher.node.name, self.book.topics[publisher.topic]
+        target = None if run is None else self._target.get(run.callback.number)
+        if target is not None and run is not None and target.callback.node == node:
+            self._tell(2, run, -1, run.number, topic, message.number, message.time)
+        else:
+            self._order += 1
+            self._told[2].append((
+                self._order, -1, self.book.nodes.get(node, -1), -1, topic, message.number,
+                message.time))
+
+    def took(self, run: Execution, message: Publication) -> None:
+        """Take in that a callback took a message itself."""
+        self._tell(3, run, run.number, message.number)

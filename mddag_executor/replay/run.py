@@ -1,0 +1,62 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded runs of every kind: one place to tell them apart."""
+
+from __future__ import annotations
+
+import os
+
+from mddag_executor.replay.imported_run import ImportedRun
+from mddag_executor.replay.own import OwnRun
+from mddag_executor.replay.recording import named_errors, read_head, ReplayError
+from mddag_executor.trace import TraceReader
+from msg_graph import TaskSet
+
+Run = OwnRun | ImportedRun
+"""
+What all have: ``play``, and
+
+* ``name`` of the recording, its ``head`` (policy, workers, …), the ``task_set`` that judges,
+  ``declared``: whether the recording itself says which deadlines there are, and ``same``: whether
+  these judge;
+* once it has been played: ``start`` and ``end`` (ns), ``shut_down``: whether the end is recorded,
+  ``lost`` events, ``dropped`` messages by reason, and ``warnings``.
+"""
+
+
+def open_run(
+    path: str | os.PathLike[str], task_set: TaskSet | None = None, name: str | None = None,
+    needs_declaration: bool = False,
+) -> Run:
+    """
+    Open a recorded run, of this executor or of another one.
+
+    :param task_set: the declaration that judges; None: the one in the trace, if it has one.
+    :param name: what messages call the trace, where that is not its path.
+    :param needs_declaration: whether there must be one.
+    :raises mddag_executor.trace.TraceError: when it is no trace.
+    :raises ReplayError: when no run is recorded in it, or none of the declaration's callbacks.
+    :raises msg_graph.GraphError: when the recorded declaration is wrong.
+    """
+    path = os.fspath(path)
+    with named_errors(path, name or path):
+        reader = TraceReader(path)
+        head = read_head(reader)
+        if head is not None:
+            return OwnRun(reader, name or path, head, task_set)
+        run = ImportedRun(reader, name or path, task_set)
+    if needs_declaration and task_set is None:
+        raise ReplayError(
+            run.name, 'it was imported, so nothing in it says which callbacks have which '
+            'deadlines', 'give the GRAPH')
+    return run
+
+
+def is_own(path: str | os.PathLike[str], name: str | None = None) -> bool:
+    """
+    Tell whether a trace was recorded by this executor.
+
+    :raises mddag_executor.trace.TraceError: when it is no trace.
+    """
+    with named_errors(os.fspath(path), name or os.fspath(path)):
+        return read_head(TraceReader(path)) is not None
