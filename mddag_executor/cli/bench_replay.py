@@ -90,7 +90,6 @@ def main(args: argparse.Namespace) -> int:
 # --- speed ---------------------------------------------------------------------------------------
 
 def _speed(args: argparse.Namespace, folder: str) -> dict[str, Any]:
-    from mddag_executor.replay.fast_compile import prepare, WORTH_LOADING
     from mddag_executor.replay.measure import measure, OTHERS, READERS, write_long_trace
     from mddag_executor.trace import TraceReader
     path = args.trace
@@ -100,8 +99,6 @@ def _speed(args: argparse.Namespace, folder: str) -> dict[str, Any]:
         with Progress('writing the trace', args.events) as line:
             write_long_trace(path, task_set, args.events, progress=line.update)
     events = TraceReader(path).message_count
-    if events is not None and events >= WORTH_LOADING:
-        prepare()       # once and for all, which is no part of what is measured
     rows: dict[str, dict[str, Any]] = {}
     with Progress('measuring', len(READERS) * args.repeat) as line:
         for turn in range(args.repeat):

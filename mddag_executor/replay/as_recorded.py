@@ -49,11 +49,13 @@ class Replay:
         self.usage = Usage(run.task_set, waits)
         self.names = CallbackNames()
         self.tally = self.judge.tally
-        self._seen = Communications() if isinstance(run, ImportedRun) else None
+        self._seen: Communications | None = None
         self._paths: ImportedPaths | OwnPaths | None = None
         self._drift: ImportedDrift | OwnDrift | None = None
-        if paths and isinstance(run, ImportedRun):
-            self._paths, self._drift = ImportedPaths(run), ImportedDrift(run)
+        if isinstance(run, ImportedRun):
+            self._seen = Communications()
+            if paths:
+                self._paths, self._drift = ImportedPaths(run), ImportedDrift(run)
         elif paths:
             self._paths, self._drift = OwnPaths(run.task_set), OwnDrift(run)
         observers = [waits, self.judge, self.usage, self._paths, self._drift, self._seen,

@@ -230,7 +230,7 @@ class Chains:
                 times.longest = int(response[worst])
                 links = chain[first[worst]:first[worst] + lengths[worst]][::-1].tolist()
                 times.worst = Worst(
-                    *(int(column[worst]) for column in (job, release, completed)),
+                    int(job[worst]), int(release[worst]), int(completed[worst]),
                     [Step(link[0], link[1], Execution(*link[2:6]), link[6]) for link in links],
                     Breakdown(*parts[:-1, worst].tolist()))
 

@@ -66,7 +66,7 @@ class OwnDrift(Observer):
 
     def take(self, batch: Batch) -> None:
         """Count releases, dispatches and who publishes what."""
-        first = []
+        first: list[tuple[int, int]] = []
         if _RELEASE in batch.events:
             places, rows = batch.events[_RELEASE]
             known = (rows[:, FIELD] >= 0) & (rows[:, FIELD] < len(self._sources))

@@ -359,7 +359,7 @@ def fields_of(event: tuple[Any, ...]) -> Fields:
 
 
 def as_table(event: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return an event of ``TraceReader.layout_events`` with the table's fields, None if not there."""
+    """Return an event of ``layout_events`` with the table's fields; None is one that it lacks."""
     values = dict(zip(event[0].fields, event[4:]))
     wanted = EVENTS[event[0].name].fields if event[0].name in EVENTS else ()
     return (event[0].name, *event[1:4], *(values.get(field) for field, _ in wanted))

@@ -165,18 +165,22 @@ class Observer:
     ) -> None:
         """Take in that an execution of a vertex was dispatched (or a coroutine went on)."""
 
-    def ran(self, *piece: Any) -> None:
+    def ran(
+        self, callback: int, dag: int, vertex: int, job: int, worker: int, ready: int, start: int,
+        end: int, first: int,
+    ) -> None:
         """Take in that a callback ran; see ``Piece``."""
 
     def completed(
-        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, *execution: int
+        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, ready: int,
+        start: int, ended: int, busy: int, number: int,
     ) -> None:
         """
         Take in that an execution of a vertex has completed.
 
         :param whole: whether that completed the vertex, as the executor saw it.
-        :param execution: see ``Execution``; the same number again for further legs that one
-            execution completes.
+        :param ready: of the execution, as ``start`` to ``number``: see ``Execution``; the same
+            number again for further legs that one execution completes.
         """
 
     def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:

@@ -109,8 +109,8 @@ class Judge(Observer):
         # by job, as one number
         self._slots: dict[int, int] = {}
         self._others: dict[int, Any] = {
-            RELEASED: self.released, ENDED: self.ended, WITHDRAWN: self.withdrawn,
-            FAILED: self.failed, MISSED: self.missed}
+            RELEASED: self._released, ENDED: self._ended, WITHDRAWN: self._withdrawn,
+            FAILED: self._failed, MISSED: self._missed}
         self._newest: dict[int, int] = {}
         #: Whether recorded misses must equal those found.
         self.compare = compare
@@ -205,7 +205,7 @@ class Judge(Observer):
     def _key_of_job(self, dag: int, job: int) -> int:
         return job * self.tables.n_dags + dag
 
-    def released(self, dag: int, job: int, release: int, now: int) -> int:
+    def _released(self, dag: int, job: int, release: int, now: int) -> int:
         """Open the job."""
         slot = self._scheduler.release(dag, job, release, now)
         key = self._newest[dag] = self._key_of_job(dag, job)
@@ -215,7 +215,7 @@ class Judge(Observer):
         self.chains.begin(self._scheduler.state.job_base[slot], dag)
         return slot
 
-    def ended(self, dag: int, job: int, aborted: bool, now: int) -> int:
+    def _ended(self, dag: int, job: int, aborted: bool, now: int) -> int:
         """End an open job as it was recorded."""
         slot = self._slots.get(self._key_of_job(dag, job), -1)
         if slot < 0:
@@ -227,21 +227,21 @@ class Judge(Observer):
             self._scheduler.expire(slot, now)
         return slot
 
-    def withdrawn(self, dag: int, job: int) -> int:
+    def _withdrawn(self, dag: int, job: int) -> int:
         """Close a job that is open without a verdict."""
         slot = self._slots.pop(self._key_of_job(dag, job), -1)
         if slot >= 0:
             self._scheduler.withdraw(slot)
         return -1
 
-    def failed(self, dag: int, vertex: int, job: int, now: int) -> int:
+    def _failed(self, dag: int, vertex: int, job: int, now: int) -> int:
         """Fail an open job."""
         slot = self._slots.get(self._key_of_job(dag, job), -1)
         if slot >= 0:
             self._scheduler.fail_open(slot, now)
         return slot
 
-    def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> int:
+    def _missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> int:
         """Compare a recorded miss."""
         if self.compare:
             self.n_recorded += 1

@@ -6,8 +6,8 @@ What belongs together in a recording of CARET or ros2_tracing: executions and th
 Theory of operation
 -------------------
 Two stages go through the events in the order of time.  The first keeps what each thread does; the
-second, `LAG_NS` of recorded time later, tells its observer, also in the order of time: a subscriber
-may run before the tracer has recorded the stamp of the message that it runs for.
+second, `LAG_NS` of recorded time later, tells its observer, also in the order of time: a
+subscriber may run before the tracer has recorded the stamp of the message that it runs for.
 
 1. *Executions*: `callback_start` to the next `callback_end` of the same callback in the same
    thread (CARET: of the same address; that is the same, except where a callback runs in several

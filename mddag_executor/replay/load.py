@@ -37,8 +37,8 @@ from typing import NamedTuple
 
 from mddag_executor.core import legs_of, quantile, Tables
 from mddag_executor.replay.dispatches import Dispatches
-from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.groups import RecordedGroups
+from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.timed import edge_numbers, edges_of, Transports
 from mddag_executor.simulate import Load
 from msg_graph import Dag, TaskSet

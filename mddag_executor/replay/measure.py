@@ -179,15 +179,9 @@ def _read_sorted(path: str, limit: int) -> int:
 
 
 def _link(path: str, limit: int) -> int:
-    from mddag_executor.replay.follower import Follower
-    from mddag_executor.replay.mapping import Mapping
-    from mddag_executor.replay.recording import Recording
-    recording = Recording(path)
-    follower = Follower(recording, Mapping(recording, None), [])
-    follower.run()
-    if recording.warnings:
-        raise MddagError(recording.warnings[0])
-    return recording.message_count or 0
+    from mddag_executor.replay.run import open_run
+    open_run(path).play([])
+    return TraceReader(path).message_count or 0
 
 
 def _replay(path: str, limit: int) -> int:
@@ -197,10 +191,9 @@ def _replay(path: str, limit: int) -> int:
     return TraceReader(path).message_count or 0
 
 
-def _replay_plain(path: str, limit: int) -> int:
-    from mddag_executor.replay import as_recorded
-    outcome = as_recorded.replay(path, compiled=False)
-    assert outcome.result()['dags']
+def _reschedule(path: str, limit: int) -> int:
+    from mddag_executor.replay import reschedule
+    assert reschedule(path).result()['dags']
     return TraceReader(path).message_count or 0
 
 
@@ -235,7 +228,7 @@ READERS: dict[str, Callable[[str, int], int]] = {
     'events in the order of time': _read_sorted,
     'read and linked': _link,
     'replayed as recorded': _replay,
-    'replayed in plain Python': _replay_plain,
+    'rescheduled': _reschedule,
     'mcap, undecoded': _mcap,
     'rosbags, undecoded': _rosbags,
 }

@@ -422,7 +422,7 @@ class _Threads:
             return
         none = np.empty(0, dtype=np.int64), np.empty((0, _WIDTH), dtype=np.int64)
         where, of = zip(*(numbers.get(name, none) for name in _OF_THREAD))
-        n_last, n_running = len(self._last), len(self._running)
+        n_running = len(self._running)
         dispatch = np.concatenate([self._running[:, :_WIDTH], of[_IS_DISPATCH]])
         since = np.concatenate([self._running[:, _WIDTH], of[_IS_DISPATCH][:, NOW]])
         dag, vertex = self._of.of(dispatch[:, FIELD + 1], dispatch[:, FIELD + 2])

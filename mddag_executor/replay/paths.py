@@ -27,9 +27,9 @@ By default, as in CARET, a path's time runs from the first publication to the st
 callback's execution; ``whole`` figures run from the start of the first callback's execution to the
 end of the last one's.
 
-A *place* is a position in a path, a *step* an execution or a publication there.  Steps are made for
-many events at once: place by place along each path, as what a place needs is known once the place
-before it is done.  Flows that are over are counted and forgotten (see ``path_forest`` and
+A *place* is a position in a path, a *step* an execution or a publication there.  Steps are made
+for many events at once: place by place along each path, as what a place needs is known once the
+place before it is done.  Flows that are over are counted and forgotten (see ``path_forest`` and
 ``path_stream``).
 """
 
@@ -40,7 +40,6 @@ from typing import Any, Literal, NamedTuple
 from mddag_executor.replay.happenings import Ints
 from mddag_executor.replay.path_forest import Bounds, bounds, NEVER, NONE, settle, Steps
 from mddag_executor.replay.path_stream import PathFigures
-from mddag_executor.replay.spread import KEEP_EXACT
 from msg_graph import Callback, Path, TaskSet
 import numpy as np
 
@@ -48,6 +47,8 @@ HopKind = Literal['trigger', 'topic', 'variable']
 
 SETTLE = 1 << 18
 """Events from which on steps are made of them, and flows that are over are taken out."""
+KEPT = 4096
+"""Executions and messages of a place that may still be referred to, unless told otherwise."""
 LAG_NS = 1_000_000_000
 """Nothing is told later than this after it happened."""
 _ORDER = 40     # bits of an event's number in the order
@@ -93,15 +94,10 @@ class PathBook:
     Callbacks, topics and nodes are told by their numbers, executions and messages by any that
     tell them apart; -1 stands for none.
 
-    :param settle_at: how many events are collected before steps are made of them.
-    :param keep: up to how many response times quantiles are exact.
     :param kept: how many executions and messages of a place may still be referred to.
     """
 
-    def __init__(
-        self, task_set: TaskSet, settle_at: int = SETTLE, keep: int = KEEP_EXACT,
-        kept: int = 4096,
-    ) -> None:
+    def __init__(self, task_set: TaskSet, kept: int = KEPT) -> None:
         self.paths: list[Path] = list(task_set.paths)
         self.hops = [hops(task_set, path) for path in self.paths]
         self.callbacks = {c.key: i for i, c in enumerate(task_set.callbacks)}
@@ -111,11 +107,11 @@ class PathBook:
         self.topics = {topic: i for i, topic in enumerate(sorted(
             {topic for path in self.hops for hop in path for topic in hop.topics}))}
         self.on_path = {key for path in self.paths for key in path.callbacks}
-        self._figures = [PathFigures(keep) for _ in self.paths]
+        self._figures = [PathFigures() for _ in self.paths]
         self._places = [self._place(task_set, number, position)
                         for number, path in enumerate(self.paths)
                         for position in range(len(path.callbacks))]
-        self._settle_at, self._kept = settle_at, kept
+        self._kept = kept
         self._told: list[list[Ints]] = [[], [], [], []]
         self._order = 1     # 0: in a round before
         self._waiting = 0
@@ -167,7 +163,7 @@ class PathBook:
                 told.append(rows)
                 self._waiting += len(rows)
         self._order += length
-        if self._waiting >= self._settle_at:
+        if self._waiting >= SETTLE:
             self._round()
             self._settle(False)
 

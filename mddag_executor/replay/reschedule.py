@@ -45,8 +45,9 @@ class Reschedule:
     """
 
     def __init__(
-        self, recorded: Replay, work: RecordedLoad, tables: Tables, policy: str, workers: int, preemptive: bool, overheads: bool,
-        dispatch_overhead: int = 0, judge_from: int = -NEVER, skip: int = 0,
+        self, recorded: Replay, work: RecordedLoad, tables: Tables, policy: str, workers: int,
+        preemptive: bool, overheads: bool, dispatch_overhead: int = 0,
+        judge_from: int = -NEVER, skip: int = 0,
     ) -> None:
         self._work = work
         self.recorded = recorded

@@ -174,11 +174,14 @@ class Exporter(Observer):
         if self._origin is None:
             self._origin = release
 
-    def ran(self, *values: Any) -> None:
+    def ran(
+        self, callback: int, dag: int, vertex: int, job: int, worker: int, ready: int, start: int,
+        end: int, first: int,
+    ) -> None:
         """Take in an execution, and hand it out or hold it back."""
         self._hand_out_completed()
-        piece = Piece(*values)
-        callback, dag, vertex, job, worker, ready, start, end, first = piece
+        piece = Piece(
+            callback, dag, vertex, job, worker, ready, start, end, bool(first))
         release = self._jobs.get((dag, job)) if vertex >= 0 else None
         reference = None if release is None else release + self._tables.rad_offset[vertex]
         row = ExecutionRow(

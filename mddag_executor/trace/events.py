@@ -28,16 +28,12 @@ class Table(NamedTuple):
     rows: Any
     places: Ints
 
-    def column(self, field: str) -> Ints:
-        """Return a field as numbers of 64 bits; what needs all 64 without a sign wraps."""
-        return self.rows[field].astype(np.int64)
-
 
 class Events:
     """
     A batch of events in order.
 
-    Messages of a fixed layout are decoded by numpy, all of a kind at once, when they are asked for.
+    Messages of a fixed layout are decoded by numpy, all of a kind at once.
 
     :param data: in which messages begin at ``positions``.
     :param channels: of each event its channel, ``OTHER``: it is in ``others``, at its position.
@@ -62,7 +58,8 @@ class Events:
         """Yield the events of fixed layouts, channel by channel."""
         order = np.argsort(self._channels, kind='stable')
         channels = self._channels[order]
-        starts = np.flatnonzero(np.r_[True, channels[1:] != channels[:-1]]) if len(order) else []
+        begins = np.r_[True, channels[1:] != channels[:-1]][:len(order)]
+        starts = np.flatnonzero(begins).tolist()
         for start, end in zip(starts, [*starts[1:], len(order)]):
             number = int(channels[start])
             if number != OTHER:

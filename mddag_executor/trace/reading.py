@@ -61,6 +61,11 @@ class _Loaded(NamedTuple):
     positions: Ints
     others: list[Event]
 
+    def some(self, which: Any) -> _Loaded:
+        """Return it with some of the events."""
+        return self._replace(times=self.times[which], channels=self.channels[which],
+                             positions=self.positions[which])
+
 
 class Reading:
     """One pass over a file: what it found, and what it could not use."""
@@ -126,7 +131,9 @@ class Reading:
             return Events(part.data, part.channels, part.positions, part.others, fixed)
         if not parts:
             return Events(b'', np.empty(0, np.uint16), np.empty(0, np.int64), [], fixed)
-        positions, others, length = [], [], 0
+        positions: list[Ints] = []
+        others: list[Event] = []
+        length = 0
         for part in parts:
             other = part.channels == OTHER
             positions.append(np.where(other, len(others), length) + part.positions)
@@ -160,13 +167,10 @@ class Reading:
         if not plain(int(times.min()), int(times.max())):
             kept = np.ones(len(times), dtype=np.bool_)
             kept[self._times.impossible(times.tolist())] = False
-            found = found._replace(times=times[kept], channels=found.channels[kept],
-                                   positions=found.positions[kept])
+            found = found.some(kept)
             times = found.times
         if (times[1:] < times[:-1]).any():
-            order = np.argsort(times, kind='stable')
-            found = found._replace(times=times[order], channels=found.channels[order],
-                                   positions=found.positions[order])
+            found = found.some(np.argsort(times, kind='stable'))
         if len(times) and found.times[0] < block.start_time:
             raise Damage('a chunk holds an event from before the time in its head', block.offset)
         return found
@@ -330,12 +334,9 @@ def _taken(loaded: dict[int, _Loaded], before: int | None) -> list[_Loaded]:
     for number in sorted(loaded):
         part = loaded[number]
         count = len(part.times) if before is None else int(np.searchsorted(part.times, before))
-        columns = part.times, part.channels, part.positions
         if count:
-            taken.append(part._replace(**dict(zip(part._fields[1:4], (c[:count] for c in columns)))))
+            taken.append(part.some(slice(None, count)))
+            loaded[number] = part.some(slice(count, None))
         if count == len(part.times):
             del loaded[number]
-        elif count:
-            loaded[number] = part._replace(
-                **dict(zip(part._fields[1:4], (c[count:] for c in columns))))
     return taken

@@ -9,8 +9,9 @@ import tempfile
 
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from mddag_executor.core import NEVER
 from mddag_executor.replay import replay, ReplayError
-from mddag_executor.trace import TraceFile
+from mddag_executor.trace import reading, TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
@@ -340,8 +341,8 @@ def test_events_that_make_no_sense_are_counted(tmp_path: Path) -> None:
     outcome = replay(path)
     assert outcome.result()['dags']['/camera']['ends']['completed'] == 1
     assert outcome.warnings == [
-        f'{path}: left out: 8 events that make no sense, most often (2) mddag:job_release of a '
-        'DAG that is not declared',
+        f'{path}: left out: 8 events that make no sense, most often (2) mddag:complete of a '
+        'vertex that is not declared',
         f'{path}: left out: 3 events that contradict earlier ones']
 
 
@@ -376,9 +377,12 @@ def test_a_trace_of_another_program(tmp_path: Path) -> None:
         replay(path, small())
 
 
-def test_memory_depends_on_open_jobs(tmp_path: Path) -> None:
+def test_memory_depends_on_open_jobs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is kept of jobs that have ended is their response times; both runs have many chunks."""
     import tracemalloc
+    monkeypatch.setattr(reading, '_BATCH', 1)
     sizes = []
     for duration in (2_000, 10_000):
         path = tmp_path / f'{duration}.mcap'
@@ -390,3 +394,20 @@ def test_memory_depends_on_open_jobs(tmp_path: Path) -> None:
         tracemalloc.stop()
         assert outcome.warnings == []
     assert sizes[1] < 2 * sizes[0]
+
+
+@pytest.mark.parametrize('skip', [0, 100 * MS])
+def test_verdicts_begin_when_all_programs_have_started(tmp_path: Path, skip: int) -> None:
+    path = tmp_path / 'a.mcap'
+    VirtualRun(path, small(), 4, duration=400 * MS)
+    events = list(TraceReader(path).events(sorted=True))
+    start = events[len(events) // 3][1]
+    jobs = sum(name == 'mddag:job_release' and release >= start + skip
+               for name, *_, release in events)
+    with TraceFile(path) as file:
+        for i, (name, time, pid, thread, *fields) in enumerate(events):
+            file.add(name, time, pid, thread, *fields)
+            if i in (0, len(events) // 3):
+                file.add('mddag:judge_from', time, pid, thread, start if i else NEVER)
+    found = replay(path, skip=skip).result()['dags'].values()
+    assert sum(dag['jobs'] for dag in found) == jobs > 0

@@ -10,16 +10,17 @@ import os
 from pathlib import Path
 from typing import Any
 
-from mddag_executor.replay import imported_jobs, links, replay, reschedule
-from mddag_executor.replay.following import make_follower, map_recording, open_recording
-from mddag_executor.replay.imported_jobs import ImportedFollower
-from mddag_executor.replay.linked import Publication, Run
+from mddag_executor.replay import imported_run, paths, replay, reschedule
+from mddag_executor.replay.imported_run import ImportedPaths, ImportedRun
+from mddag_executor.replay.linker import Execution, LinkObserver, Publication
 from mddag_executor.replay.paths import PathBook
+from mddag_executor.replay.run import open_run
 from mddag_executor.trace import import_ctf
 from msg_graph import loads, TaskSet
 import pytest
 
 from .cases_by_hand import slow_cases
+from .flows import flows, note_steps
 
 # not a part of the repository: looked for beside it
 BESIDE = Path(__file__).resolve().parents[3] / 'shared' / 'caret'
@@ -74,34 +75,33 @@ def graph() -> TaskSet:
     return loads(GRAPH, 'sample.yaml')
 
 
-class Told:
+class Told(LinkObserver):
     """Keeps what the linker says."""
 
     def __init__(self) -> None:
-        self.runs: list[Run] = []
-        self.sent: list[Publication] = []
+        self.runs: list[Execution] = []
+        self.messages: list[Publication] = []
         self.arrived: dict[tuple[int, str], int] = {}
 
-    def started(self, run: Run, message: Publication | None) -> None:
+    def began(self, run: Execution, message: Publication | None) -> None:
         if message is not None:
             self.arrived[(id(message), run.callback.label)] = run.start
 
-    def ended(self, run: Run) -> None:
+    def over(self, run: Execution) -> None:
         self.runs.append(run)
 
-    def published(self, message: Publication) -> None:
-        self.sent.append(message)
+    def sent(self, message: Publication) -> None:
+        self.messages.append(message)
 
 
 @pytest.fixture(scope='module')
-def told(trace: Path, graph: TaskSet) -> tuple[Told, ImportedFollower]:
-    recording = open_recording(trace)
-    told = Told()
-    follower = make_follower(recording, map_recording(recording, graph), [], sinks=[told])
-    assert isinstance(follower, ImportedFollower)
-    follower.run()
-    assert follower.warnings() == []
-    return told, follower
+def told(trace: Path, graph: TaskSet) -> tuple[Told, PathBook]:
+    run = open_run(trace, graph)
+    assert isinstance(run, ImportedRun)
+    told, found = Told(), ImportedPaths(run)
+    run.play([told, found])
+    assert run.warnings == []
+    return told, found.book
 
 
 def rows(name: str) -> Iterator[tuple[int | None, ...]]:
@@ -112,7 +112,7 @@ def rows(name: str) -> Iterator[tuple[int | None, ...]]:
             yield tuple(int(cell) if cell else None for cell in line)
 
 
-def test_callbacks(told: tuple[Told, ImportedFollower]) -> None:
+def test_callbacks(told: tuple[Told, PathBook]) -> None:
     found = [(run.start, run.end) for run in told[0].runs
              if run.callback.label == '/filter_node subscription /topic1']
     expected = list(rows('cb_filter_node_callback_0.csv'))
@@ -120,20 +120,22 @@ def test_callbacks(told: tuple[Told, ImportedFollower]) -> None:
     assert len(found) == 49
 
 
-def test_communication(told: tuple[Told, ImportedFollower]) -> None:
+def test_communication(told: tuple[Told, PathBook]) -> None:
     found = [(m.rclcpp, m.rcl, m.dds, m.stamp,
               told[0].arrived.get((id(m), '/filter_node subscription /topic1')))
-             for m in told[0].sent if m.topic == '/topic1']
+             for m in told[0].messages if m.topic == '/topic1']
     expected = list(rows('comm_topic1.csv'))
     assert found == expected
     assert len(found) == 49
 
 
-def test_path(told: tuple[Told, ImportedFollower]) -> None:
-    found = [
-        (*c[0][:3], c[1][3], *c[1][:3], c[2][3], *c[3][:3], c[4][3], *c[5][:3], c[6][3])
-        for c in (flow.columns for flow in told[1].paths.flows(0))]
-    expected = list(rows('demo_target_path.csv'))
+def test_path(told: tuple[Told, PathBook]) -> None:
+    columns = [flow.columns for flow in flows(told[1])]
+    found = [(c[0][0], c[1][1], c[1][0], c[2][1], c[3][0], c[4][1], c[5][0], c[6][1])
+             for c in columns]
+    # of the three times of each publication the first
+    expected = [tuple(row[i] for i in (0, 3, 4, 7, 8, 11, 12, 15))
+                for row in rows('demo_target_path.csv')]
 
     def order(row: tuple[int | None, ...]) -> list[int]:
         return [time or 0 for time in row]
@@ -141,8 +143,7 @@ def test_path(told: tuple[Told, ImportedFollower]) -> None:
     assert sorted(found, key=order) == sorted(expected, key=order)
     assert len(found) == 56
     response = slow_cases([(row[0] or 0, row[-1]) for row in expected])
-    records = [(first, flow.columns[-1][3]) for flow in told[1].paths.flows(0)
-               if (first := flow.columns[0][0]) is not None]
+    records = [(first, c[-1][1]) for c in columns if (first := c[0][0]) is not None]
     assert slow_cases(records) == response
 
 
@@ -168,18 +169,10 @@ def test_the_same_when_what_is_over_is_forgotten(
     trace: Path, graph: TaskSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = replay(trace, graph).result()['paths']
-    left: list[int] = []
-    tidy = PathBook.tidy
-
-    def note(book: PathBook) -> None:
-        before = len(book._books[0].parent)
-        tidy(book)
-        if len(book._books[0].parent) < before:
-            left.append(len(book._books[0].parent))
-
-    monkeypatch.setattr(PathBook, 'tidy', note)
-    monkeypatch.setattr(links, 'KEEP', 4)
-    monkeypatch.setattr(imported_jobs, 'PathBook', lambda declared: PathBook(declared, 100))
+    left = note_steps(monkeypatch)
+    monkeypatch.setattr(paths, 'SETTLE', 100)
+    monkeypatch.setattr(imported_run, '_BATCH', 50)
+    monkeypatch.setattr(imported_run, 'KEEP', 4)
     assert replay(trace, graph).result()['paths'] == expected
     assert len(left) > 3 and max(left) < 200, left
 

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from mddag_executor.replay import replay, ReplayError, reschedule
-from mddag_executor.replay.follower import Execution, Observer
-from mddag_executor.replay.imported import ImportedMapping, ImportedRecording
-from mddag_executor.replay.imported_jobs import ImportedFollower
+from mddag_executor.replay.happenings import Observer
+from mddag_executor.replay.run import open_run
 from msg_graph import loads, TaskSet
 import pytest
 
@@ -347,15 +346,14 @@ def test_cut_anywhere_it_says_something_or_judges_what_is_there(
 
 
 def test_the_last_leg_makes_a_sync_callback_whole(recorded: Recorded, graph: TaskSet) -> None:
-    recording = ImportedRecording(recorded.write())
     told: list[tuple[int, int, bool]] = []
 
     class Completed(Observer):
 
         def completed(self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
-                      execution: Execution | None) -> None:
+                      *execution: int) -> None:
             if graph.vertices[vertex].name == '/fuse:join':
-                told.append((job, leg, whole))
+                told.append((job, leg, bool(whole)))
 
-    ImportedFollower(recording, ImportedMapping(recording, graph), [Completed()]).run()
+    open_run(recorded.write(), graph).play([Completed()])
     assert told == [each for job in range(N) for each in ((job, 1, False), (job, 0, True))]

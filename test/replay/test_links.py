@@ -6,9 +6,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mddag_executor.replay.imported import ImportedMapping, ImportedRecording
-from mddag_executor.replay.imported_jobs import ImportedFollower
-from mddag_executor.replay.linked import Publication, Run
+from mddag_executor.replay.imported_run import ImportedRun
+from mddag_executor.replay.linker import Execution, LinkObserver, Publication
+from mddag_executor.replay.run import open_run
 import pytest
 
 from .recorded import BEGIN, MS, Recorded, STYLES, US
@@ -17,7 +17,7 @@ CAMERA, DETECT = 11, 12         # callbacks
 IMAGE = 100                     # publisher
 
 
-class Told:
+class Told(LinkObserver):
     """Keeps what a linker says."""
 
     def __init__(self) -> None:
@@ -25,16 +25,16 @@ class Told:
         self.links: list[tuple[str, int, int | None]] = []
         self.published_at: list[tuple[str, int, int, int]] = []
 
-    def started(self, run: Run, message: Publication | None) -> None:
+    def began(self, run: Execution, message: Publication | None) -> None:
         """Keep what an execution ran for: the publication's time."""
         self.links.append((run.callback.label, run.start - BEGIN,
                            None if message is None else message.time - BEGIN))
 
-    def ended(self, run: Run) -> None:
+    def over(self, run: Execution) -> None:
         """Keep an execution."""
         self.runs.append((run.callback.label, run.start - BEGIN, run.end - BEGIN))
 
-    def published(self, message: Publication) -> None:
+    def sent(self, message: Publication) -> None:
         """Keep a publication's times."""
         rclcpp, rcl, dds = (
             time - BEGIN if time else 0 for time in (message.rclcpp, message.rcl, message.dds))
@@ -44,10 +44,9 @@ class Told:
 def linked(path: Path) -> tuple[Told, list[str]]:
     """Return what the linker says of a recording, and the warnings."""
     told = Told()
-    recording = ImportedRecording(path)
-    follower = ImportedFollower(recording, ImportedMapping(recording, None), [], sinks=[told])
-    follower.run()
-    return told, [line.removeprefix(f'{path}: ') for line in follower.warnings()]
+    run = open_run(path)
+    run.play([told])
+    return told, [line.removeprefix(f'{path}: ') for line in run.warnings]
 
 
 @pytest.fixture
@@ -213,7 +212,9 @@ def test_what_was_initialised_before_the_recording(tmp_path: Path) -> None:
     recorded.add('ros2:rclcpp_timer_callback_added', 92 * MS, 1, 10_011, CAMERA)
     recorded.add('ros2:rclcpp_timer_link_node', 93 * MS, 1, 10_011, 1)
     recorded.run(CAMERA, 1, 131 * MS, 132 * MS)
-    entities = ImportedRecording(recorded.write()).entities
+    run = open_run(recorded.write())
+    assert isinstance(run, ImportedRun)
+    entities = run.entities
     assert [(c.label, c.grid) for c in entities.every] == [
         ('/camera timer 100ms', BEGIN + 30 * MS)]
 

@@ -11,16 +11,18 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import quantile
-from mddag_executor.replay import own_paths, path_flows, paths, replay
+from mddag_executor.replay import paths, replay
 from mddag_executor.replay.path_forest import NEVER
 from mddag_executor.replay.path_stream import CaseBook
 from mddag_executor.replay.paths import PathBook
 from mddag_executor.replay.spread import QUANTILE_ERROR, Spread
+from mddag_executor.trace import reading
 from msg_graph import loads
 import numpy as np
 import pytest
 
 from .cases_by_hand import slow_cases
+from .flows import note_steps
 from .helpers import Chances, MS, SMALL, VirtualRun
 
 Record = tuple[int, int | None]
@@ -134,8 +136,8 @@ def test_a_spread(times: list[int], keep: int, size: int) -> None:
 
 # --- the whole way -------------------------------------------------------------------------------
 
-def all_paths(trace: Path, **how: Any) -> str:
-    return json.dumps(replay(trace, **how).result()['paths'], indent=0)
+def all_paths(trace: Path) -> str:
+    return json.dumps(replay(trace).result()['paths'], indent=0)
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -145,36 +147,11 @@ def test_a_forest_that_is_kept_small(
     trace = tmp_path / 'a.mcap'
     VirtualRun(trace, loads(SMALL + PATHS, 'g.yaml'), seed, duration=4000 * MS,
                chances=Chances(undeclared=1))
-    expected = all_paths(trace, compiled=False)
-    settled: list[int] = []
+    expected = all_paths(trace)
     monkeypatch.setattr(paths, 'LAG_NS', 0)
-    monkeypatch.setattr(own_paths, '_KEEP_JOBS', 100)
-    tidy = paths._Book.tidy
-    monkeypatch.setattr(paths._Book, 'tidy', lambda book: (
-        tidy(book), settled.append(len(book.parent))))
-    monkeypatch.setattr(own_paths, 'PathBook', lambda declared: PathBook(declared, 50))
-    assert all_paths(trace, compiled=False).split('\n') == expected.split('\n')
+    monkeypatch.setattr(paths, 'SETTLE', 50)
+    monkeypatch.setattr(PathBook.__init__, '__defaults__', (30,))
+    monkeypatch.setattr(reading, '_BATCH', 1)
+    settled = note_steps(monkeypatch)
+    assert all_paths(trace).split('\n') == expected.split('\n')
     assert len(settled) > 20 and max(settled) < 1200
-
-
-def test_the_compiled_table_is_kept_small(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip('numba')
-    from mddag_executor.replay import fast_arrays
-    trace = tmp_path / 'a.mcap'
-    VirtualRun(trace, loads(SMALL + PATHS, 'g.yaml'), 7, duration=60_000 * MS,
-               chances=Chances(undeclared=1))
-    expected = all_paths(trace, compiled=False)
-    settled: list[int] = []
-    monkeypatch.setattr(path_flows, 'LAG_NS', 0)
-    monkeypatch.setattr(fast_arrays, 'FIRST_STEPS', 128)
-    tidy = path_flows.Flows._tidy
-
-    def note(flows: Any, work: Any, n: int) -> None:
-        tidy(flows, work, n)
-        settled.append(len(flows._marks))
-
-    monkeypatch.setattr(path_flows.Flows, '_tidy', note)
-    assert all_paths(trace, compiled=True).split('\n') == expected.split('\n')
-    assert len(settled) > 5 and max(settled) < 25_000     # of the last 4096 jobs

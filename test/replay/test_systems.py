@@ -9,9 +9,8 @@ from pathlib import Path
 import re
 
 from mddag_executor.errors import InputError
-from mddag_executor.replay.as_recorded import replay_recording
+from mddag_executor.replay import replay
 from mddag_executor.replay.drafting import System
-from mddag_executor.replay.drift import drift_of_import, WatchedRecording
 from mddag_executor.trace import TraceFile
 from msg_graph import load, loads
 from msg_graph.caret import declaration_from_caret
@@ -189,18 +188,15 @@ def test_a_recorded_sync_callback_has_its_times() -> None:
 
 
 def test_a_recorded_run_as_declared_has_no_drift() -> None:
-    recording = WatchedRecording(BAGS / 'demo_short.mcap')
-    replayed = replay_recording(recording, None)
+    replayed = replay(BAGS / 'demo_short.mcap')
     assert replayed.task_set.callbacks
-    assert recording.drift(replayed.task_set) == []
+    assert replayed.drift() == []
 
 
 def test_drift_of_a_recorded_run_against_another_declaration() -> None:
-    recording = WatchedRecording(BAGS / 'demo_short.mcap')
-    text = recording.task_set.text
+    text = replay(BAGS / 'demo_short.mcap').task_set.text
     other = loads(text.replace('timer: 100ms', 'timer: 150ms'))
-    replay_recording(recording, None)
-    found = recording.drift(other)
+    found = replay(BAGS / 'demo_short.mcap', other).drift()
     slower = [dag.vertices[dag.source].callback.key for dag in other.dags
               if dag.period_ns == 150 * MS]
     assert {each.callback for each in found if each.kind == 'rate'} == set(slower) != set()
@@ -219,11 +215,11 @@ nodes:
       - {name: x, subscription: /x, deadline: 5ms}
       - {name: o, subscription: /out, period: 5ms, deadline: 5ms, dag: o}
 """
-    census = System(recorded).census
-    assert drift_of_import(census, loads(text)) == []
-    found = drift_of_import(census, loads(text.replace(', publishes: [/x]', ', deadline: 1s')
-                                          .replace('/x, deadline', '/x, period: 15ms, deadline')
-                                          .replace('/out', '/gone').replace('two', 'zwei')))
+    assert replay(recorded, loads(text)).drift() == []
+    found = replay(recorded, loads(
+        text.replace(', publishes: [/x]', ', deadline: 1s')
+        .replace('/x, deadline', '/x, period: 15ms, deadline')
+        .replace('/out', '/gone').replace('two', 'zwei'))).drift()
     assert [(each.kind, each.callback) for each in found] == [
         ('publishes', '/a:zwei'), ('rate', '/b:x'), ('never ran', '/b:o')]
     assert (found[1].declared, found[1].observed) == (15 * MS, 10 * MS)

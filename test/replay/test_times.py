@@ -163,7 +163,7 @@ def test_any_bit_of_a_trace(tmp_path: Path, kind: str) -> None:
     for seed in range(150):
         changed(sound, odd, random.Random(seed))
         try:
-            found = replay(odd, graph, compiled=False).result()
+            found = replay(odd, graph).result()
             outcome = reschedule(odd, graph, policy='rad', workers=2)
         except MddagError:
             continue

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from mddag_executor.replay import replay
-from mddag_executor.replay.follower import Piece
 from mddag_executor.replay.judge import Judge
 from mddag_executor.report import export
 from mddag_executor.report.export import Exporter, KEEP_ENDED, MOST_HELD, target
@@ -30,7 +29,7 @@ def exported(path: Path, form: str, jobs: bool = False) -> bytes:
     file = io.BytesIO()
     rows = target(form, file, jobs)
     exporter = Exporter(rows)
-    replay(path, watcher=exporter)
+    replay(path, more=exporter.of)
     exporter.finish()
     return file.getvalue()
 
@@ -140,14 +139,14 @@ def test_memory_does_not_grow_with_the_run(tmp_path: Path) -> None:
     load, run = runs.simulated(task_set, ms=1000)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     exporter = Exporter(target('csv', io.BytesIO(), False))
-    replay(tmp_path / 'run.mcap', watcher=exporter)
+    replay(tmp_path / 'run.mcap', more=exporter.of)
     assert KEEP_ENDED > len(exporter._ended) > 100
     assert len(exporter._held) < 50
     for _ in range(KEEP_ENDED):
         exporter._ended.append((0, 10 ** 9))
     before = len(exporter._jobs)
     from mddag_executor.core.state import JOB_END
-    exporter._decided([(JOB_END, 0, -1, 10 ** 9, 0, 0)] * 50)
+    exporter.decided([(JOB_END, 0, -1, 10 ** 9, 0, 0)] * 50)
     assert len(exporter._ended) >= KEEP_ENDED and len(exporter._jobs) < before
 
 
@@ -166,9 +165,9 @@ def test_what_is_never_completed_is_not_held_for_ever() -> None:
     task_set = runs.autoware()
     judge = Judge(task_set, compare=False)
     count.begin = lambda *_: None
-    exporter.observers(task_set, judge)
+    exporter._begin(task_set, judge)
     for i in range(3 * MOST_HELD):
-        exporter.ran(Piece(1, 0, 0, i, 0, i, i, i + 1, True))
+        exporter.ran(1, 0, 0, i, 0, i, i, i + 1, 1)
     assert count.executions == 2 * MOST_HELD == 3 * MOST_HELD - len(exporter._held)
     exporter.finish()
     assert count.executions == 3 * MOST_HELD

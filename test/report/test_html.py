@@ -76,7 +76,7 @@ class Page(HTMLParser):
 
 def report(path: Path) -> tuple[Page, dict[str, Any]]:
     watch = html.Watch()
-    outcome = replay(path, watcher=watch)
+    outcome = replay(path, more=watch.of)
     file = io.BytesIO()
     html.write(file, html.of_outcome(outcome, watch))
     page = Page(file.getvalue().decode())
@@ -193,7 +193,7 @@ def test_end_to_end_times_of_declared_paths(tmp_path: Path) -> None:
     page, meta = report(runs.by_hand(tmp_path / 'run.mcap'))
     assert meta['paths'][1]['name'] == 'path whole' and meta['paths'][1]['worst'] is None
     watch = html.Watch()
-    outcome = replay(runs.by_hand(tmp_path / 'run.mcap'), watcher=watch)
+    outcome = replay(runs.by_hand(tmp_path / 'run.mcap'), more=watch.of)
     data = html.of_outcome(outcome, watch)
     assert data.paths == outcome.result()['paths']
     text = ' '.join(' '.join(page.texts).split())

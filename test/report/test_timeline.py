@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE, SINK_MISSED
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.bags_reschedule import reschedule_bag
-from mddag_executor.replay.follower import Observer, Piece
+from mddag_executor.replay.computed import ComputedRun
+from mddag_executor.replay.happenings import Batch, Observer, Piece, RAN, RELEASED
 from mddag_executor.report import html
 from mddag_executor.report.timeline import (
     BINS,
@@ -25,7 +26,6 @@ from mddag_executor.report.timeline import (
     START,
     Timeline,
 )
-from mddag_executor.report.timeline_log import Schedule, tell
 from mddag_executor.simulate import periodic_load, Settings, simulate
 from mddag_executor.simulate.recording import write_trace
 import msg_graph
@@ -52,7 +52,7 @@ def test_a_schedule_is_told_as_its_trace_says(
     told = html.of_run(task_set, load, run)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     watch = html.Watch()
-    read = html.of_replay(replay(tmp_path / 'run.mcap', watcher=watch), watch)
+    read = html.of_replay(replay(tmp_path / 'run.mcap', more=watch.of), watch)
     assert told.tally.result() == read.tally.result() == run.tally.result()
     assert told.timeline.n_executions == len(told.timeline.columns().executions[0]) > 100
     for ours, theirs in zip(told.timeline.columns(), read.timeline.columns()):
@@ -75,23 +75,17 @@ class Spy(Observer):
     def started(self, *what: Any) -> None:
         self.told.append(('started', *what))
 
-    def ran(self, piece: Piece) -> None:
-        self.told.append(('ran', *piece))
+    def ran(self, *what: Any) -> None:
+        self.told.append(('ran', *what))
 
     def completed(self, *what: Any) -> None:
-        self.told.append(('completed', *what))
+        self.told.append(('completed', *what[:-1]))     # executions have other numbers
 
     def ended(self, *what: Any) -> None:
         self.told.append(('ended', *what))
 
-    def finished(self, now: int) -> None:
+    def finished(self, now: int, batch: Batch) -> None:
         self.told.append(('finished', now))
-
-    def observers(self, task_set: Any, judge: Any) -> list[Observer]:
-        return [self]
-
-    def name_by(self, names: Any) -> None:
-        pass
 
 
 @pytest.mark.parametrize(('settings', 'utilisation'), [
@@ -104,8 +98,9 @@ def test_observers_are_told_the_same_in_the_same_order(
     load, run = runs.simulated(task_set, utilisation=utilisation, **settings)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     told, read = Spy(), Spy()
-    tell(Schedule(task_set, load, run.log, run.decisions, 300 * runs.MS, run.ended_ns), [told])
-    replay(tmp_path / 'run.mcap', watcher=read)
+    ComputedRun(
+        task_set, load, run.log, run.decisions, 300 * runs.MS, run.ended_ns).play([told])
+    replay(tmp_path / 'run.mcap', more=lambda _: [read])
     assert len(told.told) > 100 and {what[0] for what in told.told} >= {
         'released', 'started', 'ran', 'completed', 'finished'}
     assert told.told == read.told
@@ -117,8 +112,9 @@ def test_an_end_at_the_instant_of_a_release_comes_first(tmp_path: Path) -> None:
     run = simulate(task_set, load, Settings(workers=1, duration_ns=50 * runs.MS), log=True)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     told, read = Spy(), Spy()
-    tell(Schedule(task_set, load, run.log, run.decisions, 50 * runs.MS, run.ended_ns), [told])
-    replay(tmp_path / 'run.mcap', watcher=read)
+    ComputedRun(
+        task_set, load, run.log, run.decisions, 50 * runs.MS, run.ended_ns).play([told])
+    replay(tmp_path / 'run.mcap', more=lambda _: [read])
     at_ten = [what[0] for what in told.told if 10 * runs.MS in what and 'started' != what[0]]
     assert at_ten[:3] == ['ran', 'completed', 'released']
     assert told.told == read.told
@@ -132,11 +128,11 @@ def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path: Path) -> No
     run = simulate(task_set, load, Settings(workers=1, duration_ns=100 * runs.MS), log=True)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     told, read = Spy(), Spy()
-    schedule = Schedule(
+    schedule = ComputedRun(
         task_set, load, run.log, run.decisions, 100 * runs.MS, run.ended_ns,
         numbers=[[10 * job for job in range(10)]])
-    tell(schedule, [told])
-    replay(tmp_path / 'run.mcap', watcher=read)
+    schedule.play([told])
+    replay(tmp_path / 'run.mcap', more=lambda _: [read])
     place = {'released': 2, 'started': 3, 'ran': 4, 'completed': 3, 'ended': 2}
     expected = []
     for what in read.told:
@@ -182,11 +178,13 @@ def test_what_is_aborted_and_stopped_is_told() -> None:
 def test_detail_is_bounded_and_keeps_the_misses() -> None:
     timeline = Timeline(most=100, block=10)
     for i in range(1000):
-        timeline.released(0, i, 100 * i, 100 * i)
-        timeline.ran(piece(0, i, 100 * i, 100 * i + 50))
+        batch = Batch([RELEASED, RAN], {RELEASED: [(0, i, 100 * i, 100 * i)],
+                                        RAN: [piece(0, i, 100 * i, 100 * i + 50)]})
         late = i in (333, 777)
-        timeline.decided([(SINK_LATE if late else SINK_IN_TIME, 0, 0, i, 100 * i + 60,
-                           100 * i + (70 if late else 50))])
+        batch.decisions.append((SINK_LATE if late else SINK_IN_TIME, 0, 0, i, 100 * i + 60,
+                                100 * i + (70 if late else 50)))
+        batch.decided_at.append(1)
+        timeline.take(batch)
     columns = timeline.columns()
     assert timeline.n_executions == 1000 and timeline.n_missed == 2
     assert timeline.kept == len(columns.executions[0]) <= 100
@@ -208,8 +206,9 @@ def test_detail_is_bounded_and_keeps_the_misses() -> None:
 def test_sums_hold_whatever_the_width(stretches: list[tuple[int, int, bool]]) -> None:
     bins = Bins()
     first = stretches[0][0]
+    bins.place(first)
     for start, took, lent in stretches:
-        bins.add(lent, start, start + took)
+        bins.add(lent, np.array([start]), np.array([start + took]))
     assert bins.origin == first
     for sums, of_lent in ((bins.lent, True), (bins.busy, False)):
         assert sum(sums) == sum(
@@ -220,10 +219,10 @@ def test_sums_hold_whatever_the_width(stretches: list[tuple[int, int, bool]]) ->
 
 
 def test_undeclared_callbacks_have_names_and_a_bound() -> None:
-    timeline = Timeline()
-    timeline.name_by({7: 'spin_some'}.get)
+    known: Any = {7: 'spin_some'}.get
+    timeline = Timeline(names=known)
     for callback in (7, 8, *range(1000, 1000 + MOST_UNDECLARED + 5)):
-        timeline.ran(piece(-1, 4, 0, 1, callback=callback))
+        timeline.take(Batch([RAN], {RAN: [piece(-1, 4, 0, 1, callback=callback)]}))
     names = timeline.undeclared_names()
     assert names[:2] == ['spin_some', None]
     assert len(names) == MOST_UNDECLARED + 1 and names[-1] == OTHERS
@@ -233,7 +232,9 @@ def test_undeclared_callbacks_have_names_and_a_bound() -> None:
 
 def test_never_completed_counts_at_its_deadline() -> None:
     timeline = Timeline()
-    timeline.ran(piece(0, 0, 0, 10))
-    timeline.decided([(SINK_MISSED, 0, 0, 0, 10 ** 9, -1)])
+    batch = Batch([RAN], {RAN: [piece(0, 0, 0, 10)]})
+    batch.decisions.append((SINK_MISSED, 0, 0, 0, 10 ** 9, -1))
+    batch.decided_at.append(0)
+    timeline.take(batch)
     assert timeline.n_missed == 1
     assert timeline.columns().verdicts.T.tolist() == [[0, 0, 10 ** 9, -1, 1]]
