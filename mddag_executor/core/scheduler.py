@@ -102,7 +102,7 @@ class Scheduler:
 
     def record(self, x: int, now: int) -> bool:
         """End an execution as it was recorded, past the ready queue; see ``complete``."""
-        return rules.record(self.tables, self.state, self._key, x, now)
+        return rules.record(self.tables, self.state, self.policy.key, x, now)
 
     def fail_open(self, slot: int, now: int) -> None:
         """Fail the job in a slot unless it has ended already."""
