@@ -18,6 +18,7 @@ import time
 from typing import Any, Protocol
 import weakref
 
+from mddag_executor.live.compat import tell_of_end
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 
@@ -44,6 +45,9 @@ _Kept = dict[weakref.ref[Any], Any]
 _started: _Kept = {}
 _executors: _Kept = {}
 _by_context: weakref.WeakKeyDictionary[Context, _Kept] = weakref.WeakKeyDictionary()
+_told: weakref.WeakKeyDictionary[Context, object] = weakref.WeakKeyDictionary()
+_ended: weakref.WeakSet[Context] = weakref.WeakSet()
+"""Contexts that are shut down, or just going to be."""
 
 
 def _keep(kept: _Kept, owner: Any, value: Any = None) -> None:
@@ -64,7 +68,7 @@ def _living(kept: _Kept) -> list[tuple[Any, Any]]:
 def is_over(context: Context) -> bool:
     """Return whether a context has ended: that it was shut down, or destroyed."""
     try:
-        return not context.ok()
+        return context in _ended or not context.ok()
     except InvalidHandle:
         return True
 
@@ -128,11 +132,14 @@ def call_at_shutdown(context: Context, method: Any) -> None:
     methods = _by_context.get(context)
     if methods is None:
         methods = _by_context[context] = {}
-        context.on_shutdown(partial(_call_all, methods))
+        _told[context] = tell_of_end(context, partial(_call_all, weakref.ref(context), methods))
     _keep(methods, method.__self__, method.__func__)
 
 
-def _call_all(methods: _Kept) -> None:
+def _call_all(reference: weakref.ref[Context], methods: _Kept) -> None:
+    context = reference()
+    if context is not None:
+        _ended.add(context)
     for owner, function in _living(methods):
         function(owner)
 

@@ -404,13 +404,16 @@ class Engine:
         if 0 < entity.depth < len(entity.waiting) and entity.kind != TIMER:
             self._drop(entity, x, 'qos_depth', now)  # a newer one has come meanwhile
 
-    def left_open(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
+    def left_open(
+        self, work: Work, start: int, end: int, vtid: int, worker: int, ran: bool
+    ) -> None:
         """Take an execution off its worker that could not do its work: its context has ended."""
-        if self.record is not None:
+        if self.record is not None and ran:
             self._record_run(work, start, end, vtid, worker)
         self.scheduler.lend(work.x)
         work.x = -1
-        work.entity.ran += 1
+        work.entity.ran += ran
+        work.entity.dropped += not ran
 
     def destroyed(self, work: Work, now: int) -> None:
         """End a dispatched execution that must not run: its job cannot complete any more."""

@@ -358,12 +358,13 @@ class Pool:
             engine.refused(work, now)
             return
         work.entity.busy_ns += end - start
-        if isinstance(raised, Destroyed):
-            engine.destroyed(work, now)
-        elif waits_for is not None:
+        if waits_for is not None:
             engine.suspended(work, start, end, seat.vtid, seat.worker)
-        elif self._context_ended():
-            engine.left_open(work, start, end, seat.vtid, seat.worker)
+        elif self._context_ended():  # which may destroy nodes, too
+            engine.left_open(
+                work, start, end, seat.vtid, seat.worker, not isinstance(raised, Destroyed))
+        elif isinstance(raised, Destroyed):
+            engine.destroyed(work, now)
         else:
             engine.finished(work, start, end, now, seat.vtid, seat.worker, True)
 

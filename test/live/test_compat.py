@@ -12,6 +12,7 @@ import weakref
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.live import compat
 from mddag_executor.live.compat.events_executor import events_executor_modules, is_available
+from mddag_executor.live.intake.entities import alive
 import pytest
 import rclpy
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -256,6 +257,18 @@ def test_the_bare_executor_has_guards_until_its_end(ros_context):
     executor.shutdown()
     assert executor.is_gone()
     executor.ring()
+
+
+def test_the_end_of_a_context_is_told_before_its_nodes_are_gone():
+    context = rclpy.context.Context()
+    rclpy.init(context=context)
+    node = rclpy.node.Node('told', context=context)
+    told: list[bool] = []
+    kept = compat.tell_of_end(context, lambda: told.append(alive(node)))
+    context.shutdown()
+    assert told and told[0]
+    del kept
+    node.destroy_node()
 
 
 def test_who_is_called_by_spin_knows(ros_context, make_node):

@@ -274,6 +274,30 @@ class BareExecutor(Executor):
         """Leave a task (7.1.9) to whoever runs it, who asks it again by himself."""
 
 
+class _FirstNode:
+    """Stands among a context's nodes, to be told first that they are destroyed."""
+
+    def __init__(self, tell: Callable[[], None]) -> None:
+        self.destroy_node = tell
+
+
+def tell_of_end(context: Any, tell: Callable[[], None]) -> object:
+    """
+    Have a function called when a context is shut down, before its nodes are gone.
+
+    In 9.1 a context first destroys its nodes, which it has in a list, and only then does what it
+    was given by ``on_shutdown``. There, the function is called twice.
+
+    :return: what is to be kept for as long as that is wanted.
+    """
+    context.on_shutdown(tell)
+    first = _FirstNode(tell)
+    nodes = getattr(context, '_Context__node_weak_ref_list', None)
+    if nodes is not None:
+        nodes.insert(0, weakref.ref(first))
+    return first
+
+
 def is_called_by_spin() -> bool:
     """
     Return whether the method that asks was called by ``rclpy.spin``.
