@@ -26,7 +26,7 @@ The rules, for live runs and for recordings alike. What was seen comes as counts
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from msg_graph.analysis import topological_order
@@ -102,8 +102,7 @@ class Drift:
 
     def result(self) -> dict[str, Any]:
         """Return its form in results for machines."""
-        return {'kind': self.kind, 'callback': self.callback, 'topic': self.topic,
-                'declared': self.declared, 'observed': self.observed, 'text': self.text}
+        return asdict(self)
 
 
 def drift(task_set: TaskSet, observed: Observed) -> list[Drift]:

@@ -148,13 +148,7 @@ def listed(texts: Iterable[str], most: int = 8) -> str:
     return ', '.join(parts)
 
 
-def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that the misspelt one most likely stands for, or None."""
-    matches = difflib.get_close_matches(word[:_LONGEST_SHOWN], list(known), n=1)
-    return matches[0] if matches else None
-
-
 def did_you_mean(word: str, known: Iterable[str], otherwise: str) -> str:
     """Return the remedy for a misspelt word: the nearest known one, else ``otherwise``."""
-    match = nearest(word, known)
-    return otherwise if match is None else f'did you mean {shown(match)}?'
+    matches = difflib.get_close_matches(word[:_LONGEST_SHOWN], list(known), n=1)
+    return f'did you mean {shown(matches[0])}?' if matches else otherwise

@@ -20,8 +20,7 @@ What Python's lock, its garbage collector and the system's scheduler let an exec
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 import gc
 import hashlib
 import json
@@ -37,6 +36,7 @@ from mddag_executor.core import quantile
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.live import current_job
 from mddag_executor.live.executor import MultiDeadlineExecutor
+from mddag_executor.live.session import Session
 from msg_graph import loads
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -114,42 +114,21 @@ class Lateness:
                 'max': ordered[-1] / 1e3}
 
 
-@contextmanager
-def spinning(**arguments: Any) -> Iterator[MultiDeadlineExecutor]:
-    """Give an executor, which ``start`` lets spin in a thread; both have ended afterwards."""
-    executor = MultiDeadlineExecutor(**arguments)
-    try:
-        yield executor
-    finally:
-        executor.shutdown(5.0)
-        thread = _threads.pop(executor, None)
-        if thread is not None:
-            thread.join(5.0)
-
-
-_threads: dict[MultiDeadlineExecutor, threading.Thread] = {}
-
-
-def start(executor: MultiDeadlineExecutor) -> None:
-    """Let an executor spin in a thread."""
-    thread = _threads[executor] = threading.Thread(target=executor.spin, daemon=True)
-    thread.start()
-
-
 def throughput(body: Body, workers: int, seconds: float) -> float:
     """Return how many bodies a second a pool runs that always has enough of them."""
     done = [0] * (2 * workers)
     ending = threading.Event()
-    with spinning(num_workers=workers) as executor:
-        def run(i: int) -> None:
-            body()
-            done[i] += 1
-            if not ending.is_set():
-                executor.create_task(run, i)
+    executor = MultiDeadlineExecutor(num_workers=workers)
 
-        start(executor)
-        for i in range(len(done)):
+    def run(i: int) -> None:
+        body()
+        done[i] += 1
+        if not ending.is_set():
             executor.create_task(run, i)
+
+    for i in range(len(done)):
+        executor.create_task(run, i)
+    with Session(executor):
         time.sleep(0.2)
         before, begin = sum(done), time.monotonic()
         time.sleep(seconds)
@@ -165,25 +144,27 @@ def lateness(
     """Return how late an empty timer runs (us) while all workers but one run bodies."""
     ending = threading.Event()
     watched = Lateness()
-    try:
-        with spinning(graph=loads(GRAPH), num_workers=workers, **arguments) as executor:
-            def run() -> None:
-                assert body is not None
-                body()
-                if not ending.is_set():
-                    executor.create_task(run)
+    executor = MultiDeadlineExecutor(loads(GRAPH), num_workers=workers, **arguments)
 
-            executor.add_node(watched.node)
-            start(executor)
-            for _ in range(workers - 1 if body is not None else 0):
-                executor.create_task(run)
-            time.sleep(0.3)
-            watched.late.clear()
-            time.sleep(seconds)
-            ending.set()
-            return watched.result()
-    finally:
-        watched.node.destroy_node()
+    def run() -> None:
+        assert body is not None
+        body()
+        if not ending.is_set():
+            executor.create_task(run)
+
+    executor.add_node(watched.node)
+    for _ in range(workers - 1 if body is not None else 0):
+        executor.create_task(run)
+    with Session(executor) as session:
+        time.sleep(0.3)
+        watched.late.clear()
+        time.sleep(seconds)
+        ending.set()
+        result = watched.result()
+    watched.node.destroy_node()
+    if session.error is not None:
+        raise session.error
+    return result
 
 
 def measure_gil(seconds: float, workers: int) -> list[dict[str, Any]]:
