@@ -28,8 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--execution-times', metavar='FILE',
         help="with --reschedule of an ordinary bag: JSON with fixed execution times ('-': "
         'standard input; default: drawn from the declared ones)')
-    add('--seed', type=int, default=0, metavar='N',
-        help='with --reschedule of an ordinary bag: of the draws (default: %(default)s)')
+    add('--seed', type=int, metavar='N',
+        help='with --reschedule of an ordinary bag: of the draws (default: 0)')
 
 
 def _overheads(text: str) -> int:
@@ -47,6 +47,8 @@ def check(args: argparse.Namespace, *files: str | None) -> None:
     """
     if args.execution_times == '-' and '-' in files:
         raise UsageError('-: standard input can be only one file: name the others')
+    if args.execution_times is not None and args.seed is not None:
+        raise UsageError('--seed: nothing is drawn where --execution-times are given: leave one out')
     if args.execution_times is not None and args.graph is None:
         raise UsageError('--execution-times: they are of a declaration: give a GRAPH')
 
@@ -78,6 +80,5 @@ def reschedule_bag(
         times = read_execution_times(task_set, text, times_name)
     with Progress('replaying'):
         return run(
-            path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
-            times=times, seed=args.seed, dispatch_overhead=args.overheads or 0, name=name,
-            skip=args.skip)
+            path, task_set, policy=args.policy, workers=args.workers, preemptive=bool(args.preemptive), times=times, seed=args.seed or 0, dispatch_overhead=args.overheads or 0,
+            name=name, skip=args.skip)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mddag_executor.replay.happenings import Observer
     from msg_graph import TaskSet
 
-_ONLY_RESCHEDULED = ('workers', 'policy', 'preemptive', 'overheads', 'execution_times')
+_ONLY_RESCHEDULED = ('workers', 'policy', 'preemptive', 'overheads', 'execution_times', 'seed')
 
 
 def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
@@ -37,8 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
         help='with --reschedule: threads that run callbacks (default: as recorded)')
     add('--policy', metavar='P',
         help=f'with --reschedule: one of {", ".join(POLICIES)} (default: as recorded)')
-    add('--preemptive', action='store_true',
-        help='with --reschedule: what is more urgent takes the worker of what runs')
+    add('--preemptive', action=argparse.BooleanOptionalAction,
+        help='with --reschedule: what is more urgent takes the worker of what runs, or not '
+        '(default: as recorded, where the policy can)')
     bags.add_arguments(parser)
     parser.set_defaults(skip=0)     # who leaves out a warm-up: add_skip
 
@@ -67,7 +68,7 @@ def check(args: argparse.Namespace, *files: str | None) -> None:
                 '--callbacks: it shows what was recorded: leave it or --reschedule out')
         return
     for option in _ONLY_RESCHEDULED:
-        if getattr(args, option) not in (None, False):
+        if getattr(args, option) is not None:
             raise UsageError(
                 f'--{option.replace("_", "-")}: a run is replayed as it was recorded: add '
                 '--reschedule')
@@ -120,6 +121,9 @@ def rescheduled(
         return bags.reschedule_bag(args, path, name, task_set)
     if args.execution_times is not None:
         raise UsageError('--execution-times: a trace has its own: leave the option out')
+    if args.seed is not None:
+        raise UsageError('--seed: a trace has its own execution times, so nothing is drawn: leave '
+                         'the option out')
     from mddag_executor.replay import reschedule
     recorded = args.overheads in (None, bags.RECORDED)
     with Progress('replaying') as line:

@@ -274,18 +274,23 @@ def _stray_stamps(arrivals: Sequence[int], stamps: Sequence[int]) -> list[int]:
 
 def is_ordinary(path: str) -> bool:
     """Tell whether a path is a bag in which nothing was traced, so that it holds no jobs."""
+    if not os.path.isdir(path):
+        return _what(path) == 'bag'
+    names = [name for name in os.listdir(path) if _BAG_FILE.fullmatch(name)]
+    kinds = {_what(os.path.join(path, name)) for name in names if name != 'metadata.yaml'}
+    return 'trace' not in kinds and ('bag' in kinds or 'metadata.yaml' in names)
+
+
+def _what(path: str) -> str:
+    """Return whether a file is a bag's or a trace; nothing for others, and for damage."""
     try:
-        if os.path.isdir(path):
-            files = [name for name in os.listdir(path) if _BAG_FILE.fullmatch(name)]
-            return 'metadata.yaml' in files or any(
-                is_ordinary(os.path.join(path, name)) for name in files)
         kind = _kind(Path(path))
         if kind != _MCAP:
-            return kind != b''
+            return 'bag' if kind else ''
         reader = TraceReader(path)
-        return not (reader.written_here or reader.has_events())
+        return 'trace' if reader.written_here or reader.has_events() else 'bag'
     except (InputError, OSError):
-        return False        # whoever reads it says why
+        return ''       # whoever reads it says why
 
 
 def _absolute(topic: str) -> str:

@@ -204,7 +204,7 @@ class ImportedDrift(LinkObserver):
     """
 
     def __init__(self, run: ImportedRun) -> None:
-        self._census = Census()
+        self._census = Census(keep_times=0)
         self._declared = bool(run.task_set.dags)
 
     def raw_handlers(self) -> Handlers:

@@ -340,13 +340,16 @@ class ImportedRun(LinkObserver):
 
     def _expire(self, now: int) -> None:
         for dag, jobs in enumerate(self._open):
+            running: list[tuple[int, int]] = []
             while jobs and now - jobs[0][0] > self._patience[dag]:
-                if self._active[(dag, jobs[0][1])] > 0:
-                    break
                 release, job = jobs.popleft()
+                if self._active[(dag, job)] > 0:
+                    running.append((release, job))
+                    continue
                 del self._active[(dag, job)]
                 if not self._close(dag, job, release):
                     self._tell(ENDED, dag, job, 0, now)
+            jobs.extendleft(reversed(running))
 
     def _close(self, dag: int, job: int, release: int) -> bool:
         """Take a job that cannot be judged out of the run; tell whether it is one."""

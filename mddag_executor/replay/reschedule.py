@@ -150,7 +150,7 @@ def reschedule(
     *,
     policy: str | None = None,
     workers: int | None = None,
-    preemptive: bool = False,
+    preemptive: bool | None = None,
     overheads: bool = True,
     dispatch_overhead: int = 0,
     name: str | None = None,
@@ -164,7 +164,8 @@ def reschedule(
     :param task_set: the declaration to schedule by; None: the one in the trace.
     :param policy: a row of ``mddag_executor.core.POLICIES``; None: as recorded.
     :param workers: size of the pool; None: as recorded.
-    :param preemptive: whether a smaller key takes the worker of a larger one.
+    :param preemptive: whether a smaller key takes the worker of a larger one; None: as recorded,
+        where the policy can.
     :param overheads: whether noticing, dispatch and transport take the time that they took in the
         recording, or none.
     :param dispatch_overhead: added to each execution, ns.
@@ -177,12 +178,14 @@ def reschedule(
     :raises mddag_executor.errors.MddagError: on a policy or number of workers that cannot be.
     """
     if policy is not None:
-        find_policy(policy).mode(preemptive)
+        find_policy(policy).mode(bool(preemptive))
     if workers is not None and not 1 <= workers <= MAX_WORKERS:
         raise UsageError(f'workers: {workers} is out of range: give 1 to {MAX_WORKERS}')
     run = open_run(path, task_set, name, needs_declaration=True)
     policy, workers = _settings(run.head, run.name, policy, workers)
     head = run.head
+    if preemptive is None:
+        preemptive = head.preemptive and not find_policy(policy).polling
     bound = head.max_active_jobs if head.max_active_jobs > 0 else NEVER
     tables = Tables.build(
         run.task_set, default_deadline=head.default_deadline, max_active_jobs=bound)

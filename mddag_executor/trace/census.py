@@ -77,9 +77,12 @@ class Census:
     Takes in events (tuples as ``TraceReader.events`` yields them) in the order of time.
 
     ``handlers`` has what takes in which event, by full name.
+
+    :param keep_times: how many times of each callback's runs to keep.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, keep_times: int = KEEP_TIMES) -> None:
+        self._keep_times = keep_times
         self.runs: dict[Address, Runs] = {}
         #: By process and thread: the callback that ended there last, and how long it ran.
         self.took: dict[tuple[int, int], tuple[Address, int]] = {}
@@ -184,7 +187,7 @@ class Census:
             if callback == (event[2], event[4]):
                 self.took[event[2], event[3]] = callback, event[1] - start
                 times = self.runs[callback].times
-                if len(times) < KEEP_TIMES:
+                if len(times) < self._keep_times:
                     times.append(event[1] - start)
                 return
 

@@ -357,3 +357,31 @@ def test_the_last_leg_makes_a_sync_callback_whole(recorded: Recorded, graph: Tas
 
     open_run(recorded.write(), graph).play([Completed()])
     assert told == [each for job in range(N) for each in ((job, 1, False), (job, 0, True))]
+
+
+def test_a_job_whose_end_is_lost_keeps_no_other_from_expiring(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / 'lost.mcap')
+    recorded.node(1, '/camera')
+    recorded.node(2, '/detect')
+    recorded.timer(11, 1, 100 * MS)
+    recorded.publisher(100, 1, '/image')
+    recorded.subscription(12, 2, '/image')
+    for k in range(1, 41):
+        at = k * 100 * MS
+        recorded.run(11, 1, at, at + 2 * MS)
+        stamp = recorded.publish(100, 1, at + 1 * MS)
+        if k == 1 or k > 20:
+            recorded.receive(12, 2 + (k == 1), at + 3 * MS, at + 5 * MS, stamp)
+    lost = next(place for place, (name, time) in enumerate(
+        zip(recorded.names(), recorded.times()))
+        if name == 'ros2:callback_end' and time == 105 * MS)
+    graph = loads("""\
+mddag: 1
+nodes:
+  - node: /camera
+    callbacks: [{name: grab, timer: 100ms, publishes: [/image]}]
+  - node: /detect
+    callbacks: [{name: run, subscription: /image, deadline: 10ms}]
+""", 'g.yaml')
+    sink = replay(recorded.write([lost]), graph).result()['dags']['/camera']['sinks']['/detect:run']
+    assert (sink['expired'], sink['late'], sink['completed']) == (19, 1, 20)

@@ -7,6 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 import random
 import tempfile
+from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,7 +16,9 @@ from mddag_executor.core import PolicyError, Tables, Tally
 from mddag_executor.core.state import Decision, new_state
 from mddag_executor.errors import UsageError
 from mddag_executor.replay import replay, ReplayError, reschedule
+from mddag_executor.simulate import periodic_load, Settings, simulate
 from mddag_executor.simulate.engine import END, Load, LogEntry, PREEMPT, run, START
+from mddag_executor.simulate.recording import write_trace
 from mddag_executor.trace import TraceFile
 from msg_graph import loads, TaskSet
 import pytest
@@ -394,3 +397,26 @@ def test_tables_without_groups_stay_as_they_are() -> None:
     from mddag_executor.replay.groups import with_groups
     tables = Tables.build(loads(TIMER_AND_MESSAGE.replace('dag: b', 'dag: b, group: g'), 'g.yaml'))
     assert with_groups(tables, {}, {}, declared_first=False) == tables
+
+
+def test_a_preemptive_run_stays_one(tmp_path: Path) -> None:
+    text = """\
+mddag: 1
+workers: 1
+nodes:
+  - node: /slow
+    callbacks: [{name: long, timer: 100ms, deadline: 100ms, execution_time: 40ms}]
+  - node: /fast
+    callbacks: [{name: short, timer: 20ms, deadline: 5ms, execution_time: 1ms}]
+"""
+    task_set = loads(text, 'g.yaml')
+    load = periodic_load(task_set, [[40 * MS], [MS]], 200 * MS)
+    outcome = simulate(
+        task_set, load, Settings(workers=1, duration_ns=200 * MS, preemptive=True), log=True)
+    write_trace(tmp_path / 'a.mcap', task_set, load, outcome)
+    hows: list[tuple[dict[str, Any], bool]] = [
+        ({}, False), ({'preemptive': False}, True), ({'policy': 'ros2'}, True)]
+    for how, late in hows:
+        result = reschedule(tmp_path / 'a.mcap', **how).result()
+        assert result['deadline_missed'] == late
+        assert result['preemptive'] != late
