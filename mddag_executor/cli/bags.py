@@ -48,7 +48,8 @@ def check(args: argparse.Namespace, *files: str | None) -> None:
     if args.execution_times == '-' and '-' in files:
         raise UsageError('-: standard input can be only one file: name the others')
     if args.execution_times is not None and args.seed is not None:
-        raise UsageError('--seed: nothing is drawn where --execution-times are given: leave one out')
+        raise UsageError(
+            '--seed: nothing is drawn where --execution-times are given: leave one out')
     if args.execution_times is not None and args.graph is None:
         raise UsageError('--execution-times: they are of a declaration: give a GRAPH')
 
@@ -80,5 +81,6 @@ def reschedule_bag(
         times = read_execution_times(task_set, text, times_name)
     with Progress('replaying'):
         return run(
-            path, task_set, policy=args.policy, workers=args.workers, preemptive=bool(args.preemptive), times=times, seed=args.seed or 0, dispatch_overhead=args.overheads or 0,
-            name=name, skip=args.skip)
+            path, task_set, policy=args.policy, workers=args.workers,
+            preemptive=bool(args.preemptive), times=times, seed=args.seed or 0,
+            dispatch_overhead=args.overheads or 0, name=name, skip=args.skip)

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from mddag_executor.replay.happenings import Observer
     from msg_graph import TaskSet
 
-_ONLY_RESCHEDULED = ('workers', 'policy', 'preemptive', 'overheads', 'execution_times', 'seed')
+_ONLY_RESCHEDULED = (
+    'workers', 'policy', 'preemptive', 'overheads', 'execution_times', 'seed')
 
 
 def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:

@@ -253,7 +253,7 @@ def test_other_bad_input_is_one_line(
         ([trace, '--workers', '2'], '--workers: a run is replayed as it was recorded: add '),
         ([trace, '--policy', 'rad'], '--policy: a run is replayed as it was recorded: add '),
         ([trace, '--preemptive'], '--preemptive: a run is replayed as it was recorded: add '),
-        ([trace, '--overheads', 'none'], '--overheads: a run is replayed as it was recorded: add '),
+        ([trace, '--overheads', 'none'], '--overheads: a run is replayed as it was recorded'),
         ([trace, '--seed', '0'], '--seed: a run is replayed as it was recorded: add '),
         ([trace, '--reschedule', '--seed', '1'], '--seed: a trace has its own execution times'),
         ([trace, '--reschedule', '--callbacks'], '--callbacks: '),

@@ -383,5 +383,6 @@ nodes:
   - node: /detect
     callbacks: [{name: run, subscription: /image, deadline: 10ms}]
 """, 'g.yaml')
-    sink = replay(recorded.write([lost]), graph).result()['dags']['/camera']['sinks']['/detect:run']
+    result = replay(recorded.write([lost]), graph).result()
+    sink = result['dags']['/camera']['sinks']['/detect:run']
     assert (sink['expired'], sink['late'], sink['completed']) == (19, 1, 20)
