@@ -129,8 +129,9 @@ class _Writer:
         """Write all lines."""
         for event in self._events:
             if isinstance(event, yaml.DocumentStartEvent) and event.explicit:
-                raise refused(self._name)
-            if isinstance(event, yaml.NodeEvent):
+                self._begin(0, event.start_mark.line, 0)
+                self._line = self._source(event)
+            elif isinstance(event, yaml.NodeEvent):
                 self._value(event, -2)
         self._begin(0, len(self._text), 0)
         if self._behind or self._alone:

@@ -121,6 +121,10 @@ nodes:
         format_text(text.replace('timer:', 'publishes: [/a,  # four\n        /b], timer:'))
 
 
+def test_the_mark_of_a_document_stays() -> None:
+    assert format_text('# a\n---   # b\n' + UGLY) == '# a\n---   # b\n\n\n' + NORMAL
+
+
 def test_a_wrong_declaration_is_an_error() -> None:
     with pytest.raises(msg_graph.GraphError, match="g.yaml:1: .*'2' is no known version"):
         format_text('mddag: 2\nnodes: []\n', 'g.yaml')
