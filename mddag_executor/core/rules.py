@@ -116,11 +116,6 @@ def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
     s.x_ready[x] = now
     s.x_started[x] = -1
     s.x_left[x] = s.x_cost[x]
-    _enqueue(t, s, key, x)
-
-
-def _enqueue(t: Tables, s: State, key: KeyFunction, x: int) -> None:
-    slot = s.x_slot[x]
     s.scalars[ORDER] += 1
     k = key(t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], s.scalars[ORDER])
     entry = (k[0], k[1], k[2], k[3], x)
@@ -254,10 +249,20 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
         return -1
     victim = s.worker_x[worker]
     _leave_worker(s, victim)
-    s.x_left[victim] += s.scalars[SWITCH_OVERHEAD] - (now - s.x_started[victim])
     x = take(t, s, worker, now)
-    _enqueue(t, s, key, victim)
+    _put_back(t, s, key, victim, now)
     return x
+
+
+def _put_back(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
+    """Put what is preempted into the ready queue again, with what is left of it (rules 3, 5)."""
+    ready, started = s.x_ready[x], s.x_started[x]
+    left = s.x_left[x] + s.scalars[SWITCH_OVERHEAD] - (now - started)
+    make_ready(t, s, key, x, now)
+    s.job_active[s.x_slot[x]] -= 1  # it was, and still is
+    s.x_ready[x] = ready
+    s.x_started[x] = started
+    s.x_left[x] = left
 
 
 def _leave_worker(s: State, x: int) -> None:

@@ -76,7 +76,8 @@ class Engine:
         self.undeclared = 0
         # how often a callback group did not let something run, and what waits for that
         self.refusals = 0
-        self._refused: list[Entity] = []
+        self.has_more = False
+        self.to_ask_again: list[Entity] = []
         self._state = self.scheduler.state
         self._work: dict[int, Work] = {}
         self._next_job = [0] * self.tables.n_dags
@@ -84,8 +85,9 @@ class Engine:
 
     # --- what became ready -----------------------------------------------------------------------
 
-    def timer_due(self, entity: Entity, work: Work, due: int, now: int) -> None:
+    def timer_due(self, work: Work, due: int, now: int) -> None:
         """Take in a timer that became due at ``due``."""
+        entity = work.entity
         if entity.removed or self._finished:
             return
         if entity.depth and len(entity.waiting) >= entity.depth:
@@ -289,10 +291,13 @@ class Engine:
         """
         Dispatch the next execution on a worker that runs nothing; None: nothing may run.
 
+        ``has_more`` tells then whether anything is left that a worker may be able to run.
+
         :param worker: -1: the idle one with the lowest number, if there is any.
         """
         state = self._state
-        if not (state.ready or state.held_back or state.unpolled):
+        self.has_more = bool(state.ready or state.held_back or state.unpolled)
+        if not self.has_more:
             return None
         if worker < 0:
             if not state.scalars[N_IDLE]:
@@ -301,6 +306,7 @@ class Engine:
         x = self.scheduler.take(worker, now)
         if state.decisions:
             self._decided(now)
+        self.has_more = bool(state.ready or state.held_back or state.unpolled)
         if x < 0:
             return None
         work = self._work.pop(x)
@@ -336,16 +342,11 @@ class Engine:
 
     def ask_again(self) -> None:
         """Make ready again what a callback group did not let run."""
-        refused, self._refused = self._refused, []
+        refused, self.to_ask_again = self.to_ask_again, []
         for entity in refused:
             x = next(iter(entity.waiting), -1)
             if x >= 0 and self._state.x_state[x] == SUSPENDED:
                 self.scheduler.resume(x)
-
-    @property
-    def has_refused(self) -> bool:
-        """Return whether there is anything to ask again."""
-        return bool(self._refused)
 
     # --- what became of it -----------------------------------------------------------------------
 
@@ -399,7 +400,7 @@ class Engine:
         self.scheduler.refuse(x)
         self._work[x] = work
         entity.waiting = {x: None, **entity.waiting}
-        self._refused.append(entity)
+        self.to_ask_again.append(entity)
         self.refusals += 1
         if 0 < entity.depth < len(entity.waiting) and entity.kind != TIMER:
             self._drop(entity, x, 'qos_depth', now)  # a newer one has come meanwhile

@@ -48,10 +48,11 @@ from typing import Any
 
 from mddag_executor.live.compat import keeps_time
 from mddag_executor.live.hooks import install, publisher_state
-from mddag_executor.live.intake.arrivals import Arrival, Receiver
+from mddag_executor.live.intake.arrivals import Receiver
 from mddag_executor.live.intake.entities import EntitySet
 from mddag_executor.live.intake.sources import MOST_AT_ONCE, SubscriptionSource
 from mddag_executor.live.jobs import PublisherState
+from mddag_executor.live.work import Work
 from rclpy.exceptions import InvalidHandle
 from rclpy.qos import DurabilityPolicy, qos_check_compatible, QoSCompatibility
 from rclpy.subscription import Subscription
@@ -84,7 +85,7 @@ class Direct:
         except InvalidHandle:
             return False  # destroyed: its node tells the executor
 
-    def take(self, begin: int, arrivals: list[Arrival]) -> bool:
+    def take(self, begin: int, arrivals: list[Work]) -> bool:
         """
         Take what is there, at least up to a message that was just published.
 
@@ -130,7 +131,7 @@ class Delivery:
 
     def deliver(self, begin: int) -> None:
         """Take what is there (see ``Direct.take``), and hand it over in one piece."""
-        arrivals: list[Arrival] = []
+        arrivals: list[Work] = []
         missed = False
         for direct in self._directs:
             direct.lock.acquire()

@@ -81,13 +81,11 @@ class Interpreter:
     # --- measuring -------------------------------------------------------------------------------
 
     def begins(self, seat: Seat, habit: Habit) -> None:
-        """Take note, in its thread, that a seat's execution begins."""
-        seat.reading = None
-        clock = seat.cpu_clock
-        if clock is not None and habit.is_to_be_measured():
-            seat.reading = clock.read(habit.computes_at_all)
-            seat.began_ns = seat.reading[0]
-            seat.computed_before = self._computed_ns
+        """Measure, in its thread, a seat's execution that begins."""
+        assert seat.cpu_clock is not None
+        seat.reading = seat.cpu_clock.read(habit.computes_at_all)
+        seat.began_ns = seat.reading[0]
+        seat.computed_before = self._computed_ns
 
     def ended(self, seat: Seat, habit: Habit, start: int, end: int) -> None:
         """Learn, in its thread, from a seat's execution."""

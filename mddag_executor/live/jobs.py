@@ -127,24 +127,6 @@ class _Topic:
             self._count = 0
             self.longest, self._longest_lately = self._longest_lately, 0
 
-    def holding(self, stamp: int) -> list[Publication]:
-        """Return the publications whose window holds a stamp."""
-        fits: list[Publication] = []
-        if self.open:
-            fits.extend(p for p in self.open.copy() if p.begin - ROUNDING_NS <= stamp)
-        # What began this long ago has ended before the stamp, like all before it.
-        first = stamp - self.longest - OUT_OF_ORDER_NS
-        publications = self.publications
-        for i in range(len(publications) - 1, -1, -1):
-            # By index: other threads append meanwhile, which may only show an entry twice.
-            publication = publications[i]
-            if publication.begin < first:
-                break
-            if (publication.begin - ROUNDING_NS <= stamp <= publication.end + ROUNDING_NS
-                    and publication not in fits):
-                fits.append(publication)
-        return fits
-
 
 class Jobs:
     """
@@ -193,7 +175,23 @@ class Jobs:
         :param sequence: its publication sequence number, where the middleware gives one.
         """
         known = self._topics.get(topic)
-        fits = known.holding(stamp) if known is not None else []
+        if known is None:
+            self.unknown += 1
+            return None
+        fits: list[Publication] = []
+        if known.open:
+            fits.extend(p for p in known.open.copy() if p.begin - ROUNDING_NS <= stamp)
+        # What began this long ago has ended before the stamp, like all before it.
+        first = stamp - known.longest - OUT_OF_ORDER_NS
+        publications = known.publications
+        for i in range(len(publications) - 1, -1, -1):
+            # By index: other threads append meanwhile, which may only show an entry twice.
+            publication = publications[i]
+            if publication.begin < first:
+                break
+            if (publication.begin - ROUNDING_NS <= stamp <= publication.end + ROUNDING_NS
+                    and publication not in fits):
+                fits.append(publication)
         if len(fits) == 1:
             if sequence is not None:
                 fits[0].publisher.offset = sequence - fits[0].sequence

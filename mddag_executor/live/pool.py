@@ -108,28 +108,30 @@ class Pool:
             running = current.running
             if running is None:
                 own = self._hand_out(now, current.intake)
-            elif not running.is_about_to_end(self.engine):
-                self._hand_out(now)
+            elif not (running.published and running.engine is self.engine
+                      and running.work is not None and not running.work.entity.ends_soon.debt):
+                self._hand_out(now)  # else who has published goes on with it soon
         if own is not None:
             self._execute(own)
             if own.relieved:
                 own.relieved = False
                 self.relieve_intake(False)
 
-    def begin_batch(self) -> None:
+    @contextmanager
+    def batch(self) -> Iterator[None]:
         """
-        Start nothing until ``end_batch``: more is going to become ready at this instant.
+        Start nothing while entered: more is going to become ready at this instant.
 
         Else the first of several would start though a more urgent one follows.
         """
         with self.lock:
             self._batches += 1
-
-    def end_batch(self) -> None:
-        """End what one ``begin_batch`` has begun."""
-        with self.lock:
-            self._batches -= 1
-            self._hand_out(self.tick())
+        try:
+            yield
+        finally:
+            with self.lock:
+                self._batches -= 1
+                self._hand_out(self.tick())
 
     def tick(self) -> int:
         """Return the engine's time now; the caller holds the lock."""
@@ -262,10 +264,12 @@ class Pool:
         """
         engine = self.engine
         chosen = None
-        while self.running and not self._batches:
+        more = self.running and not self._batches
+        while more:
             work = engine.next(now)
+            more = engine.has_more and work is not None
             if work is None:
-                if engine.holds_back:
+                if engine.has_more and engine.holds_back:
                     self._interpreter.watch()
                 break
             if own is not None and chosen is None and not work.entity.is_brief.debt:
@@ -309,7 +313,8 @@ class Pool:
         raised: BaseException | None = None
         start = monotonic_ns() + self.clock.offset_ns
         seat.began_ns = start
-        if seat.cpu_clock is not None:
+        seat.reading = None
+        if seat.cpu_clock is not None and entity.habit.is_to_be_measured():
             self._interpreter.begins(seat, entity.habit)
         try:
             waits_for = work.step() if entity.gate is None else entity.gate.step(work)
@@ -318,7 +323,8 @@ class Pool:
         end = monotonic_ns() + self.clock.offset_ns
         current.running = before
         if seat.published:
-            seat.callback_ended()
+            entity.ends_soon.took(end - self.clock.offset_ns - seat.published)
+            seat.published = 0
         if entity.is_brief.debt or end - start > BRIEF_NS:
             entity.is_brief.took(end - start)
         if seat.reading is not None or entity.habit.holds:
@@ -330,13 +336,17 @@ class Pool:
                 engine.finished(work, start, end, now, seat.vtid, seat.worker)
             else:
                 self._tell_outcome(seat, work, waits_for, raised, start, end, now)
-            if engine.has_refused and type(raised) is not Refused:
+            if engine.to_ask_again and type(raised) is not Refused:
                 engine.ask_again()
             seat.work = None
-            if seat.thread is not None:
-                self._take_next(seat, now)
-            if engine.has_waiting:
+            if seat.thread is None:
                 self._hand_out(now)
+            elif self._closed or not self.running or seat.worker < 0:
+                self._leave(seat, now)
+            else:
+                seat.work = engine.next(now, seat.worker)
+                if engine.has_more:
+                    self._hand_out(now)
         let_run = type(raised) is not Refused
         if waits_for is not None:
             self._resume_when_done(work, waits_for)
@@ -368,15 +378,14 @@ class Pool:
         else:
             engine.finished(work, start, end, now, seat.vtid, seat.worker, True)
 
-    def _take_next(self, seat: Seat, now: int) -> None:
-        """Leave a thread's next execution in its seat."""
+    def _leave(self, seat: Seat, now: int) -> None:
+        """Leave nothing to run in a thread's seat: it ends, is a spare again, or pauses."""
         if self._closed:
             seat.ended = True
         elif seat.worker < 0:
             self._lenders.remove(seat)
             self._spares.append(seat)
-        elif self.running:
-            seat.work = self.engine.next(now, seat.worker)
+        self._hand_out(now)
 
     # --- waiting ---------------------------------------------------------------------------------
 
@@ -404,7 +413,7 @@ class Pool:
         """
         engine = self.engine
         refusals, self._refusals = self._refusals, engine.refusals
-        if engine.has_waiting or engine.has_refused:
+        if engine.has_waiting or engine.to_ask_again:
             with self.lock:
                 engine.ask_again()
                 self._hand_out(self.tick())

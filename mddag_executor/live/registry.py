@@ -43,6 +43,7 @@ class Registry:
     Not thread-safe: the executor refreshes it under a lock of its own, and other threads only
     look entities up.
 
+    :ivar by_id: what is kept for each entity of rclpy, by the ``id`` of that.
     :param passed: told of each execution that a callback group has let through (see ``gates``).
     """
 
@@ -59,17 +60,13 @@ class Registry:
         # and all that are not given back yet
         self._groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
         self._numbers: set[int] = set()
-        self._entities: dict[int, Entity] = {}
+        self.by_id: dict[int, Entity] = {}
         # destroyed entities whose last executions are not done yet, and the counts of those before
         self._retired: list[Entity] = []
         self._past: dict[str, dict[str, Any]] = {}
         self._published: dict[str, set[str]] = {}
         self._undeclared: dict[binding.Entity, None] = {}
         self._names: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
-
-    def __getitem__(self, rclpy_entity: Any) -> Entity | None:
-        """Return what is kept for an entity of rclpy; None: it is not known (any more)."""
-        return self._entities.get(id(rclpy_entity))
 
     @property
     def declared(self) -> tuple[Callback, ...]:
@@ -91,7 +88,7 @@ class Registry:
             name = self._name(node)
             for attribute, kind in KINDS:
                 for rclpy_entity in getattr(node, attribute):
-                    entity = self._entities.get(id(rclpy_entity))
+                    entity = self.by_id.get(id(rclpy_entity))
                     if entity is None or entity.rclpy is not rclpy_entity or self._retimed(entity):
                         entity = self._new_entity(kind, rclpy_entity, name)
                         if entity is None:
@@ -99,11 +96,11 @@ class Registry:
                         added.append(entity)
                     present[id(rclpy_entity)] = entity
         if keep:
-            present = {**self._entities, **present}
-        gone = [e for key, e in self._entities.items() if present.get(key) is not e]
+            present = {**self.by_id, **present}
+        gone = [e for key, e in self.by_id.items() if present.get(key) is not e]
         for entity in gone:
             self._unbind(entity)
-        self._entities = present
+        self.by_id = present
         self._retired.extend(gone)
         self._fold()
         self._free_groups()
@@ -149,7 +146,7 @@ class Registry:
         """Return on which topics each declared callback has published."""
         found = {callback.key: set(self._published.get(callback.key, ()))
                  for callback in self.declared}
-        for entity in (*self._retired, *self._entities.values()):
+        for entity in (*self._retired, *self.by_id.values()):
             if entity.callback is not None:
                 found[entity.callback.key] |= entity.publishes
         return found
@@ -157,7 +154,7 @@ class Registry:
     def counts(self) -> dict[str, dict[str, Any]]:
         """Return the counts of all entities there have been, by callback (see ``Entity``)."""
         counts = {name: dict(past) for name, past in self._past.items()}
-        for entity in (*self._retired, *self._entities.values()):
+        for entity in (*self._retired, *self.by_id.values()):
             entity.count_into(counts)
         return counts
 
@@ -171,7 +168,7 @@ class Registry:
         for past in list(self._past.values()):
             for key in COUNTS:
                 totals[key] += past[key]
-        for entity in (*self._retired, *self._entities.values()):
+        for entity in (*self._retired, *self.by_id.values()):
             if entity.ready or entity.skipped:
                 for key in COUNTS:
                     totals[key] += getattr(entity, key)
@@ -180,7 +177,7 @@ class Registry:
     def hosted(self) -> set[str]:
         """Return the keys of the declared callbacks that an entity is bound to now."""
         return {
-            entity.callback.key for entity in self._entities.values()
+            entity.callback.key for entity in self.by_id.values()
             if entity.callback is not None}
 
     def undeclared(self) -> list[binding.Entity]:
@@ -189,11 +186,11 @@ class Registry:
 
     def subscriptions(self) -> list[Entity]:
         """Return the subscriptions that there are now."""
-        return [entity for entity in self._entities.values() if entity.kind == SUBSCRIPTION]
+        return [entity for entity in self.by_id.values() if entity.kind == SUBSCRIPTION]
 
     def timers(self) -> list[Entity]:
         """Return the timers that there are now."""
-        return [entity for entity in self._entities.values() if entity.kind == TIMER]
+        return [entity for entity in self.by_id.values() if entity.kind == TIMER]
 
     def _new_entity(self, kind: str, rclpy_entity: Any, node: str) -> Entity | None:
         callback, topic, depth, label, period = None, '', 0, '', None

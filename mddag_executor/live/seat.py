@@ -40,6 +40,7 @@ class Seat:
     """
     A thread that runs callbacks, and what it runs.
 
+    :ivar engine: whose executions it runs.
     :ivar worker: the worker that it is; -1: none at present.
     :ivar work: the execution that it runs, or is to run when it is woken.
     :ivar thread: its thread where that is one of the pool's own.
@@ -50,7 +51,7 @@ class Seat:
 
     __slots__ = (
         'worker', 'wake', 'work', 'ended', 'thread', 'vtid', 'cpu_clock', 'waits', 'relieved',
-        'reading', 'began_ns', 'computed_before', '_engine', '_clock', '_lend', 'published')
+        'reading', 'began_ns', 'computed_before', 'engine', '_clock', '_lend', 'published')
 
     def __init__(
         self, engine: Engine, clock: TraceClock, worker: int,
@@ -71,14 +72,14 @@ class Seat:
         self.reading: Reading | None = None
         self.began_ns = 0
         self.computed_before = 0
-        self._engine = engine
+        self.engine = engine
         self._clock = clock
         self._lend = lend
         self.published = 0
 
     def publish(self, send: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
         """Publish on behalf of the callback that runs; the caller holds the publisher's lock."""
-        work, engine = self.work, self._engine
+        work, engine = self.work, self.engine
         assert work is not None
         if engine.record is not None:
             engine.record(
@@ -89,17 +90,6 @@ class Seat:
         if not self.published:
             self.published = monotonic_ns()
 
-    def is_about_to_end(self, engine: Engine) -> bool:
-        """Return whether its callback, which is this engine's, has published and ends soon."""
-        return (self.published != 0 and self._engine is engine and self.work is not None
-                and not self.work.entity.ends_soon.debt)
-
-    def callback_ended(self) -> None:
-        """Note how soon after publishing its callback has ended."""
-        assert self.work is not None
-        self.work.entity.ends_soon.took(monotonic_ns() - self.published)
-        self.published = 0
-
     def lend(self) -> AbstractContextManager[None]:
         """Lend its worker while entered: the callback waits for a service."""
         return self._lend(self)
@@ -109,5 +99,5 @@ class Seat:
         """Return DAG, index and release of the job whose callback runs; None for no job."""
         if self.work is None or self.work.origin is None:
             return None
-        return (self._engine.dag_names[self.work.origin.dag], self.work.origin.job,
-                self._engine.release_of(self.work))
+        return (self.engine.dag_names[self.work.origin.dag], self.work.origin.job,
+                self.engine.release_of(self.work))

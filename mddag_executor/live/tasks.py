@@ -126,7 +126,7 @@ def make_task(
     if inspect.iscoroutine(callback):
         coroutine = callback
     task = ObservedTask(callback, args, kwargs, executor=executor)
-    work = TaskWork(entity, task, ())
+    work = TaskWork(None, task, entity=entity)
     work.coroutine = coroutine
     work.then = unclaimed.ended
     if coroutine is not None:

@@ -43,7 +43,17 @@ class Work:
     """
     One execution of a callback: what to call, for which job, and where it stands.
 
-    :param function: what to call, with ``args``; ``then`` gets what it returns.
+    The intake makes it of what has been taken: that is no longer in the middleware.
+
+    :ivar rclpy_entity: the timer, subscription, service, guard condition or waitable.
+    :ivar function: what is to be called for it, with ``args``.
+    :ivar then: what is to be called with its result, or None: a service's response is sent so.
+    :ivar info: of a message: what the middleware tells of it, with its stamps.
+    :ivar due: of a timer: its nominal due time, ns on the scale of ``time.monotonic_ns``, a point
+        of the timer's exact phase grid; with simulated time active, when it was noticed. After
+        an overrun it is when the first of the missed periods was due.
+    :ivar missed: so many periods after that one are skipped, as rcl does it.
+    :ivar entity: what the executor keeps for the entity.
     :ivar x: the execution in the core; -1 before it is ready and after it has ended.
     :ivar origin: the vertex and job that it executes; None where no DAG declares it.
     :ivar worker: where it runs, or has run last.
@@ -51,17 +61,23 @@ class Work:
     """
 
     __slots__ = (
-        'entity', 'x', 'function', 'args', 'then', 'coroutine', 'origin', 'worker', 'ready_ns')
+        'rclpy_entity', 'function', 'args', 'then', 'info', 'due', 'missed', 'entity', 'x',
+        'coroutine', 'origin', 'worker', 'ready_ns')
 
     def __init__(
-        self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...],
-        then: Callable[[Any], None] | None = None,
+        self, rclpy_entity: Any, function: Callable[..., Any], args: tuple[Any, ...] = (),
+        then: Callable[[Any], Any] | None = None, info: dict[str, Any] | None = None,
+        due: int | None = None, missed: int = 0, entity: Entity | None = None,
     ) -> None:
-        self.entity = entity
-        self.x = -1
+        self.rclpy_entity = rclpy_entity
         self.function = function
         self.args = args
         self.then = then
+        self.info = info
+        self.due = due
+        self.missed = missed
+        self.entity: Entity = entity  # type: ignore[assignment]  # else the receiver sets it
+        self.x = -1
         self.coroutine: Any = None
         self.origin: Origin | None = None
         self.worker = -1

@@ -64,7 +64,7 @@ class Driver:
                 return
             while releases and releases[0][0] == now:
                 source = self.entities[self.tables.source[releases.pop(0)[1]]]
-                self.engine.timer_due(source, Work(source, print, ()), now, now)
+                self.engine.timer_due(Work(None, print, entity=source), now, now)
             while (work := self.engine.next(now)) is not None:
                 self.note(now, 'start', work)
                 assert work.origin is not None
@@ -81,7 +81,7 @@ class Driver:
         for i in range(tables.first_successor[vertex], tables.first_successor[vertex + 1]):
             after = self.entities[tables.successors[i]]
             self.engine.arrived(
-                Work(after, print, ()), Origin(slot, dag, job, vertex), -1, -1, now)
+                Work(None, print, entity=after), Origin(slot, dag, job, vertex), -1, -1, now)
 
 
 @examples(150)
@@ -102,7 +102,7 @@ def test_the_same_events_give_the_same_answers_as_the_simulator(case: Case) -> N
 def test_a_full_queue_drops_the_oldest_and_counts_it() -> None:
     engine = Engine(None, 1, 'rad', default_deadline=100, max_active_jobs=64, expire_after=NEVER)
     entity = Entity('waitable', None, '/n', None, -1, 2, '/t')
-    works = [Work(entity, print, (number,)) for number in range(5)]
+    works = [Work(None, print, (number,), entity=entity) for number in range(5)]
     for now, work in enumerate(works):
         engine.arrived(work, None, -1, -1, now)
     ran = []

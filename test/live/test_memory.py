@@ -129,7 +129,7 @@ def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context)
 
     def nothing_left() -> bool:
         gc.collect()
-        return len(executor._registry._entities) == 0 and not executor._registry._retired
+        return len(executor._registry.by_id) == 0 and not executor._registry._retired
 
     with Spinning(executor) as spinning:
         cycle(SETTLED)
@@ -174,7 +174,7 @@ def test_a_destroyed_node_is_freed_without_the_collector(make_executor, ros_cont
                   *subscription.event_handlers, node.create_timer(100.0, print)]
         n_things = len(things) - 1  # publishers are not kept
         executor.add_node(node)
-        assert wait_for(lambda: len(executor._registry._entities) >= n_things)
+        assert wait_for(lambda: len(executor._registry.by_id) >= n_things)
         assert wait_for(lambda: executor._intake.settled())
         time.sleep(0.1)
         left = [weakref.ref(thing) for thing in (node, *things)]
@@ -203,7 +203,7 @@ def test_a_node_that_went_while_its_callback_ran_is_freed(make_executor, ros_con
         executor.remove_node(node)
         node.destroy_node()
         del node
-        assert wait_for(lambda: not executor._registry._entities)
+        assert wait_for(lambda: not executor._registry.by_id)
         go_on.set()
 
         def is_free() -> bool:

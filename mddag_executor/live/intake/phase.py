@@ -8,7 +8,7 @@ import time
 from typing import Any
 
 from mddag_executor.live.compat import timer_functions, with_timer_info
-from mddag_executor.live.intake.arrivals import Arrival
+from mddag_executor.live.work import Work
 from rclpy.clock_type import ClockType
 from rclpy.timer import Timer
 
@@ -51,14 +51,14 @@ class PhasedTimer:
         """Move its next call time on; rcl skips what it has missed."""
         self._info = self._call()
 
-    def arrival(self, due: int) -> Arrival | None:
+    def arrival(self, due: int) -> Work | None:
         """Return what it is handed over as, now that it was called; None without a callback."""
         timer = self.timer
         callback = timer.callback
         missed, self.missed = self.missed, 0
         if callback is None:
             return None
-        return Arrival(
+        return Work(
             timer, with_timer_info(timer, callback, self._info), due=due, missed=missed)
 
     def measure(self) -> tuple[int, int] | None:

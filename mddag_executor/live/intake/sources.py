@@ -14,8 +14,9 @@ from functools import partial
 from typing import Any, ClassVar
 
 from mddag_executor.live import compat
-from mddag_executor.live.intake.arrivals import Arrival, Receiver
+from mddag_executor.live.intake.arrivals import Receiver
 from mddag_executor.live.intake.entities import EntitySet
+from mddag_executor.live.work import Work
 from rclpy.exceptions import InvalidHandle
 from rclpy.qos import HistoryPolicy
 
@@ -93,11 +94,11 @@ class SubscriptionSource(Source):
         """Hand over a message that has been taken."""
         self._receiver.take_in((self.arrival(taken),))
 
-    def arrival(self, taken: tuple[Any, dict[str, Any]]) -> Arrival:
+    def arrival(self, taken: tuple[Any, dict[str, Any]]) -> Work:
         """Return what a message that has been taken is handed over as."""
         subscription = self.entity
         args = taken if compat.callback_type(subscription) is compat.WITH_INFO else taken[:1]
-        return Arrival(subscription, subscription.callback, args, None, taken[1])
+        return Work(subscription, subscription.callback, args, None, taken[1])
 
 
 class ServiceSource(Source):
@@ -122,7 +123,7 @@ class ServiceSource(Source):
     def arrived(self, request: Any, header: Any) -> None:
         """Hand over a request that has been taken."""
         service = self.entity
-        self._receiver.take_in((Arrival(
+        self._receiver.take_in((Work(
             service, service.callback, (request, service.srv_type.Response()),
             partial(service.send_response, header=header)),))
 
@@ -167,7 +168,7 @@ class GuardSource(Source):
         """Hand it over."""
         guard = self.entity
         if guard.callback is not None:
-            self._receiver.take_in((Arrival(guard, guard.callback),))
+            self._receiver.take_in((Work(guard, guard.callback),))
         return True
 
 
@@ -194,9 +195,9 @@ class WaitableSource(Source):
         data = waitable.take_data()
         compat.attach_futures(waitable, self._receiver.executor)
         feedback = compat.feedback_taken(waitable, data, MOST_AT_ONCE)
-        arrivals = [Arrival(waitable, callback, (message,)) for callback, message in feedback]
+        arrivals = [Work(waitable, callback, (message,)) for callback, message in feedback]
         if data or not arrivals:
-            arrivals.append(Arrival(waitable, waitable.execute, (data,)))
+            arrivals.append(Work(waitable, waitable.execute, (data,)))
         self._receiver.take_in(arrivals)
         return True
 

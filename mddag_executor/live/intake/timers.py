@@ -44,9 +44,10 @@ from heapq import heapify, heappop, heappush
 import time
 from typing import Any
 
-from mddag_executor.live.intake.arrivals import Arrival, Receiver
+from mddag_executor.live.intake.arrivals import Receiver
 from mddag_executor.live.intake.entities import alive
 from mddag_executor.live.intake.phase import PhasedTimer, TOLERANCE_NS, WIDE_NS
+from mddag_executor.live.work import Work
 from rclpy.clock import Clock, JumpHandle, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
@@ -169,7 +170,7 @@ class TimerQueue:
         heap = self._heap
         if not heap or heap[0][0] > now:
             return 0
-        arrivals: list[Arrival] = []
+        arrivals: list[Work] = []
         # An entry made meanwhile is of the next round, so this ends.
         last = self._entries
         while heap and heap[0][1] <= last and (heap[0][0] <= now or heap[0][0] <= _now()):
@@ -247,7 +248,7 @@ class TimerQueue:
         timer.entry = self._entries
         heappush(self._heap, (due, self._entries, timer))
 
-    def _fire(self, timer: PhasedTimer, arrivals: list[Arrival]) -> None:
+    def _fire(self, timer: PhasedTimer, arrivals: list[Work]) -> None:
         """Call a timer if rcl agrees that it is due."""
         try:
             with timer.handle:

@@ -10,10 +10,10 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.live.intake.arrivals import Arrival
 from mddag_executor.live.intake.entities import snapshot
 from mddag_executor.live.intake.events import EventsIntake
 from mddag_executor.live.intake.waitset import WaitSetIntake
+from mddag_executor.live.work import Work
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.waitable import NumberOfEntities, Waitable
@@ -59,13 +59,14 @@ class Recorder:
         if reaction is not None:
             reaction(*what)
 
-    def take_in(self, arrivals: Sequence[Arrival]) -> None:
+    def take_in(self, arrivals: Sequence[Work]) -> None:
         self.rounds.append(len(arrivals))
         for arrival in arrivals:
             self._arrived(arrival)
 
-    def _arrived(self, arrival: Arrival) -> None:
-        entity, function, args, then, info, due, missed = arrival
+    def _arrived(self, arrival: Work) -> None:
+        entity, function, args = arrival.rclpy_entity, arrival.function, arrival.args
+        then, info, due, missed = arrival.then, arrival.info, arrival.due, arrival.missed
         if due is not None:
             self.timers.append((entity, due))
             if missed:

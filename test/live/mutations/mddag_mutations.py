@@ -24,7 +24,6 @@ from mddag_executor.live import executor
 from mddag_executor.live.compat import BareTask
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import Entity, TASK
-from mddag_executor.live.intake.arrivals import Arrival
 from mddag_executor.live.intake.events import EventsIntake
 from mddag_executor.live.intake.sources import ClientSource
 from mddag_executor.live.intake.waitset import WaitSetIntake
@@ -206,9 +205,11 @@ def shutdown_leaves_intake() -> None:
 @mutation("A job's release is when its timer was looked at, and not when it was due.")
 def release_is_when_noticed() -> None:
     def make(take_in: Any) -> Any:
-        def broken(self: Receiver, arrivals: Sequence[Arrival]) -> None:
-            take_in(self, [a if a.due is None else a._replace(due=time.monotonic_ns())
-                           for a in arrivals])
+        def broken(self: Receiver, arrivals: Sequence[Work]) -> None:
+            for work in arrivals:
+                if work.due is not None:
+                    work.due = time.monotonic_ns()
+            take_in(self, arrivals)
         return broken
     replace(Receiver, 'take_in', make)
 
