@@ -128,8 +128,9 @@ class _Writer:
     def write(self) -> None:
         """Write all lines."""
         for event in self._events:
+            mark: Any = event.start_mark
             if isinstance(event, yaml.DocumentStartEvent) and event.explicit:
-                self._begin(0, event.start_mark.line, 0)
+                self._begin(0, mark.line, 0)
                 self._line = self._source(event)
             elif isinstance(event, yaml.NodeEvent):
                 self._value(event, -2)
