@@ -68,9 +68,18 @@ class Counts(NamedTuple):
         """Return how many were not in time."""
         return self.due - self.in_time
 
+    def minus(self, earlier: Counts) -> Counts:
+        """Return what has come since."""
+        return Counts(*(now - before for now, before in zip(self, earlier)))
+
+    @classmethod
+    def sum(cls, several: Iterable[Counts]) -> Counts:
+        """Return the sums of several."""
+        return cls(*(sum(column) for column in zip(cls(0, 0, 0, 0, 0, 0), *several)))
+
 
 def counts(sink: Mapping[str, Any]) -> Counts:
-    """Return the verdicts that a sink's result holds."""
+    """Return the verdicts that a sink's result holds, or its counters (``vars``)."""
     overdue = sink.get('overdue', 0)
     aborted, failed = sink.get('aborted', 0), sink.get('failed', 0)
     in_time = sink['completed'] - (sink['late'] - overdue)
@@ -80,8 +89,7 @@ def counts(sink: Mapping[str, Any]) -> Counts:
 
 def total(dags: Mapping[str, Any]) -> Counts:
     """Return the verdicts about all sinks of a result."""
-    every = [counts(sink) for dag in dags.values() for sink in dag['sinks'].values()]
-    return Counts(*(sum(column) for column in zip(Counts(0, 0, 0, 0, 0, 0), *every)))
+    return Counts.sum(counts(sink) for dag in dags.values() for sink in dag['sinks'].values())
 
 
 def never_due(dags: Mapping[str, Any]) -> list[str]:

@@ -28,10 +28,10 @@ import os
 import socket
 import threading
 import time
-from typing import NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from mddag_executor.core import quantile
-from mddag_executor.core.tally import SinkTally, Tally
+from mddag_executor.core.tally import Counts, counts, SinkTally, Tally
 from mddag_executor.live.endings import is_over, stop_at_exit
 from mddag_executor.live.settings import Thresholds
 from mddag_executor.text import counted
@@ -61,39 +61,6 @@ class Status:
     values: dict[str, str]
 
 
-class Results(NamedTuple):
-    """What came of the results of a DAG: counts since the start, or differences of two."""
-
-    jobs: int
-    completed: int
-    late: int
-    expired: int
-    aborted: int
-    failed: int
-
-    @property
-    def missed(self) -> int:
-        """Return how many were not in time."""
-        return self.late + self.expired + self.aborted + self.failed
-
-    @property
-    def due(self) -> int:
-        """Return how many have been judged."""
-        return self.completed + self.expired + self.aborted + self.failed
-
-    def minus(self, earlier: Results) -> Results:
-        """Return what has come since."""
-        return Results(*(a - b for a, b in zip(self, earlier)))
-
-
-def read_results(tally: Tally, dag: int, sinks: list[SinkTally]) -> Results:
-    """Read the counters of a DAG as they stand; those overdue at the run's end are left out."""
-    return Results(
-        tally.jobs[dag], sum(s.completed for s in sinks),
-        sum(s.late - s.overdue for s in sinks), sum(s.expired for s in sinks),
-        sum(s.aborted for s in sinks), sum(s.failed for s in sinks))
-
-
 def last_responses(sink: SinkTally, count: int) -> list[int]:
     """Return the last response times, ns; while others are added, one may be there twice."""
     kept = sink.responses
@@ -120,24 +87,29 @@ class DagWatch:
         self._sinks = sinks
         self._thresholds = thresholds
         self._stale_after = max(thresholds.stale_periods * period_ns, every_ns)
-        self._last = read_results(tally, dag, sinks)
+        self._last = self._read()
+        self._jobs = tally.jobs[dag]
         self._completed = [s.completed for s in sinks]
-        self._window: deque[Results] = deque(maxlen=thresholds.window)
+        self._window: deque[Counts] = deque(maxlen=thresholds.window)
         self._released_at: int | None = None
+
+    def _read(self) -> Counts:
+        """Read the counters as they stand."""
+        return Counts.sum(counts(vars(sink)) for sink in self._sinks)
 
     def status(self, now: int) -> Status:
         """Return the state of things; to be called once a period (``now``: monotonic ns)."""
-        results = read_results(self._tally, self._dag, self._sinks)
+        results, jobs = self._read(), self._tally.jobs[self._dag]
         step = results.minus(self._last)
-        self._last = results
         self._window.append(step)
-        if step.jobs:
+        if jobs != self._jobs:
             self._released_at = now
-        window = Results(*(sum(column) for column in zip(*self._window)))
+        self._last, self._jobs = results, jobs
+        window = Counts.sum(self._window)
         level, message = self._level(step, window, now)
         ratio = window.missed / window.due if window.due else 0.0
         values = {
-            'period_ms': _ms(self._period_ns), 'jobs': str(results.jobs),
+            'period_ms': _ms(self._period_ns), 'jobs': str(jobs),
             'results': str(results.due), 'missed': str(results.missed),
             'late': str(results.late), 'expired': str(results.expired),
             'aborted': str(results.aborted), 'failed': str(results.failed),
@@ -145,7 +117,7 @@ class DagWatch:
             'window_missed_ratio': f'{ratio:.4f}', **self._response_times()}
         return Status(f'{self._thresholds.name}: {self._name}', level, message, values)
 
-    def _level(self, step: Results, window: Results, now: int) -> tuple[int, str]:
+    def _level(self, step: Counts, window: Counts, now: int) -> tuple[int, str]:
         limits = self._thresholds
         if self._released_at is None:
             return STALE, 'nothing has been released yet'

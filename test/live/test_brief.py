@@ -124,3 +124,32 @@ def test_shutdown_waits_for_it(ears: Ears) -> None:
         ears.say('/a')
         assert ears.executor.shutdown()
         assert ended
+
+
+@pytest.mark.parametrize('what', ['subscription', 'node', 'executor', 'context'])
+def test_it_may_end_what_it_runs_on(
+        what: str, make_executor: Any, make_node: Any, ros_context: Any) -> None:
+    ears = Ears(make_executor, make_node)
+    ended = threading.Event()
+
+    def end() -> None:
+        if what == 'subscription':
+            for subscription in list(ears.node.subscriptions):
+                ears.node.destroy_subscription(subscription)
+        elif what == 'node':
+            ears.node.destroy_node()
+        elif what == 'executor':
+            ears.executor.shutdown()
+        else:
+            ros_context.shutdown()
+        ended.set()
+
+    with Spinning(ears.executor) as spinning:
+        ears.warm_up()
+        ears.body = end
+        ears.publishers['/a'].publish(Header())
+        assert ended.wait(20.0)
+        if what == 'subscription':
+            assert wait_for(lambda: ears.executor.statistics()['idle_workers'] == 3)
+        elif what in ('executor', 'context'):
+            spinning.join()
