@@ -11,11 +11,9 @@ from typing import Any
 
 from mddag_executor.replay.communications import Communications
 from mddag_executor.replay.drift import ImportedDrift, OwnDrift
-from mddag_executor.replay.groups import RecordedGroups
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.imported_run import ImportedPaths, ImportedRun
 from mddag_executor.replay.judge import Judge
-from mddag_executor.replay.names import CallbackNames
 from mddag_executor.replay.own_paths import OwnPaths
 from mddag_executor.replay.path_results import path_results
 from mddag_executor.replay.run import open_run, Run
@@ -43,11 +41,9 @@ class Replay:
     ) -> None:
         self.run = run
         self.task_set = run.task_set
-        self.groups = RecordedGroups()
-        waits = GroupWaits(self.groups)
+        waits = GroupWaits(run.who)
         self.judge = Judge(run.task_set, run.same, waits, skip)
         self.usage = Usage(run.task_set, waits)
-        self.names = CallbackNames()
         self.tally = self.judge.tally
         self._seen: Communications | None = None
         self._paths: ImportedPaths | OwnPaths | None = None
@@ -57,9 +53,9 @@ class Replay:
             if paths:
                 self._paths, self._drift = ImportedPaths(run), ImportedDrift(run)
         elif paths:
-            self._paths, self._drift = OwnPaths(run.task_set), OwnDrift(run)
+            self._paths, self._drift = OwnPaths(run), OwnDrift(run)
         observers = [waits, self.judge, self.usage, self._paths, self._drift, self._seen,
-                     *(more(self) if more is not None else ()), self.names]
+                     *(more(self) if more is not None else ())]
         collects = gc.isenabled()
         gc.disable()    # there are no cycles to find, and many tuples to look through
         try:

@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections import Counter
 
 from mddag_executor.replay.happenings import (
-    ADDRESS,
     Batch,
     Event,
     FIELD,
@@ -30,7 +29,7 @@ from mddag_executor.replay.happenings import (
 from mddag_executor.replay.imported_run import ImportedRun
 from mddag_executor.replay.linker import LinkObserver
 from mddag_executor.replay.own import OwnRun
-from mddag_executor.trace.census import Address, Census
+from mddag_executor.trace.census import ADDRESS, Address, Census
 from msg_graph import TaskSet
 from msg_graph.binding import Binder, Entity
 from msg_graph.drift import Drift, drift, Observed, Releases
@@ -48,7 +47,7 @@ class OwnDrift(Observer):
         self._run = run
         self._sources = [dag.vertices[dag.source].callback.key for dag in run.recorded_set.dags]
         self._keys = [[v.callback.key for v in dag.vertices] for dag in run.recorded_set.dags]
-        self._census = Census()
+        self._census = run.who
         self._observed = Observed()
         self._key: dict[Address, str] = {}
         self._executions: Counter[Address] = Counter()
@@ -58,8 +57,8 @@ class OwnDrift(Observer):
         self._running: dict[tuple[int, int], list[int]] = {}
 
     def handlers(self) -> Handlers:
-        """Return what takes in who there is, and what is dropped."""
-        return {**self._census.who, _DROP: self._drop}
+        """Return what takes in what is dropped."""
+        return {_DROP: self._drop}
 
     def _drop(self, event: Event) -> None:
         self._dropped[event[2], event[4]] += 1

@@ -37,8 +37,6 @@ Numbers = tuple[Ints, Ints]
 """Places in a batch, and the columns of the events of a kind that stand there."""
 # Columns that all events have; the fields follow.
 NOW, PROCESS, THREAD, FIELD = range(4)
-ADDRESS = 2 ** 64 - 1
-"""Columns have addresses with a sign; this mask takes it away."""
 
 #: Kinds of what happens; ``Observer`` has a method for each, and says what is in a row.
 KINDS = ('released', 'started', 'ran', 'completed', 'ended', 'withdrawn', 'failed', 'missed',

@@ -42,7 +42,6 @@ from mddag_executor.replay.happenings import (
     Batch,
     COMPLETED,
     ENDED,
-    Handlers,
     merged,
     Observer,
     RAN,
@@ -62,6 +61,7 @@ from mddag_executor.replay.paths import PathBook
 from mddag_executor.replay.recording import Head, named_errors, no_run
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
+from mddag_executor.trace.census import Census
 from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
 import numpy as np
@@ -110,6 +110,7 @@ class ImportedRun(LinkObserver):
             raise no_run(reader)
         #: Who is who in it.
         self.entities = Entities(init)
+        self.who = _Who(self.entities)
         # What another executor goes by is not recorded; it takes the place of the pool.
         self.head = Head(first, '', '', 'ros2', len(threads), _DEFAULT_DEADLINE, 0, False)
         self._matching = Matching(name, self.entities, threads, task_set)
@@ -176,16 +177,12 @@ class ImportedRun(LinkObserver):
         self, observers: Sequence[Observer], progress: Function[[int], None] | None = None
     ) -> None:
         """
-        Tell the observers everything.
-
-        They are told of callbacks and groups as a trace of this executor would, but with the
-        numbers of callbacks in place of addresses.
+        Tell the observers everything, with the numbers of callbacks in place of addresses.
 
         :param progress: told now and then how many events there have been.
         """
         self._observers = observers
         self._links = [each for each in observers if isinstance(each, LinkObserver)]
-        self._tell_groups(merged([observer.handlers() for observer in observers]))
         more = merged([observer.raw_handlers() for observer in self._links])
         count = 0
         take, linked = self._linker.take, self._linker.events
@@ -224,23 +221,6 @@ class ImportedRun(LinkObserver):
         self._order, self._rows = [], {}
         for observer in self._observers:
             observer.take(batch)
-
-    def _tell_groups(self, who: Handlers) -> None:
-        """Tell of callbacks and their groups, by numbers of callbacks."""
-        def tell(name: str, *fields: Any) -> None:
-            if name in who:
-                who[name]((name, self.head.time, 0, 0, *fields))
-
-        for callback in self.entities.every:
-            tell('ros2:rclcpp_callback_register', callback.number,
-                 callback.label or callback.description)
-            if callback.group is None or callback.kind not in (
-                    'timer', 'subscription', 'service'):
-                continue
-            kind = 'reentrant' if callback.group < 0 else 'mutually_exclusive'
-            tell('ros2_caret:add_callback_group', 0, callback.group, kind)
-            tell(f'ros2_caret:callback_group_add_{callback.kind}', callback.group,
-                 callback.number)
 
     # --- executions ------------------------------------------------------------------------------
 
@@ -410,6 +390,19 @@ class ImportedRun(LinkObserver):
         if self._dags and self.jobs == 0:
             lines.append(f'{name}: no job was released in it')
         return lines
+
+
+class _Who(Census):
+    """Who is who, by the numbers of callbacks."""
+
+    def __init__(self, entities: Entities) -> None:
+        super().__init__(keep_times=0)
+        self._groups = {
+            callback.number: callback.group for callback in entities.every
+            if callback.group is not None
+            and callback.kind in ('timer', 'subscription', 'service')}
+        self._names = {callback.number: callback.label or callback.description
+                       for callback in entities.every}
 
 
 class _Timers:

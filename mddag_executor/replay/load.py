@@ -37,10 +37,10 @@ from typing import NamedTuple
 
 from mddag_executor.core import legs_of, quantile, Tables
 from mddag_executor.replay.dispatches import Dispatches
-from mddag_executor.replay.groups import RecordedGroups
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.timed import edge_numbers, edges_of, Transports
 from mddag_executor.simulate import Load
+from mddag_executor.trace.census import Census
 from msg_graph import Dag, TaskSet
 
 _UNKNOWN = -1
@@ -102,17 +102,17 @@ class LoadBuilder(Observer):
     """
     Collects a load while it is told what happened.
 
-    :param groups: the callback groups, as far as the recording has told of them.
+    :param who: who is who, as far as the recording has told.
     :param n_workers: how many workers it was recorded with.
     """
 
     def __init__(
-        self, task_set: TaskSet, tables: Tables, groups: RecordedGroups, n_workers: int
+        self, task_set: TaskSet, tables: Tables, who: Census, n_workers: int
     ) -> None:
         self._task_set = task_set
         self._first = tables.first_vertex
         self._declared_group = tables.group
-        self._groups = groups
+        self._who = who
         self._jobs = [_Jobs(dag, n) for dag, n in zip(task_set.dags, edges_of(tables))]
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
         # when each round of timers ended
@@ -151,7 +151,7 @@ class LoadBuilder(Observer):
         row = -1 if vertex < 0 else self._jobs[dag].row.get(job, -1)
         if row >= 0 and not self._edges_into[vertex]:
             ready = max(ready, self._round_end(self._jobs[dag], row))
-        group: int | None = self._groups.numbers().get(callback, _UNTOLD)
+        group: int | None = self._who.groups().get(callback, _UNTOLD)
         if group == _UNTOLD and vertex >= 0 and self._declared_group[vertex] >= 0:
             group = _UNTOLD - 1 - self._declared_group[vertex]
         if group in (_NO_GROUP, _UNTOLD):

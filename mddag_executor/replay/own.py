@@ -50,6 +50,7 @@ from mddag_executor.replay.mapping import Mapping
 from mddag_executor.replay.recording import declared, Head, named_errors, TASK_SET
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
+from mddag_executor.trace.census import Census
 from mddag_executor.trace.events import Events
 from mddag_executor.trace.times import FAR_NS
 from msg_graph import TaskSet
@@ -92,6 +93,8 @@ class OwnRun:
     ) -> None:
         self._reader = reader
         self.name, self.head = name, head
+        #: Who is who in it.
+        self.who = Census(keep_times=0)
         #: The DAG tasks that it was recorded with; its events refer to them by index.
         self.recorded_set = declared(head, name)
         self._mapping = mapping = Mapping(name, self.recorded_set, task_set)
@@ -121,7 +124,8 @@ class OwnRun:
         :param progress: told now and then how many events there have been.
         """
         self._observers = observers
-        who = merged([observer.handlers() for observer in observers])
+        who = merged([dict.fromkeys(self.who.who, self.who.take),
+                      *(observer.handlers() for observer in observers)])
         count = 0
         with named_errors(self._reader.path, self.name):
             for events in self._reader.batches(

@@ -17,16 +17,14 @@ pieces (a coroutine) is one, from its first start to its last end.
 from __future__ import annotations
 
 from mddag_executor.replay.happenings import (
-    ADDRESS,
     Batch,
-    Event,
-    Handlers,
     Ints,
     Observer,
     PUBLISHED,
     RAN,
     STARTED,
 )
+from mddag_executor.replay.own import OwnRun
 from mddag_executor.replay.path_forest import NONE
 from mddag_executor.replay.paths import by_column, PathBook, S_MESSAGE, S_TOPIC, S_VERTEX
 from msg_graph import TaskSet
@@ -39,10 +37,11 @@ class OwnPaths(Observer):
     """
     Collects the flows along the paths of a run.
 
-    :param task_set: the declaration that judges.
+    :param run: which knows who publishes and takes what.
     """
 
-    def __init__(self, task_set: TaskSet) -> None:
+    def __init__(self, run: OwnRun) -> None:
+        task_set, self._who = run.task_set, run.who
         self.book = _Book(task_set)
         self._n_dags = max(1, len(task_set.dags))
         book, vertices = self.book, task_set.vertices
@@ -53,40 +52,6 @@ class OwnPaths(Observer):
         self._takes_topics = np.array([*(bool(v.callback.topics) for v in vertices), False])
         self._publishes = [[book.topics[topic] for topic in v.callback.publishes
                             if topic in book.topics] for v in vertices]
-        #: By address: number of the topic, and the node.
-        self._publishers: dict[int, tuple[int, int]] = {}
-        self._node: dict[int, str] = {}
-        # by handle, then by callback: the topic; and its number
-        self._topic_of: dict[int, str] = {}
-        # whether what is published is recorded
-        self._any_published = False
-
-    def handlers(self) -> Handlers:
-        """Return what takes in who publishes and takes what."""
-        if not self.book:
-            return {}
-        return {
-            'ros2:rcl_node_init': self._node_init,
-            'ros2:rcl_publisher_init': self._publisher_init,
-            'ros2:rcl_subscription_init': self._subscription_init,
-            'ros2:rclcpp_subscription_callback_added': self._callback_added}
-
-    def _node_init(self, event: Event) -> None:
-        self._node[event[4]] = f'{event[7].rstrip("/")}/{event[6]}'
-
-    def _publisher_init(self, event: Event) -> None:
-        self._any_published = True
-        self._publishers[_signed(event[4])] = (
-            self.book.topics.get(event[7], NONE),
-            self.book.nodes.get(self._node.get(event[5], ''), NONE))
-
-    def _subscription_init(self, event: Event) -> None:
-        self._topic_of[_signed(event[4])] = event[7]
-
-    def _callback_added(self, event: Event) -> None:
-        topic = self._topic_of.get(_signed(event[4]))
-        if topic is not None:
-            self._topic_of[_signed(event[5])] = topic
 
     def take(self, batch: Batch) -> None:
         """Take in what callbacks on paths did."""
@@ -105,7 +70,7 @@ class OwnPaths(Observer):
         ended = np.column_stack((
             batch.places(RAN)[chosen], self._callback[vertex],
             self._run(vertex, ran[:, 3], ran[:, 5]), ran[:, 7]))
-        if not self._any_published:
+        if not self._who.published_by():     # what is published is not recorded
             sent = self._at_ends(ended, ran)
         else:
             sent = self._published(batch)
@@ -117,7 +82,8 @@ class OwnPaths(Observer):
     def _number_of(self, callbacks: Ints) -> Ints:
         """Return the numbers of the topics of callbacks: -2 of one that no path leads over."""
         different, which = np.unique(callbacks, return_inverse=True)
-        topics = [self._topic_of.get(callback, '') for callback in different.tolist()]
+        topic_of = self._who.topics()
+        topics = [topic_of.get(callback, '') for callback in different.tolist()]
         return np.array([self.book.topics.get(topic, -2) if topic else NONE
                          for topic in topics], dtype=np.int64)[which]
 
@@ -144,8 +110,11 @@ class OwnPaths(Observer):
         """Return what is published on topics that paths lead over."""
         published = batch.columns(PUBLISHED)
         different, which = np.unique(published[:, 0], return_inverse=True)
-        known = [self._publishers.get(address, (NONE, NONE)) for address in different.tolist()]
-        topic, node = np.array(known, dtype=np.int64).reshape(-1, 2)[which].T
+        by = self._who.published_by()
+        known = [by.get(address, ('', '')) for address in different.tolist()]
+        topic, node = np.array(
+            [(self.book.topics.get(of, NONE), self.book.nodes.get(name, NONE))
+             for name, of in known], dtype=np.int64).reshape(-1, 2)[which].T
         vertex = published[:, 3]
         callback = np.where(published[:, 2] < 0, NONE, self._callback[vertex])
         chosen = np.flatnonzero(
@@ -191,9 +160,3 @@ class _Book(PathBook):
                     fits = mine & ((topics == topic) | (topics == NONE))
                     found.append(np.where(fits, self.message(job, before, topic), NONE))
         return found
-
-
-def _signed(address: int) -> int:
-    """Return an address as columns have it."""
-    address &= ADDRESS
-    return address - 2 ** 64 if address >= 2 ** 63 else address

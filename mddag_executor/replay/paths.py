@@ -47,7 +47,7 @@ HopKind = Literal['trigger', 'topic', 'variable']
 
 SETTLE = 1 << 18
 """Events from which on steps are made of them, and flows that are over are taken out."""
-KEPT = 4096
+KEPT = 1024
 """Executions and messages of a place that may still be referred to, unless told otherwise."""
 LAG_NS = 1_000_000_000
 """Nothing is told later than this after it happened."""
@@ -79,7 +79,8 @@ class _Place:
         self.node = node
         self.sync = sync
         self.hop: Hop | None = None             # to it
-        self.hop_topics = self.topics = np.empty(0, dtype=np.int64)     # of it, and behind it
+        self.hop_topics: list[int] = []         # of it
+        self.topics: list[int] = []             # behind it
         # the last steps that were started, done and published
         self.last = np.full(3, NONE, dtype=np.int64)
         # runs and messages with their steps
@@ -130,11 +131,9 @@ class PathBook:
                        callback.kind == 'sync')
         if position:
             place.hop = path_hops[position - 1]
-            place.hop_topics = np.array(
-                [self.topics[topic] for topic in place.hop.topics], dtype=np.int64)
+            place.hop_topics = [self.topics[topic] for topic in place.hop.topics]
         if position < len(path_hops):
-            place.topics = np.array(
-                [self.topics[topic] for topic in path_hops[position].topics], dtype=np.int64)
+            place.topics = [self.topics[topic] for topic in path_hops[position].topics]
         return place
 
     # --- what is told ----------------------------------------------------------------------------
@@ -186,7 +185,7 @@ class PathBook:
         for number, place in enumerate(self._places):
             before = self._at(number, place, before, *(
                 [rows.get(key, none[:0]) for key in keys] for rows, none, keys in zip(
-                    sorted_out, told, ([place.callback], [place.callback], place.topics.tolist(),
+                    sorted_out, told, ([place.callback], [place.callback], place.topics,
                                        [place.callback]))))
 
     def _at(
@@ -202,10 +201,16 @@ class PathBook:
         rows, = started
         if place.hop is not None and place.hop.kind == 'trigger':
             # else another leg of a sync callback
-            rows = rows[(rows[:, S_TOPIC] == NONE) | np.isin(rows[:, S_TOPIC], place.hop_topics)]
+            fits = rows[:, S_TOPIC] == NONE
+            for topic in place.hop_topics:
+                fits |= rows[:, S_TOPIC] == topic
+            rows = rows[fits]
         # a coroutine that goes on is started already
         rows = rows[np.sort(np.unique(rows[:, S_RUN], return_index=True)[1])]
-        rows = rows[~np.isin(rows[:, S_RUN], place.runs[:, 0])]
+        kept = np.sort(place.runs[:, 0])
+        at = np.searchsorted(kept, rows[:, S_RUN])
+        if len(kept):
+            rows = rows[kept[np.minimum(at, len(kept) - 1)] != rows[:, S_RUN]]
         parent = np.full(len(rows), NONE, dtype=np.int64)
         if place.hop is not None:
             last = self._places[number - 1]

@@ -192,7 +192,7 @@ def reschedule(
     builders: list[LoadBuilder] = []
 
     def build(recorded: Replay) -> list[LoadBuilder]:
-        builders.append(LoadBuilder(run.task_set, tables, recorded.groups, head.workers))
+        builders.append(LoadBuilder(run.task_set, tables, run.who, head.workers))
         return builders
 
     recorded = Replay(run, skip, progress, build, paths=False)
@@ -204,7 +204,7 @@ def reschedule(
             f'and no execution_time is declared: {listed(work.unknown)}',
             'give a GRAPH that declares it')
     tables = with_groups(
-        tables, builder.callback_of, recorded.groups.numbers(), declared_first=not run.same)
+        tables, builder.callback_of, run.who.groups(), declared_first=not run.same)
     return Reschedule(
         recorded, work, tables, policy, workers, preemptive, overheads, dispatch_overhead,
         recorded.judge.judge_from, skip)

@@ -7,8 +7,8 @@ from __future__ import annotations
 from collections import deque
 from itertools import islice
 
-from mddag_executor.replay.groups import RecordedGroups
-from mddag_executor.replay.happenings import Batch, Handlers, Ints, Observer, RAN
+from mddag_executor.replay.happenings import Batch, Ints, Observer, RAN
+from mddag_executor.trace.census import Census
 import numpy as np
 
 _KEEP = 256
@@ -23,21 +23,17 @@ class GroupWaits(Observer):
     :ivar found: of the batch that was told last: by piece, how long its group was busy, ns.
     """
 
-    def __init__(self, groups: RecordedGroups) -> None:
-        self._groups = groups
+    def __init__(self, who: Census) -> None:
+        self._who = who
         # by group what ran in it last: start and end
         self._busy: dict[int, deque[tuple[int, int]]] = {}
         self.found: Ints = np.empty(0, dtype=np.int64)
-
-    def handlers(self) -> Handlers:
-        """Return what takes in the callback groups."""
-        return self._groups.handlers()
 
     def take(self, batch: Batch) -> None:
         """Take in pieces of executions."""
         pieces = batch.columns(RAN)
         self.found = np.zeros(len(pieces), dtype=np.int64)
-        number = self._groups.numbers()
+        number = self._who.groups()
         if not len(pieces) or not number:
             return
         callbacks, which = np.unique(pieces[:, 0], return_inverse=True)

@@ -52,8 +52,8 @@ from mddag_executor.replay import Replay
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.happenings import Observer, Piece
 from mddag_executor.replay.judge import Judge
-from mddag_executor.replay.names import no_names
 from mddag_executor.report.text import printable
+from mddag_executor.report.timeline import no_names
 from msg_graph import TaskSet
 
 KEEP_ENDED = 4096
@@ -152,7 +152,7 @@ class Exporter(Observer):
 
     def of(self, replay: Replay) -> list[Observer]:
         """Export a replay: return what is told of the run, after the judge."""
-        self._name_of = replay.names
+        self._name_of = replay.run.who.name
         return self._begin(replay.task_set, replay.judge)
 
     def of_computed(self, run: ComputedRun) -> None:

@@ -23,7 +23,6 @@ from mddag_executor.replay.bags_reschedule import BagReschedule
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.judge import Judge
-from mddag_executor.replay.names import no_names
 from mddag_executor.replay.usage import Usage
 from mddag_executor.report.html_data import (
     json_for_html,
@@ -40,7 +39,7 @@ from mddag_executor.report.html_tables import (
 )
 from mddag_executor.report.tables import never_due_lines, verdicts_line
 from mddag_executor.report.text import format_ns, printable
-from mddag_executor.report.timeline import MOST_EXECUTIONS, Timeline
+from mddag_executor.report.timeline import MOST_EXECUTIONS, no_names, Timeline
 from mddag_executor.simulate import Load, Run
 from mddag_executor.text import counted
 from msg_graph import TaskSet
@@ -64,7 +63,7 @@ class Watch:
 
     def of(self, replay: Replay) -> list[Observer]:
         """Watch a replay: return what is told of the run, after the judge."""
-        return self._watch(replay.judge, replay.usage, replay.names)
+        return self._watch(replay.judge, replay.usage, replay.run.who.name)
 
     def _watch(
         self, judge: Judge, usage: Usage, names: Callable[[int], str] = no_names

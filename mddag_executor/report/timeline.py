@@ -37,7 +37,6 @@ from mddag_executor.core.state import (
     SINK_MISSED,
 )
 from mddag_executor.replay.happenings import Batch, Observer, RAN, RELEASED
-from mddag_executor.replay.names import no_names
 import numpy as np
 import numpy.typing as npt
 
@@ -59,6 +58,11 @@ _ADDRESS = 2 ** 64 - 1
 CALLBACK, _, VERTEX, DONE_FOR, WORKED_BY, BECAME_READY, STARTED, ENDED = range(8)
 
 Ints = npt.NDArray[np.int64]
+
+
+def no_names(callback: int) -> str:
+    """Stand for all undeclared callbacks, where a run was computed."""
+    return 'undeclared callbacks'
 
 
 class Columns(NamedTuple):

@@ -28,6 +28,8 @@ from msg_graph.binding import entity_name
 from msg_graph.duration import exact_duration
 
 KEEP_TIMES = 100_000
+ADDRESS = 2 ** 64 - 1
+"""Columns have addresses with a sign; this mask takes it away."""
 
 Event = tuple[Any, ...]
 Address = tuple[int, int]
@@ -96,6 +98,8 @@ class Census:
         self._exclusive: set[Address] = set()
         self._group: dict[Address, Address] = {}
         self._symbols: dict[Address, str] = {}
+        self._groups: dict[int, int] | None = None      # None: something new has come
+        self._names: dict[int, str] | None = None
         self._running: dict[tuple[int, int], list[tuple[Address, int]]] = {}
         #: What takes in who there is.
         self.who: dict[str, Callable[[Event], None]] = {
@@ -127,6 +131,8 @@ class Census:
         """Take in an event; one without some of its fields, or of another kind, is left out."""
         handler = self.handlers.get(event[0])
         if handler is not None and None not in event:
+            if event[0] in self.who:
+                self._groups = self._names = None
             handler(event)
 
     def _node(self, event: Event) -> None:
@@ -135,9 +141,9 @@ class Census:
         self.publishers.setdefault(name, {})
 
     def _publisher(self, event: Event) -> None:
-        node = self._nodes.get((event[2], event[5]))
-        if node is not None:
-            self._topic[event[2], event[4]] = (node, event[7])
+        node = self._nodes.get((event[2], event[5]), '')
+        self._topic[event[2], event[4]] = (node, event[7])
+        if node:
             self.publishers[node].setdefault(event[7], False)
 
     def _add(self, kind: str, event: Event, node: int | None, start: str, period: int | None
@@ -198,9 +204,8 @@ class Census:
 
     def published(self, callback: Address, publisher: Address) -> None:
         """Take in that a callback has published with a publisher."""
-        known = self._topic.get(publisher)
-        if known is not None:
-            node, topic = known
+        node, topic = self._topic.get(publisher, ('', ''))
+        if node:
             self.runs.setdefault(callback, Runs()).publishes[topic] = None
             self.publishers[node][topic] = True
 
@@ -218,8 +223,41 @@ class Census:
                          group if group in self._exclusive else None,
                          '' if callback is None else self._symbols.get(callback, ''))
 
-    def names(self) -> dict[int, str]:
-        """Return by address what callbacks are called that no declaration names."""
+    def groups(self) -> dict[int, int]:
+        """Return by callback its mutually exclusive group, or -1 for a reentrant one."""
+        if self._groups is None:
+            self._groups = {
+                signed(callback): signed(group[1]) if group in self._exclusive else -1
+                for entity, group in self._group.items() for callback in self._reachable(entity)}
+        return self._groups
+
+    def topics(self) -> dict[int, str]:
+        """Return by callback of a subscription its topic."""
+        return {signed(callback): start for entity, (kind, _, start, _) in self._made.items()
+                if kind == 'subscription' for callback in self._reachable(entity)}
+
+    def published_by(self) -> dict[int, tuple[str, str]]:
+        """Return by publisher its node (empty: not known) and topic."""
+        return {signed(address): what for (_, address), what in self._topic.items()}
+
+    def name(self, callback: int) -> str:
+        """Return what a callback is called that no declaration names."""
+        if self._names is None:
+            self._names = self._all_names()
+        return self._names.get(callback & ADDRESS, 'a callback whose start is not recorded')
+
+    def _reachable(self, address: Address) -> Iterator[int]:
+        """Yield what the links from a handle lead to, and itself."""
+        seen = {address: None}
+        todo = [address]
+        for handle in todo:
+            yield handle[1]
+            for after in self._links.get(handle, ()):
+                if after not in seen:
+                    seen[after] = None
+                    todo.append(after)
+
+    def _all_names(self) -> dict[int, str]:
         found = {address: symbol for (_, address), symbol in self._symbols.items()}
         for entity in self.entities():
             if entity.callback is not None:
@@ -238,3 +276,8 @@ class Census:
             seen.add(after)
             address = after
         return address if len(seen) > 1 else None
+
+
+def signed(address: int) -> int:
+    """Return an address as columns have it."""
+    return address - 2 ** 64 if address >= 2 ** 63 else address

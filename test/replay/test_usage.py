@@ -6,10 +6,10 @@ from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.replay.groups import RecordedGroups
 from mddag_executor.replay.happenings import Batch, Piece, RAN
 from mddag_executor.replay.usage import PoolUse
 from mddag_executor.replay.waits import GroupWaits
+from mddag_executor.trace.census import Census
 import numpy as np
 
 STEP = PoolUse.FIRST_STEP_NS
@@ -43,12 +43,11 @@ def piece(callback: int, ready: int, start: int, end: int) -> Piece:
 
 
 def test_waits_for_the_group() -> None:
-    groups = RecordedGroups()
-    handlers = groups.handlers()
-    handlers['ros2_caret:add_callback_group'](('', 0, 0, 0, 1, 50, 'mutually_exclusive'))
-    handlers['ros2_caret:add_callback_group'](('', 0, 0, 0, 1, 60, 'reentrant'))
+    groups = Census()
+    groups.take(('ros2_caret:add_callback_group', 0, 0, 0, 1, 50, 'mutually_exclusive'))
+    groups.take(('ros2_caret:add_callback_group', 0, 0, 0, 1, 60, 'reentrant'))
     for entity, group in ((1, 50), (2, 50), (3, 60)):
-        handlers['ros2_caret:callback_group_add_timer'](('', 0, 0, 0, group, entity))
+        groups.take(('ros2_caret:callback_group_add_timer', 0, 0, 0, group, entity))
     waits = GroupWaits(groups)
     pieces = [piece(1, 0, 2, 10), piece(2, 4, 12, 20), piece(3, 5, 20, 30),
               piece(1, 8, 25, 30), piece(9, 0, 40, 41)]
