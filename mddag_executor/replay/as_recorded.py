@@ -5,10 +5,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-import gc
 import os
 from typing import Any
 
+from mddag_executor.memory import no_garbage
 from mddag_executor.replay.communications import Communications
 from mddag_executor.replay.drift import ImportedDrift, OwnDrift
 from mddag_executor.replay.happenings import Observer
@@ -56,13 +56,8 @@ class Replay:
             self._paths, self._drift = OwnPaths(run), OwnDrift(run)
         observers = [waits, self.judge, self.usage, self._paths, self._drift, self._seen,
                      *(more(self) if more is not None else ())]
-        collects = gc.isenabled()
-        gc.disable()    # there are no cycles to find, and many tuples to look through
-        try:
+        with no_garbage():
             run.play([each for each in observers if each is not None], progress)
-        finally:
-            if collects:
-                gc.enable()
         self.warnings = run.warnings
         if self.judge.contradictions:
             self.warnings.append(

@@ -197,7 +197,7 @@ class Bag:
         return self.name if str(file) == self.path else str(file)
 
     def _look_through(self, times: Sequence[int]) -> None:
-        """Take in when the messages of a file came, and leave out those that cannot have."""
+        """Keep when the messages of a file came, and leave out those that cannot have."""
         wrong = self._times.impossible(times)
         if wrong:
             never = {times[place] for place in wrong}

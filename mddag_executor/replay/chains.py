@@ -126,7 +126,7 @@ class Chains:
         self._lengths: list[int] = []
 
     def begin_batch(self, batch: Batch) -> tuple[int, int]:
-        """Take in what completes and starts; return the numbers of the first links of each."""
+        """Begin with what completes and starts; return the numbers of the first links of each."""
         completed, started = batch.columns(COMPLETED), batch.columns(STARTED)
         first = len(self._kept)
         table = np.zeros((first + len(completed) + len(started), _N_LINK), dtype=np.int64)
@@ -150,7 +150,7 @@ class Chains:
         links[base:base + n] = [-1] * n
 
     def sink(self, base: int, vertex: int, job: int, release: int, completed: int) -> None:
-        """Take in that a sink has completed."""
+        """Note the chain of a sink that has completed."""
         links, offset, chain, before = self.links, self._offset, self._chains, self.before
         at, legs, ready, start, end = self._columns
         length = len(chain)

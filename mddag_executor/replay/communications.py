@@ -45,7 +45,7 @@ class _Latencies:
             self.flush()
 
     def flush(self) -> None:
-        """Take in what is left."""
+        """Add what is left."""
         self.spread.add(np.array(self._last, dtype=np.int64))
         self._last = array('q')
 
@@ -59,7 +59,7 @@ class Communications(LinkObserver):
         self._arrived: dict[tuple[int, int], _Latencies] = {}
 
     def began(self, run: Execution, message: Publication | None) -> None:
-        """Take in that an execution has begun."""
+        """Count an execution, and the way of its message."""
         callback = run.callback
         use = self._executions.get(callback.number)
         if use is None:
@@ -73,7 +73,7 @@ class Communications(LinkObserver):
             found.add(run.start - message.time)
 
     def over(self, run: Execution) -> None:
-        """Take in that an execution has ended."""
+        """Add how long an execution took."""
         use = self._executions[run.callback.number]
         took = run.end - run.start
         use.shortest = took if not use.finished else min(use.shortest, took)
@@ -82,7 +82,7 @@ class Communications(LinkObserver):
         use.busy += took
 
     def sent(self, message: Publication) -> None:
-        """Take in that a message was published."""
+        """Count a message of its publisher."""
         publisher = message.publisher
         if publisher is not None:
             _, count = self._sent.get(publisher.number, (publisher, 0))

@@ -54,21 +54,21 @@ class Doubts:
         (self._unsent if stamped else self._unknown)[key] = time
 
     def discarded(self, time: int) -> None:
-        """Take in that events were discarded up to a time."""
+        """Doubt what was released before events were discarded."""
         self._discarded = max(self._discarded, time)
 
     def opened(self, dag: int, job: int) -> None:
-        """Take in that a job was released."""
+        """Begin a job."""
         self._done[dag, job] = set()
         self._sent[dag, job] = set()
 
     def done(self, dag: int, vertex: int, job: int) -> None:
-        """Take in that a vertex of a job has completed."""
+        """Note that a vertex of a job has completed."""
         if (dag, job) in self._done:
             self._done[dag, job].add(vertex)
 
     def sent(self, dag: int, job: int, topic: str) -> None:
-        """Take in that a message of a job was published, and that it can be found."""
+        """Note that a message of a job was published, and that it can be found."""
         if (dag, job) in self._sent:
             self._sent[dag, job].add(topic)
 

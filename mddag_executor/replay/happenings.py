@@ -128,7 +128,7 @@ class Observer:
         return {}
 
     def take(self, batch: Batch) -> None:
-        """Take in a batch; here: one thing after the other."""
+        """Look at a batch; here: one thing after the other."""
         tell: list[Any] = [None] * len(KINDS)
         for kind, name in enumerate(KINDS):
             if getattr(type(self), name) is not getattr(Observer, name):
@@ -150,31 +150,31 @@ class Observer:
             self.decided(batch.decisions[at:])
 
     def hosted(self, dag: int, vertices: set[int]) -> None:
-        """Take in which (global) vertices of a DAG the process has from here on."""
+        """Hear that from here on the process has these (global) vertices of a DAG."""
 
     def judging(self, release: int) -> None:
-        """Take in that from here on only jobs released at a time or later are judged."""
+        """Hear that from here on only jobs released at a time or later are judged."""
 
     def released(self, dag: int, job: int, release: int, now: int) -> None:
-        """Take in the release of a job; `now` is when the executor noticed it."""
+        """Hear that a job was released; `now` is when the executor noticed it."""
 
     def started(
         self, dag: int, vertex: int, job: int, ready: int, start: int, callback: int
     ) -> None:
-        """Take in that an execution of a vertex was dispatched (or a coroutine went on)."""
+        """Hear that an execution of a vertex was dispatched (or a coroutine went on)."""
 
     def ran(
         self, callback: int, dag: int, vertex: int, job: int, worker: int, ready: int, start: int,
         end: int, first: int,
     ) -> None:
-        """Take in that a callback ran; see ``Piece``."""
+        """Hear that a callback ran; see ``Piece``."""
 
     def completed(
         self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, ready: int,
         start: int, ended: int, busy: int, number: int,
     ) -> None:
         """
-        Take in that an execution of a vertex has completed.
+        Hear that an execution of a vertex has completed.
 
         :param whole: whether that completed the vertex, as the executor saw it.
         :param ready: of the execution, as ``start`` to ``number``: see ``Execution``; the same
@@ -182,28 +182,28 @@ class Observer:
         """
 
     def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
-        """Take in that a job was aborted or, else, has expired."""
+        """Hear that a job was aborted or, else, has expired."""
 
     def withdrawn(self, dag: int, job: int) -> None:
-        """Take in that nobody can tell what became of a job: it is not to be judged."""
+        """Hear that nobody can tell what became of a job: it is not to be judged."""
 
     def failed(self, dag: int, vertex: int, job: int, now: int) -> None:
-        """Take in that an execution of a vertex failed: its job does; told before it completes."""
+        """Hear that an execution of a vertex failed: its job does; told before it completes."""
 
     def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
-        """Take in a miss as the executor saw it; `completed` is -1 where it never did."""
+        """Hear of a miss as the executor saw it; `completed` is -1 where it never did."""
 
     def published(
         self, publisher: int, callback: int, dag: int, vertex: int, job: int, ready: int, now: int
     ) -> None:
-        """Take in a publication; the DAG is -1 where no declared callback did it."""
+        """Hear of a publication; the DAG is -1 where no declared callback did it."""
 
     def decided(self, decisions: Sequence[Decision]) -> None:
-        """Take in what the judge's core has decided."""
+        """Hear what the judge's core has decided."""
 
     def finished(self, now: int, batch: Batch) -> None:
         """
-        Take in that the run has ended; what it had begun may still complete.
+        Hear that the run has ended; what it had begun may still complete.
 
         :param batch: is told after it; the judge puts in what the core decides.
         """

@@ -225,7 +225,7 @@ class ImportedRun(LinkObserver):
     # --- executions ------------------------------------------------------------------------------
 
     def began(self, run: Execution, message: Publication | None) -> None:
-        """Take in that an execution has begun."""
+        """Find the job of an execution that has begun, and tell of it."""
         target = self.targets.get(run.callback.number)
         run.ready = self._ready(run, message)
         if target is not None:
@@ -288,7 +288,7 @@ class ImportedRun(LinkObserver):
         return min(run.taken or run.start, run.start)
 
     def over(self, run: Execution) -> None:
-        """Take in that an execution has ended."""
+        """Tell of an execution that has ended, and of what it completes."""
         for observer in self._links:
             observer.over(run)
         dag, vertex, job = run.of if run.of is not None else (-1, -1, -1)
@@ -339,7 +339,7 @@ class ImportedRun(LinkObserver):
         return doubted
 
     def lost_sight(self, callback: Callback | None, run: Execution | None, time: int) -> None:
-        """Take in that something is not recorded."""
+        """Keep in mind what nobody can tell of a callback."""
         if callback is None:
             self._doubts.discarded(time)
         elif (target := self.targets.get(callback.number)) is not None:
@@ -349,7 +349,7 @@ class ImportedRun(LinkObserver):
             self._active[(dag, job)] -= 1
 
     def sent(self, message: Publication) -> None:
-        """Take in that a message was published."""
+        """Keep in mind which jobs have sent what."""
         of = None if message.run is None else message.run.of
         if of is not None and (message.stamp or message.within):
             self._doubts.sent(of[0], of[2], message.topic)
@@ -357,7 +357,7 @@ class ImportedRun(LinkObserver):
             observer.sent(message)
 
     def took(self, run: Execution, message: Publication) -> None:
-        """Take in that a callback took a message itself."""
+        """Hand on that a callback took a message itself."""
         for observer in self._links:
             observer.took(run, message)
 
@@ -471,7 +471,7 @@ class ImportedPaths(LinkObserver):
             (self._order, self.book.callbacks[target.callback.key], *row))
 
     def began(self, run: Execution, message: Publication | None) -> None:
-        """Take in that an execution has begun."""
+        """Note what an execution runs for."""
         self._number += 1
         run.number = self._number
         target = self._target.get(run.callback.number)
@@ -481,11 +481,11 @@ class ImportedPaths(LinkObserver):
                    -1 if message is None else message.number, -1)
 
     def over(self, run: Execution) -> None:
-        """Take in that an execution has ended."""
+        """Note the end of an execution."""
         self._tell(1, run, run.number, run.end)
 
     def sent(self, message: Publication) -> None:
-        """Take in that a message was published."""
+        """Note a publication."""
         self._number += 1
         message.number = self._number
         publisher, run = message.publisher, message.run
@@ -503,5 +503,5 @@ class ImportedPaths(LinkObserver):
                 message.time))
 
     def took(self, run: Execution, message: Publication) -> None:
-        """Take in that a callback took a message itself."""
+        """Note a message that a callback took itself."""
         self._tell(3, run, run.number, message.number)

@@ -276,7 +276,7 @@ class Judge(Observer):
         state.decisions.clear()
 
     def differ(self, miss: Miss, side: int) -> None:
-        """Take in a miss that was found here (side 1) or recorded (-1)."""
+        """Count a miss that was found here (side 1) or recorded (-1) against the other side."""
         if self.skip:
             return  # what was recorded is of all jobs
         difference = self._open_misses.pop(miss, 0) + side

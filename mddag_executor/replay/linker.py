@@ -140,20 +140,20 @@ class LinkObserver(Observer):
         return {}
 
     def began(self, run: Execution, message: Publication | None) -> None:
-        """Take in that an execution has begun, with the message that it runs for."""
+        """Hear that an execution has begun, with the message that it runs for."""
 
     def sent(self, message: Publication) -> None:
-        """Take in that a message was published."""
+        """Hear that a message was published."""
 
     def took(self, run: Execution, message: Publication) -> None:
-        """Take in that a running callback took a message itself."""
+        """Hear that a running callback took a message itself."""
 
     def over(self, run: Execution) -> None:
-        """Take in that an execution has ended."""
+        """Hear that an execution has ended."""
 
     def lost_sight(self, callback: Callback | None, run: Execution | None, time: int) -> None:
         """
-        Take in that something is not recorded.
+        Hear that something is not recorded.
 
         :param callback: it ran, nobody can tell for what; None: events were discarded.
         :param run: its execution, where only the end is not recorded.
@@ -267,7 +267,7 @@ class Linker:
         self.events = frozenset(self._handlers)
 
     def take(self, event: Event) -> None:
-        """Take in an event as ``TraceReader.layout_events`` has it; times never decrease."""
+        """Link an event as ``TraceReader.layout_events`` has it; times never decrease."""
         layout, now, pid, tid = event[:4]
         queue = self._queue
         while queue and queue[0][0] < now - LAG_NS:

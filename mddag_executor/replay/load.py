@@ -87,7 +87,7 @@ class _Jobs:
         self._new_edges = array('q', [_UNKNOWN]) * n_edges
 
     def add(self, job: int, release: int, now: int, number: int) -> None:
-        """Take in a job, and the round of timers that it was noticed in (or none)."""
+        """Add a job, and the round of timers that it was noticed in (or none)."""
         self.row[job] = len(self.numbers)
         self.numbers.append(job)
         self.release.append(release)
@@ -134,7 +134,7 @@ class LoadBuilder(Observer):
         self.callback_of: dict[int, int] = {}
 
     def released(self, dag: int, job: int, release: int, now: int) -> None:
-        """Take in a job."""
+        """Add a job."""
         number = _UNKNOWN
         if self._timer[dag]:
             if not self._rounds or release > self._rounds[-1]:

@@ -28,8 +28,6 @@ from mddag_executor.text import counted, listed
 from msg_graph import Callback, Dag, TaskSet, Vertex
 from msg_graph.binding import entities_of, Entity, meant
 
-_ORPHAN = (-1, -1, -1)
-
 
 class Mapping:
     """
@@ -77,16 +75,6 @@ class Mapping:
             legs.append(map_of_legs)
         self.vertex.append(vertices)
         self.leg.append(legs)
-
-    def look_up(self, dag: int, vertex: int, leg: int) -> tuple[int, int, int]:
-        """Return DAG, global vertex and leg of the declaration that judges, or -1 for each."""
-        if not 0 <= dag < len(self.dag) or not 0 <= vertex < len(self.vertex[dag]):
-            return _ORPHAN
-        target = self.vertex[dag][vertex]
-        legs = self.leg[dag][vertex]
-        if target < 0 or not 0 <= leg < len(legs):
-            return _ORPHAN
-        return self.dag[dag], target, legs[leg]
 
     def _compare(self, name: str, recorded: TaskSet, judge: TaskSet) -> None:
         """Find out which callbacks of the graph the trace does not have."""

@@ -269,7 +269,7 @@ class OwnRun:
                     self.end = max(self.end, int(numbers[name][1][:, NOW].max()))
 
     def begin(self, times: Ints) -> None:
-        """Take in when something became ready or was released."""
+        """Let the run begin no later than any of these times."""
         if len(times):
             least = int(times.min())
             self.start = least if self.start is None else min(self.start, least)

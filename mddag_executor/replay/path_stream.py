@@ -151,7 +151,7 @@ class PathFigures:
         self.whole = CaseBook(keep)     # from the first begin to the last end
 
     def add(self, flows: FlowColumns, to_come: Bounds) -> None:
-        """Take in flows of the path that are over; `to_come` bounds those that are not."""
+        """Count flows of the path that are over; `to_come` bounds those that are not."""
         self.flows += len(flows.path)
         self.arrived += int((flows.arrival != NONE).sum())
         self.inner.add(flows.first, flows.arrival, to_come.start, to_come.arrival)

@@ -143,7 +143,7 @@ class PathBook:
         took: Ints | None = None,
     ) -> None:
         """
-        Take in a stretch of what happened; the first column tells the places in its order.
+        Collect a stretch of what happened; the first column tells the places in its order.
 
         :param length: how many places there are.
         :param started: executions: callback, run, start, the topic that started it, the message

@@ -18,6 +18,7 @@ from mddag_executor.core import policy as find_policy
 from mddag_executor.core.jobs import finish
 from mddag_executor.core.state import Decision, JUDGE_FROM, new_state
 from mddag_executor.errors import UsageError
+from mddag_executor.memory import no_garbage
 from mddag_executor.replay.as_recorded import Progress, recording_result, Replay
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.groups import with_groups
@@ -197,7 +198,8 @@ def reschedule(
 
     recorded = Replay(run, skip, progress, build, paths=False)
     builder, = builders
-    work = builder.build(overheads)
+    with no_garbage():
+        work = builder.build(overheads)
     if work.unknown:
         raise ReplayError(
             run.name, f'{counted(len(work.unknown), "callback")} did not complete in it, '
@@ -205,9 +207,10 @@ def reschedule(
             'give a GRAPH that declares it')
     tables = with_groups(
         tables, builder.callback_of, run.who.groups(), declared_first=not run.same)
-    return Reschedule(
-        recorded, work, tables, policy, workers, preemptive, overheads, dispatch_overhead,
-        recorded.judge.judge_from, skip)
+    with no_garbage():
+        return Reschedule(
+            recorded, work, tables, policy, workers, preemptive, overheads, dispatch_overhead,
+            recorded.judge.judge_from, skip)
 
 
 def _settings(

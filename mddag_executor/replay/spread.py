@@ -39,7 +39,7 @@ class Spread:
         self._bins: dict[int, int] = {}
 
     def add(self, times: Column) -> None:
-        """Take in times."""
+        """Add times."""
         if not len(times):
             return
         least, greatest = int(times.min()), int(times.max())

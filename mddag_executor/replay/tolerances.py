@@ -43,7 +43,7 @@ class Runs:
         self._runs: list[tuple[int, int]] = []
 
     def add(self, number: int) -> None:
-        """Take in a number; one that is there already changes nothing."""
+        """Add a number; one that is there already changes nothing."""
         self._new.append(number)
         if len(self._new) >= max(FOLD, len(self._runs)):
             self._fold()

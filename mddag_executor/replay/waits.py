@@ -30,7 +30,7 @@ class GroupWaits(Observer):
         self.found: Ints = np.empty(0, dtype=np.int64)
 
     def take(self, batch: Batch) -> None:
-        """Take in pieces of executions."""
+        """Look how long pieces of executions waited."""
         pieces = batch.columns(RAN)
         self.found = np.zeros(len(pieces), dtype=np.int64)
         number = self._who.groups()
@@ -45,7 +45,7 @@ class GroupWaits(Observer):
             self._take_group(int(group[mine[0]]), mine, pieces[mine])
 
     def _take_group(self, group: int, rows: Ints, pieces: Ints) -> None:
-        """Take in the pieces of a group, in order."""
+        """Look at the pieces of a group, in order."""
         before = self._busy.setdefault(group, deque(maxlen=_KEEP))
         n = len(before)
         busy = [*before, *zip(pieces[:, 6].tolist(), pieces[:, 7].tolist())]

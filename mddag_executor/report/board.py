@@ -62,7 +62,7 @@ class Board:
         self._statuses: dict[tuple[str, str], Status] = {}
 
     def take(self, message: Any) -> None:
-        """Take in a ``DiagnosticArray``."""
+        """Show a ``DiagnosticArray``."""
         now = self._clock()
         for each in message.status:
             level = each.level[0] if isinstance(each.level, bytes) else int(each.level)

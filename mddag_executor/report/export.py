@@ -124,13 +124,13 @@ class Target(Protocol):
     """Where rows go."""
 
     def begin(self, task_set: TaskSet, tables: Tables) -> None:
-        """Take in what the run is of."""
+        """Begin with what the run is of."""
 
     def execution(self, ran: Ran) -> None:
-        """Take in an execution."""
+        """Write an execution."""
 
     def verdict(self, row: JobRow, vertex: int) -> None:
-        """Take in a verdict; the vertex is the global index of the sink."""
+        """Write a verdict; the vertex is the global index of the sink."""
 
     def finish(self) -> None:
         """Write what is left."""
@@ -178,7 +178,7 @@ class Exporter(Observer):
         self, callback: int, dag: int, vertex: int, job: int, worker: int, ready: int, start: int,
         end: int, first: int,
     ) -> None:
-        """Take in an execution, and hand it out or hold it back."""
+        """Make a row of an execution, and hand it out or hold it back."""
         self._hand_out_completed()
         piece = Piece(
             callback, dag, vertex, job, worker, ready, start, end, bool(first))
@@ -274,18 +274,18 @@ class Ordered:
         self._verdicts: list[tuple[int, int, int, tuple[JobRow, int]]] = []
 
     def begin(self, task_set: TaskSet, tables: Tables) -> None:
-        """Take in what the run is of."""
+        """Begin with what the run is of."""
         self._target.begin(task_set, tables)
 
     def execution(self, ran: Ran) -> None:
-        """Take in an execution."""
+        """Hold an execution back until its turn."""
         self._count += 1
         heapq.heappush(self._executions, (self._execution(ran.row), self._count, ran))
         if len(self._executions) > MOST_ORDERED:
             self._target.execution(heapq.heappop(self._executions)[-1])
 
     def verdict(self, row: JobRow, vertex: int) -> None:
-        """Take in a verdict."""
+        """Hold a verdict back until its turn."""
         self._count += 1
         heapq.heappush(self._verdicts, (row.release_ns, vertex, self._count, (row, vertex)))
         if len(self._verdicts) > MOST_ORDERED:
@@ -319,15 +319,15 @@ class _Rows:
         self.kind: type[ExecutionRow] | type[JobRow] = JobRow if jobs else ExecutionRow
 
     def begin(self, task_set: TaskSet, tables: Tables) -> None:
-        """Take in what the run is of."""
+        """Write what the run is of."""
 
     def execution(self, ran: Ran) -> None:
-        """Take in an execution."""
+        """Write an execution."""
         if not self._jobs:
             self._add(ran.row)
 
     def verdict(self, row: JobRow, vertex: int) -> None:
-        """Take in a verdict."""
+        """Write a verdict."""
         if self._jobs:
             self._add(row)
 

@@ -128,7 +128,7 @@ class Census:
         }
 
     def take(self, event: Event) -> None:
-        """Take in an event; one without some of its fields, or of another kind, is left out."""
+        """Note who or what an event tells; one that lacks fields, or of another kind, is left out."""
         handler = self.handlers.get(event[0])
         if handler is not None and None not in event:
             if event[0] in self.who:
@@ -203,7 +203,7 @@ class Census:
             self.published(stack[-1][0], (event[2], event[4]))
 
     def published(self, callback: Address, publisher: Address) -> None:
-        """Take in that a callback has published with a publisher."""
+        """Note that a callback has published with a publisher."""
         node, topic = self._topic.get(publisher, ('', ''))
         if node:
             self.runs.setdefault(callback, Runs()).publishes[topic] = None
