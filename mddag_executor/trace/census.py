@@ -128,7 +128,7 @@ class Census:
         }
 
     def take(self, event: Event) -> None:
-        """Note who or what an event tells; one that lacks fields, or of another kind, is left out."""
+        """Note what an event tells; one without some fields, or of another kind, is left out."""
         handler = self.handlers.get(event[0])
         if handler is not None and None not in event:
             if event[0] in self.who:
