@@ -12,6 +12,7 @@ from __future__ import annotations
 from mddag_executor.core.state import (
     ABORTED,
     ELSEWHERE,
+    ENDS_HERE,
     EXPIRED,
     FAILED,
     FREE,
@@ -19,7 +20,6 @@ from mddag_executor.core.state import (
     IDLE,
     JOB_END,
     JUDGE_FROM,
-    LAST_HERE,
     NOT_JUDGED,
     OPEN,
     SINK_ABORTED,
@@ -104,7 +104,7 @@ def expect(t: Tables, s: State, dag: int, here: list[int]) -> None:
             s.expected[first + i] = ELSEWHERE
             s.partial[dag] = 1
         elif leads_on[i] == 0 and t.sink_deadline[first + i] < 0:
-            s.expected[first + i] = LAST_HERE
+            s.expected[first + i] = ENDS_HERE
 
 
 def _leave_out(t: Tables, s: State, slot: int) -> None:
@@ -116,7 +116,7 @@ def _leave_out(t: Tables, s: State, slot: int) -> None:
             s.x_pending[s.job_base[slot] + t.region_offset[vertex]] = -1
             if t.sink_deadline[vertex] >= 0:
                 s.job_sinks_left[slot] -= 1
-        elif s.expected[vertex] == LAST_HERE:
+        elif s.expected[vertex] == ENDS_HERE:
             s.job_sinks_left[slot] += 1
 
 

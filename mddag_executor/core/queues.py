@@ -27,14 +27,14 @@ from __future__ import annotations
 
 from heapq import heapify, heappop, heappush
 
-from mddag_executor.core.state import ABORTED, Entry, N_HOLDING, N_STALE, State, WAITING
+from mddag_executor.core.state import ABORTED, N_HOLDING, N_STALE, QueueEntry, State, WAITING
 from mddag_executor.core.tables import Tables
 
 SWEEP_AT = 64
 """So many stale entries may stand in the queues anyway."""
 
 
-def is_stale(s: State, entry: Entry) -> bool:
+def is_stale(s: State, entry: QueueEntry) -> bool:
     """Tell whether a queue's entry is of a dropped execution (whose id may be in use again)."""
     return s.x_state[entry[4]] != WAITING or s.x_key[entry[4]] != entry
 
@@ -70,7 +70,7 @@ def _sweep(s: State) -> None:
     s.scalars[N_STALE] = 0
 
 
-def _keep_valid(s: State, heap: list[Entry]) -> None:
+def _keep_valid(s: State, heap: list[QueueEntry]) -> None:
     kept = 0
     for i in range(len(heap)):
         if not is_stale(s, heap[i]):
@@ -80,7 +80,7 @@ def _keep_valid(s: State, heap: list[Entry]) -> None:
     heapify(heap)
 
 
-def next_queue(s: State) -> list[Entry]:
+def next_queue(s: State) -> list[QueueEntry]:
     """
     Return the queue whose first entry goes first; it is empty when nothing is there to go.
 
@@ -94,13 +94,13 @@ def next_queue(s: State) -> list[Entry]:
     return s.held_back if interpreter_is_free(s, s.held_back[0]) else s.ready
 
 
-def _drop_stale(s: State, queue: list[Entry]) -> None:
+def _drop_stale(s: State, queue: list[QueueEntry]) -> None:
     while queue and is_stale(s, queue[0]):
         heappop(queue)
         s.scalars[N_STALE] -= 1
 
 
-def interpreter_is_free(s: State, entry: Entry) -> bool:
+def interpreter_is_free(s: State, entry: QueueEntry) -> bool:
     """Tell whether nothing that is as urgent or more holds the interpreter (rule 11)."""
     if s.scalars[N_HOLDING] > 0:
         for worker in range(len(s.worker_x)):
@@ -110,7 +110,7 @@ def interpreter_is_free(s: State, entry: Entry) -> bool:
     return True
 
 
-def wait_for_poll(t: Tables, s: State, entry: Entry) -> None:
+def wait_for_poll(t: Tables, s: State, entry: QueueEntry) -> None:
     """Let an execution wait at its entity for a poll (rule 9)."""
     x = entry[4]
     vertex = s.x_vertex[x]

@@ -87,8 +87,8 @@ from mddag_executor.core.state import (
     DONE,
     DROP,
     DROPPED,
+    ENDS_HERE,
     EXPIRED,
-    LAST_HERE,
     LATE,
     N_HOLDING,
     N_IDLE,
@@ -387,7 +387,7 @@ def _complete_vertex(
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
         elif late and t.on_miss[dag] == ABORT:
             abort_job(t, s, slot, now)
-    elif s.expected[vertex] == LAST_HERE:
+    elif s.expected[vertex] == ENDS_HERE:
         s.job_sinks_left[slot] -= 1
         if s.job_sinks_left[slot] == 0:
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)

@@ -21,8 +21,8 @@ IDLE, WAITING, RUNNING, SUSPENDED, DONE, DROPPED = range(6)
 # States of a job.  Of the last five every ended job is in exactly one.
 FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED = range(7)
 
-# Where a vertex is expected to run; LAST_HERE: here, is no sink, and nothing after it runs here.
-ELSEWHERE, HERE, LAST_HERE = range(3)
+# Where a vertex is expected to run; ENDS_HERE: here, is no sink, and nothing after it runs here.
+ELSEWHERE, HERE, ENDS_HERE = range(3)
 
 # Columns of ``scalars``.
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
@@ -38,7 +38,7 @@ ELSEWHERE, HERE, LAST_HERE = range(3)
 SINK_COMPLETED = (SINK_IN_TIME, SINK_LATE)
 NOT_JUDGED = -2
 
-Entry = tuple[int, int, int, int, int]
+QueueEntry = tuple[int, int, int, int, int]
 """What the ready queue holds: the four integers of a key, then the execution."""
 
 Decision = tuple[int, int, int, int, int, int]
@@ -50,12 +50,12 @@ class State(NamedTuple):
     scalars: list[int]
     # ready queue (a heap), a heap with those that wait for the interpreter, and one heap for each
     # callback group with those that wait for it
-    ready: list[Entry]
-    held_back: list[Entry]
-    group_heap: list[list[Entry]]
+    ready: list[QueueEntry]
+    held_back: list[QueueEntry]
+    group_heap: list[list[QueueEntry]]
     group_owner: list[int]
     # under a policy that polls: a heap for each entity, and the entities that have any entry there
-    entity_queue: list[list[Entry]]
+    entity_queue: list[list[QueueEntry]]
     unpolled: list[int]
     # workers
     worker_x: list[int]
@@ -87,7 +87,7 @@ class State(NamedTuple):
     # whether it holds the interpreter while it runs
     x_holds: list[int]
     x_worker: list[int]
-    x_key: list[Entry]
+    x_key: list[QueueEntry]
     x_ready: list[int]
     x_started: list[int]
     x_left: list[int]
@@ -195,6 +195,6 @@ def add_group(s: State) -> int:
     return len(s.group_owner) - 1
 
 
-def add_queue(queues: list[list[Entry]]) -> None:
+def add_queue(queues: list[list[QueueEntry]]) -> None:
     """Add an empty queue."""
     queues.append([])

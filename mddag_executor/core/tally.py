@@ -73,7 +73,7 @@ class Counts(NamedTuple):
         return Counts(*(now - before for now, before in zip(self, earlier)))
 
     @classmethod
-    def sum(cls, several: Iterable[Counts]) -> Counts:
+    def total(cls, several: Iterable[Counts]) -> Counts:
         """Return the sums of several."""
         return cls(*(sum(column) for column in zip(cls(0, 0, 0, 0, 0, 0), *several)))
 
@@ -89,7 +89,7 @@ def counts(sink: Mapping[str, Any]) -> Counts:
 
 def total(dags: Mapping[str, Any]) -> Counts:
     """Return the verdicts about all sinks of a result."""
-    return Counts.sum(counts(sink) for dag in dags.values() for sink in dag['sinks'].values())
+    return Counts.total(counts(sink) for dag in dags.values() for sink in dag['sinks'].values())
 
 
 def never_due(dags: Mapping[str, Any]) -> list[str]:

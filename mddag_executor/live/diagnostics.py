@@ -95,7 +95,7 @@ class DagWatch:
 
     def _read(self) -> Counts:
         """Read the counters as they stand."""
-        return Counts.sum(counts(vars(sink)) for sink in self._sinks)
+        return Counts.total(counts(vars(sink)) for sink in self._sinks)
 
     def status(self, now: int) -> Status:
         """Return the state of things; to be called once a period (``now``: monotonic ns)."""
@@ -105,7 +105,7 @@ class DagWatch:
         if jobs != self._jobs:
             self._released_at = now
         self._last, self._jobs = results, jobs
-        window = Counts.sum(self._window)
+        window = Counts.total(self._window)
         level, message = self._level(step, window, now)
         ratio = window.missed / window.due if window.due else 0.0
         values = {

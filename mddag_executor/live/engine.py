@@ -11,13 +11,13 @@ lock, so that times never decrease.  Nobody else reads or changes the core's sta
 
 1.  *What becomes ready* (``timer_due``, ``arrived``, ``ready``) is work for a job of a declared
     DAG, or for none.  Messages of known publications go to the job of these (``jobs``), others
-    may enter from another process (``crossings``), and what fits nothing runs as undeclared.
+    may enter from another process (``other_processes``), and what fits nothing runs as undeclared.
 2.  *A queue holds as many messages as its QoS says*; of more than that the oldest go, and are
     counted.  What no DAG declares runs in the order of becoming ready, so that nobody starves.
     For that the turn is the callback's and not the message's: where a queue overflows all the
     time, none of its messages waits for long, and it would have its turn after everybody who has
     waited longer.  So the next message takes the place of the one that goes.
-3.  *What to run* (``next``) and *what became of it* (``finished``,
+3.  *What to run* (``dispatch``) and *what became of it* (``finished``,
     ``suspended``, ``refused``, …) is the core's decision, see ``core.rules``.
 4.  *What the core decides beside* (verdicts, ends of jobs, what an abort drops) is counted,
     recorded and told to the user (``verdicts``).
@@ -32,9 +32,9 @@ from typing import TYPE_CHECKING
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.state import IDLE, N_HOLDING, N_IDLE, OPEN, SUSPENDED
-from mddag_executor.live.crossings import Crossings
 from mddag_executor.live.entity import Entity, TIMER
 from mddag_executor.live.jobs import Jobs, NO_ORIGIN, Origin
+from mddag_executor.live.other_processes import OtherProcesses
 from mddag_executor.live.verdicts import DeadlineMiss, Record, Verdicts
 from mddag_executor.trace.groups import EXECUTION
 from msg_graph import TaskSet
@@ -69,7 +69,7 @@ class Engine:
         self.scheduler = Scheduler(self.tables, n_workers, policy, propagate=False)
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss, fail)
         self.jobs = Jobs(task_set)
-        self.crossings = Crossings.of(task_set, self.tables, self.scheduler, self.jobs)
+        self.other_processes = OtherProcesses.of(task_set, self.tables, self.scheduler, self.jobs)
         self.dag_names = [d.name for d in task_set.dags] if task_set else []
         self.n_workers = n_workers
         self.record = record
@@ -134,8 +134,8 @@ class Engine:
             self._drop(entity, next(iter(entity.waiting)), 'qos_depth', now)
         if entity.source >= 0:
             self._start_job(work, max(entity.since, min(release, now)), now)
-            if stamp >= 0 and self.crossings is not None and work.origin is not None:
-                self.crossings.note(stamp, work.origin)
+            if stamp >= 0 and self.other_processes is not None and work.origin is not None:
+                self.other_processes.note(stamp, work.origin)
             return
         if origin is None and stamp >= 0:
             origin = self._enter(entity, stamp, min(release, now), now)
@@ -162,19 +162,19 @@ class Engine:
         self._start(work, self.scheduler.source(slot), now)
 
     def _enter(self, entity: Entity, stamp: int, release: int, now: int) -> Origin | None:
-        """Find or start the job of a message from another process (see ``crossings``)."""
-        if self.crossings is None or not entity.enters:
+        """Find or start the job of a message from another process (see ``other_processes``)."""
+        if self.other_processes is None or not entity.remote_publishers:
             return None
-        dag = self.tables.dag_of[entity.enters[0]]
-        job = self.crossings.find(dag, stamp)
+        dag = self.tables.dag_of[entity.remote_publishers[0]]
+        job = self.other_processes.find(dag, stamp)
         if job is None:
             slot = self._release(dag, release, now)
-            job = Origin(slot, dag, self._state.job_index[slot], entity.enters[0])
-            self.crossings.note(stamp, job)
+            job = Origin(slot, dag, self._state.job_index[slot], entity.remote_publishers[0])
+            self.other_processes.note(stamp, job)
         # Of a sync: the first of its legs that nothing has come for yet.
         return job._replace(vertex=next(
-            (v for v in entity.enters if self._is_idle(job, *entity.targets[v])),
-            entity.enters[0]))
+            (v for v in entity.remote_publishers if self._is_idle(job, *entity.targets[v])),
+            entity.remote_publishers[0]))
 
     def _is_idle(self, job: Origin, vertex: int, leg: int) -> bool:
         return self._state.x_state[self.scheduler.execution(job.slot, vertex, leg)] == IDLE
@@ -287,7 +287,7 @@ class Engine:
         """Return how many workers run nothing."""
         return self._state.scalars[N_IDLE]
 
-    def next(self, now: int, worker: int = -1) -> Work | None:
+    def dispatch(self, now: int, worker: int = -1) -> Work | None:
         """
         Dispatch the next execution on a worker that runs nothing; None: nothing may run.
 

@@ -70,8 +70,8 @@ class Entity:
     __slots__ = (
         'kind', 'rclpy', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
-        'busy_ns', 'unattributed', 'removed', 'address', 'handle', 'enters', 'ends_soon',
-        'is_brief', 'publishes', 'at_once', 'habit', 'since', 'gate', '__weakref__')
+        'busy_ns', 'unattributed', 'removed', 'address', 'handle', 'remote_publishers',
+        'ends_soon', 'is_brief', 'publishes', 'at_once', 'habit', 'since', 'gate', '__weakref__')
 
     def __init__(
         self, kind: str, rclpy: Any, node: str, callback: Callback | None, group: int,
@@ -89,8 +89,8 @@ class Entity:
         self.source = -1
         # publishing vertex -> (vertex that its message starts, leg)
         self.targets: dict[int, tuple[int, int]] = {}
-        # publishing vertices in other processes whose messages enter here (see ``crossings``)
-        self.enters: list[int] = []
+        # the vertices in other processes whose messages enter here
+        self.remote_publishers: list[int] = []
         # its executions that wait, the oldest first
         self.waiting: dict[int, None] = {}
         self.ready = 0

@@ -64,7 +64,7 @@ from mddag_executor.live.stop_watch import StopWatch
 from mddag_executor.live.tasks import make_task, Unclaimed
 from mddag_executor.live.upkeep import Upkeep
 from mddag_executor.live.verdicts import DeadlineMiss
-from mddag_executor.live.work import AtOnce, Work
+from mddag_executor.live.work import QuickCallback, Work
 from msg_graph import TaskSet
 from rclpy.executors import ExternalShutdownException, TimeoutObject
 from rclpy.task import Future, Task
@@ -277,7 +277,7 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
         """Run a function or coroutine in this executor; return its task, which is a future."""
-        if type(callback) is AtOnce:
+        if type(callback) is QuickCallback:
             task = Task(callback, args, kwargs)
             task()
             return task
@@ -323,7 +323,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self, future: Future, timeout_sec: float | None = None
     ) -> None:
         """Run callbacks on the pool until a future is done or the time is over."""
-        future.add_done_callback(AtOnce(self._attention.set))
+        future.add_done_callback(QuickCallback(self._attention.set))
         try:
             with short_switch_interval():
                 self._spin(lambda: future.done() or future.cancelled(), timeout_sec)
@@ -480,7 +480,7 @@ class MultiDeadlineExecutor(BareExecutor):
     ) -> None:
         """Wait for one callback, or until a future is done, and run it."""
         seconds = timeout_sec.timeout if isinstance(timeout_sec, TimeoutObject) else timeout_sec
-        future.add_done_callback(AtOnce(self.wake))
+        future.add_done_callback(QuickCallback(self.wake))
         self._spin_once(seconds, lambda: future.done() or future.cancelled())
 
     def _spin_once(self, timeout_sec: float | None, done: Callable[[], bool]) -> None:

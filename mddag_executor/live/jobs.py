@@ -107,7 +107,7 @@ class _Topic:
         # The longest window of those kept; a maximum of two generations, so that it is forgotten.
         self.longest = 0
         self._longest_lately = 0
-        # gets the stamp of each message, where other processes subscribe (see ``crossings``)
+        # gets the stamp of each message, where other processes subscribe (see ``other_processes``)
         self.on_header: Callable[[int, Origin], None] | None = None
         self._count = 0
 

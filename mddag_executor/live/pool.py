@@ -44,7 +44,7 @@ from mddag_executor.live.gates import Refused
 from mddag_executor.live.interpreter import Interpreter
 from mddag_executor.live.seat import current, Seat
 from mddag_executor.live.thread_clock import ThreadClock
-from mddag_executor.live.work import AtOnce, Destroyed, Work
+from mddag_executor.live.work import Destroyed, QuickCallback, Work
 
 LOOK_AGAIN_S = 0.02
 LOOK_POLLED_S = 0.002
@@ -266,7 +266,7 @@ class Pool:
         chosen = None
         more = self.running and not self._batches
         while more:
-            work = engine.next(now)
+            work = engine.dispatch(now)
             more = engine.has_more and work is not None
             if work is None:
                 if engine.has_more and engine.holds_back:
@@ -290,7 +290,7 @@ class Pool:
         ran = False
         while not ran:
             with self.lock:
-                work = self.engine.next(self.tick())
+                work = self.engine.dispatch(self.tick())
                 if work is None:
                     return False
                 seat = self._new_seat(work.worker)
@@ -344,7 +344,7 @@ class Pool:
             elif self._closed or not self.running or seat.worker < 0:
                 self._leave(seat, now)
             else:
-                seat.work = engine.next(now, seat.worker)
+                seat.work = engine.dispatch(now, seat.worker)
                 if engine.has_more:
                     self._hand_out(now)
         let_run = type(raised) is not Refused
@@ -394,7 +394,7 @@ class Pool:
             with self.lock:
                 self._polled.append(work)
         else:
-            waits_for.add_done_callback(AtOnce(partial(self.resume, work)))
+            waits_for.add_done_callback(QuickCallback(partial(self.resume, work)))
 
     def is_idle(self) -> bool:
         """Return whether nothing runs and nothing is ready."""

@@ -67,7 +67,7 @@ class Receiver:
                 origin = engine.jobs.find(
                     entity.topic, info['source_timestamp'],
                     info.get('publication_sequence_number'))
-                if origin is None and entity.enters:
+                if origin is None and entity.remote_publishers:
                     stamp = header_stamp(work.args[0])
                     release = steady_time(stamp, self._clock.now())
             if self._recorder is not None:

@@ -33,7 +33,7 @@ def statistics(
         waiting = engine.scheduler.queue_length
         idle = engine.scheduler.idle_workers
         undeclared = engine.undeclared
-        elsewhere = set() if engine.crossings is None else engine.crossings.elsewhere()
+        elsewhere = set() if engine.other_processes is None else engine.other_processes.elsewhere()
     callbacks = registry.counts()
     never_ran = [c.key for c in registry.declared
                  if c.key not in elsewhere

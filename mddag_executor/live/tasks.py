@@ -25,7 +25,7 @@ import weakref
 from mddag_executor.live.compat import BareTask, forget_task_frames
 from mddag_executor.live.entity import Entity
 from mddag_executor.live.seat import current
-from mddag_executor.live.work import AtOnce, TaskWork, Work
+from mddag_executor.live.work import QuickCallback, TaskWork, Work
 from rclpy.task import Future
 
 
@@ -130,5 +130,5 @@ def make_task(
     work.coroutine = coroutine
     work.then = unclaimed.ended
     if coroutine is not None:
-        Future.add_done_callback(task, AtOnce(partial(resume, work)))  # not an observer
+        Future.add_done_callback(task, QuickCallback(partial(resume, work)))  # not an observer
     return task, work

@@ -102,9 +102,9 @@ class Upkeep:
     def _register(self, nodes: list[Any], keep: bool = False) -> None:
         added, gone = self._registry.refresh(nodes, keep)
         engine, pool = self._pool.engine, self._pool
-        if engine.crossings is not None and (added or gone):
+        if engine.other_processes is not None and (added or gone):
             with pool.lock:
-                engine.crossings.host(
+                engine.other_processes.host(
                     self._registry.hosted(), self._registry.subscriptions(), engine.record,
                     pool.tick())
         since = pool.clock.now()

@@ -14,7 +14,7 @@ from mddag_executor.live.jobs import Origin
 from rclpy.exceptions import InvalidHandle
 
 
-class AtOnce:
+class QuickCallback:
     """
     A future's done callback that takes no time, and never fails.
 

@@ -21,8 +21,8 @@ from numba.extending import overload
 _KINDS = {
     'int': types.int64,
     'list[int]': VectorType(),
-    'list[Entry]': VectorType(5),
-    'list[list[Entry]]': VectorType(5, nested=True),
+    'list[QueueEntry]': VectorType(5),
+    'list[list[QueueEntry]]': VectorType(5, nested=True),
     'list[Decision]': VectorType(6),
 }
 

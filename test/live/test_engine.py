@@ -65,7 +65,7 @@ class Driver:
             while releases and releases[0][0] == now:
                 source = self.entities[self.tables.source[releases.pop(0)[1]]]
                 self.engine.timer_due(Work(None, print, entity=source), now, now)
-            while (work := self.engine.next(now)) is not None:
+            while (work := self.engine.dispatch(now)) is not None:
                 self.note(now, 'start', work)
                 assert work.origin is not None
                 _, dag, _, vertex = work.origin
@@ -106,7 +106,7 @@ def test_a_full_queue_drops_the_oldest_and_counts_it() -> None:
     for now, work in enumerate(works):
         engine.arrived(work, None, -1, -1, now)
     ran = []
-    while (ready := engine.next(10)) is not None:
+    while (ready := engine.dispatch(10)) is not None:
         ran.append(ready.args[0])
         engine.finished(ready, 10, 11, 11, 0, ready.worker)
     assert (ran, entity.dropped, entity.ran) == ([3, 4], 3, 2)

@@ -99,9 +99,9 @@ def ways() -> list[tuple[Way, Way]]:
         try:
             taken_in = last(names, 'Receiver.take_in', place)
             waits = names.index('key_rad', taken_in, place)
-            taken = last(names, 'Engine.next', place)
+            taken = last(names, 'Engine.dispatch', place)
             published = names.index('key_rad', place)
-            ended = names.index('Engine.next', published)
+            ended = names.index('Engine.dispatch', published)
         except ValueError:
             continue  # another worker ran a part of it
         if 'sink' not in names[place:ended]:

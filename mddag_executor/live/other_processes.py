@@ -50,7 +50,7 @@ KEEP = 4096
 """The jobs of so many stamps are remembered."""
 
 
-class Crossings:
+class OtherProcesses:
     """
     The DAGs that may reach beyond this process, and the jobs of their stamps.
 
@@ -73,11 +73,11 @@ class Crossings:
     @staticmethod
     def of(
         task_set: TaskSet | None, tables: Tables, scheduler: Scheduler, jobs: Jobs,
-    ) -> Crossings | None:
-        """Return the crossings of a declaration, None where no DAG has any."""
+    ) -> OtherProcesses | None:
+        """Return what is kept for a declaration; None: no DAG reaches beyond the process."""
         if task_set is None or all(d.release_from != 'header_stamp' for d in task_set.dags):
             return None
-        return Crossings(task_set, tables, scheduler, jobs)
+        return OtherProcesses(task_set, tables, scheduler, jobs)
 
     def update(self, hosted: set[str], entities: Iterable[Entity]) -> list[tuple[int, list[int]]]:
         """
@@ -99,7 +99,7 @@ class Crossings:
                     t for v in dag.vertices if here[v.index] for t in v.callback.publishes)
         self._job_notes.note_headers(self.note, leaving)
         for entity in entities:
-            entity.enters = self._entrance(entity, hosted)
+            entity.remote_publishers = self._entrance(entity, hosted)
         return changes
 
     def host(
