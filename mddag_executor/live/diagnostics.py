@@ -32,8 +32,8 @@ from typing import TYPE_CHECKING
 
 from mddag_executor.core import quantile
 from mddag_executor.core.tally import Counts, counts, SinkTally, Tally
-from mddag_executor.live.endings import is_over, stop_at_exit
 from mddag_executor.live.settings import Thresholds
+from mddag_executor.live.shutdown import is_over, stop_at_exit
 from mddag_executor.text import counted
 from rclpy.logging import get_logger
 

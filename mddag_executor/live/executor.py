@@ -35,7 +35,6 @@ from mddag_executor.live.compat import (
     TASKS_NEWEST_FIRST,
 )
 from mddag_executor.live.diagnostics import Diagnostics
-from mddag_executor.live.endings import call_at_shutdown, halt_at_exit, is_over
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import Entity, TASK
 from mddag_executor.live.groups import Groups
@@ -58,6 +57,7 @@ from mddag_executor.live.settings import (
     Thresholds,
     whole_number,
 )
+from mddag_executor.live.shutdown import call_at_shutdown, halt_at_exit, is_over
 from mddag_executor.live.statistics import statistics
 from mddag_executor.live.stepping import Stepper
 from mddag_executor.live.stop_watch import StopWatch

@@ -27,10 +27,10 @@ import time
 from types import TracebackType
 from typing import Any
 
-from mddag_executor.live.endings import is_over
 from mddag_executor.live.intake.entities import alive
 from mddag_executor.live.interception import Interception
 from mddag_executor.live.loading import describe, LoadingError, Program
+from mddag_executor.live.shutdown import is_over
 from rclpy.executors import Executor
 from rclpy.node import Node
 

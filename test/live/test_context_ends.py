@@ -13,7 +13,7 @@ import threading
 from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
-from mddag_executor.live.endings import call_at_shutdown
+from mddag_executor.live.shutdown import call_at_shutdown
 import pytest
 import rclpy
 from rclpy.context import Context

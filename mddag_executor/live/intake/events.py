@@ -21,12 +21,18 @@ import time
 from typing import Any
 
 from mddag_executor.live.compat.events_executor import is_available, NativeExecutor
-from mddag_executor.live.endings import call_at_shutdown, is_over, join, SecondLooks, stop_at_exit
 from mddag_executor.live.inline import InlineDelivery
 from mddag_executor.live.intake.arrivals import Receiver
 from mddag_executor.live.intake.entities import EMPTY, EntitySet
 from mddag_executor.live.intake.sources import sources
 from mddag_executor.live.intake.waitset import PATIENCE, QOS_EVENTS, WaitSetIntake
+from mddag_executor.live.shutdown import (
+    call_at_shutdown,
+    ContextChecks,
+    is_over,
+    join,
+    stop_at_exit,
+)
 from rclpy.context import Context
 from rclpy.guard_condition import GuardCondition
 from rclpy.task import Future
@@ -101,7 +107,7 @@ class _NativeThread:
     def _spin(self) -> None:
         ended = broken = False
         failures = 0
-        looks = SecondLooks()
+        looks = ContextChecks()
         try:
             while not ended and not broken:
                 with self._lock:

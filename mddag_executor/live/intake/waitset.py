@@ -35,11 +35,17 @@ import time
 
 from mddag_executor.live.compat import RCLError
 from mddag_executor.live.compat.wait_set import RefilledSet
-from mddag_executor.live.endings import call_at_shutdown, is_over, join, SecondLooks, stop_at_exit
 from mddag_executor.live.intake.arrivals import Receiver
 from mddag_executor.live.intake.entities import EMPTY, EntitySet
 from mddag_executor.live.intake.sources import SOURCES, sources
 from mddag_executor.live.intake.timers import sharpen_wake_ups, TimerQueue
+from mddag_executor.live.shutdown import (
+    call_at_shutdown,
+    ContextChecks,
+    is_over,
+    join,
+    stop_at_exit,
+)
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
@@ -115,7 +121,7 @@ class WaitSetIntake:
         self._thread: threading.Thread | None = None
         self._stopping = False
         self._failures = 0
-        self._looks = SecondLooks()
+        self._looks = ContextChecks()
         self._waiting = False  # in a poll
         # in a thread: QoS events with the part of their share, by when to look at them next
         self._events: list[tuple[int, int, RefilledSet]] = []

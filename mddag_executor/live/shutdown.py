@@ -144,7 +144,7 @@ def _call_all(reference: weakref.ref[Context], methods: _Kept) -> None:
         function(owner)
 
 
-class SecondLooks:
+class ContextChecks:
     """
     When to look again whether a context has ended, after something could have been a signal.
 
