@@ -82,12 +82,12 @@ def stop_at_exit(thing: _Stopped) -> None:
     _keep(_started, thing)
 
 
-def join(thread: threading.Thread) -> None:
+def join(thread: threading.Thread, seconds: float | None = None) -> None:
     """Wait for the end of a thread that has been told to end; never for the calling one."""
     if thread is threading.current_thread():
         return
     try:
-        thread.join()
+        thread.join(seconds)
     except RuntimeError:
         pass  # a KeyboardInterrupt came while it was started; it finds out by itself
 

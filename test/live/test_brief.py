@@ -126,6 +126,17 @@ def test_shutdown_waits_for_it(ears: Ears) -> None:
         assert ended
 
 
+def test_a_spin_ends_though_it_does_not(ears: Ears) -> None:
+    goes_on = threading.Event()
+    with Spinning(ears.executor) as spinning:
+        ears.warm_up()
+        ears.body = lambda: goes_on.wait(60.0)
+        ears.say('/a')
+        assert not ears.executor.shutdown(0.1)
+        spinning.join()
+        goes_on.set()
+
+
 @pytest.mark.parametrize('what', ['subscription', 'node', 'executor', 'context'])
 def test_it_may_end_what_it_runs_on(
         what: str, make_executor: Any, make_node: Any, ros_context: Any) -> None:

@@ -45,6 +45,7 @@ _PARTS = {
     'waitables': ('waitables', 'guards', *QOS_EVENTS),
 }
 SPIN_S = 3600.0
+PATIENCE_S = 2.0
 
 
 class _NativeThread:
@@ -94,11 +95,11 @@ class _NativeThread:
                 self._future.set_result(None)
 
     def stop(self) -> None:
-        """End the thread and release all entities."""
+        """End the thread and release all entities; after a while, leave it to end by itself."""
         with self._lock:
             self._stopping = True
         self.wake()
-        join(self._thread)
+        join(self._thread, PATIENCE_S)  # a callback may run in it that does not end
 
     def _run(self) -> None:
         with self._serve_here():
