@@ -55,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
     :raises msg_graph.GraphError: when the declaration is wrong
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
-    from mddag_executor.simulate.compiled import available
+    from mddag_executor.simulate.compiling import available
     common.check_output(args.json)
     policies = options.policies(args.policies)
     if max(args.vertices) > 100_000:

@@ -253,7 +253,7 @@ class _Doer:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         compiled = self._compiled
         if compiled:
-            from mddag_executor.simulate.compiled import available
+            from mddag_executor.simulate.compiling import available
             compiled = available()
         self._evaluator = Evaluator(self._experiments, self._runs, compiled)
         self._prepare = threading.Lock()

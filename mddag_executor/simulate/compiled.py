@@ -13,7 +13,6 @@ from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.core.state import Decision, State
 from mddag_executor.core.tables import Tables
 from mddag_executor.simulate.compiling import (
-    available,
     cached_entries,
     compile_elsewhere,
     entries_of,
@@ -21,18 +20,12 @@ from mddag_executor.simulate.compiling import (
 )
 from mddag_executor.simulate.draws import Times
 from mddag_executor.simulate.engine import Load, LogEntry
-from mddag_executor.simulate.lending import Empty, Lent
+from mddag_executor.simulate.lending import EmptyMemory, LentTuple
 from mddag_executor.simulate.run import Settings
 from mddag_executor.simulate.workload import periodic_load
 from msg_graph import TaskSet
 import numpy as np
 import numpy.typing as npt
-
-# Some of these are named here by those who use the compiled core otherwise.
-__all__ = [
-    'CompiledJudge', 'Empty', 'Lent', 'available', 'cached', 'cached_entries',
-    'compile_elsewhere', 'entries_of', 'keeps_entries', 'run_compiled',
-]
 
 _ENTRIES = ('accept_runs', 'run_once', 'free_run')
 _WORD = 8
@@ -40,18 +33,18 @@ _WORD = 8
 
 def cached() -> bool:
     """Tell whether what ``evaluate`` needs has been compiled before (for any processor)."""
-    return cached_entries((), 'accept_runs')
+    return cached_entries('accept_runs')
 
 
 @cache
 def _entries() -> dict[str, Callable[..., Any]]:
     from mddag_executor.simulate import kernel
-    return entries_of((kernel,), _ENTRIES, ())
+    return entries_of(kernel, _ENTRIES)
 
 
 def compile_here() -> None:
     """Compile what ``evaluate`` needs, by evaluating no run of nothing."""
-    nothing = Empty(max(len(Tables._fields) + 1, len(State._fields)))
+    nothing = EmptyMemory(max(len(Tables._fields) + 1, len(State._fields)))
     _entries()['accept_runs'](
         nothing.address, nothing.address, nothing.address, 0, 0, 1, 0, 0, 0, 0, 1, False,
         np.zeros(0, dtype=np.bool_))
@@ -70,13 +63,13 @@ class CompiledJudge:
             task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
         self._columns = built.n_vertices
         self._duration_ns = duration_ns
-        self._tables = [Lent(built, number) for number in range(len(POLICIES))]
-        self._load = Lent(load._replace(
+        self._tables = [LentTuple(built, number) for number in range(len(POLICIES))]
+        self._load = LentTuple(load._replace(
             cost_base=[built.first_vertex[dag.index] for dag in task_set.dags]))
 
     def warm_up(self, waiting: Callable[[], None] = lambda: None) -> None:
         """Compile, and call ``waiting`` now and then, or load what was compiled before."""
-        if keeps_entries(()) and not cached():
+        if keeps_entries() and not cached():
             compile_elsewhere(__name__, waiting)
         none = np.ones((0, self._columns), dtype=np.int64)
         self(Settings(preemptive=False, judge='completions'), none)
@@ -85,7 +78,7 @@ class CompiledJudge:
         """Tell which of the runs met every deadline."""
         row = find_policy(settings.policy)
         load = self._load.copy()  # whose costs become each run's
-        working = Empty(len(State._fields))
+        working = EmptyMemory(len(State._fields))
         times = np.ascontiguousarray(times, dtype=np.int64)
         accepted = np.zeros(len(times), dtype=np.bool_)
         _entries()['accept_runs'](
@@ -107,10 +100,10 @@ def run_compiled(
     :return: when the run ended (ns), the log of every worker, and the core's decisions.
     """
     row = find_policy(settings.policy)
-    lent = Lent(built, list(POLICIES).index(settings.policy))
-    lent_load = Lent(load)
-    working = Empty(len(State._fields))
-    log = Empty()
+    lent = LentTuple(built, list(POLICIES).index(settings.policy))
+    lent_load = LentTuple(load)
+    working = EmptyMemory(len(State._fields))
+    log = EmptyMemory()
     entries = _entries()
     ended = entries['run_once'](
         lent.address, lent_load.address, working.address, settings.workers,

@@ -12,8 +12,8 @@ rule.  Only ``add_queue`` is replaced, as an empty list has no type.  The policy
 is added to the tables, and the key function one that looks at it, so that all policies need one
 compilation.
 
-A driver is a module (or several) of functions that are compiled beside those of the core, some of
-them *entry points*: ``kernel`` for evaluations, ``replay.fast_kernel`` for traces.
+A driver is a module of functions that are compiled beside those of the core, some of them *entry
+points*: ``kernel``.
 
 What numba makes of an entry point (with everything that it calls inside) is kept on disk, in
 ``$XDG_CACHE_HOME/mddag_executor`` (``~/.cache``), under a hash of all sources and versions that it
@@ -62,38 +62,30 @@ def available() -> bool:
     return find_spec('numba') is not None and os.environ.get('NUMBA_DISABLE_JIT', '0') == '0'
 
 
-def entries_of(
-    kernels: tuple[ModuleType, ...], names: tuple[str, ...], sources: tuple[str, ...]
-) -> dict[str, Callable[..., Any]]:
+def entries_of(kernel: ModuleType, names: tuple[str, ...]) -> dict[str, Callable[..., Any]]:
     """
     Return entry points of a driver of the core, which compile, or load what was, when called.
 
-    :param kernels: modules all of whose functions are compiled beside those of the core, under
-        names that are not in use there; their entry points are in the last one.
+    :param kernel: the driver, all of whose functions are compiled beside those of the core.
     :param names: of the entry points.
-    :param sources: names of all modules that what is compiled depends on, the core's left out.
     """
-    return _compiled_entries(kernels, names, _stamp(sources))
+    return _compiled_entries(kernel, names, _stamp())
 
 
-def keeps_entries(sources: tuple[str, ...]) -> bool:
+def keeps_entries() -> bool:
     """Tell whether there is a folder to keep what is compiled (see ``entries_of``)."""
-    return _stamp(sources) is not None
+    return _stamp() is not None
 
 
-def cached_entries(sources: tuple[str, ...], name: str) -> bool:
-    """Tell whether an entry point of a driver (see ``entries_of``) has been compiled before."""
-    folder = _folder(sources)
+def cached_entries(name: str) -> bool:
+    """Tell whether an entry point (see ``entries_of``) has been compiled before."""
+    folder = _folder()
     return folder is not None and any(folder.glob(f'**/*{name}*.nbc'))
 
 
 @cache
-def _fingerprint(more: tuple[str, ...] = ()) -> str:
-    """
-    Return a hash of all that the compiled code depends on.
-
-    :param more: names of further modules that are compiled.
-    """
+def _fingerprint() -> str:
+    """Return a hash of all that the compiled code depends on."""
     import llvmlite
     import numba
     digest = hashlib.sha256()
@@ -103,7 +95,6 @@ def _fingerprint(more: tuple[str, ...] = ()) -> str:
     names = {module.__name__ for module in _MODULES}
     names |= {row.key.__module__ for row in POLICIES.values()}
     names |= {f'{__package__}.{name}' for name in _OWN}
-    names |= set(more)
     files = set()
     for name in sorted(names):
         spec = find_spec(name)
@@ -115,22 +106,22 @@ def _fingerprint(more: tuple[str, ...] = ()) -> str:
     return digest.hexdigest()[:24]
 
 
-def _folder(more: tuple[str, ...] = ()) -> Path | None:
+def _folder() -> Path | None:
     """Return the folder for the compiled code, whether it is there or not; None without a home."""
     base = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
     if not os.path.isabs(base):
         return None
-    return Path(base, 'mddag_executor', _fingerprint(more))
+    return Path(base, 'mddag_executor', _fingerprint())
 
 
-def _stamp(more: tuple[str, ...] = ()) -> Path | None:
+def _stamp() -> Path | None:
     """
     Return a file beside which numba may keep what it compiles; None where there can be none.
 
     numba keeps the code with the source file of a function, and compiles anew when that file is
     changed.  This file is never changed: its folder's name tells the sources.
     """
-    folder = _folder(more)
+    folder = _folder()
     if folder is None:
         return None
     file = folder / 'kernel.py'
@@ -155,15 +146,15 @@ def _forget_old(folder: Path) -> None:
 
 
 def _compiled_entries(
-    kernels: tuple[ModuleType, ...], names: tuple[str, ...], stamp: Path | None
+    kernel: ModuleType, names: tuple[str, ...], stamp: Path | None
 ) -> dict[str, Callable[..., Any]]:
     from mddag_executor.simulate import structures, vectors
     from numba import njit
-    space = dict(vars(kernels[-1]))  # with its name: what is loaded from disk looks its module up
-    for module in (*_MODULES, *kernels):
+    space = dict(vars(kernel))  # with its name: what is loaded from disk looks its module up
+    for module in (*_MODULES, kernel):
         space.update((k, v) for k, v in vars(module).items() if not k.startswith('__'))
     space.update((name, getattr(vectors, name)) for name in _REPLACED)
-    for module in (*_MODULES, *kernels):
+    for module in (*_MODULES, kernel):
         inner = ModuleType(module.__name__)  # for names such as `rules.complete`
         for name, function in _functions(module):
             assert space[name] is function or name in _REPLACED, f'there are two of {name}'
@@ -174,7 +165,7 @@ def _compiled_entries(
     structures.bind_policies(space)
     return {
         name: njit(error_model='numpy', nogil=True, cache=stamp is not None)(
-            _bound(getattr(kernels[-1], name), space, None if stamp is None else str(stamp)))
+            _bound(getattr(kernel, name), space, None if stamp is None else str(stamp)))
         for name in names}
 
 

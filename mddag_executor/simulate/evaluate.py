@@ -128,7 +128,8 @@ def uses_compiled(core: str, experiments: Sequence[Experiment], runs: int, jobs:
             f"core '{core}': there is no such core: choose one of {', '.join(CORES)}")
     if core == 'plain':
         return False
-    from mddag_executor.simulate.compiled import available, cached
+    from mddag_executor.simulate.compiled import cached
+    from mddag_executor.simulate.compiling import available
     if core == 'compiled' and not available():
         raise SimulationError(
             "core: numba, which compiles it, is not there: install 'mddag_executor[batch]' "

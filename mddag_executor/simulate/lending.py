@@ -9,7 +9,6 @@ integer in the first of them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import copy
 import ctypes
 from typing import NamedTuple
@@ -18,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 
-class Lent:
+class LentTuple:
     """A named tuple of integers and lists, as a structure in numpy's memory."""
 
     def __init__(self, row: NamedTuple, *more: int) -> None:
@@ -38,14 +37,14 @@ class Lent:
         """Return where the structure is, as long as this object lives."""
         return int(self._words.ctypes.data)
 
-    def copy(self) -> Lent:
+    def copy(self) -> LentTuple:
         """Return a structure of its own over the same columns."""
         copied = copy(self)
         copied._words = self._words.copy()
         return copied
 
 
-class Empty:
+class EmptyMemory:
     """Memory for a structure or a vector that is all empty."""
 
     def __init__(self, fields: int = 1) -> None:
@@ -55,17 +54,6 @@ class Empty:
     def address(self) -> int:
         """Return where it is, as long as this object lives."""
         return int(self._words.ctypes.data)
-
-    def length(self, field: int) -> int:
-        """Return how many elements a field has, which is a vector."""
-        return int(self._words[3 * field + 1])
-
-    def write(self, field: int, values: Sequence[int]) -> None:
-        """Write a field, which is a vector of so many numbers."""
-        address, length = self._words[3 * field:3 * field + 2].tolist()
-        assert length == len(values)
-        data = (ctypes.c_int64 * length).from_address(address)
-        data[:] = list(values)
 
     def rows(self, field: int, width: int) -> list[tuple[int, ...]]:
         """Return a copy of a field, which is a vector of tuples."""

@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 
 from mddag_executor.cli.bench_evaluate import growth
-from mddag_executor.simulate import compiled
+from mddag_executor.simulate import compiling
 from mddag_executor.simulate.draws import Draws, utilisations
 from mddag_executor.simulate.measure import random_task_set, WORKERS
 import pytest
@@ -26,7 +26,7 @@ nodes: [{node: /n, callbacks: [{name: a, timer: 50ms, deadline: 9ms, execution_t
 @pytest.fixture
 def plain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Do without compiling."""
-    monkeypatch.setattr(compiled, 'available', lambda: False)
+    monkeypatch.setattr(compiling, 'available', lambda: False)
 
 
 def test_figures(

@@ -27,7 +27,7 @@ import pytest
 from ..core.task_sets import Case, cases, examples, TICK
 
 pytestmark = [
-    pytest.mark.skipif(not compiled.available(), reason='numba is not there'),
+    pytest.mark.skipif(not compiling.available(), reason='numba is not there'),
     pytest.mark.timeout(400),  # a first run compiles
 ]
 CONFIG = Path(__file__).parents[2] / 'config'

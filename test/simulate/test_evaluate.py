@@ -17,6 +17,7 @@ from pathlib import Path
 from mddag_executor.core import POLICIES, PolicyError
 from mddag_executor.simulate import (
     compiled,
+    compiling,
     periodic_load,
     Settings,
     simulate,
@@ -31,7 +32,7 @@ import numpy as np
 import pytest
 
 CONFIG = Path(__file__).parents[2] / 'config'
-NEEDS_NUMBA = pytest.mark.skipif(not compiled.available(), reason='numba is not there')
+NEEDS_NUMBA = pytest.mark.skipif(not compiling.available(), reason='numba is not there')
 
 REFERENCE_COUNTS = (8, 122, 472, 907, 1166, 992, 657, 388, 177, 71, 40)
 REFERENCE = {
@@ -241,7 +242,7 @@ def test_bad_experiments(small: TaskSet) -> None:
 
 
 def test_without_numba(small: TaskSet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled, 'available', lambda: False)
+    monkeypatch.setattr(compiling, 'available', lambda: False)
     assert not evaluate(Experiment(small), 2).compiled
     with pytest.raises(SimulationError, match='numba, which compiles it, is not there'):
         evaluate(Experiment(small), 2, core='compiled')
@@ -253,6 +254,6 @@ def test_choice_of_the_core(autoware: TaskSet, monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr(compiled, 'cached', lambda: warm)
         return module.uses_compiled('auto', [Experiment(autoware)], runs, 2)
 
-    monkeypatch.setattr(compiled, 'available', lambda: True)
+    monkeypatch.setattr(compiling, 'available', lambda: True)
     assert [chosen(runs, False) for runs in (1, 100, 5000)] == [False, False, True]
     assert [chosen(runs, True) for runs in (1, 100, 5000)] == [False, True, True]
