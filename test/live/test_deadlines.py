@@ -333,11 +333,16 @@ def with_source(more: str) -> TaskSet:
 def test_abort_drops_what_is_left_of_a_late_job(make_executor, make_node):
     chain = Chain(make_node, {'relay': lambda: time.sleep(0.06)})
     executor = make_executor(with_source('on_miss: abort'), num_workers=2)
+
+    def all_ended() -> bool:
+        dag = executor.statistics()['dags']['chain']
+        return is_idle(executor) and sum(dag['ends'].values()) == dag['jobs']
+
     with Spinning(executor):
         chain.start(executor)
         assert wait_for(lambda: len(chain.jobs['relay']) >= 5)
         chain.timer.cancel()
-        assert wait_for(lambda: is_idle(executor))
+        assert wait_for(all_ended)
     dag = executor.statistics()['dags']['chain']
     assert dag['ends']['aborted'] > 0
     assert sum(dag['ends'].values()) == dag['jobs']
