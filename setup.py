@@ -10,7 +10,11 @@ from setuptools import find_packages, setup
 NAME = 'mddag_executor'
 BATCH = ['matplotlib>=3.6', 'numba>=0.59']
 DASK = ['distributed>=2023.5']
-DOCS = ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26']
+DOCS = [
+    'mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26',
+    # the last mkdocstrings for Python 3.10 does not work with later ones
+    'pymdown-extensions<12; python_version<"3.11"',
+]
 EXPORT = ['perfetto>=0.11', 'pyarrow>=14']
 REPORT = ['bokeh>=3.6']
 TOP = ['rich>=13']

@@ -201,6 +201,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._intake_kind = intake
         # What is ready still would run before the spin notices.
         call_at_shutdown(self.context, self._pool.start_no_more)
+        call_at_shutdown(self.context, self.wake)
         halt_at_exit(self)
 
     def _context_ended(self) -> bool:

@@ -240,10 +240,21 @@ TASKS_NEWEST_FIRST = TimerInfo is None
 """Whether tasks that wait run in the reverse of their order: in all of 7.1, but not in 9.1."""
 
 
+def _nothing() -> None:
+    """Do nothing when a context ends."""
+
+
 class BareExecutor(Executor):
     """rclpy's executor, without its own way of running things."""
 
     _sigint_gc: Any = None  # for its finalizer, where construction fails
+
+    def __init__(self, *, context: Any = None) -> None:
+        # The context keeps a WeakMethod of ``wake``. When that goes first, as at Python 3.11's
+        # exit, its end is an exception that is printed. See ``shutdown.call_at_shutdown``.
+        self.wake = _nothing  # type: ignore[method-assign]
+        super().__init__(context=context)
+        del self.wake
 
     def guards(self) -> tuple[Any, ...]:
         """Return the guard conditions that end a wait: the executor's, and that of SIGINT."""
