@@ -32,6 +32,21 @@ from mddag_executor.core.state import (
 from mddag_executor.core.tables import NEVER, Tables
 
 
+def open_undeclared(s: State, dag: int, job: int, release: int) -> int:
+    """
+    Open the job of a callback that no DAG declares; return its slot, or -1 as ``release_job``.
+
+    It has one execution and nobody judges it, so it stands in no list of open jobs.
+    """
+    slot = s.free_slot[dag]
+    if slot >= 0:
+        s.free_slot[dag] = s.job_next[slot]
+        s.job_index[slot] = job
+        s.job_release[slot] = release
+        s.job_state[slot] = OPEN
+    return slot
+
+
 def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int) -> int:
     """
     Open a job (rule 1) and return its slot, or -1 when the DAG needs one more slot first.
@@ -39,6 +54,8 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     :param job: index of the job in its DAG, from 0.
     :param release: time its source became due, ns; not later than ``now``.
     """
+    if dag == t.n_dags:
+        return open_undeclared(s, dag, job, release)
     expire_idle(t, s, dag, now)
     if s.n_open[dag] >= t.max_active_jobs[dag]:
         expire_job(t, s, s.oldest[dag], now)
@@ -62,21 +79,6 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
         s.x_worker[x] = -1
     if s.partial[dag] != 0:
         _leave_out(t, s, slot)
-    return slot
-
-
-def open_undeclared(t: Tables, s: State, index: int, now: int) -> int:
-    """
-    Open the job of a callback that no DAG declares; return its slot, or -1 as ``release_job``.
-
-    It has one execution and nobody judges it, so it stands in no list of open jobs.
-    """
-    slot = s.free_slot[t.n_dags]
-    if slot >= 0:
-        s.free_slot[t.n_dags] = s.job_next[slot]
-        s.job_index[slot] = index
-        s.job_release[slot] = now
-        s.job_state[slot] = OPEN
     return slot
 
 

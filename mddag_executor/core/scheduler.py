@@ -94,10 +94,10 @@ class Scheduler:
 
     def undeclared(self, job: int, now: int) -> int:
         """Return an execution for a callback that no DAG declares; to be made ready at once."""
-        slot = jobs.open_undeclared(self.tables, self.state, job, now)
+        slot = jobs.open_undeclared(self.state, self.tables.n_dags, job, now)
         if slot < 0:
             add_slot(self.tables, self.state, self.tables.n_dags)
-            slot = jobs.open_undeclared(self.tables, self.state, job, now)
+            slot = jobs.open_undeclared(self.state, self.tables.n_dags, job, now)
         return self.state.job_base[slot]
 
     def record(self, x: int, now: int) -> bool:

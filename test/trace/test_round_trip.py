@@ -246,21 +246,12 @@ def test_add_refuses_what_it_cannot_write(tmp_path: Path) -> None:
     assert [event[1] for event in events] == [1, 2] and not warnings
 
 
-def test_the_declaration_in_the_trace(tmp_path: Path) -> None:
-    path = tmp_path / 'a.mcap'
-    with TraceFile(path) as file:
-        file.add('callback_end', 1, 2, 3, 4)
-        file.add('task_set', 5, 1, 1, 'mddag: 1\n', 'f', 'rad', 7, 1, 2, False)
-    assert TraceReader(path).task_set_text == 'mddag: 1\n'
-
-
 def test_an_empty_trace(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     with TraceFile(path):
         pass
     assert read(path) == ([], [])
     assert TraceReader(path).message_count == 0
-    assert TraceReader(path).task_set_text is None
     with open(path, 'rb') as stream:
         assert list(make_reader(stream, validate_crcs=True).iter_messages()) == []
 
