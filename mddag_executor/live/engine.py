@@ -7,7 +7,8 @@ Theory of operation
 -------------------
 The engine is told what happens, with the time of it, and says what to run.  It has no thread,
 lock or clock and knows nothing of rclpy; ``pool`` has all of these, and tells the engine under its
-lock, so that times never decrease.  Nobody else reads or changes the core's state.
+lock, so that times never decrease.  Nobody but the engine and its parts (``jobs``,
+``other_processes``) changes the core's state.
 
 1.  *What becomes ready* (``timer_due``, ``arrived``, ``ready``) is work for a job of a declared
     DAG, or for none.  Messages of known publications go to the job of these (``jobs``), others
@@ -339,6 +340,14 @@ class Engine:
     def leave_group(self, work: Work) -> None:
         """Take in that an execution's callback group has let it run (see ``gates``)."""
         self.scheduler.leave_group(work.x)
+
+    def new_group(self) -> int:
+        """Return the number of a new mutually exclusive callback group."""
+        return self.scheduler.new_group()
+
+    def free_group(self, group: int) -> None:
+        """Forget a group, and use its number again."""
+        self.scheduler.free_group(group)
 
     def ask_again(self) -> None:
         """Make ready again what a callback group did not let run."""

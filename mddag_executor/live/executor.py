@@ -178,8 +178,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._pool.relieve_intake = self._relieve_intake
         self._stop_watch = StopWatch(
             self._attention, self._stopped, look=self._pool.relieve_late_intakes)
-        self._registry = Registry(
-            task_set, self._engine.tables, self._engine.scheduler, self._pool.leave_group)
+        self._registry = Registry(task_set, self._engine, self._pool.leave_group)
         self._receiver = Receiver(
             self._pool, self._registry, self, self._fail, self._recorder)
         self._new_tasks: deque[Work] = deque()

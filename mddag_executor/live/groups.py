@@ -109,14 +109,7 @@ class Groups:
         _by_executor[executor] = weakref.ref(self)
 
     def add(self, group: CallbackGroup, node: Node) -> None:
-        """
-        Run the callbacks of one group of a node, and of those that will be created in it.
-
-        The executor that the node was added to, if there is one, runs the others.
-
-        :raises RuntimeError: when the group has been added to an executor already, or rclpy's own
-            executor has the node, which would run the group too.
-        """
+        """Add a group, as ``MultiDeadlineExecutor.add_callback_group`` says."""
         _hook_nodes()
         holder = node.executor
         known = _by_executor.get(holder) if holder is not None else None
@@ -137,11 +130,7 @@ class Groups:
         self._wake()
 
     def remove(self, group: CallbackGroup) -> None:
-        """
-        Stop running a group that was added by itself; who has its node runs it again.
-
-        :raises RuntimeError: when it was not added to this executor.
-        """
+        """Remove a group, as ``MultiDeadlineExecutor.remove_callback_group`` says."""
         with _lock:
             if owner_of(group) is not self:
                 raise RuntimeError('the callback group was not added to this executor')

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable
 from typing import Any
 import weakref
 
-from mddag_executor.core import Scheduler, Tables
 from mddag_executor.live.compat import keeps_time, service_name
+from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import (
     CLIENT,
     COUNTS,
@@ -48,12 +48,11 @@ class Registry:
     """
 
     def __init__(
-        self, task_set: TaskSet | None, tables: Tables, scheduler: Scheduler,
-        passed: Callable[[Work], None],
+        self, task_set: TaskSet | None, engine: Engine, passed: Callable[[Work], None],
     ) -> None:
         self._task_set = task_set
-        self._tables = tables
-        self._scheduler = scheduler
+        self._tables = engine.tables
+        self._engine = engine
         self._passed = passed
         self._binder = binding.Binder(task_set) if task_set is not None else None
         # the core's numbers of callback groups (where a group decides itself, of its entities),
@@ -237,7 +236,7 @@ class Registry:
             return -1
         number = self._groups.get(group)
         if number is None:
-            number = self._groups[group] = self._scheduler.new_group()
+            number = self._groups[group] = self._engine.new_group()
             self._numbers.add(number)
         return number
 
@@ -246,7 +245,7 @@ class Registry:
         if len(self._groups) < len(self._numbers):
             for number in self._numbers.difference(list(self._groups.values())):
                 self._numbers.remove(number)
-                self._scheduler.free_group(number)
+                self._engine.free_group(number)
 
     def _unbind(self, entity: Entity) -> None:
         if self._binder is not None and entity.callback is not None:

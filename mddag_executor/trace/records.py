@@ -26,7 +26,6 @@ CHUNK = 0x06
 MESSAGE_INDEX = 0x07
 CHUNK_INDEX = 0x08
 STATISTICS = 0x0B
-SUMMARY_OFFSET = 0x0E
 DATA_END = 0x0F
 
 RECORD = struct.Struct('<BQ')               # opcode, length of the content

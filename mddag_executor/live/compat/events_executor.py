@@ -53,8 +53,6 @@ from rclpy.task import Future
 
 DRAIN_TURNS = 16
 """So many times a source's share is taken from a new entity at the most."""
-SPIN_SEC = 3600.0
-"""It spins for that long at a time: see above."""
 
 KINDS = ('subscription', 'service', 'client')
 """The kinds of entities that it can look after."""
