@@ -20,6 +20,7 @@ from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from mddag_executor.cli import main as program
 from mddag_executor.cli.text import printable
+import pytest
 import yaml
 
 EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '60'))
@@ -94,7 +95,8 @@ def run(*arguments: str) -> tuple[int, str, str]:
 def through_all_verbs(text: str) -> int:
     """Give a declaration to all verbs; return how many used it."""
     used = 0
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as here:
+        here.chdir(folder)
         Path('graph.yaml').write_text(text, encoding='utf-8')
         for verb in VERBS:
             kind = 2 if verb[0] == 'graph' else 1

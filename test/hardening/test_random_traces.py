@@ -160,7 +160,8 @@ def test_events_that_lie(runs: list[list[Row]], batch: int) -> None:
     first = batch * EXAMPLES // BATCHES
     last = (batch + 1) * EXAMPLES // BATCHES
     for seed in range(first, last):
-        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as here:
+            here.chdir(folder)
             used += give(changed(runs[seed % 8 == 0], random.Random(seed)), seed)
     # Most lies leave a run that can be judged.
     assert used > (last - first) * len(VERBS) // 3

@@ -53,7 +53,7 @@ def until_there(take):
 @pytest.mark.parametrize('raw', [False, True])
 def test_a_message_is_taken_with_its_info(make_node, raw):
     node = make_node()
-    subscription = node.create_subscription(String, 'said', print, 10, raw=raw)
+    subscription = node.create_subscription(String, 'said', lambda message: None, 10, raw=raw)
     publisher = node.create_publisher(String, 'said', 10)
     take = compat.message_taker(subscription)
     assert take() is None
@@ -304,15 +304,16 @@ def test_changes_of_a_node_are_told(make_node, monkeypatch):
 
 def test_the_subscription_that_keeps_time_is_known(make_node):
     node = make_node(parameter_overrides=[rclpy.parameter.Parameter('use_sim_time', value=True)])
-    other = node.create_subscription(String, 'said', print, 1)
+    other = node.create_subscription(String, 'said', lambda message: None, 1)
     kept = [s for s in node.subscriptions if compat.keeps_time(s)]
     assert [s.topic_name for s in kept] == ['/clock'] and other not in kept
 
 
 def test_which_qos_events_only_write_to_the_log_is_known(make_node):
     node = make_node()
-    node.create_subscription(String, 'said', print, 1, event_callbacks=SubscriptionEventCallbacks(
-        deadline=print))
+    callbacks = SubscriptionEventCallbacks(deadline=print)
+    node.create_subscription(
+        String, 'said', lambda message: None, 1, event_callbacks=callbacks)
     logs = {w.event_type.name.rpartition('_')[2]: compat.only_logs(w) for w in node.waitables}
     assert logs.pop('MISSED') is False
     assert logs and all(logs.values())

@@ -393,7 +393,7 @@ def test_a_message_of_a_publisher_that_was_there_for_a_moment_does_not_wait(
 
 def test_no_thread_is_left(ros_context, make_node):
     node = make_node()
-    node.create_subscription(Header, '/a', print, 10)
+    node.create_subscription(Header, '/a', lambda message: None, 10)
     publisher = node.create_publisher(Header, '/a', 10)
     executor = make_direct(ros_context)
     executor.add_node(node)

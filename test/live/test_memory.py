@@ -169,7 +169,7 @@ def test_a_destroyed_node_is_freed_without_the_collector(make_executor, ros_cont
         node = Node('brief', context=ros_context, enable_rosout=False,
                     start_parameter_services=False)
         publisher = node.create_publisher(Header, 'chatter', 10)
-        subscription = node.create_subscription(Header, 'chatter', print, 10)
+        subscription = node.create_subscription(Header, 'chatter', lambda message: None, 10)
         things = [publisher, subscription, *publisher.event_handlers,
                   *subscription.event_handlers, node.create_timer(100.0, print)]
         n_things = len(things) - 1  # publishers are not kept
@@ -216,7 +216,7 @@ def test_a_spin_that_has_ended_holds_no_entities(make_executor, make_node):
     executor = make_executor()
     node = make_node()
     timer = node.create_timer(100.0, print)
-    subscription = node.create_subscription(Header, 'chatter', print, 10)
+    subscription = node.create_subscription(Header, 'chatter', lambda message: None, 10)
     executor.add_node(node)
     with without_collector():
         executor.spin_until_future_complete(Future(), timeout_sec=LOOK_S + 0.2)
