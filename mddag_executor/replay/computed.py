@@ -23,7 +23,7 @@ from typing import NamedTuple
 from mddag_executor.core import legs_of, NEVER
 from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END
 from mddag_executor.replay.happenings import (
-    Batch,
+    Batches,
     COMPLETED,
     ENDED,
     FAILED,
@@ -35,7 +35,6 @@ from mddag_executor.replay.happenings import (
 from mddag_executor.simulate import END, Load, LogEntry, START
 from msg_graph import TaskSet
 
-_BATCH = 16_384
 Delay = Callable[[int, int, int, int], int]
 """Time (ns) from the end of an execution to its message: DAG, job in the load, edge's ends."""
 
@@ -87,7 +86,8 @@ class _Teller:
     def __init__(self, schedule: ComputedRun, observers: Sequence[Observer]) -> None:
         task_set = schedule.task_set
         self._schedule = schedule
-        self._observers = observers
+        self._batches = Batches(observers)
+        self._tell = self._batches.add
         self._vertices = task_set.vertices
         self._last_leg = [
             max(1, len(legs_of(vertex, task_set.dags[vertex.dag].vertices))) - 1
@@ -104,8 +104,6 @@ class _Teller:
         self._next_end = next(self._ends, None)
         self._ready: dict[Id, int] = {}
         self._running: dict[Id, _Running] = {}
-        self._order: list[int] = []
-        self._rows: dict[int, list[tuple[int, ...]]] = {}
         self._finished = 0      # executions
 
     def run(self) -> None:
@@ -114,26 +112,9 @@ class _Teller:
             # what ends at an instant does so before anything is released or given up there
             self._until(entry[0] - 1 if entry[1] == END else entry[0])
             self._change(entry)
-            if len(self._order) >= _BATCH:
-                self._flush()
+            self._batches.tell_if_full()
         self._until(schedule.end)
-        self._flush()
-        if schedule.judged:
-            batch = Batch((), {})
-            for observer in self._observers:
-                observer.finished(schedule.end, batch)
-                observer.take(batch)
-
-    def _tell(self, kind: int, *row: int) -> None:
-        self._order.append(kind)
-        self._rows.setdefault(kind, []).append(row)
-
-    def _flush(self) -> None:
-        """Tell the observers what happened so far."""
-        batch = Batch(self._order, self._rows)
-        self._order, self._rows = [], {}
-        for observer in self._observers:
-            observer.take(batch)
+        self._batches.finish(schedule.end, schedule.judged)
 
     def _number(self, dag: int, job: int) -> int:
         numbers = self._schedule.numbers

@@ -137,10 +137,6 @@ class Addresses(Generic[_T]):
         place = min(range(len(times)), key=lambda i: (abs(times[i] - time), i))
         return things[place]
 
-    def reused(self) -> int:
-        """Count the addresses that named more than one thing."""
-        return sum(len(things) > 1 for things in self._things.values())
-
 
 class _Entity(NamedTuple):
     """A timer, subscription or service, by its handle."""

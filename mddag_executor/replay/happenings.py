@@ -35,6 +35,7 @@ Ints = npt.NDArray[np.int64]
 Row = Sequence[Any]
 Numbers = tuple[Ints, Ints]
 """Places in a batch, and the columns of the events of a kind that stand there."""
+BATCH = 16_384
 # Columns that all events have; the fields follow.
 NOW, PROCESS, THREAD, FIELD = range(4)
 
@@ -207,6 +208,41 @@ class Observer:
 
         :param batch: is told after it; the judge puts in what the core decides.
         """
+
+
+class Batches:
+    """Collects what happens, one thing after the other, and tells it many at a time."""
+
+    def __init__(self, observers: Sequence[Observer]) -> None:
+        self._observers = observers
+        self._order: list[int] = []
+        self._rows: dict[int, list[tuple[int, ...]]] = {}
+
+    def add(self, kind: int, *row: int) -> None:
+        """Take in what happened."""
+        self._order.append(kind)
+        self._rows.setdefault(kind, []).append(row)
+
+    def tell_if_full(self) -> None:
+        """Tell the observers of it if it is much; the caller is between two happenings."""
+        if len(self._order) >= BATCH:
+            self.tell()
+
+    def tell(self) -> None:
+        """Tell the observers what happened so far."""
+        batch = Batch(self._order, self._rows)
+        self._order, self._rows = [], {}
+        for observer in self._observers:
+            observer.take(batch)
+
+    def finish(self, now: int, judged: bool = True) -> None:
+        """Tell the rest, and where what is open is judged, that the run has ended."""
+        self.tell()
+        if judged:
+            batch = Batch((), {})
+            for observer in self._observers:
+                observer.finished(now, batch)
+                observer.take(batch)
 
 
 def merged(several: Sequence[Handlers]) -> Handlers:

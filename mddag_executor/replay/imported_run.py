@@ -40,6 +40,7 @@ from mddag_executor.replay.doubts import Doubts
 from mddag_executor.replay.entities import as_table, Callback, Entities, fields_of, INIT_EVENTS
 from mddag_executor.replay.happenings import (
     Batch,
+    Batches,
     COMPLETED,
     ENDED,
     merged,
@@ -70,7 +71,6 @@ EXPIRE_AFTER_NS = 1_000_000_000
 _SLACK_NS = 1_000_000
 _PROGRESS_STEP = 4096
 _KEEP_LEGS = 65_536
-_BATCH = 16_384
 _START = 'ros2:callback_start'
 _OWN = ('mddag:job_release', 'mddag:dispatch')
 _DEFAULT_DEADLINE = 100_000_000
@@ -129,8 +129,6 @@ class ImportedRun(LinkObserver):
         self._workers: dict[tuple[int, int], int] = {}
         self._timers = _Timers()
         self._fallbacks: Counter[str] = Counter()
-        self._order: list[int] = []
-        self._rows: dict[int, list[tuple[int, ...]]] = {}
         self._number = 0
         self._graph()
 
@@ -181,7 +179,8 @@ class ImportedRun(LinkObserver):
 
         :param progress: told now and then how many events there have been.
         """
-        self._observers = observers
+        self._batches = Batches(observers)
+        self._tell = self._batches.add
         self._links = [each for each in observers if isinstance(each, LinkObserver)]
         more = merged([observer.raw_handlers() for observer in self._links])
         count = 0
@@ -197,30 +196,14 @@ class ImportedRun(LinkObserver):
                 count += 1
                 if event[1] > self.end:
                     self.end = event[1]
-                if len(self._order) >= _BATCH:
-                    self._flush()
+                self._batches.tell_if_full()
                 if progress is not None and count % _PROGRESS_STEP == 0:
                     progress(count)
         self._linker.finish()
         for dag, jobs in enumerate(self._open):
             for release, job in jobs:
                 self._close(dag, job, release)
-        self._flush()
-        batch = Batch((), {})
-        for observer in observers:
-            observer.finished(self.end, batch)
-            observer.take(batch)
-
-    def _tell(self, kind: int, *row: int) -> None:
-        self._order.append(kind)
-        self._rows.setdefault(kind, []).append(row)
-
-    def _flush(self) -> None:
-        """Tell the observers what happened so far."""
-        batch = Batch(self._order, self._rows)
-        self._order, self._rows = [], {}
-        for observer in self._observers:
-            observer.take(batch)
+        self._batches.finish(self.end)
 
     # --- executions ------------------------------------------------------------------------------
 
