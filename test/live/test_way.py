@@ -9,6 +9,8 @@ import re
 import subprocess
 import sys
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 MOST_BEFORE, MOST_AFTER, MOST_FILES = 15, 6, 8
 
@@ -115,6 +117,7 @@ def last(names: list[str], name: str, end: int) -> int:
     return end - 1 - names[:end][::-1].index(name)
 
 
+@pytest.mark.skipif(sys.version_info < (3, 11), reason='code has no qualified name before 3.11')
 def test_a_message_takes_the_way_that_the_page_names() -> None:
     page = (ROOT / 'docs' / 'layout.md').read_text(encoding='utf-8')
     named = set(re.findall(r'`((?:live|core)/[\w/]+\.py)`', page))
