@@ -151,6 +151,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _silence_stdout()
         return EXIT_BROKEN_PIPE
     except Exception as error:
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+            _silence_stdout()
         line = user_line(error)
         if line is None or os.environ.get('MDDAG_DEBUG') == '1':
             import traceback

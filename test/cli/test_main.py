@@ -237,7 +237,8 @@ def test_a_full_disk_is_one_line(how: str) -> None:
     graph = Path(__file__).resolve().parents[2] / 'config' / 'autoware.yaml'
     done = subprocess.run(
         f'{sys.executable} -m mddag_executor graph check {graph} {how}', shell=True, text=True,
-        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, check=False)
+        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, check=False,
+        env={name: value for name, value in os.environ.items() if name != 'PYTHONUNBUFFERED'})
     place = 'standard output' if '>' in how else '/dev/full'
     assert done.stderr.startswith(f'error: {place}: no space left on device: ')
     assert (done.returncode, done.stderr.count('\n')) == (2, 1)
