@@ -93,7 +93,7 @@ class Cluster:
             self._client = Client(target, timeout=CONNECT_S, set_as_default=False)
         try:
             self._client.wait_for_workers(1, timeout=_WORKER_S)
-        except TimeoutError:
+        except asyncio.TimeoutError:  # the built-in one since Python 3.11
             raise ClusterError(
                 f"--dask {self.address}: the cluster has no workers: start some, as 'dask worker "
                 f"{self.address}'") from None
