@@ -29,10 +29,10 @@ from mddag_executor.core.jobs import finish
 from mddag_executor.core.state import Decision, JUDGE_FROM, new_state
 from mddag_executor.replay.bags import Bag, BagError, UNKNOWN
 from mddag_executor.replay.computed import ComputedRun
-from mddag_executor.replay.timed import busy_times, Engine, Transports
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import Load, LogEntry, SimulationError
+from mddag_executor.simulate.engine import busy_times, run
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
@@ -168,19 +168,18 @@ class BagReschedule:
     def _run(self, load: Load) -> list[LogEntry]:
         policy = find_policy(self.policy)
         state = new_state(
-            self.tables, self.workers, preemptive=policy.mode(self.preemptive), propagate=2,
+            self.tables, self.workers, preemptive=policy.mode(self.preemptive),
             dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
-        engine = Engine(
-            self.tables, state, policy.key, load, Transports.none(self.tables))
         state.scalars[JUDGE_FROM] = self.judge_from
-        engine.run(self.end)
+        log: list[LogEntry] = []
+        run(self.tables, state, policy.key, load, self.end, False, log)
         finish(self.tables, state, self.end)
         for dag, release in zip(load.dags, load.releases):
             if release >= self.judge_from:
                 self.tally.released(dag)
         self.tally.add(state.decisions)
         self.decisions = state.decisions
-        return engine.log
+        return log
 
     @property
     def duration_ns(self) -> int:

@@ -38,8 +38,8 @@ from typing import NamedTuple
 from mddag_executor.core import legs_of, quantile, Tables
 from mddag_executor.replay.dispatches import Dispatches
 from mddag_executor.replay.happenings import Observer
-from mddag_executor.replay.timed import edge_numbers, edges_of, Transports
 from mddag_executor.simulate import Load
+from mddag_executor.simulate.deliveries import edge_numbers, edges_of, Transports
 from mddag_executor.trace.census import Census
 from msg_graph import Dag, TaskSet
 

@@ -25,10 +25,11 @@ from mddag_executor.replay.groups import with_groups
 from mddag_executor.replay.load import LoadBuilder, RecordedLoad
 from mddag_executor.replay.recording import Head, ReplayError
 from mddag_executor.replay.run import open_run
-from mddag_executor.replay.timed import busy_times, edge_numbers, Engine
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
-from mddag_executor.simulate import LogEntry
+from mddag_executor.simulate import engine, LogEntry
+from mddag_executor.simulate.deliveries import Deliveries, edge_numbers
+from mddag_executor.simulate.engine import busy_times
 from mddag_executor.text import counted, listed
 from msg_graph import TaskSet
 
@@ -74,10 +75,11 @@ class Reschedule:
             dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
         state.scalars[JUDGE_FROM] = self.judge_from
         load, end = self._work.load, self.recorded.run.end
-        engine = Engine(
-            self.tables, state, policy.key, load, self._work.transports, self._work.failed)
-        engine.run(end)
-        self.log = engine.log
+        self.log = []
+        deliveries = Deliveries(
+            self.tables, state, policy.key, self._work.transports, self._work.failed)
+        engine.run(
+            self.tables, state, policy.key, load, end, False, self.log, deliveries=deliveries)
         self.decisions = state.decisions
         finish(self.tables, state, end)
         for time, dag, release in zip(load.times, load.dags, load.releases or load.times):

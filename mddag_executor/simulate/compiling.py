@@ -51,7 +51,8 @@ import numpy as np
 
 _MODULES = (tables, state, queues, jobs, policies, rules, engine)
 _NOT_COMPILED = frozenset({
-    'new_state', 'add_queue', 'rad_offsets', 'latest_starts', 'policy'})  # for plain lists
+    'new_state', 'add_queue', 'rad_offsets', 'latest_starts', 'policy',
+    'busy_times'})  # for plain lists
 _OWN = ('compiling', 'kernel', 'lending', 'structures', 'vectors')
 _REPLACED = ('add_queue', 'heapify', 'heappop', 'heappush')
 _KEEP_S = 90 * 86400

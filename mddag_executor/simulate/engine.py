@@ -10,6 +10,9 @@ one instant first the completions are told to the core, workers in ascending ord
 releases in DAG order, then the core dispatches until it has nothing left to do (design section 9).
 A completion at the horizon counts; nothing is released or dispatched there any more.
 
+Where messages take time or executions fail, ``deliveries`` ends the executions, and the messages
+of an instant arrive between its completions and its releases.
+
 A job's deadlines count from its release, which is the time at which its source becomes ready,
 unless ``releases`` says that it was earlier (a sensor's message that arrived later).
 
@@ -17,18 +20,22 @@ The execution time of vertex v in job k of DAG d is ``costs[cost_base[d] + k * c
 local index of v]``: a stride of zero gives every job the same times, the number of vertices of the
 DAG a row for each job.
 
-Like the rules this is plain integer arithmetic on lists, so that it can be compiled as it is.
+Like the rules this is plain integer arithmetic on lists, so that it can be compiled as it is;
+what is None then costs nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.state import add_slot, DROP, JOB_END, SINK_IN_TIME, State
 from mddag_executor.core.tables import NEVER, Tables
+
+if TYPE_CHECKING:
+    from mddag_executor.simulate.deliveries import Deliveries
 
 # Kinds of log entries.
 START, END, PREEMPT = range(3)
@@ -63,6 +70,7 @@ def run(
     stop_at_first_miss: bool,
     log: list[LogEntry] | None = None,
     progress: Callable[[int], None] | None = None,
+    deliveries: Deliveries | None = None,
 ) -> int:
     """
     Run the core over a load and return the time at which the run ended, ns.
@@ -84,6 +92,8 @@ def run(
         for w in range(n_workers):
             if finish_at[w] < instant:
                 instant = finish_at[w]
+        if deliveries is not None:
+            instant = min(instant, deliveries.next_time())
         if instant > horizon:
             return horizon
         now = instant
@@ -97,13 +107,18 @@ def run(
                 if log is not None:
                     running[w] = -1
                     _note(t, s, log, now, END, w, x)
-                rules.complete(t, s, key, x, now)
+                if deliveries is not None:
+                    deliveries.complete(x, now)
+                else:
+                    rules.complete(t, s, key, x, now)
         if now == horizon:
             return horizon
+        if deliveries is not None:
+            deliveries.arrive(now)
         while next_release < n_releases and load.times[next_release] == now:
             release_load(t, s, key, load, next_release, now)
             next_release += 1
-        _dispatch(t, s, key, now, finish_at, running, log)
+        _dispatch(t, s, key, now, finish_at, running, log, deliveries)
         if stop_at_first_miss and any_missed(s, seen):
             return now
 
@@ -128,7 +143,7 @@ def release_load(
 
 def _dispatch(
     t: Tables, s: State, key: KeyFunction, now: int, finish_at: list[int], running: list[int],
-    log: list[LogEntry] | None,
+    log: list[LogEntry] | None, deliveries: Deliveries | None,
 ) -> None:
     """Dispatch what is to run now; ``running`` is kept for the log, which wants the preempted."""
     x = rules.schedule(t, s, key, now)
@@ -140,6 +155,8 @@ def _dispatch(
                 _note(t, s, log, now, PREEMPT, worker, running[worker])
             running[worker] = x
             _note(t, s, log, now, START, worker, x)
+        if deliveries is not None:
+            deliveries.started(x, now)
         x = rules.schedule(t, s, key, now)
 
 
@@ -157,3 +174,17 @@ def any_missed(s: State, first: int) -> bool:
         if kind != SINK_IN_TIME and kind != JOB_END and kind != DROP:
             return True
     return False
+
+
+def busy_times(log: Sequence[LogEntry], workers: int, end: int) -> list[int]:
+    """Return for each worker how long it was busy until the end, ns."""
+    busy = [0] * workers
+    since = [-1] * workers
+    for time, kind, worker, *_ in log:
+        if since[worker] >= 0:
+            busy[worker] += time - since[worker]
+        since[worker] = time if kind == START else -1
+    for worker, start in enumerate(since):
+        if start >= 0:
+            busy[worker] += end - start
+    return busy

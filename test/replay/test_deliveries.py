@@ -10,8 +10,9 @@ from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Tables
 from mddag_executor.core.state import new_state, SINK_COMPLETED
 from mddag_executor.replay import reschedule
-from mddag_executor.replay.timed import busy_times, edge_numbers, edges_of, Engine, Transports
-from mddag_executor.simulate import END, Load, PREEMPT, START
+from mddag_executor.simulate import END, Load, LogEntry, PREEMPT, START
+from mddag_executor.simulate.deliveries import Deliveries, edge_numbers, edges_of, Transports
+from mddag_executor.simulate.engine import busy_times, run
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
 import pytest
@@ -54,9 +55,11 @@ def engine(
         (numbers[edge] for edge in ((0, 1), (0, 2), (1, 2))), delays))]
     transports = Transports(by_edge * jobs, [0, 0], [3, 0])
     state = new_state(tables, workers, preemptive=preemptive, propagate=2)
-    run = Engine(tables, state, find_policy('rad').key, load, transports)
-    run.run(horizon)
-    starts = [(time // 1000, worker, vertex) for time, kind, worker, _, vertex, _ in run.log
+    log: list[LogEntry] = []
+    key = find_policy('rad').key
+    run(tables, state, key, load, horizon, False, log,
+        deliveries=Deliveries(tables, state, key, transports))
+    starts = [(time // 1000, worker, vertex) for time, kind, worker, _, vertex, _ in log
               if kind == START]
     done = [(d[2], d[5] // 1000) for d in state.decisions if d[0] in SINK_COMPLETED]
     assert edges_of(tables) == [3, 0]
