@@ -33,6 +33,7 @@ from typing import BinaryIO
 import zlib
 
 import lz4.frame
+from mcap.opcode import Opcode
 from mddag_executor.trace import records
 from mddag_executor.trace.errors import TraceError
 import zstandard
@@ -110,7 +111,7 @@ def open_data(stream: BinaryIO, path: str) -> tuple[int, str]:
         except ValueError:
             pass
         # A wrong length might lead past the first chunk.
-        if opcode == records.HEADER and cursor.position == length:
+        if opcode == Opcode.HEADER and cursor.position == length:
             return len(magic) + len(head) + int(length), library
     raise TraceError(path, 'ends or is damaged before its first event', _REMEDY)
 
@@ -215,26 +216,26 @@ def scan(stream: BinaryIO, start: int, size: int) -> Iterator[Block]:
         if end > size:
             raise Damage('a record is cut off, or its length is wrong', position)
 
-        if opcode == records.CHUNK:
+        if opcode == Opcode.CHUNK:
             yield _chunk(stream, position, end)
             chunks_seen = True
-        elif opcode == records.MESSAGE_INDEX:
-            if previous not in (records.CHUNK, records.MESSAGE_INDEX):
+        elif opcode == Opcode.MESSAGE_INDEX:
+            if previous not in (Opcode.CHUNK, Opcode.MESSAGE_INDEX):
                 raise Damage('a message index belongs to no chunk', position)
             content = stream.read(min(length, 6))
             if len(content) < 6 or length != 6 + records.UINT32.unpack_from(content, 2)[0]:
                 raise Damage('the lengths in a message index are wrong', position)
-        elif opcode in (records.SCHEMA, records.CHANNEL, records.MESSAGE):
-            if chunks_seen and opcode == records.MESSAGE:
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            if chunks_seen and opcode == Opcode.MESSAGE:
                 raise Damage('a message stands outside of the chunks', position)
             block = _plain(stream, position, size, messages=not chunks_seen)
             yield block
             end = block.end
-        elif opcode == records.DATA_END:
+        elif opcode == Opcode.DATA_END:
             if length != 4:
                 raise Damage('the finish record is damaged', position)
             return
-        elif opcode in (0, records.HEADER, records.FOOTER):    # 0: a tail of zeros, no opcode
+        elif opcode in (0, Opcode.HEADER, Opcode.FOOTER):    # 0: a tail of zeros, no opcode
             raise Damage('a record is where it cannot be', position)
         previous = opcode
         position = end
@@ -258,7 +259,7 @@ def _chunk(stream: BinaryIO, position: int, end: int) -> Block:
 
 def _plain(stream: BinaryIO, position: int, size: int, messages: bool) -> Block:
     """Return the run of plain records from a position on, at least one."""
-    allowed = [records.SCHEMA, records.CHANNEL] + [records.MESSAGE] * messages
+    allowed = [Opcode.SCHEMA, Opcode.CHANNEL] + [Opcode.MESSAGE] * messages
     times = []
     end = position
     while True:
@@ -274,7 +275,7 @@ def _plain(stream: BinaryIO, position: int, size: int, messages: bool) -> Block:
             break
         if after - position > MAX_CHUNK:
             raise Damage('a record is too large', position)
-        if opcode == records.MESSAGE and length >= records.MESSAGE_HEAD.size:
+        if opcode == Opcode.MESSAGE and length >= records.MESSAGE_HEAD.size:
             times.append(records.MESSAGE_HEAD.unpack_from(head, records.RECORD.size)[2])
         end = after
     length = end - position
@@ -333,7 +334,7 @@ def read_summary(stream: BinaryIO, size: int, data: int) -> tuple[bool, Summary 
     stream.seek(footer_start)
     footer = stream.read(_FOOTER_SIZE)
     content = footer[records.RECORD.size:-len(records.MAGIC)]
-    expected = records.RECORD.pack(records.FOOTER, records.FOOTER_CONTENT.size)
+    expected = records.RECORD.pack(Opcode.FOOTER, records.FOOTER_CONTENT.size)
     if not (footer.endswith(records.MAGIC) and footer.startswith(expected)):
         return False, None
     start, _, crc = records.FOOTER_CONTENT.unpack(content)
@@ -361,7 +362,7 @@ def _data_end(stream: BinaryIO, start: int, size: int) -> int:
             stream.seek(end)
             opcode, length = records.RECORD.unpack(stream.read(records.RECORD.size))
             end += records.RECORD.size + length
-            if opcode == records.DATA_END:
+            if opcode == Opcode.DATA_END:
                 return int(end)
     except (Damage, struct.error):
         pass
@@ -387,14 +388,14 @@ def _parse_summary(stream: BinaryIO, start: int, end: int, moved: bool) -> Summa
     while start < end:
         stream.seek(start)
         opcode, length = records.RECORD.unpack(stream.read(records.RECORD.size))
-        if opcode in (records.STATISTICS, records.CHANNEL) or (
-                moved and opcode == records.CHUNK_INDEX):
+        if opcode in (Opcode.STATISTICS, Opcode.CHANNEL) or (
+                moved and opcode == Opcode.CHUNK_INDEX):
             cursor = records.Cursor(stream.read(min(length, 1 << 20)))
-            if opcode == records.CHUNK_INDEX:
+            if opcode == Opcode.CHUNK_INDEX:
                 head = cursor.take(records.CHUNK_INDEX_HEAD.size)
                 first, _, offset, size = records.CHUNK_INDEX_HEAD.unpack(head)
                 index.append((offset, first, size))
-            elif opcode == records.STATISTICS:
+            elif opcode == Opcode.STATISTICS:
                 head = cursor.take(records.STATISTICS_HEAD.size)
                 messages, _, _, _, _, chunks, _, _ = records.STATISTICS_HEAD.unpack(head)
             else:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 import struct
 from typing import Any, Protocol
 
+from mcap.opcode import Opcode
 from mddag_executor.trace import cdr, records
 
 EXECUTION = 'execution'
@@ -48,7 +49,7 @@ def events_of(entry: Sequence[Any]) -> int:
 
 
 _SEQUENCE = 0xFFFFFFFF
-_M = records.MESSAGE
+_M = Opcode.MESSAGE
 _E = cdr.ENCAPSULATION
 
 

@@ -14,6 +14,7 @@ from collections.abc import Collection, Iterator
 import os
 from typing import NamedTuple
 
+from mcap.opcode import Opcode
 from mddag_executor.text import counted
 from mddag_executor.trace import records
 from mddag_executor.trace.blocks import (
@@ -109,7 +110,7 @@ class MessageReader:
             after = content + length
             if after > end:
                 raise Damage('the records of a chunk do not fit into it', block.offset)
-            if opcode == records.MESSAGE:
+            if opcode == Opcode.MESSAGE:
                 if position + head_size > after:
                     raise Damage('a message is shorter than its head', block.offset)
                 channel, _, log_time, publish_time = records.MESSAGE_HEAD.unpack_from(
@@ -118,7 +119,7 @@ class MessageReader:
                 topic = wanted.get(channel)
                 if topic is not None:
                     yield Message(topic, log_time, publish_time, view[position + head_size:after])
-            elif opcode in (records.SCHEMA, records.CHANNEL):
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 try:
                     self._define(opcode, data[content:after], topics)
                 except ValueError as error:
@@ -137,7 +138,7 @@ class MessageReader:
             raise ValueError('the schemas are too large')
         cursor = records.Cursor(content)
         number = cursor.uint16()
-        if opcode == records.SCHEMA:
+        if opcode == Opcode.SCHEMA:
             name, encoding = cursor.string(), cursor.string()
             schema = (name, encoding, cursor.block().decode(errors='replace'))
             if self._schemas.setdefault(number, schema) != schema:

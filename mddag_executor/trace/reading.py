@@ -28,6 +28,7 @@ from collections.abc import Iterator
 import struct
 from typing import Any, BinaryIO, NamedTuple
 
+from mcap.opcode import Opcode
 from mddag_executor.text import counted
 from mddag_executor.trace import records
 from mddag_executor.trace.blocks import Block, Damage, load
@@ -240,7 +241,7 @@ class Reading:
         stream.seek(block.end)
         while True:
             head = stream.read(_CONTENT)
-            if len(head) < _CONTENT or head[0] != records.MESSAGE_INDEX:
+            if len(head) < _CONTENT or head[0] != Opcode.MESSAGE_INDEX:
                 break
             length = records.RECORD.unpack(head)[1]
             if length % _INDEX_ENTRY.itemsize != 6 or length > 16 * end:
@@ -259,7 +260,7 @@ class Reading:
         befores[0], afters[-1] = 0, end
         befores[1:] = starts + _CONTENT + lengths
         afters[:-1] = starts
-        if (rows_at(data, np.dtype('u1'), starts) != records.MESSAGE).any():
+        if (rows_at(data, np.dtype('u1'), starts) != Opcode.MESSAGE).any():
             return None
         # what is between messages are definitions
         gaps = np.flatnonzero(befores != afters).tolist()
@@ -282,9 +283,9 @@ class Reading:
             after = position + _CONTENT + length
             if after > end:
                 raise Damage('the records of a chunk do not fit into it', block.offset)
-            if opcode == records.MESSAGE:
+            if opcode == Opcode.MESSAGE:
                 starts.append(position)
-            elif define and opcode in (records.SCHEMA, records.CHANNEL):
+            elif define and opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._define(opcode, data[position + _CONTENT:after], block)
             position = after
         return np.array(starts, dtype=np.int64)
@@ -302,7 +303,7 @@ class Reading:
 
     def _define(self, opcode: int, content: bytes, block: Block) -> None:
         try:
-            if opcode == records.SCHEMA:
+            if opcode == Opcode.SCHEMA:
                 self._channels.add_schema(content)
             else:
                 self._channels.add_channel(content)

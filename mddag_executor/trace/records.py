@@ -1,7 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Building blocks of an MCAP file: opcodes, record layouts, and how a record is put together.
+Building blocks of an MCAP file, beside those of the package mcap.
+
+mcap writes all records but messages and their indexes, which are many. What is read may be
+damaged: its readers here believe no length.
 
 Source: the MCAP format specification (https://mcap.dev/spec). A file is the magic, a header
 record, the data section (ended by a data-end record), the summary section, a footer and the magic
@@ -13,20 +16,12 @@ from __future__ import annotations
 
 import struct
 
+from mcap.data_stream import RecordBuilder
+from mcap.records import McapRecord
+
 MAGIC = b'\x89MCAP0\r\n'
 LIBRARY = 'mddag_executor'
 """Stands in the header of files that this program wrote."""
-
-HEADER = 0x01
-FOOTER = 0x02
-SCHEMA = 0x03
-CHANNEL = 0x04
-MESSAGE = 0x05
-CHUNK = 0x06
-MESSAGE_INDEX = 0x07
-CHUNK_INDEX = 0x08
-STATISTICS = 0x0B
-DATA_END = 0x0F
 
 RECORD = struct.Struct('<BQ')               # opcode, length of the content
 MESSAGE_HEAD = struct.Struct('<HIQQ')       # channel, sequence, log_time, publish_time
@@ -46,25 +41,12 @@ def record(opcode: int, content: bytes) -> bytes:
     return RECORD.pack(opcode, len(content)) + content
 
 
-def string(text: str) -> bytes:
-    """Return a string as records hold it."""
-    return block(text.encode())
-
-
-def block(data: bytes) -> bytes:
-    """Return bytes, or a map or array already put together, with its length in front."""
-    return UINT32.pack(len(data)) + data
-
-
-def schema(number: int, name: str, text: str) -> bytes:
-    """Return the schema record of a ros2msg definition."""
-    return record(SCHEMA, UINT16.pack(number) + string(name) + string('ros2msg') + string(text))
-
-
-def channel(number: int, schema_number: int, topic: str) -> bytes:
-    """Return the record of a channel of CDR messages without metadata."""
-    return record(CHANNEL, UINT16.pack(number) + UINT16.pack(schema_number) + string(topic)
-                  + string('cdr') + block(b''))
+def written(what: McapRecord) -> bytes:
+    """Return one of mcap's records as it stands in a file."""
+    builder = RecordBuilder()
+    what.write(builder)
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data
 
 
 class Cursor:

@@ -30,6 +30,17 @@ from types import TracebackType
 from typing import Any
 import zlib
 
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    Schema,
+    Statistics,
+)
 from mddag_executor.trace import cdr, records
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.groups import Group, GROUPS
@@ -51,8 +62,9 @@ class _Channel:
         self.event = event
         self.schema_name = schema_name
         self.number = number            # of the channel and of its schema
-        self.schema = records.schema(number, schema_name, event.text)
-        self.channel = records.channel(number, number, event.topic)
+        self.schema = records.written(
+            Schema(number, event.text.encode(), 'ros2msg', schema_name))
+        self.channel = records.written(Channel(number, event.topic, 'cdr', {}, number))
         self.undefined = len(self.schema) + len(self.channel)   # 0 once they are in the file
         self.count = 0                  # messages so far
         self.index: list[int] = []      # log_time and offset of each message in the open chunk
@@ -69,14 +81,14 @@ def _encoder(event: EventType, number: int) -> Callable[..., bytes]:
     if layout is not None:
         packer = struct.Struct('<BQHIQQ4s' + layout)
         length = packer.size - records.RECORD.size
-        return functools.partial(packer.pack, records.MESSAGE, length, number)
+        return functools.partial(packer.pack, Opcode.MESSAGE, length, number)
 
     types = event.types
 
     def encode(sequence: int, log_time: int, publish_time: int, encapsulation: bytes,
                *values: Any) -> bytes:
         head = records.MESSAGE_HEAD.pack(number, sequence, log_time, publish_time)
-        return records.record(records.MESSAGE, head + encapsulation + cdr.encode(types, values))
+        return records.record(Opcode.MESSAGE, head + encapsulation + cdr.encode(types, values))
 
     return encode
 
@@ -148,8 +160,7 @@ class TraceFile:
             reason = getattr(error, 'strerror', None) or str(error)
             raise TraceError(self.path, f'cannot be written ({reason})',
                              'name a file in an existing folder that you may write') from None
-        content = records.string('ros2') + records.string(records.LIBRARY)
-        self._write(records.MAGIC + records.record(records.HEADER, content))
+        self._write(records.MAGIC + records.written(Header('ros2', records.LIBRARY)))
 
     def define(self, event: EventType) -> str:
         """
@@ -285,27 +296,23 @@ class TraceFile:
         end = max(max(channel.index[::2]) for channel in used)
         data = b''.join(self._records)
         packed = self._zstd.compress(data)
-        chunk = records.record(
-            records.CHUNK,
-            records.CHUNK_HEAD.pack(start, end, len(data), zlib.crc32(data))
-            + records.string('zstd') + records.UINT64.pack(len(packed)) + packed)
-
+        chunk = records.written(Chunk('zstd', packed, end, start, zlib.crc32(data), len(data)))
         messages = 0
         indexes = b''
-        index_offsets = b''
+        offsets = {}
         for channel in used:
-            index_offsets += struct.pack('<HQ', channel.number,
-                                         self._offset + len(chunk) + len(indexes))
+            offsets[channel.number] = self._offset + len(chunk) + len(indexes)
+            # not with mcap's MessageIndex: a live run's writer takes the interpreter for this
             entries = struct.pack(f'<{len(channel.index)}Q', *channel.index)
-            indexes += records.record(records.MESSAGE_INDEX, records.UINT16.pack(channel.number)
-                                      + records.block(entries))
+            indexes += records.record(
+                Opcode.MESSAGE_INDEX, struct.pack('<HI', channel.number, len(entries)) + entries)
             messages += len(channel.index) // 2
             channel.index = []
-        self._chunk_indexes.append(records.record(
-            records.CHUNK_INDEX,
-            struct.pack('<QQQQ', start, end, self._offset, len(chunk))
-            + records.block(index_offsets) + records.UINT64.pack(len(indexes))
-            + records.string('zstd') + struct.pack('<QQ', len(packed), len(data))))
+        self._chunk_indexes.append(records.written(ChunkIndex(
+            chunk_length=len(chunk), chunk_start_offset=self._offset, compression='zstd',
+            compressed_size=len(packed), message_end_time=end, message_index_length=len(indexes),
+            message_index_offsets=offsets, message_start_time=start,
+            uncompressed_size=len(data))))
         self._start = start if self._start is None else min(self._start, start)
         self._end = max(self._end, end)
         self._records = []
@@ -322,26 +329,26 @@ class TraceFile:
         if self._stream.closed:
             return
         self.flush()
-        self._write(records.record(records.DATA_END, records.UINT32.pack(0)))
+        self._write(records.written(DataEnd(0)))
         summary_start = self._offset
         summary = self._summary()
-        content = records.FOOTER_CONTENT.pack(summary_start, 0, 0)[:-4]
-        footer = records.RECORD.pack(records.FOOTER, len(content) + 4) + content
+        footer = records.written(Footer(summary_start, 0, 0))[:-4]
         crc = zlib.crc32(summary + footer)      # of all from the summary's start to the CRC itself
         self._write(summary + footer + records.UINT32.pack(crc) + records.MAGIC)
         self._stream.close()
 
     def _summary(self) -> bytes:
         defined = [channel for channel in self._in_order if not channel.undefined]
-        counts = b''.join(struct.pack('<HQ', channel.number, channel.count)
-                          for channel in defined)
-        statistics = records.STATISTICS_HEAD.pack(
-            sum(channel.count for channel in defined), len(defined), len(defined), 0, 0,
-            len(self._chunk_indexes), self._start or 0, self._end)
+        counts = {channel.number: channel.count for channel in defined}
+        statistics = Statistics(
+            attachment_count=0, channel_count=len(defined), channel_message_counts=counts,
+            chunk_count=len(self._chunk_indexes), message_count=sum(counts.values()),
+            message_end_time=self._end, message_start_time=self._start or 0, metadata_count=0,
+            schema_count=len(defined))
         return b''.join((
             *(channel.schema for channel in defined),
             *(channel.channel for channel in defined),
-            records.record(records.STATISTICS, statistics + records.block(counts)),
+            records.written(statistics),
             *self._chunk_indexes))
 
     def abandon(self) -> None:

@@ -24,6 +24,7 @@ import time
 from typing import Any
 import zlib
 
+from mcap.opcode import Opcode
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.bags import Bag
@@ -114,7 +115,7 @@ def row(data: bytearray, rng: random.Random) -> None:
 
 def summary(data: bytearray, rng: random.Random) -> None:
     """Damage what follows the data: the summary and the footer."""
-    start = next(start for opcode, start, _ in spans(bytes(data)) if opcode == records.DATA_END)
+    start = next(start for opcode, start, _ in spans(bytes(data)) if opcode == Opcode.DATA_END)
     for _ in range(rng.choice((1, 3))):
         data[rng.randrange(start, len(data))] = rng.randrange(256)
 
@@ -125,7 +126,7 @@ STRUCTURAL: tuple[Callable[[bytearray, random.Random], None], ...] = (
 
 def inside(data: bytearray, rng: random.Random) -> None:
     """Change the records in a chunk, and give it the right size, CRC and compression again."""
-    chunks = [span for span in spans(bytes(data)) if span[0] == records.CHUNK]
+    chunks = [span for span in spans(bytes(data)) if span[0] == Opcode.CHUNK]
     _, start, end = rng.choice(chunks)
     cursor = records.Cursor(bytes(data[start + records.RECORD.size:end]))
     begin, last, size, _ = records.CHUNK_HEAD.unpack(cursor.take(records.CHUNK_HEAD.size))
@@ -139,7 +140,7 @@ def inside(data: bytearray, rng: random.Random) -> None:
             struct.pack_into('<Q', content, where, rng.choice(INTERESTING))
     packed = zstandard.compress(bytes(content))
     data[start:end] = records.record(
-        records.CHUNK, records.CHUNK_HEAD.pack(begin, last, len(content), zlib.crc32(content))
+        Opcode.CHUNK, records.CHUNK_HEAD.pack(begin, last, len(content), zlib.crc32(content))
         + records.string('zstd') + records.UINT64.pack(len(packed)) + packed)
 
 

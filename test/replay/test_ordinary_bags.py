@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 from typing import Any
 
+from mcap.opcode import Opcode
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from mddag_executor.cli import main as program
@@ -17,7 +18,7 @@ from mddag_executor.replay import bags
 from mddag_executor.replay.bags import Bag, BagError, is_ordinary, UNKNOWN
 from mddag_executor.replay.bags_reschedule import BagReschedule, reschedule_bag
 from mddag_executor.simulate import SimulationError, START
-from mddag_executor.trace import records, TraceFile
+from mddag_executor.trace import TraceFile
 from msg_graph import loads
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -354,7 +355,7 @@ def test_a_chunk_that_is_there_twice_is_used_once(tmp_path: Path) -> None:
             writer.add_message(channel, BEGIN + i * MS, header(BEGIN), BEGIN + i * MS)
         writer.finish()
     data = bag.read_bytes()
-    chunks = [(start, end) for opcode, start, end in records_of(data) if opcode == records.CHUNK]
+    chunks = [(start, end) for opcode, start, end in records_of(data) if opcode == Opcode.CHUNK]
     (start, _), (end, _) = chunks[3:5]
     whole = list(Bag(bag, ['/points']).stamps['/points'].arrival)
     for changed, says, lost in (

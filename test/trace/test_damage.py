@@ -19,6 +19,8 @@ from typing import Any
 import zlib
 
 import lz4.frame
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
 from mddag_executor.trace import records, TraceError, TraceFile, TraceReader
 from mddag_executor.trace.schema import EVENTS
 import pytest
@@ -83,7 +85,7 @@ def test_the_sample_is_sound(tmp_path: Path, sample: Any) -> None:
 def test_cut_at_every_byte(tmp_path: Path, sample: Any) -> None:
     data, chunks = sample
     path = tmp_path / 'a.mcap'
-    ends = [end for opcode, _, end in records_of(data) if opcode == records.CHUNK]
+    ends = [end for opcode, _, end in records_of(data) if opcode == Opcode.CHUNK]
     for length in range(len(data)):
         found = check(path, data[:length], chunks)
         if length < HEADER_END:
@@ -96,7 +98,7 @@ def test_cut_at_every_byte(tmp_path: Path, sample: Any) -> None:
 def test_warnings_have_counts(tmp_path: Path, sample: Any) -> None:
     data, _ = sample
     path = tmp_path / 'a.mcap'
-    chunk = [(start, end) for opcode, start, end in records_of(data) if opcode == records.CHUNK][2]
+    chunk = [(start, end) for opcode, start, end in records_of(data) if opcode == Opcode.CHUNK][2]
     unread = len(data) - chunk[0]
     path.write_bytes(data[:chunk[0] + 20])
     assert read(path)[1] == [
@@ -131,8 +133,8 @@ def flips(data: bytes, count: int, seed: int) -> Iterator[tuple[int, bytes]]:
 def test_flipped_bits(tmp_path: Path, sample: Any) -> None:
     data, chunks = sample
     path = tmp_path / 'a.mcap'
-    in_summary = (records.SCHEMA, records.CHANNEL, records.STATISTICS, records.CHUNK_INDEX,
-                  records.FOOTER)
+    in_summary = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX,
+                  Opcode.FOOTER)
     where = {position: opcode for opcode, start, end in records_of(data)
              for position in range(start, end)}
     for position, changed in flips(data, len(data), 1):
@@ -145,7 +147,7 @@ def test_flipped_bits(tmp_path: Path, sample: Any) -> None:
 def test_flipped_bits_without_a_summary(tmp_path: Path, sample: Any) -> None:
     """A killed writer's file: nothing says how many chunks there were."""
     data, chunks = sample
-    end = next(start for opcode, start, _ in records_of(data) if opcode == records.DATA_END)
+    end = next(start for opcode, start, _ in records_of(data) if opcode == Opcode.DATA_END)
     for _, changed in flips(data[:end], end, 2):
         check(tmp_path / 'a.mcap', changed, chunks)
 
@@ -181,9 +183,9 @@ def test_a_lost_chunk_is_noticed(tmp_path: Path, sample: Any) -> None:
     data, _ = sample
     path = tmp_path / 'a.mcap'
     found = records_of(data)
-    place = next(number for number, record in enumerate(found) if record[0] == records.CHUNK) + 1
+    place = next(number for number, record in enumerate(found) if record[0] == Opcode.CHUNK) + 1
     place = next(number for number, record in enumerate(found[place:], place)
-                 if record[0] == records.CHUNK)
+                 if record[0] == Opcode.CHUNK)
     for opcode in (0x86, 0x46, 0x0C, 0x09):
         changed = bytearray(data)
         changed[found[place][1]] = opcode
@@ -192,7 +194,7 @@ def test_a_lost_chunk_is_noticed(tmp_path: Path, sample: Any) -> None:
         assert len(events) == SIZES[0] and len(warnings) == 1
         assert 'a message index belongs to no chunk' in warnings[0]
     # without the indexes too, the summary's counts tell
-    end = next(start for opcode, start, _ in found[place + 1:] if opcode != records.MESSAGE_INDEX)
+    end = next(start for opcode, start, _ in found[place + 1:] if opcode != Opcode.MESSAGE_INDEX)
     gap = end - found[place][1] - 9
     padding = struct.pack('<BQ', 0x90, gap) + bytes(gap)
     path.write_bytes(data[:found[place][1]] + padding + data[end:])
@@ -207,8 +209,8 @@ def test_no_length_leads_past_a_chunk(tmp_path: Path, sample: Any) -> None:
     path = tmp_path / 'a.mcap'
     found = records_of(data)
     first, second = [number for number, record in enumerate(found)
-                     if record[0] == records.CHUNK][:2]
-    end = next(start for opcode, start, _ in found[second:] if opcode == records.MESSAGE_INDEX)
+                     if record[0] == Opcode.CHUNK][:2]
+    end = next(start for opcode, start, _ in found[second:] if opcode == Opcode.MESSAGE_INDEX)
     for number, expected in ((0, -1), (second - 1, 1)):
         changed = bytearray(data)
         start = found[number][1]
@@ -273,7 +275,7 @@ def test_a_folder_says_what_is_in_it(tmp_path: Path, files: list[str], says: str
 def spans(data: bytes) -> list[tuple[int, int]]:
     """Return where each chunk with its indexes begins and ends."""
     starts = [start for opcode, start, _ in records_of(data)
-              if opcode in (records.CHUNK, records.DATA_END)]
+              if opcode in (Opcode.CHUNK, Opcode.DATA_END)]
     return list(zip(starts, starts[1:]))
 
 
@@ -344,23 +346,34 @@ def test_a_file_that_goes_away_or_shrinks(tmp_path: Path, sample: Any) -> None:
         list(reader.events())
 
 
+def prefixed(data: bytes) -> bytes:
+    """Return bytes with their length in front."""
+    return records.UINT32.pack(len(data)) + data
+
+
 def chunk(content: bytes, **changes: Any) -> bytes:
     """Return a chunk record around packed content, with some of its head changed."""
     head = {'size': 100, 'crc': 0, 'compression': 'zstd', 'length': len(content), **changes}
     return records.record(
-        records.CHUNK,
+        Opcode.CHUNK,
         records.CHUNK_HEAD.pack(0, 0, head['size'], head['crc'])
-        + records.string(head['compression']) + records.UINT64.pack(head['length']) + content)
+        + prefixed(head['compression'].encode()) + records.UINT64.pack(head['length']) + content)
 
 
 def definitions(text: str = EVENTS['ros2:callback_end'].text) -> bytes:
     """Return the records that make channel 1 one of callback_end."""
-    return records.schema(1, 'a', text) + records.channel(1, 1, '/trace/ros2/callback_end')
+    schema = Schema(1, text.encode(), 'ros2msg', 'a')
+    return records.written(schema) + channel('/trace/ros2/callback_end')
+
+
+def channel(topic: str) -> bytes:
+    """Return the record that makes channel 1 one of a topic."""
+    return records.written(Channel(1, topic, 'cdr', {}, 1))
 
 
 def message(fields: bytes) -> bytes:
     """Return a message record on channel 1."""
-    return records.record(records.MESSAGE, records.MESSAGE_HEAD.pack(1, 0, 1, 1)
+    return records.record(Opcode.MESSAGE, records.MESSAGE_HEAD.pack(1, 0, 1, 1)
                           + b'\0\1\0\0' + struct.pack('<qii', 1, 2, 3) + fields)
 
 
@@ -388,7 +401,7 @@ def hostile() -> dict[str, bytes]:
         'uncompressed size of 255 MiB': chunk(bomb[:100], size=255 << 20),
         'records length of 2**60': chunk(bomb, length=2**60),
         'compression name of 2**32-1 bytes': records.record(
-            records.CHUNK, records.CHUNK_HEAD.pack(0, 0, 1, 0) + b'\xff' * 40),
+            Opcode.CHUNK, records.CHUNK_HEAD.pack(0, 0, 1, 0) + b'\xff' * 40),
         'zstd bomb': chunk(large_bomb), 'zstd bomb of unknown size': chunk(unsized),
         'zstd frame of 2**40 bytes': chunk(claims), 'zstd frame as it claims': chunk(
             claims, size=2**40),
@@ -404,14 +417,14 @@ def hostile() -> dict[str, bytes]:
         'record longer than its chunk': one(struct.pack('<BQ', 5, 2**63) + bytes(50)),
         'record cut off in its chunk': one(good + b'\x05\x01'),
         'schema longer than its record': one(records.record(
-            records.SCHEMA, b'\1\0' + b'\xff' * 20)),
-        'channel changes': one(definitions() + records.channel(1, 1, '/other')),
-        'short definition': one(records.record(records.CHANNEL, b'\1')),
+            Opcode.SCHEMA, b'\1\0' + b'\xff' * 20)),
+        'channel changes': one(definitions() + channel('/other')),
+        'short definition': one(records.record(Opcode.CHANNEL, b'\1')),
         'schemas of 70 MiB': one(b''.join(records.record(
-            records.SCHEMA, struct.pack('<H', number) + b'\1\0\0\0a\1\0\0\0b'
-            + records.block(zeros)) for number in range(1, 71))),
+            Opcode.SCHEMA, struct.pack('<H', number) + b'\1\0\0\0a\1\0\0\0b'
+            + prefixed(zeros)) for number in range(1, 71))),
         'undefined channel': one(message(bytes(8))), 'message without a head': one(
-            definitions() + records.record(records.MESSAGE, b'\1\0')),
+            definitions() + records.record(Opcode.MESSAGE, b'\1\0')),
         'string of 4 GiB': one(definitions('int64 timestamp\nint32 vpid\nint32 vtid\nstring s\n')
                                + message(b'\xff\xff\xff\xff')),
         'sequence of 4 G': one(definitions(
@@ -455,9 +468,9 @@ print(round(mddag_executor.memory.peak_memory_mb()))
 
 @pytest.mark.parametrize('finished', [False, True])
 def test_hostile_lengths(tmp_path: Path, finished: bool) -> None:
-    start = records.MAGIC + records.record(records.HEADER, records.string('ros2') * 2)
-    end = (records.record(records.DATA_END, bytes(4))
-           + records.record(records.FOOTER, bytes(20)) + records.MAGIC) if finished else b''
+    start = records.MAGIC + records.record(Opcode.HEADER, prefixed(b'ros2') * 2)
+    end = (records.record(Opcode.DATA_END, bytes(4))
+           + records.record(Opcode.FOOTER, bytes(20)) + records.MAGIC) if finished else b''
     paths = []
     for name, data in hostile().items():
         paths.append(tmp_path / f'{name.replace("/", "-")}.mcap')
