@@ -80,7 +80,8 @@ def test_a_program_may_shut_the_executor_down_right_before_it_ends(spin: str) ->
 def test_a_forked_child_ends_without_what_the_parent_has() -> None:
     # Only what Python does at exit: Fast DDS itself does not survive the end of such a child.
     end = (
-        'import atexit\n'
+        'import atexit, warnings\n'
+        'warnings.simplefilter("ignore", DeprecationWarning)  # of a fork with threads\n'
         'with executor._pool.lock:\n'
         '    child = os.fork()\n'
         '    if not child:\n'
