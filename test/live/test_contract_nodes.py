@@ -352,7 +352,7 @@ def test_a_result_does_not_overtake_the_feedback_before_it(make_executor, make_n
         for turn in range(1, 11):
             task = executor.create_task(run)
             assert wait_for(task.done)
-            assert wait_for(lambda n=turn: len(feedback) == 8 * n, 1.0), (turn, len(feedback))
+            assert wait_for(lambda n=turn: len(feedback) == 8 * n), (turn, len(feedback))
     assert spinning.error is None
     server.destroy()
     client.destroy()

@@ -35,7 +35,7 @@ def of_coroutines(executor: Any, node: Any, call: Callable[[int], None]) -> None
     futures = [Future(executor=executor) for _ in range(MANY)]
     for number in range(MANY):
         executor.create_task(work, number)
-    wait_for(lambda: len(waiting) >= MANY, 2.0)
+    wait_for(lambda: len(waiting) >= MANY, 6.0)
     for number, future in enumerate(futures):
         future.set_result(number)
 
@@ -60,7 +60,7 @@ def of_services(executor: Any, node: Any, call: Callable[[int], None]) -> None:
     assert client.wait_for_service(5.0)
     for _ in range(MANY):  # one after the other, since of those that wait the queue keeps ten
         future = client.call_async(Trigger.Request())
-        assert wait_for(future.done, 2.0)
+        assert wait_for(future.done, 6.0)
 
 
 def of_guards(executor: Any, node: Any, call: Callable[[int], None]) -> None:
@@ -92,7 +92,7 @@ def one_by_one(
     trigger = make(ran)
     for number in range(1, MANY + 1):
         trigger()
-        assert wait_for(lambda n=number: len(done) == n, 2.0)
+        assert wait_for(lambda n=number: len(done) == n, 6.0)
 
 
 @pytest.mark.parametrize('start', [
@@ -104,7 +104,7 @@ def test_each_of_many_runs_once(make_executor, make_node, start):
     calls: list[int] = []
     with Spinning(executor) as spinning:
         start(executor, node, calls.append)
-        wait_for(lambda: len(calls) >= MANY, 2.0)
+        wait_for(lambda: len(calls) >= MANY, 6.0)
     assert sorted(calls) == list(range(MANY))
     assert spinning.error is None
 

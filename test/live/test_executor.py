@@ -261,7 +261,7 @@ def test_create_task_wakes_an_idle_executor(make_executor, monkeypatch):
     with Spinning(executor):
         time.sleep(0.2)
         task = executor.create_task(lambda: None)
-        assert wait_for(task.done, 3.0)
+        assert wait_for(task.done)
 
 
 def test_add_node_wakes_an_idle_executor(make_executor, make_node, monkeypatch):
@@ -274,7 +274,7 @@ def test_add_node_wakes_an_idle_executor(make_executor, make_node, monkeypatch):
         node.create_timer(0.001, lambda: calls.append(1))
         assert executor.add_node(node)
         assert not executor.add_node(node)
-        assert wait_for(lambda: calls, 3.0)
+        assert wait_for(lambda: calls)
         assert executor.get_nodes() == [node]
         executor.remove_node(node)
         assert executor.get_nodes() == []
@@ -298,7 +298,7 @@ def test_entities_created_and_destroyed_while_it_spins(make_executor, make_node)
             calls.clear()
             subscription = node.create_subscription(Header, '/topic', calls.append, 10)
             assert wait_for(lambda: publisher.get_subscription_count() == 1)
-            assert wait_for(lambda: publisher.publish(Header()) or calls, 2.0)
+            assert wait_for(lambda: publisher.publish(Header()) or calls)
             node.destroy_subscription(subscription)
             assert wait_for(lambda: publisher.get_subscription_count() == 0)
     assert spinning.error is None

@@ -267,7 +267,7 @@ def test_no_thread_goes_on_though_the_context_does(make_executor, make_node, ros
         names = {thread.name for thread in set(threading.enumerate()) - before}
         # between two spins the workers wait for the next one
         return names if end == 'shutdown' else {n for n in names if 'worker' not in n}
-    assert wait_for(lambda: not left(), 1.0), left()
+    assert wait_for(lambda: not left()), left()
 
 
 def test_freeze_gc_leaves_what_there_is_alone(make_executor):

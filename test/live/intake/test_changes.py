@@ -277,7 +277,7 @@ def test_it_ends_with_its_context(
     start(intake, node)
     time.sleep(0.05)
     ros_context.shutdown()
-    assert wait_for(lambda: not intake_threads(), 2.0)
+    assert wait_for(lambda: not intake_threads())
     intake.stop()
     node.destroy_node()
     assert not recorder.errors

@@ -235,7 +235,7 @@ def test_a_shortened_period_and_reset_are_noticed(
     time.sleep(0.05)
     timer.timer_period_ns = 10 * MS
     timer.reset()
-    assert wait_for(lambda: recorder.timers, 0.3)
+    assert wait_for(lambda: recorder.timers)
 
 
 def test_a_timer_without_autostart_fires_once_it_is_reset(
