@@ -384,12 +384,13 @@ class Engine:
             slot, dag, job, vertex = work.origin
             deadline = state.job_release[slot] + tables.rad_offset[vertex]
             leg = x - state.job_base[slot] - tables.region_offset[vertex]
+            held = state.x_holds[x]
             whole = end_it(x, end)
             if failed:  # told first, or its completion would count
                 self.record('fail', now, vtid, dag, tables.index_in_dag[vertex], job)
             self.record(
                 EXECUTION, start, vtid, entity.address, dag, tables.index_in_dag[vertex],
-                job, worker, work.ready_ns, deadline, end, now, whole, leg)
+                job, worker, work.ready_ns, deadline, end, now, whole, leg, work.cpu_ns, held)
         if self._state.decisions:
             self._decided(now)
 

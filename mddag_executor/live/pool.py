@@ -33,7 +33,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 import math
 import threading
-from time import monotonic_ns
+from time import monotonic_ns, thread_time_ns
 from typing import Any
 
 from mddag_executor.clocks import TraceClock
@@ -316,10 +316,15 @@ class Pool:
         seat.reading = None
         if seat.cpu_clock is not None and entity.habit.is_to_be_measured():
             self._interpreter.begins(seat, entity.habit)
+        traced = engine.record is not None
+        if traced:
+            work.cpu_ns -= thread_time_ns()
         try:
             waits_for = work.step() if entity.gate is None else entity.gate.step(work)
         except BaseException as error:
             raised = error
+        if traced:
+            work.cpu_ns += thread_time_ns()
         end = monotonic_ns() + self.clock.offset_ns
         current.running = before
         if seat.published:

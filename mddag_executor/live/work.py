@@ -58,11 +58,12 @@ class Work:
     :ivar origin: the vertex and job that it executes; None where no DAG declares it.
     :ivar worker: where it runs, or has run last.
     :ivar ready_ns: when it became ready, on the trace's clock.
+    :ivar cpu_ns: what it has computed, while a trace is recorded.
     """
 
     __slots__ = (
         'rclpy_entity', 'function', 'args', 'then', 'info', 'due', 'missed', 'entity', 'x',
-        'coroutine', 'origin', 'worker', 'ready_ns')
+        'coroutine', 'origin', 'worker', 'ready_ns', 'cpu_ns')
 
     def __init__(
         self, rclpy_entity: Any, function: Callable[..., Any], args: tuple[Any, ...] = (),
@@ -82,6 +83,7 @@ class Work:
         self.origin: Origin | None = None
         self.worker = -1
         self.ready_ns = 0
+        self.cpu_ns = 0
 
     def step(self) -> Any:
         """

@@ -173,7 +173,7 @@ class _Teller:
             self._tell(FAILED, dag, v, number, now)
         last = self._last_leg[v] if kind == END and declared else 0
         for leg in range(last):     # they took no time: the execution is the last one's
-            self._tell(COMPLETED, dag, v, number, leg, 0, now, -1, -1, -1, -1, -1)
+            self._tell(COMPLETED, dag, v, number, leg, 0, now, -1, -1, -1, -1, -1, -1, 0)
         self._tell(
             RAN, self._callback[v] if declared else 0, dag if declared else -1,
             v if declared else -1, number, worker, before.ready, before.since, now,
@@ -188,7 +188,7 @@ class _Teller:
         vertex, number = self._vertices[v], self._number(dag, job)
         self._finished += 1
         self._tell(COMPLETED, dag, v, number, leg, 1, now, ran.ready, ran.first, now, busy,
-                   self._finished)
+                   self._finished, -1, 0)
         delay = self._schedule.delay
         for local in vertex.successors:
             after = (dag, self._first[dag] + local, job)

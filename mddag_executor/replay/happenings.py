@@ -43,7 +43,7 @@ NOW, PROCESS, THREAD, FIELD = range(4)
 KINDS = ('released', 'started', 'ran', 'completed', 'ended', 'withdrawn', 'failed', 'missed',
          'published')
 RELEASED, STARTED, RAN, COMPLETED, ENDED, WITHDRAWN, FAILED, MISSED, PUBLISHED = range(len(KINDS))
-_WIDTHS = (4, 6, 9, 11, 4, 2, 4, 5, 7)
+_WIDTHS = (4, 6, 9, 13, 4, 2, 4, 5, 7)
 
 
 class Piece(NamedTuple):
@@ -172,7 +172,7 @@ class Observer:
 
     def completed(
         self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, ready: int,
-        start: int, ended: int, busy: int, number: int,
+        start: int, ended: int, busy: int, number: int, cpu: int, held: int,
     ) -> None:
         """
         Hear that an execution of a vertex has completed.
@@ -180,6 +180,8 @@ class Observer:
         :param whole: whether that completed the vertex, as the executor saw it.
         :param ready: of the execution, as ``start`` to ``number``: see ``Execution``; the same
             number again for further legs that one execution completes.
+        :param cpu: its CPU time, ns; -1: not known.
+        :param held: whether it held the interpreter.
         """
 
     def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:

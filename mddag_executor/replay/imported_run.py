@@ -286,7 +286,7 @@ class ImportedRun(LinkObserver):
             self._doubts.done(dag, vertex, job)
         self._number += 1
         self._tell(COMPLETED, dag, vertex, job, run.leg, int(whole), run.end, run.ready,
-                   run.start, run.end, run.end - run.start, self._number)
+                   run.start, run.end, run.end - run.start, self._number, -1, 0)
 
     def _is_whole(self, vertex: int, job: int, leg: int) -> bool:
         """Tell whether an execution completes its vertex: of a sync's legs the last one does."""

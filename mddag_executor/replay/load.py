@@ -171,7 +171,7 @@ class LoadBuilder(Observer):
 
     def completed(
         self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, ready: int,
-        start: int, ended: int, busy: int, number: int,
+        start: int, ended: int, busy: int, number: int, cpu: int, held: int,
     ) -> None:
         """Note an execution's times."""
         jobs = self._jobs[dag]

@@ -524,7 +524,8 @@ class _Threads:
         times = np.full((len(found), 5), -1, dtype=np.int64)
         times[matched] = executions[found[matched], X_READY:]
         add(COMPLETED, where[_IS_COMPLETE][told], *of_job[told].T, leg[told],
-            complete[told, FIELD + 4], end[told], *times[told].T)
+            complete[told, FIELD + 4], end[told], *times[told].T,
+            *complete[told, FIELD + 7:FIELD + 9].T)
         return first
 
     def _join(self, executions: Ints, ended: Ints, found: Ints, places: Ints) -> Ints:

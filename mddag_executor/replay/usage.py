@@ -16,7 +16,8 @@ import numpy as np
 class CallbackUse:
     """Counts and sums of one callback's executions, ns."""
 
-    __slots__ = ('executions', 'busy', 'longest', 'waiting', 'longest_wait', 'group')
+    __slots__ = ('executions', 'busy', 'longest', 'waiting', 'longest_wait', 'group', 'measured',
+                 'measured_busy', 'cpu', 'held')
 
     def __init__(self) -> None:
         self.executions = 0
@@ -25,13 +26,23 @@ class CallbackUse:
         self.waiting = 0
         self.longest_wait = 0
         self.group = 0
+        # of how many executions the CPU time is known, what these took, and what they computed
+        self.measured = 0
+        self.measured_busy = 0
+        self.cpu = 0
+        self.held = 0
 
     def result(self) -> dict[str, int]:
         """Return the callback's part of the result; the sums are over all executions."""
-        return {
+        result = {
             'executions': self.executions, 'busy_ns': self.busy, 'longest_ns': self.longest,
             'waiting_ns': self.waiting, 'longest_wait_ns': self.longest_wait,
             'waiting_group_ns': self.group}
+        if self.measured:
+            result.update(
+                measured=self.measured, measured_busy_ns=self.measured_busy, cpu_ns=self.cpu,
+                held_interpreter=self.held)
+        return result
 
 
 class PoolUse:
@@ -113,14 +124,23 @@ class Usage(Observer):
         if len(pieces):
             self._ran(pieces, every)
         done = batch.columns(COMPLETED)
-        done = done[done[:, -1] >= 0]
+        done = done[done[:, 10] >= 0]
         if len(done):
-            numbers = done[:, -1]
+            numbers = done[:, 10]
             done = done[np.r_[self._counted, numbers[:-1]] != numbers]   # not one leg more
             self._counted = int(numbers[-1])
             place = self._place[done[:, 1]]
             _count(place, every)
             _longest(place, done[:, 9], every, 'longest')
+            known = done[:, 11] >= 0
+            place, done = place[known], done[known]
+            counts = [sums(place, each, len(every)) for each in (
+                np.ones_like(place), done[:, 9], done[:, 11], done[:, 12])]
+            for use, n, busy, cpu, held in zip(every, *counts):
+                use.measured += n
+                use.measured_busy += busy
+                use.cpu += cpu
+                use.held += held
 
     def _ran(self, pieces: Ints, every: list[CallbackUse]) -> None:
         took, place = pieces[:, 7] - pieces[:, 6], self._place[pieces[:, 2]]

@@ -200,7 +200,7 @@ class Exporter(Observer):
 
     def completed(
         self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, ready: int,
-        start: int, ended: int, busy: int, number: int,
+        start: int, ended: int, busy: int, number: int, cpu: int, held: int,
     ) -> None:
         """Note what an execution completed; one may complete several legs, one after the other."""
         if self._completed is not None and self._completed[0] != number:

@@ -16,7 +16,8 @@ _TIMES_HEADER = (
     'DAG', 'sink', 'release lag', 'waiting', 'for group', 'executing', 'suspended', 'transport',
     'worst job', 'waiting', 'for group', 'executing', 'suspended', 'transport')
 CALLBACKS_HEADER = (
-    'callback', 'executions', 'busy', 'mean', 'longest', 'mean wait', 'longest wait')
+    'callback', 'executions', 'busy', 'mean', 'longest', 'mean wait', 'longest wait', 'CPU',
+    'interpreter')
 RECORDED_HEADER = ('callback', 'executions', 'busy', 'shortest', 'mean', 'longest')
 PATHS_HEADER = ('path', 'arrived', 'case', 'count', 'min', 'median', 'p99', 'max')
 _COMPARISON_HEADER = (
@@ -60,7 +61,14 @@ def callbacks_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[
         yield [
             key, n, _time(use['busy_ns']), _time(use['busy_ns'] // n) if n else None,
             _time(use['longest_ns']), _time(use['waiting_ns'] // n) if n else None,
-            _time(use['longest_wait_ns'])]
+            _time(use['longest_wait_ns']), *_computed(use)]
+
+
+def _computed(use: Mapping[str, int]) -> list[Cell]:
+    """Return which share of its time a callback computed, and how often it held the lock."""
+    n, busy = use.get('measured', 0), use.get('measured_busy_ns', 0)
+    return [f'{use["cpu_ns"] / busy:.0%}' if n and busy else None,
+            f'{use["held_interpreter"] / n:.0%}' if n else None]
 
 
 def recorded_table(callbacks: Mapping[str, Mapping[str, int]]) -> str:

@@ -11,7 +11,8 @@ Theory of operation:
    writer or an importer may have other fields. A channel whose schema is not a flat CDR message
    with the preamble cannot be decoded; its messages are left out and counted.
 3. An event of the table comes out with the table's fields in the table's order, whatever the file
-   has: fields that the file does not have are None, others are left out. A field of another kind
+   has: fields that the file does not have are None, or what the table says of optional ones;
+   others are left out. A field of another kind
    than the table's (text for a number) makes the channel one that cannot be decoded.
 """
 
@@ -21,11 +22,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import re
 import struct
-from typing import Any
 
 from mddag_executor.trace import cdr
 from mddag_executor.trace.cdr import FieldType
-from mddag_executor.trace.events import Event
+from mddag_executor.trace.events import Event, Fixed
 from mddag_executor.trace.records import Cursor
 from mddag_executor.trace.schema import EVENTS, PREAMBLE
 import numpy as np
@@ -63,9 +63,9 @@ class Channels:
         self.topics: dict[int, str] = {}
         #: Channels whose messages are not wanted.
         self.passed_over: set[int] = set()
-        #: Channels whose messages have one fixed layout: the beginning of their events, and the
-        #: structure of the rest.
-        self.fixed: dict[int, tuple[Event, Any]] = {}
+        #: Channels whose messages have one fixed layout: the beginning of their events, the
+        #: structure of the rest, and what the fields are that it does not have.
+        self.fixed: dict[int, Fixed] = {}
         #: The fields of the events met, by full name.
         self.fields: dict[str, tuple[str, ...]] = {}
         self._decoders: dict[int, Decoder | str] = {}       # or the reason why there is none
@@ -141,22 +141,27 @@ class Channels:
 
         head = (name if self._as_table else layout,)
         names, types = list(fields), list(fields.values())
-        places = [names.index(field) if field in fields else -1
-                  for field in (*preamble, *layout.fields)]
+        defaults = EVENTS[name].defaults if table else {}
+        missing = [field for field in layout.fields if field not in fields]
+        others = [*names, *missing]
+        places = [others.index(field) for field in (*preamble, *layout.fields)]
+        rest = tuple(defaults.get(field) for field in missing)
 
         def decode(data: bytes) -> Event:
-            values = (*cdr.decode(types, data), None)       # place -1 is None
+            values = (*cdr.decode(types, data), *rest)
             return tuple(values[place] for place in places)
 
         self._decoders[number] = head, decode
         fixed = cdr.fixed_layout(types)
-        if fixed is not None and places == list(range(len(names))):
+        if (fixed is not None and places == list(range(len(others)))
+                and all(field in defaults for field in missing)):
             ends = [struct.calcsize('<' + fixed[:i + 1])
                     for i, code in enumerate(fixed) if code != 'x']
             formats = ['<' + code for code in fixed if code != 'x']
             self.fixed[number] = head, np.dtype({
                 'names': names, 'formats': formats, 'itemsize': struct.calcsize('<' + fixed),
-                'offsets': [end - struct.calcsize(code) for end, code in zip(ends, formats)]})
+                'offsets': [end - struct.calcsize(code) for end, code in zip(ends, formats)]}), {
+                    field: defaults[field] for field in missing}
 
     def _fields_of(self, schema: int) -> dict[str, FieldType]:
         if schema not in self._schemas:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 Event = tuple[Any, ...]
 Ints = npt.NDArray[np.int64]
+Fixed = tuple[Event, Any, dict[str, int]]
 OTHER = 0xFFFF
 """Stands for the channel of events that no fixed layout decodes."""
 
@@ -37,12 +38,13 @@ class Events:
 
     :param data: in which messages begin at ``positions``.
     :param channels: of each event its channel, ``OTHER``: it is in ``others``, at its position.
-    :param decoders: by channel the beginning of its tuples and the type of its rows.
+    :param decoders: by channel the beginning of its tuples, the type of its rows, and what the
+        fields are that these do not have.
     """
 
     def __init__(
         self, data: bytes, channels: npt.NDArray[np.uint16], positions: Ints,
-        others: Sequence[Event], decoders: dict[int, tuple[Event, Any]],
+        others: Sequence[Event], decoders: dict[int, Fixed],
     ) -> None:
         self._data = data
         self._channels = channels
@@ -63,9 +65,10 @@ class Events:
         for start, end in zip(starts, [*starts[1:], len(order)]):
             number = int(channels[start])
             if number != OTHER:
-                head, kind = self._decoders[number]
+                head, kind, missing = self._decoders[number]
                 places = order[start:end]
-                yield Table(head, rows_at(self._data, kind, self._positions[places]), places)
+                rows = rows_at(self._data, kind, self._positions[places])
+                yield Table(head, _with_fields(rows, missing) if missing else rows, places)
 
     def others(self) -> list[tuple[int, Event]]:
         """Return the other events with their places."""
@@ -82,6 +85,17 @@ class Events:
         for place, event in self.others():
             found[place] = event
         return iter(found)
+
+
+def _with_fields(rows: Any, missing: dict[str, int]) -> Any:
+    """Return a structured array with more fields, the same in each row."""
+    kinds = [(name, rows.dtype[name]) for name in rows.dtype.names]
+    wider = np.empty(len(rows), [*kinds, *((name, np.int64) for name in missing)])
+    for name, _ in kinds:
+        wider[name] = rows[name]
+    for name, value in missing.items():
+        wider[name] = value
+    return wider
 
 
 def rows_at(data: bytes, kind: Any, positions: Ints) -> Any:

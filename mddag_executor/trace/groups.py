@@ -25,7 +25,7 @@ EXECUTION = 'execution'
 A declared callback has run: ``dispatch``, ``callback_start``, ``callback_end``, ``complete``.
 
 After the name: start, vtid, callback, dag, vertex, job, worker, ready, deadline, end, completed
-(the core's time of its completion), whole, leg.
+(the core's time of its completion), whole, leg, CPU time, whether it held the interpreter.
 """
 
 PUBLICATION = 'publication'
@@ -95,7 +95,7 @@ def _execution(
 
     def encode(entry: Sequence[Any], vpid: int) -> tuple[bytes, tuple[int, ...]]:
         (_, start, vtid, callback, dag, vertex, job, worker, ready, deadline, end, completed,
-         whole, leg) = entry
+         whole, leg, cpu_time, held) = entry
         data = pack(
             _M, l0, n0, dispatch.count & _SEQUENCE, start, start, _E, start, vpid, vtid,
             callback, dag, vertex, job, worker, ready, deadline,
@@ -104,7 +104,7 @@ def _execution(
             _M, l2, n2, ended.count & _SEQUENCE, end, end, _E, end, vpid, vtid,
             callback,
             _M, l3, n3, complete.count & _SEQUENCE, completed, completed, _E, completed, vpid,
-            vtid, callback, dag, vertex, job, whole, end, leg)
+            vtid, callback, dag, vertex, job, whole, end, leg, cpu_time, held)
         return data, (start, start, end, completed)
 
     return encode

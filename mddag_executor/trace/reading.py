@@ -229,7 +229,7 @@ class Reading:
             self._met = met
             self._sizes[:] = 1 << 62
             self._sizes[list(channels.passed_over)] = 0
-            for number, (_, kind) in channels.fixed.items():
+            for number, (_, kind, _) in channels.fixed.items():
                 self._sizes[number] = kind.itemsize + _FIELDS - _CONTENT
         return self._sizes
 

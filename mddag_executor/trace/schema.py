@@ -26,12 +26,16 @@ class EventType:
     """
     One kind of event: its provider, its name, and its fields as pairs of name and ros2msg type.
 
+    :ivar optional: what the last fields are where a writer, or a file of an older version, does
+        not have them.
+
     :raises ValueError: for a name or type that a flat ROS message cannot have
     """
 
     provider: str
     name: str
     fields: tuple[tuple[str, str], ...]
+    optional: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the names and the types."""
@@ -60,6 +64,12 @@ class EventType:
         return tuple(FieldType.parse(kind) for _, kind in PREAMBLE + self.fields)
 
     @property
+    def defaults(self) -> dict[str, int]:
+        """Return what the optional fields are by default."""
+        first = len(self.fields) - len(self.optional)
+        return {name: value for (name, _), value in zip(self.fields[first:], self.optional)}
+
+    @property
     def text(self) -> str:
         """Return the message definition in ros2msg."""
         return ''.join(f'{kind} {name}\n' for name, kind in PREAMBLE + self.fields)
@@ -70,8 +80,10 @@ def camel_case(name: str) -> str:
     return ''.join(part[:1].upper() + part[1:] for part in name.split('_'))
 
 
-def _event(provider: str, name: str, /, **fields: str) -> EventType:
-    return EventType(provider, name, tuple(fields.items()))
+def _event(
+    provider: str, name: str, optional: tuple[int, ...] = (), /, **fields: str
+) -> EventType:
+    return EventType(provider, name, tuple(fields.items()), optional)
 
 
 _U64, _I64, _I32, _STR, _BOOL = 'uint64', 'int64', 'int32', 'string', 'bool'
@@ -125,9 +137,10 @@ _ALL = (
     _event('mddag', 'job_release', dag=_I32, job=_I64, release=_I64),
     _event('mddag', 'dispatch', callback=_U64, dag=_I32, vertex=_I32, job=_I64, worker=_I32,
            ready=_I64, reference_deadline=_I64),
-    _event('mddag', 'complete',
+    # the CPU time of the execution, -1 where it is not known, and whether it held the interpreter
+    _event('mddag', 'complete', (-1, False),
            callback=_U64, dag=_I32, vertex=_I32, job=_I64, last_leg=_BOOL, completed=_I64,
-           leg=_I32),
+           leg=_I32, cpu_time=_I64, held_interpreter=_BOOL),
     _event('mddag', 'deadline',
            dag=_I32, vertex=_I32, job=_I64, deadline=_I64, completed=_I64),
     _event('mddag', 'drop', callback=_U64, dag=_I32, vertex=_I32, job=_I64, reason=_STR),

@@ -81,7 +81,8 @@ def _encoder(event: EventType, number: int) -> Callable[..., bytes]:
     if layout is not None:
         packer = struct.Struct('<BQHIQQ4s' + layout)
         length = packer.size - records.RECORD.size
-        return functools.partial(packer.pack, Opcode.MESSAGE, length, number)
+        pack = functools.partial(packer.pack, Opcode.MESSAGE, length, number)
+        return _completed(event, pack) if event.optional else pack
 
     types = event.types
 
@@ -89,6 +90,19 @@ def _encoder(event: EventType, number: int) -> Callable[..., bytes]:
                *values: Any) -> bytes:
         head = records.MESSAGE_HEAD.pack(number, sequence, log_time, publish_time)
         return records.record(Opcode.MESSAGE, head + encapsulation + cdr.encode(types, values))
+
+    return encode
+
+
+def _completed(event: EventType, pack: Callable[..., bytes]) -> Callable[..., bytes]:
+    """Return a packer that takes the optional fields of an event or leaves them out."""
+    whole = len(event.types)
+
+    def encode(sequence: int, log_time: int, publish_time: int, encapsulation: bytes,
+               *values: Any) -> bytes:
+        missing = whole - len(values)
+        return pack(sequence, log_time, publish_time, encapsulation, *values,
+                    *(event.optional[-missing:] if missing else ()))
 
     return encode
 

@@ -4,13 +4,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from hypothesis import given
 from hypothesis import strategies as st
+from mddag_executor.replay import replay
 from mddag_executor.replay.happenings import Batch, Piece, RAN
 from mddag_executor.replay.usage import PoolUse
 from mddag_executor.replay.waits import GroupWaits
+from mddag_executor.trace import TraceFile
 from mddag_executor.trace.census import Census
 import numpy as np
+
+from .helpers import MS, START_TIME
 
 STEP = PoolUse.FIRST_STEP_NS
 SPANS = st.lists(st.tuples(st.integers(0, 10 ** 13), st.integers(0, 10 ** 11)), max_size=30)
@@ -60,3 +66,24 @@ def test_waits_for_the_group() -> None:
         waits.take(Batch([RAN], {RAN: [each]}))
         found += waits.found.tolist()
     assert found == expected
+
+
+def test_what_computed_and_held_the_interpreter(tmp_path: Path) -> None:
+    """Executions whose CPU time is not recorded are left out."""
+    path, text = tmp_path / 'a.mcap', 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, ' \
+        'timer: 100ms, deadline: 50ms}]}]'
+    took = [(4, 3, True), (2, 0, False), (9, None, False)]
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
+        for job, (busy, cpu, held) in enumerate(took):
+            start = START_TIME + job * 100 * MS
+            end = start + busy * MS
+            file.add('job_release', start, 1, 1, 0, job, start)
+            file.add('dispatch', start, 1, 10, 9, 0, 0, job, 0, start, 0)
+            file.add('callback_start', start, 1, 10, 9, False)
+            file.add('callback_end', end, 1, 10, 9)
+            file.add('complete', end, 1, 10, 9, 0, 0, job, True, end, 0,
+                     *(() if cpu is None else (cpu * MS, held)))
+    use = replay(path).result()['callbacks']['/n:a']
+    assert (use['executions'], use['measured'], use['measured_busy_ns']) == (3, 2, 6 * MS)
+    assert (use['cpu_ns'], use['held_interpreter']) == (3 * MS, 1)

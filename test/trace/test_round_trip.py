@@ -265,3 +265,19 @@ def test_a_block_left_by_an_exception_gives_the_file_up(tmp_path: Path) -> None:
     events, warnings = read(path)
     assert len(events) == 1
     assert len(warnings) == 1 and 'without a finish record' in warnings[0]
+
+
+def test_optional_fields_of_older_files(tmp_path: Path) -> None:
+    """What versions before 1.1 wrote of a completion is read with the fields that came later."""
+    path = tmp_path / 'a.mcap'
+    now = EVENTS['mddag:complete']
+    before = EventType(now.provider, now.name, now.fields[:7])
+    cases: list[tuple[Any, ...]] = [
+        ((before,), (), -1, False), ((), (), -1, False), ((), (700, True), 700, True)]
+    for events, fields, cpu_time, held in cases:
+        with TraceFile(path, extra_events=events) as file:
+            for job in range(3):
+                file.add('complete', 1000 + job, 1, 2, 5, 0, 1, job, True, 900, 0, *fields)
+        read = list(TraceReader(path).events())
+        assert [event[7:] for event in read] == [
+            (job, True, 900, 0, cpu_time, held) for job in range(3)]
