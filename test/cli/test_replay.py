@@ -75,8 +75,11 @@ def test_the_tables(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_the_table_of_callbacks(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, out, _ = call(capsys, trace, '--callbacks')
     lines = [line.split() for line in out.splitlines()]
-    assert ['/driver:tick', '3', '9', 'ms', '3', 'ms', '6', 'ms', '0', 'ns', '0', 'ns'] in lines
-    assert ['/filter:run', '3', '9', 'ms', '3', 'ms', '3', 'ms', '1', 'ms', '1', 'ms'] in lines
+    # nobody knows what they computed
+    assert ['/driver:tick', '3', '9', 'ms', '3', 'ms', '6', 'ms', '0', 'ns', '0', 'ns', '-',
+            '-'] in lines
+    assert ['/filter:run', '3', '9', 'ms', '3', 'ms', '3', 'ms', '1', 'ms', '1', 'ms', '-',
+            '-'] in lines
 
 
 def test_the_result_for_machines(

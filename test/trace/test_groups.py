@@ -21,7 +21,7 @@ SMALL = st.integers(-1, 2 ** 31 - 1)
 JOB = st.integers(-1, 2 ** 63 - 1)
 EXECUTIONS = st.tuples(
     st.just(EXECUTION), TIME, SMALL, ADDRESS, SMALL, SMALL, JOB, SMALL, TIME, TIME, TIME, TIME,
-    st.booleans(), SMALL)
+    st.booleans(), SMALL, TIME, st.booleans())
 PUBLICATIONS = st.tuples(st.just(PUBLICATION), TIME, SMALL, ADDRESS, ADDRESS)
 SINGLE = st.tuples(st.just('callback_end'), TIME, SMALL, ADDRESS)
 
@@ -34,11 +34,12 @@ def one_by_one(entry):
                 ('rcl_publish', time, vtid, publisher, message)]
     if name != EXECUTION:
         return [entry]
-    callback, dag, vertex, job, worker, ready, deadline, end, completed, whole, leg = rest
+    callback, dag, vertex, job, worker, ready, deadline, end, completed, whole, leg, *computed = rest
     return [('dispatch', time, vtid, callback, dag, vertex, job, worker, ready, deadline),
             ('callback_start', time, vtid, callback, False),
             ('callback_end', end, vtid, callback),
-            ('complete', completed, vtid, callback, dag, vertex, job, whole, end, leg)]
+            ('complete', completed, vtid, callback, dag, vertex, job, whole, end, leg,
+             *computed)]
 
 
 @given(st.lists(EXECUTIONS | PUBLICATIONS | SINGLE, max_size=30), st.integers(1, 40))
@@ -60,7 +61,8 @@ def test_chunks_stay_within_their_limit(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     with TraceFile(path) as file:
         file.extend(
-            [(EXECUTION, START + n, 1, n, 0, 0, n, 0, START, START, START + n, START + n, True, 0)
+            [(EXECUTION, START + n, 1, n, 0, 0, n, 0, START, START, START + n, START + n, True, 0,
+              500, False)
              for n in range(5000)], VPID)
     events, warnings = read(path)
     assert len(events) == 20000 and not warnings
@@ -68,7 +70,7 @@ def test_chunks_stay_within_their_limit(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('bad', [
     (EXECUTION, START, 1), (PUBLICATION, START, 1, 'text', 2), (PUBLICATION,),
-    (EXECUTION, START, 1, -1, 0, 0, 0, 0, 0, 0, 0, 0, True, 0)])
+    (EXECUTION, START, 1, -1, 0, 0, 0, 0, 0, 0, 0, 0, True, 0, 0, False)])
 def test_a_bad_entry_costs_its_events_only(tmp_path: Path, bad) -> None:
     path = tmp_path / 'a.mcap'
     with TraceWriter(path, flush_interval_s=0.01) as writer:
