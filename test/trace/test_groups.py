@@ -34,7 +34,8 @@ def one_by_one(entry):
                 ('rcl_publish', time, vtid, publisher, message)]
     if name != EXECUTION:
         return [entry]
-    callback, dag, vertex, job, worker, ready, deadline, end, completed, whole, leg, *computed = rest
+    (callback, dag, vertex, job, worker, ready, deadline, end, completed, whole, leg,
+     *computed) = rest
     return [('dispatch', time, vtid, callback, dag, vertex, job, worker, ready, deadline),
             ('callback_start', time, vtid, callback, False),
             ('callback_end', end, vtid, callback),
