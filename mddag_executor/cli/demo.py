@@ -29,6 +29,7 @@ from mddag_executor.cli.text import Cell, format_ns, printable, Progress, table
 from mddag_executor.core.tally import counts
 from mddag_executor.errors import MddagError
 from mddag_executor.live.bench.spec import Spec
+from mddag_executor.report.explained import causes_line
 from mddag_executor.report.live_runs import summary
 from mddag_executor.report.tables import (
     each_sink,
@@ -86,6 +87,8 @@ def main(args: argparse.Namespace) -> int:
     say('\n== The recording, replayed ==')
     say(replay_table(live, recorded, rescheduled))
     say(agreement(live, recorded))
+    for line in causes_line(recorded['misses']):
+        say(f'{line} (mddag explain {output / "demo.mcap"})')
     say(f"\n== The same nodes on rclpy's MultiThreadedExecutor({WORKERS}), "
         f'{args.baseline_seconds:g} s ==')
     baseline = run_baseline(args, graph)

@@ -56,6 +56,7 @@ VERBS = {
     'demo': Verb('demo', 'run the whole Autoware workload, record it and replay the recording'),
     'run': Verb('run', 'run rclpy nodes, or nodes made from the declaration, and record them'),
     'replay': Verb('replay', 'check a recorded run against its deadlines, or reschedule it'),
+    'explain': Verb('explain', 'tell why each deadline of a recorded run was missed'),
     'simulate': Verb('simulate', 'run a declaration in virtual time'),
     'evaluate': Verb('evaluate', 'measure acceptance ratios over many simulated runs'),
     'generate': Verb('generate', 'make random multi-deadline, multi-rate DAG sets'),

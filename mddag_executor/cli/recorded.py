@@ -96,18 +96,20 @@ def check_declared(path: str, name: str) -> None:
 def as_recorded(
     path: str, name: str, task_set: TaskSet | None,
     more: Callable[[Replay], Sequence[Observer]] | None = None, doing: str = 'replaying',
-    skip: int = 0,
+    skip: int = 0, jobs: bool = False,
 ) -> Replay:
     """
     Replay a recorded run.
 
     :param more: who else is told of the run.
+    :param jobs: whether to keep of each miss why.
     :raises mddag_executor.errors.MddagError: where that cannot be
     """
     from mddag_executor.replay import replay
     with Progress(doing) as line:
         return replay(
-            path, task_set, name=name, progress=line.events, more=more, skip=skip)
+            path, task_set, name=name, progress=line.events, more=more, skip=skip,
+            jobs=jobs)
 
 
 def rescheduled(

@@ -13,6 +13,8 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
+LEAST_NS = 20_000_000
+"""What is shorter is no stop."""
 KEEP_STOPS = 100
 KEEP_MISSES = 2_000
 

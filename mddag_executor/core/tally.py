@@ -34,6 +34,10 @@ from mddag_executor.core.state import (
 from mddag_executor.core.tables import Tables
 from msg_graph import TaskSet
 
+VERDICTS = {
+    SINK_IN_TIME: 'in_time', SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
+    SINK_ABORTED: 'aborted', SINK_FAILED: 'failed'}
+"""What a verdict of the core is called."""
 _OUTCOMES = {COMPLETED: 'completed', LATE: 'late', ABORTED: 'aborted', EXPIRED: 'expired',
              FAILED: 'failed'}
 

@@ -435,7 +435,7 @@ class MultiDeadlineExecutor(BareExecutor):
     def _stopped(self, begin: int, end: int) -> None:
         """Take note that no thread of the process ran from ``begin`` to ``end`` (monotonic)."""
         with self._pool.lock:
-            self._engine.verdicts.stops.stopped(
+            self._engine.verdicts.stopped(
                 begin + self._trace_clock.offset_ns, end + self._trace_clock.offset_ns)
 
     def _fail(self, error: BaseException) -> None:

@@ -25,8 +25,9 @@ from collections.abc import Callable
 import threading
 import time
 
+from mddag_executor.core.stops import LEAST_NS
+
 SLICE_NS = 20_000_000
-LEAST_NS = 20_000_000
 CPU_SHARE = 4
 
 

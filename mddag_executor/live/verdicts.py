@@ -17,23 +17,18 @@ from mddag_executor.core.state import (
     DROP,
     EXPIRED,
     JOB_END,
-    SINK_ABORTED,
-    SINK_EXPIRED,
     SINK_FAILED,
     SINK_IN_TIME,
     SINK_LATE,
-    SINK_MISSED,
 )
 from mddag_executor.core.stops import Stops
+from mddag_executor.core.tally import VERDICTS
 from mddag_executor.live.entity import Entity
 from mddag_executor.live.jobs import Origin
 from msg_graph import TaskSet
 
 KEEP_RESPONSES = 2_000
 KEEP_ABORTED = 4096
-
-_WHY = {SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
-        SINK_ABORTED: 'aborted', SINK_FAILED: 'failed'}
 
 
 @dataclass(frozen=True)
@@ -127,7 +122,7 @@ class Verdicts:
         if self._on_miss is not None:
             self.misses.append(DeadlineMiss(
                 self._dags[dag].name, self.tally.vertex_name(vertex), job, release, deadline,
-                time if kind == SINK_LATE else None, _WHY[kind]))
+                time if kind == SINK_LATE else None, VERDICTS[kind]))
 
     def report_misses(self) -> None:
         """Call ``on_miss`` for the misses since the last call."""
@@ -147,6 +142,12 @@ class Verdicts:
             self.on_release(dag, release)
         if self.record is not None:
             self.record('job_release', now, threading.get_native_id(), dag, job, release)
+
+    def stopped(self, begin: int, end: int) -> None:
+        """Take in that no thread of the process ran for a while, which has just ended."""
+        self.stops.stopped(begin, end)
+        if self.record is not None:
+            self.record('stop', end, threading.get_native_id(), begin, end)
 
     def dropped(self, entity: Entity, origin: Origin, reason: str, now: int) -> None:
         """Take in that an execution was dropped."""

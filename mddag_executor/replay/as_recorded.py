@@ -11,6 +11,7 @@ from typing import Any
 from mddag_executor.memory import no_garbage
 from mddag_executor.replay.communications import Communications
 from mddag_executor.replay.drift import ImportedDrift, OwnDrift
+from mddag_executor.replay.explain import Explainer
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.imported_run import ImportedPaths, ImportedRun
 from mddag_executor.replay.judge import Judge
@@ -31,13 +32,17 @@ class Replay:
     Plays a recorded run, and tells what came of it.
 
     :param more: makes further observers, who are told after the judge.
-    :param paths: whether to follow the declared paths, and to look for drift.
+    :param paths: whether to follow the declared paths, to look for drift, and to count why
+        deadlines were missed.
+    :param jobs: whether to keep of each miss why.
+    :ivar explainer: knows why; None without ``paths``.
     :ivar warnings: what is missing or doubtful, one line each.
     """
 
     def __init__(
         self, run: Run, skip: int = 0, progress: Progress | None = None,
         more: Callable[[Replay], Sequence[Observer]] | None = None, paths: bool = True,
+        jobs: bool = False,
     ) -> None:
         self.run = run
         self.task_set = run.task_set
@@ -54,10 +59,14 @@ class Replay:
                 self._paths, self._drift = ImportedPaths(run), ImportedDrift(run)
         elif paths:
             self._paths, self._drift = OwnPaths(run), OwnDrift(run)
+        self.explainer = Explainer(run, self.judge, jobs) if paths else None
         observers = [waits, self.judge, self.usage, self._paths, self._drift, self._seen,
+                     self.explainer,
                      *(more(self) if more is not None else ())]
         with no_garbage():
             run.play([each for each in observers if each is not None], progress)
+            if self.explainer is not None:
+                self.explainer.finish()
         self.warnings = run.warnings
         if self.judge.contradictions:
             self.warnings.append(
@@ -101,6 +110,7 @@ class Replay:
             'undeclared': self.usage.undeclared.result(),
             'worker_use': self.usage.workers(head.workers, duration),
             'dropped': dict(sorted(self.run.dropped.items())),
+            'misses': None if self.explainer is None else self.explainer.summary(),
             'paths': {} if self._paths is None else path_results(self._paths.book),
             **({} if self._seen is None else {
                 'recorded_callbacks': self._seen.callbacks(),
@@ -137,6 +147,7 @@ def replay(
     progress: Progress | None = None,
     more: Callable[[Replay], Sequence[Observer]] | None = None,
     skip: int = 0,
+    jobs: bool = False,
 ) -> Replay:
     """
     Replay a trace as recorded.
@@ -150,8 +161,9 @@ def replay(
     :param progress: told now and then how many events have been read.
     :param more: who else is told of the run; see ``Replay``.
     :param skip: how long after the first release jobs are not judged (a warm-up), ns.
+    :param jobs: whether to keep of each miss why.
     :raises mddag_executor.trace.TraceError: when it is no trace.
     :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, or none of
         the declaration's callbacks.
     """
-    return Replay(open_run(path, task_set, name), skip, progress, more)
+    return Replay(open_run(path, task_set, name), skip, progress, more, jobs=jobs)

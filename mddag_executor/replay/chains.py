@@ -28,6 +28,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of, NEVER, Tables
+from mddag_executor.core.state import SINK_LATE
 from mddag_executor.replay.happenings import (
     Batch,
     COMPLETED,
@@ -66,7 +67,18 @@ class Step(NamedTuple):
 
 
 # Columns of a link: a step while it is only counted.
-_L_VERTEX, _L_LEG, _L_READY, _L_START, _L_END, _L_BUSY, _L_GROUP, _N_LINK = range(8)
+L_VERTEX, L_LEG, L_READY, L_START, L_END, L_BUSY, L_GROUP, N_LINK = range(8)
+
+
+# Columns of a miss; ``M_AT`` is the vertex that the job came to, ``M_LENGTH`` of how many links.
+M_KIND, M_SINK, M_JOB, M_RELEASE, M_UNTIL, M_AT, M_LENGTH, N_MISS = range(8)
+
+
+class Misses(NamedTuple):
+    """Missed deadlines of a batch; the links of their chains one after the other, end first."""
+
+    rows: Ints
+    chains: Ints
 
 
 class Worst(NamedTuple):
@@ -118,25 +130,32 @@ class Chains:
         self.sinks = {vertex: SinkTimes() for vertex in tables.sinks}
         #: As the core's columns of executions: the link of each vertex of the open jobs, or -1.
         self.links: list[int] = []
-        self._kept = np.empty((0, _N_LINK), dtype=np.int64)
+        self._kept = np.empty((0, N_LINK), dtype=np.int64)
         # of the sinks that have completed in this batch: vertex, job, release, completion; and
         # their chains one after the other, from the end on, and how long each is
         self._sinks: list[tuple[int, int, int, int]] = []
         self._chains: list[int] = []
         self._lengths: list[int] = []
+        #: Whether to keep the chains of sinks that missed their deadlines, for ``misses``.
+        self.keeps_misses = False
+        # of these sinks in this batch the columns of a miss; as above, their chains
+        self._missed: list[tuple[int, ...]] = []
+        self._of_missed: list[int] = []
+        self.misses = Misses(
+            np.empty((0, N_MISS), dtype=np.int64), np.empty((0, N_LINK), dtype=np.int64))
 
     def begin_batch(self, batch: Batch) -> tuple[int, int]:
         """Begin with what completes and starts; return the numbers of the first links of each."""
         completed, started = batch.columns(COMPLETED), batch.columns(STARTED)
         first = len(self._kept)
-        table = np.zeros((first + len(completed) + len(started), _N_LINK), dtype=np.int64)
+        table = np.zeros((first + len(completed) + len(started), N_LINK), dtype=np.int64)
         table[:first] = self._kept
-        table[first:first + len(completed), :_L_GROUP] = completed[:, (1, 3, 6, 7, 8, 9)]
+        table[first:first + len(completed), :L_GROUP] = completed[:, (1, 3, 6, 7, 8, 9)]
         running = table[first + len(completed):]
-        running[:, _L_VERTEX], running[:, _L_READY:_L_END] = started[:, 1], started[:, 3:5]
-        running[:, _L_LEG], running[:, _L_END:_L_GROUP] = -1, NEVER
+        running[:, L_VERTEX], running[:, L_READY:L_END] = started[:, 1], started[:, 3:5]
+        running[:, L_LEG], running[:, L_END:L_GROUP] = -1, NEVER
         self._table = table
-        vertex, leg, ready, start, end = table[:, :_L_BUSY].T.tolist()
+        vertex, leg, ready, start, end = table[:, :L_BUSY].T.tolist()
         self.ready, self.first = ready, first
         self._columns = vertex, leg, ready, start, end
         self.waited: dict[int, int] = {}
@@ -151,10 +170,15 @@ class Chains:
 
     def sink(self, base: int, vertex: int, job: int, release: int, completed: int) -> None:
         """Note the chain of a sink that has completed."""
-        links, offset, chain, before = self.links, self._offset, self._chains, self.before
+        length = len(self._chains)
+        self._follow(base, self.links[base + self._offset[vertex]], self._chains)
+        self._sinks.append((vertex, job, release, completed))
+        self._lengths.append(len(self._chains) - length)
+
+    def _follow(self, base: int, link: int, chain: list[int]) -> None:
+        """Add a link and those before it."""
+        links, offset, before = self.links, self._offset, self.before
         at, legs, ready, start, end = self._columns
-        length = len(chain)
-        link = links[base + offset[vertex]]
         while link >= 0:
             chain.append(link)
             publishers = before[at[link]]
@@ -171,17 +195,45 @@ class Chains:
                 other = links[base + offset[publisher]]
                 if other >= 0 and start[other] <= since and (link < 0 or end[other] > end[link]):
                     link = other
-        self._sinks.append((vertex, job, release, completed))
-        self._lengths.append(len(chain) - length)
+
+    def missed(
+        self, kind: int, base: int, vertex: int, job: int, release: int, until: int
+    ) -> None:
+        """
+        Note the chain of a sink that has missed its deadline, as far as the job came.
+
+        :param until: when it completed or was given up, ns.
+        """
+        if not self.keeps_misses:
+            return
+        links, offset, end = self.links, self._offset, self._columns[-1]
+        at = vertex
+        if kind != SINK_LATE:
+            while True:
+                missing = [v for v in self.before[at] if links[base + offset[v]] < 0]
+                if not missing:
+                    break
+                at = missing[0]
+        link = links[base + offset[at]]
+        if link < 0 and self.before[at]:    # the last message that it waited for
+            link = max((links[base + offset[v]] for v in self.before[at]), key=end.__getitem__)
+        length = len(self._of_missed)
+        self._follow(base, link, self._of_missed)
+        self._missed.append(
+            (kind, vertex, job, release, until, at, len(self._of_missed) - length))
 
     def end_batch(self) -> None:
         """Add up where the time went, and keep what open jobs have."""
         table = self._table
         for link, waited in self.waited.items():
-            table[link, _L_GROUP] = waited
+            table[link, L_GROUP] = waited
         if self._sinks:
             self._split(table)
             self._sinks, self._chains, self._lengths = [], [], []
+        self.misses = Misses(
+            np.array(self._missed, dtype=np.int64).reshape(-1, N_MISS),
+            table[np.array(self._of_missed, dtype=np.int64)])
+        self._missed, self._of_missed = [], []
         links = np.array(self.links, dtype=np.int64)
         held = np.flatnonzero(links >= 0)
         self._kept = table[links[held]]

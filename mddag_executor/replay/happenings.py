@@ -156,6 +156,9 @@ class Observer:
     def judging(self, release: int) -> None:
         """Hear that from here on only jobs released at a time or later are judged."""
 
+    def was_dropped(self, vertex: int, job: int, reason: str) -> None:
+        """Hear that an execution of a (global) vertex was dropped before it ran."""
+
     def released(self, dag: int, job: int, release: int, now: int) -> None:
         """Hear that a job was released; `now` is when the executor noticed it."""
 

@@ -29,12 +29,9 @@ from mddag_executor.core.state import (
     IDLE,
     JOB_END,
     JUDGE_FROM,
-    SINK_ABORTED,
     SINK_COMPLETED,
-    SINK_EXPIRED,
-    SINK_FAILED,
+    SINK_IN_TIME,
     SINK_LATE,
-    SINK_MISSED,
     SKIP,
 )
 from mddag_executor.core.tables import CONTINUE
@@ -63,7 +60,6 @@ KEEP_RESPONSES = 1_000_000
 """How many response times are kept for each sink: beyond that, quantiles are of the last ones."""
 
 _LARGE = 1 << 40
-_MISSES = {SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, SINK_FAILED}
 
 
 class Miss(NamedTuple):
@@ -118,6 +114,7 @@ class Judge(Observer):
         self._open_misses: dict[Miss, int] = {}
         #: How many misses were recorded.
         self.n_recorded = 0
+        self._now = 0
 
     def hosted(self, dag: int, vertices: set[int]) -> None:
         """Expect nothing of a DAG that other processes run."""
@@ -218,6 +215,7 @@ class Judge(Observer):
     def _ended(self, dag: int, job: int, aborted: bool, now: int) -> int:
         """End an open job as it was recorded."""
         slot = self._slots.get(self._key_of_job(dag, job), -1)
+        self._now = now
         if slot < 0:
             # under another declaration it may have completed before
             self.contradictions += self.compare
@@ -237,6 +235,7 @@ class Judge(Observer):
     def _failed(self, dag: int, vertex: int, job: int, now: int) -> int:
         """Fail an open job."""
         slot = self._slots.get(self._key_of_job(dag, job), -1)
+        self._now = now
         if slot >= 0:
             self._scheduler.fail_open(slot, now)
         return slot
@@ -252,6 +251,8 @@ class Judge(Observer):
         """Judge what is open."""
         self._scheduler.finish(now)
         if self._scheduler.state.decisions:
+            self._now = now
+            self.chains.begin_batch(batch)
             self._decided(batch, 0, -1)
 
     def _decided(self, batch: Batch, place: int, slot: int) -> None:
@@ -263,16 +264,18 @@ class Judge(Observer):
             batch.decided_at.append(place)
             if kind == JOB_END:
                 del self._slots[job * self.tables.n_dags + dag]
-            elif kind in SINK_COMPLETED:
-                self.chains.sink(
-                    state.job_base[slot], vertex, job,
-                    deadline - self.tables.sink_deadline[vertex], time)
-                if kind == SINK_LATE and self.compare:
+                continue
+            assert kind != DROP, 'nothing waits in this core, so nothing can be dropped'
+            release = deadline - self.tables.sink_deadline[vertex]
+            if kind in SINK_COMPLETED:
+                self.chains.sink(state.job_base[slot], vertex, job, release, time)
+            if kind != SINK_IN_TIME:
+                of = slot if slot >= 0 else self._slots[self._key_of_job(dag, job)]
+                self.chains.missed(
+                    kind, state.job_base[of], vertex, job, release,
+                    time if kind == SINK_LATE else self._now)
+                if self.compare:
                     self.differ(Miss(dag, vertex, job, deadline, time), 1)
-            elif kind in _MISSES and self.compare:
-                self.differ(Miss(dag, vertex, job, deadline, time), 1)
-            else:
-                assert kind != DROP, 'nothing waits in this core, so nothing can be dropped'
         state.decisions.clear()
 
     def differ(self, miss: Miss, side: int) -> None:

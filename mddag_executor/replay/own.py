@@ -59,10 +59,10 @@ import numpy as np
 _KEEP_UNDECLARED = 4096
 _RELEASE, _DISPATCH, _COMPLETE = 'mddag:job_release', 'mddag:dispatch', 'mddag:complete'
 _START, _END, _PUBLISH = 'ros2:callback_start', 'ros2:callback_end', 'ros2:rclcpp_publish'
-_DEADLINE, _FAIL, _EXPIRE, _ABORT, _LOST = (
-    f'mddag:{name}' for name in ('deadline', 'fail', 'expire', 'abort', 'lost'))
+_DEADLINE, _FAIL, _EXPIRE, _ABORT, _LOST, STOP = (
+    f'mddag:{name}' for name in ('deadline', 'fail', 'expire', 'abort', 'lost', 'stop'))
 _NUMBERS = (_START, _END, _PUBLISH, 'ros2:rcl_publish', _RELEASE, _DISPATCH, _COMPLETE, _DEADLINE,
-            _FAIL, _EXPIRE, _ABORT, _LOST)
+            _FAIL, _EXPIRE, _ABORT, _LOST, STOP)
 _DROP, _HOSTED, _SHUTDOWN = 'mddag:drop', 'mddag:hosted', 'mddag:shutdown'
 _JUDGE_FROM = 'mddag:judge_from'
 _WIDTH = 10     # of a dispatch
@@ -333,6 +333,7 @@ class OwnRun:
             self.end = max(self.end, event[1])
         if name == _DROP:
             self.dropped[event[8]] += 1
+            self._dropped(*event[5:9])
         elif name == _HOSTED:
             self._hosted(event)
         elif name == _JUDGE_FROM:
@@ -351,6 +352,11 @@ class OwnRun:
             self.end = event[4]
             self.shut_down = True
             self._finish()
+
+    def _dropped(self, dag: int, vertex: int, job: int, reason: str) -> None:
+        if 0 <= dag < len(self._mapping.vertex) and 0 <= vertex < len(self._mapping.vertex[dag]):
+            for observer in self._observers:
+                observer.was_dropped(self._mapping.vertex[dag][vertex], job, reason)
 
     def _hosted(self, event: Event) -> None:
         dag, text = event[4:6]

@@ -39,14 +39,9 @@ from mddag_executor.core.state import (
     Decision,
     DROP,
     JOB_END,
-    SINK_ABORTED,
     SINK_COMPLETED,
-    SINK_EXPIRED,
-    SINK_FAILED,
-    SINK_IN_TIME,
-    SINK_LATE,
-    SINK_MISSED,
 )
+from mddag_executor.core.tally import VERDICTS
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import Replay
 from mddag_executor.replay.computed import ComputedRun
@@ -60,10 +55,6 @@ KEEP_ENDED = 4096
 MOST_HELD = 1024
 MOST_ORDERED = 65536
 BATCH = 65536
-
-_VERDICTS = {
-    SINK_IN_TIME: 'in_time', SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
-    SINK_ABORTED: 'aborted', SINK_FAILED: 'failed'}
 
 
 class ExecutionRow(NamedTuple):
@@ -255,7 +246,7 @@ class Exporter(Observer):
         self.target.verdict(JobRow(
             self._dags[dag], job, self._names[vertex], self._seconds(release), release, deadline,
             completed, None if completed is None else completed - release,
-            None if completed is None else deadline - completed, _VERDICTS[kind]), vertex)
+            None if completed is None else deadline - completed, VERDICTS[kind]), vertex)
 
 
 class Ordered:

@@ -24,6 +24,7 @@ from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.usage import Usage
+from mddag_executor.report.explained import causes_line
 from mddag_executor.report.html_data import (
     json_for_html,
     prepare,
@@ -121,7 +122,8 @@ def of_replay(outcome: Replay, watch: Watch) -> ReportData:
     data = watch.data('Replay as recorded', facts, outcome.task_set, result['workers'],
                       outcome.duration_ns, outcome.warnings)
     return data._replace(
-        paths=result.get('paths', {}), recorded=result.get('recorded_callbacks', {}))
+        paths=result.get('paths', {}), recorded=result.get('recorded_callbacks', {}),
+        misses=result['misses'])
 
 
 def of_reschedule(outcome: Reschedule) -> ReportData:
@@ -237,6 +239,8 @@ def _head(data: ReportData) -> Iterator[str]:
     if data.task_set.dags:
         good = every.due and not every.missed
         yield f'<p class="verdict {"good" if good else "bad"}">{verdicts_line(dags)}</p>\n'
+        if data.misses is not None:
+            yield from (f'<p>{line}</p>\n' for line in causes_line(data.misses))
     for warning in [*never_due_lines(dags), *data.warnings]:
         yield f'<p class="warning">{escape(printable(warning))}</p>\n'
     timeline = data.timeline

@@ -59,6 +59,7 @@ class ReportData(NamedTuple):
     :ivar duration_ns: from the first release to the end of the run.
     :ivar paths: end-to-end times of the declared paths, as in the result of a replay.
     :ivar recorded: the callbacks of an imported recording, as in the result of a replay.
+    :ivar misses: why deadlines were missed, as in the result of a replay.
     """
 
     title: str
@@ -74,6 +75,7 @@ class ReportData(NamedTuple):
     warnings: list[str]
     paths: Mapping[str, Any] = {}
     recorded: Mapping[str, Any] = {}
+    misses: Mapping[str, Any] | None = None
 
 
 class Line(NamedTuple):

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from mddag_executor.core.tally import counts
+from mddag_executor.report.explained import causes_line
 from mddag_executor.report.tables import each_sink, never_due_lines, percent, verdicts_line
 from mddag_executor.report.text import Cell, format_ns, printable, table
 from mddag_executor.text import counted
@@ -171,6 +172,8 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
         late = 'never completed' if miss['completed_ns'] is None else \
             f'{format_ns(miss["completed_ns"] - miss["deadline_ns"])} late'
         yield f'first miss: {printable(miss["vertex"])}, job {miss["job"]}, {late}'
+        if result.get('misses') is not None:
+            yield from causes_line(result['misses'])
     if result['rescheduled']:
         if result['estimated_executions']:
             yield (f'{result["estimated_executions"]} of {result["executions"]} executions did '

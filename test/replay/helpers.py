@@ -190,7 +190,7 @@ class VirtualRun:
         for dag in self.task_set.dags:
             for k in range(self.duration // dag.period_ns):
                 release = START_TIME + (k + 1) * dag.period_ns
-                self._at(release + self.random.randrange(MS), self._release(dag.index, release))
+                self._at(release + self.lag(dag.index, k), self._release(dag.index, release))
         if self.random.random() < self.chances.undeclared:
             for _ in range(20):
                 self._at(START_TIME + self.random.randrange(self.duration), self._undeclared)
@@ -209,6 +209,20 @@ class VirtualRun:
         else:
             self.file.flush()
             self.file.abandon()
+
+    # --- what a test may change ------------------------------------------------------------------
+
+    def took(self, work: _Execution) -> int:
+        """Return how long a piece takes."""
+        return self.random.randrange(1, self.longest)
+
+    def way(self, work: _Execution) -> int:
+        """Return how long a message takes from the end of the callback that published it."""
+        return 100_000 + self.random.randrange(2 * MS)
+
+    def lag(self, dag: int, job: int) -> int:
+        """Return how long after its release a job is noticed."""
+        return self.random.randrange(MS)
 
     def _at(self, time: int, action: Callable[[int], None]) -> None:
         self._order += 1
@@ -287,7 +301,7 @@ class VirtualRun:
 
     def _start(self, work: _Execution, worker: int, now: int) -> None:
         start = now + self.random.randrange(50_000)
-        end = start + self.random.randrange(1, self.longest)
+        end = start + self.took(work)
         self._at(end + self.random.choice((0, 0, 1, 30_000)),
                  lambda locked: self._end(work, worker, start, end, locked))
         if work.vertex >= 0:
@@ -295,7 +309,7 @@ class VirtualRun:
                 if self.random.random() >= self.chances.lost:
                     early = self.random.random() < self.chances.early_message
                     arrival = self.random.randrange(start, end + 1) if early \
-                        else end + 100_000 + self.random.randrange(2 * MS)
+                        else end + self.way(work)
                     self._at(arrival, self._message(work.slot, work.dag, work.job, vertex, leg))
 
     def _end(self, work: _Execution, worker: int, start: int, end: int, now: int) -> None:

@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 
 from mddag_executor.cli import main as program
+from mddag_executor.core.tally import total
 from msg_graph import loads
 import pytest
 
@@ -63,4 +64,8 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_result_is_that_of_version_1(name: str, arguments: str) -> None:
     assert program.main(['replay', *arguments.split(), '--json', 'found.json']) == 0
     expected = json.loads((EXPECTED / f'{name}.json').read_text())
-    assert json.loads(Path('found.json').read_text()) == expected
+    found = json.loads(Path('found.json').read_text())
+    misses = found.pop('misses', None)      # newer than 1.0.0
+    assert found == expected
+    if misses is not None:
+        assert misses['missed'] == total(found['dags']).missed

@@ -1,0 +1,124 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The verb `explain`: why each deadline of a recorded run was missed.
+
+The run is judged as `replay` does it; `mddag_executor.replay.causes` says what the causes are.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from mddag_executor.cli import common, options, recorded
+from mddag_executor.cli.text import printable, warn
+from mddag_executor.errors import UsageError
+
+if TYPE_CHECKING:
+    from mddag_executor.replay import Replay
+    from msg_graph import TaskSet
+
+EXAMPLE = """\
+mddag explain run.mcap
+mddag explain run.mcap --sink /fusion:publish --job 17
+mddag explain run.mcap graph.yaml --json -"""
+
+MOST_SHOWN = 20
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add('trace', metavar='TRACE', help="a recorded run, an MCAP file ('-': standard input)")
+    add('graph', metavar='GRAPH', nargs='?',
+        help="the declaration that judges, a YAML file ('-': standard input; default: the one "
+        'that the trace was recorded with)')
+    add('--sink', metavar='S', help='only jobs of this sink, as /node:callback')
+    add('--job', type=options.or_zero(options.positive_int), metavar='K',
+        help='only the job of this number')
+    recorded.add_skip(parser)
+    options.add_json(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Explain the misses of a trace.
+
+    :raises mddag_executor.trace.TraceError: when the trace cannot be used
+    :raises msg_graph.GraphError: when the declaration is wrong
+    :raises mddag_executor.errors.MddagError: when anything else cannot be used
+    """
+    common.check_output(args.json)
+    if args.trace == '-' and args.graph == '-':
+        raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
+    task_set = None if args.graph is None else common.load_graph(args.graph)
+    with common.input_trace(args.trace) as (path, name):
+        if task_set is None or recorded.is_bag(path):
+            recorded.check_declared(path, name)
+        outcome = recorded.as_recorded(
+            path, name, task_set, doing='explaining', skip=args.skip, jobs=True)
+    sink = None if args.sink is None else _sink(args.sink, outcome.task_set)
+    for warning in outcome.warnings:
+        warn(warning)
+    explainer = outcome.explainer
+    assert explainer is not None
+    if args.json is not None:
+        common.write_json(args.json, explainer.result(sink, args.job))
+    if common.wants_tables(args):
+        if sink is None and args.job is None:
+            _show(outcome)
+        else:
+            _show_jobs(outcome, sink, args.job)
+    return 0
+
+
+def _sink(name: str, task_set: TaskSet) -> int:
+    """Return the global vertex of a sink."""
+    from msg_graph.errors import did_you_mean
+    sinks = {v.name: i for i, v in enumerate(task_set.vertices) if v.deadline_ns is not None}
+    if name not in sinks:
+        raise UsageError(f"--sink: there is no sink '{printable(name)}': " + did_you_mean(
+            name, sinks, 'mddag graph check lists them'))
+    return sinks[name]
+
+
+def _show(outcome: Replay) -> None:
+    from mddag_executor.report.explained import (
+        causes_line,
+        causes_table,
+        job_lines,
+        sinks_table,
+        stalls_table,
+    )
+    from mddag_executor.report.tables import verdicts_line
+    explainer = outcome.explainer
+    assert explainer is not None
+    summary = explainer.summary()
+    if summary['missed']:
+        print(causes_table(summary))
+        print('Where that time went:')
+        print(sinks_table(explainer.mostly()))
+        if summary['stalls']:
+            print(stalls_table(summary['stalls'], outcome.run.start or 0))
+        worst = explainer.worst()
+        if worst is not None:
+            for line in job_lines(worst):
+                print(line)
+    print(verdicts_line(outcome.tally.result()['dags']))
+    for line in causes_line(summary):
+        print(line)
+
+
+def _show_jobs(outcome: Replay, sink: int | None, job: int | None) -> None:
+    from mddag_executor.report.explained import job_lines
+    explainer = outcome.explainer
+    assert explainer is not None
+    jobs = explainer.result(sink, job)['jobs']
+    for each in jobs[:MOST_SHOWN]:
+        for line in job_lines(each):
+            print(line)
+    if not jobs:
+        print('no such job missed its deadline')
+    elif len(jobs) > MOST_SHOWN:
+        print(f'{len(jobs) - MOST_SHOWN} more: --job or --json tells of them')

@@ -1,0 +1,103 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Stalls: times in which no thread of the process ran though something was ready or running.
+
+Theory of operation
+-------------------
+The executor itself notices most stops of the machine while it runs, and records them (``stop``).
+It does so up to a slice late, so such a stall begins with the last event before.
+
+A trace without them is searched.  Where nothing at all was recorded for ``LEAST_NS`` or longer, it
+was a stall
+
+* if nothing ran, but a callback was ready all the while, or a timer was due and nobody noticed;
+* if something ran, a timer was due and nobody noticed, and all that ran took longer than usual by
+  most of that time;
+* if several callbacks ran, and each took longer than usual by just about that time.
+
+A single callback that runs long while nothing else was to be done looks the same as a stop in the
+middle of it, and counts as running long.
+"""
+
+from __future__ import annotations
+
+from mddag_executor.core.stops import LEAST_NS
+from mddag_executor.replay.happenings import Ints
+from mddag_executor.replay.spans import Spans
+import numpy as np
+
+_UNNOTICED_NS = 10_000_000
+_MOST, _ABOUT = 0.75, 1.25
+
+
+class Seen:
+    """
+    What was seen of a run for some time.
+
+    :ivar times: of all events.
+    :ivar timers: releases of timers, and when they were noticed.
+    :ivar started: executions: ready and start.
+    :ivar ran: pieces: start, end, and how much longer than usual they took.
+    :ivar stops: as recorded: begin and end.
+    """
+
+    def __init__(
+        self, times: Ints, timers: Ints, started: Ints, ran: Ints, stops: Ints
+    ) -> None:
+        self.times = np.unique(times)
+        self.timers = timers[timers[:, 1] - timers[:, 0] >= _UNNOTICED_NS]
+        self.started = started[started[:, 1] - started[:, 0] >= LEAST_NS]
+        self.ran, self.stops = ran, stops
+
+    def suspicious(self) -> Spans:
+        """Return the times within which there may be stalls that are not recorded."""
+        long = self.ran[self.ran[:, 2] >= _MOST * LEAST_NS]
+        starts, ends = np.concatenate(
+            [self.timers, self.started, long[:, :2]]).reshape(-1, 2).T
+        return Spans(starts, ends, int(self.times[0]))
+
+
+def find(seen: Seen, since: int, until: int) -> list[tuple[int, int]]:
+    """Return begin and end of the stalls that ended within a time, in order."""
+    found = [_widened(seen.times, begin, end) for begin, end in seen.stops.tolist()
+             if since < end <= until]
+    times = seen.times
+    gaps = np.flatnonzero(np.diff(times) >= LEAST_NS)
+    gaps = gaps[(times[gaps + 1] > since) & (times[gaps + 1] <= until)]
+    if len(gaps):
+        gaps = gaps[seen.suspicious().within(times[gaps], times[gaps + 1]) > 0]
+    for gap in gaps.tolist():
+        begin, end = int(times[gap]), int(times[gap + 1])
+        if any(first < end and begin < last for first, last in found):
+            continue
+        stalled = _begin(seen, begin, end)
+        if stalled is not None and end - stalled >= LEAST_NS:
+            found.append((stalled, end))
+    return sorted(found)
+
+
+def _widened(times: Ints, begin: int, end: int) -> tuple[int, int]:
+    """Return a recorded stop from the event before it, if that is near."""
+    before = int(np.searchsorted(times, begin, 'right')) - 1
+    last = int(times[before]) if before >= 0 else begin
+    return (last if begin - last <= LEAST_NS else begin), end
+
+
+def _begin(seen: Seen, begin: int, end: int) -> int | None:
+    """Return when the stall began that a time without any event was, None if it was none."""
+    release, noticed = seen.timers.T
+    due = release[(release > begin) & (release <= end - _UNNOTICED_NS) & (noticed >= end)]
+    start, ended, more = seen.ran.T
+    ran = (start <= begin) & (ended >= end)
+    length = end - begin
+    if ran.any():
+        long = more[ran] >= _MOST * length
+        if not long.all():
+            return None
+        several = ran.sum() > 1 and bool((more[ran] <= _ABOUT * length).all())
+        return begin if len(due) or several else None
+    ready, begun = seen.started.T
+    if ((ready <= begin) & (begun >= end)).any():
+        return begin
+    return int(due.min()) if len(due) else None

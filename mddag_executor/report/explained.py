@@ -1,0 +1,75 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Why deadlines were missed, as tables and lines for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from mddag_executor.replay.causes import REMEDIES
+from mddag_executor.report.tables import percent, short_names
+from mddag_executor.report.text import Cell, format_ns, table
+from mddag_executor.text import counted
+
+MOST_STALLS = 10
+
+
+def causes_line(misses: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line with the causes of all misses, stops of the machine apart, if there are any."""
+    causes = {cause: n for cause, n in misses['causes'].items() if n}
+    if not causes:
+        return
+    stalls = misses['stalls']
+    parts = []
+    stood = sum(stall['misses'] > 0 for stall in stalls)
+    if stood and 'machine' in causes:
+        length = sum(stall['length_ns'] for stall in stalls if stall['misses'])
+        parts.append(f'{causes.pop("machine")} in {counted(stood, "stop")} of the machine '
+                     f'({length / 1e9:.2f} s)')
+    parts += [f'{n} {cause}' for cause, n in sorted(causes.items(), key=lambda item: -item[1])]
+    yield f'{counted(misses["missed"], "miss", "misses")}: {", ".join(parts)}'
+
+
+def causes_table(misses: Mapping[str, Any]) -> str:
+    """Return a table of the causes, with what can be done."""
+    return table(('cause', 'misses', 'share', 'what to do'), [
+        [cause, n, percent(n, misses['missed']), REMEDIES[cause]]
+        for cause, n in sorted(misses['causes'].items(), key=lambda item: -item[1]) if n])
+
+
+def sinks_table(mostly: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table of the causes of each sink, and where most of that time went."""
+    names = short_names({name for each in mostly for name in (
+        each['sink'], each['vertex'], each['behind']) if name is not None})
+    rows: list[list[Cell]] = []
+    for each, before in zip(mostly, [None, *mostly]):
+        same = before is not None and before['sink'] == each['sink']
+        rows.append([
+            '' if same else each['dag'], '' if same else names[each['sink']], each['cause'],
+            each['missed'], format_ns(each['ns'], 3) if each['ns'] else None,
+            *(None if each[key] is None else names[each[key]] for key in ('vertex', 'behind'))])
+    return table(('DAG', 'sink', 'cause', 'misses', 'mean', 'mostly at', 'mostly behind'), rows)
+
+
+def stalls_table(stalls: Sequence[Mapping[str, int]], start: int) -> str:
+    """Return a table of the longest stalls, in order; times since the start of the run."""
+    longest = sorted(stalls, key=lambda stall: -stall['length_ns'])[:MOST_STALLS]
+    return table(('stop of the machine at', 'length', 'misses'), [
+        [f'{(stall["at_ns"] - start) / 1e9:.3f} s', format_ns(stall['length_ns'], 3),
+         stall['misses']] for stall in sorted(longest, key=lambda stall: stall['at_ns'])])
+
+
+def job_lines(job: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what became of a job, and where its time went."""
+    late = job['verdict'] if job['late_ns'] is None else f'late by {format_ns(job["late_ns"], 3)}'
+    allowed = job['deadline_ns'] - job['release_ns']
+    yield (f'Job {job["job"]} of {job["sink"]}: {late} (deadline {format_ns(allowed)} after its '
+           f'release): {job["cause"]}')
+    parts = job['parts']
+    names = short_names({part['vertex'] for part in parts} | {
+        each['callback'] for part in parts for each in part['behind']})
+    yield table(('callback', 'what', 'time', 'behind'), [
+        [names[part['vertex']], part['cause'], format_ns(part['ns'], 3),
+         ', '.join(f'{names[each["callback"]]} {format_ns(each["ns"], 3)}'
+                   for each in part['behind']) or None] for part in parts])

@@ -1,0 +1,225 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Runs in which deadlines are missed for one known reason, and what is told of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import json
+from pathlib import Path
+from typing import Any
+
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
+from mddag_executor.cli import main as program
+from mddag_executor.core.tally import total
+from mddag_executor.replay import replay
+from mddag_executor.replay.causes import CAUSES, REMEDIES
+from msg_graph import loads, TaskSet
+import pytest
+
+from .helpers import Chances, MS, small, START_TIME, VirtualRun
+
+QUIET = Chances(0, 0, 0, 0, 0, 0, 0)
+VICTIM = """\
+mddag: 1
+nodes:
+  - node: /sensor
+    callbacks: [{name: tick, timer: 50ms, publishes: [/data]}]
+  - node: /victim
+    callbacks: [{name: use, subscription: /data, deadline: 12ms}]
+"""
+HEAVY = VICTIM + """\
+  - node: /heavy
+    callbacks:
+      - {name: first, dag: first, timer: 100ms, deadline: 90ms}
+      - {name: second, dag: second, timer: 100ms, deadline: 90ms}
+"""
+TICK, USE, FIRST, SECOND = range(4)
+
+
+@dataclass
+class Planned(VirtualRun):
+    """
+    A run in virtual time in which callbacks take what is planned.
+
+    :ivar times: by vertex (modulo its number) what it takes; the last one: every fifth time.
+    :ivar late: releases that are noticed late, every fifth: by how much.
+    :ivar slow: how long every fifth message takes.
+    :ivar stops: every so often, for so long, nothing goes on.
+    :ivar groups: by vertex its callback group; ``holds``: which hold the interpreter.
+    """
+
+    chances: Chances = field(default_factory=lambda: QUIET)
+    duration: int = 26_000 * MS
+    longest: int = MS
+    times: dict[int, tuple[int, int]] = field(default_factory=dict)
+    late: int = 0
+    slow: int = 0
+    stops: tuple[int, int] | None = None
+    groups: dict[int, int] = field(default_factory=dict)
+    holds: bool = False
+
+    def took(self, work: Any) -> int:
+        usual, fifth = self.times.get(work.vertex, (MS // 2, MS // 2))
+        took = fifth if work.job % 5 == 4 else usual
+        return self._shifted(self._now + took) - self._now
+
+    def _start(self, work: Any, worker: int, now: int) -> None:
+        self._now = now
+        super()._start(work, worker, now)
+
+    def lag(self, dag: int, job: int) -> int:
+        return self.late if job % 5 == 4 and dag == 0 else 20_000
+
+    def way(self, work: Any) -> int:
+        return self.slow if self.slow and work.job % 5 == 4 else 50_000
+
+    def _at(self, time: int, action: Any) -> None:
+        super()._at(self._shifted(time), action)
+
+    def _shifted(self, time: int) -> int:
+        """Return when something happens that would have happened in a stop."""
+        if self.stops is None:
+            return time
+        every, length = self.stops
+        into = (time - START_TIME) % every
+        return time + every - into if into >= every - length else time
+
+    def _ready(self, slot: int, dag: int, job: int, vertex: int, leg: int, now: int) -> None:
+        x = self.scheduler.execution(slot, vertex, leg)
+        self.scheduler.state.x_group[x] = self.groups.get(vertex, -1)
+        self.scheduler.state.x_holds[x] = int(self.holds)
+        super()._ready(slot, dag, job, vertex, leg, now)
+
+    def _run(self) -> None:
+        for group in sorted(set(self.groups.values())):
+            assert self.scheduler.new_group() == group
+        if self.groups:
+            self._tell_groups()
+        super()._run()
+
+    def _tell_groups(self) -> None:
+        for group in set(self.groups.values()):
+            self.record('add_callback_group', START_TIME, 1, 1, 900 + group, 'mutually_exclusive')
+        for vertex, group in self.groups.items():
+            self.record('callback_group_add_timer', START_TIME, 1, 900 + group, 800 + vertex)
+            self.record('rcl_timer_init', START_TIME, 1, 800 + vertex, 1)
+            self.record('rclcpp_timer_callback_added', START_TIME, 1, 800 + vertex,
+                        self._address(vertex))
+
+
+BUSY = {FIRST: (30 * MS, 30 * MS), SECOND: (30 * MS, 30 * MS)}
+PLANS: dict[str, tuple[str, dict[str, Any]]] = {
+    'ran long': (VICTIM, {'times': {USE: (2 * MS, 20 * MS)}}),
+    # both heavy ones are released with every second job of the victim
+    'waited': (HEAVY, {'times': BUSY, 'duration': 12_000 * MS}),
+    'group': (HEAVY, {'times': BUSY, 'workers': 6, 'groups': {USE: 0, FIRST: 0, SECOND: 0},
+                      'duration': 12_000 * MS}),
+    'interpreter': (HEAVY, {'times': BUSY, 'workers': 6, 'holds': True, 'policy': 'fifo',
+                            'duration': 12_000 * MS}),
+    'released late': (VICTIM, {'late': 15 * MS}),
+    'transport': (VICTIM, {'slow': 15 * MS}),
+    'machine': (HEAVY, {'times': {FIRST: (5 * MS, 5 * MS), SECOND: (5 * MS, 5 * MS)},
+                        'stops': (2_000 * MS, 300 * MS)}),
+    'lost': (VICTIM, {'chances': Chances(0.2, 0.02, 0, 0, 0, 0, 0)}),
+    'failed': (VICTIM, {'chances': Chances(0, 0, 0, 0, 0, 0, 0.2)})}
+
+
+def explained(path: Path, task_set: TaskSet | None = None) -> dict[str, Any]:
+    found = replay(path, task_set, jobs=True)
+    assert found.explainer is not None
+    result = found.explainer.result()
+    assert len(result['jobs']) == result['missed'] == sum(result['causes'].values())
+    assert result['missed'] == total(found.tally.result()['dags']).missed
+    return result
+
+
+@pytest.mark.parametrize('cause', list(PLANS))
+def test_the_right_cause_is_told(cause: str, tmp_path: Path) -> None:
+    declaration, plan = PLANS[cause]
+    path = tmp_path / 'run.mcap'
+    Planned(path, loads(declaration, 'g.yaml'), **plan)
+    result = explained(path)
+    assert result['missed'] >= 100
+    assert result['causes'][cause] >= 0.95 * result['missed'], result['causes']
+    if cause == 'machine':
+        assert len(result['stalls']) == 13
+        assert all(295 * MS <= stall['length_ns'] <= 320 * MS for stall in result['stalls'])
+        assert sum(stall['misses'] for stall in result['stalls']) == result['causes'][cause]
+    else:
+        assert not result['stalls']
+    for job in result['jobs']:
+        if job['verdict'] == 'late':
+            assert sum(part['ns'] for part in job['parts']) == \
+                job['until_ns'] - job['release_ns']
+    if cause in ('waited', 'group', 'interpreter'):
+        behind = {each['callback'] for job in result['jobs'] for part in job['parts']
+                  if part['cause'] == cause for each in part['behind'] if each['ns'] > 5 * MS}
+        assert behind and behind <= {'/heavy:first', '/heavy:second'}
+
+
+@settings(max_examples=8, deadline=None,
+          suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(0, 10 ** 6), st.sampled_from([1, 2, 4]), st.sampled_from([20, 10 ** 6]))
+def test_all_misses_of_any_run_are_explained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, workers: int, block: int
+) -> None:
+    monkeypatch.setattr('mddag_executor.replay.explain.BLOCK', block)
+    monkeypatch.setattr('mddag_executor.replay.explain.LATER_NS', 30 * MS)
+    path = tmp_path / 'run.mcap'
+    run = VirtualRun(path, small(), seed, workers, duration=400 * MS,
+                     chances=Chances(undeclared=1))
+    result = explained(path)
+    assert result['missed'] == total(run.tally.result()['dags']).missed
+    assert {job['cause'] for job in result['jobs']} <= set(CAUSES)
+    for job in result['jobs']:
+        assert (job['cause'] == 'failed') == (job['verdict'] == 'failed')
+        for part in job['parts']:
+            assert part['ns'] > 0
+            for each in part['behind']:
+                assert each['ns'] <= workers * (job['until_ns'] - job['release_ns'])
+
+
+def test_recorded_stops_are_stalls(tmp_path: Path) -> None:
+    path = tmp_path / 'run.mcap'
+
+    class Stopped(Planned):
+
+        def _run(self) -> None:
+            for begin in range(1_000, 26_001, 1_000):   # noticed 15 ms late, as live
+                time = START_TIME + begin * MS
+                self._at(time - 1, lambda now: self.record(
+                    'stop', now, 3, now - 35 * MS, now))
+            super()._run()
+
+    # a callback that runs alone: only the record tells that it stood still
+    Stopped(path, loads(VICTIM, 'g.yaml'), stops=(1_000 * MS, 52 * MS))
+    result = explained(path)
+    assert len(result['stalls']) == 26
+    assert result['causes']['machine'] == result['missed'] > 25
+
+
+def test_what_people_see(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    declaration, plan = PLANS['waited']
+    path = str(tmp_path / 'run.mcap')
+    Planned(Path(path), loads(declaration, 'g.yaml'), **plan)
+    assert program.main(['explain', path]) == 0
+    out = capsys.readouterr().out
+    assert REMEDIES['waited'] in out
+    assert out.splitlines()[-1] == '119 misses: 119 waited'
+    assert program.main(['explain', path, '--sink', '/victim:use', '--job', '9']) == 0
+    out = capsys.readouterr().out
+    assert out.startswith('Job 9 of /victim:use: late by ')
+    assert 'heavy:first' in out
+    assert program.main(['explain', path, '--job', '8']) == 0
+    assert capsys.readouterr().out == 'no such job missed its deadline\n'
+    assert program.main(['explain', path, '--sink', '/victim:uze']) == 2
+    assert "did you mean '/victim:use'" in capsys.readouterr().err
+    assert program.main(['explain', path, '--job', '9', '--json', '-']) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [job['job'] for job in result['jobs']] == [9]
+    assert result['missed'] == 119
+    assert program.main(['replay', path, '--report', path + '.html']) == 0
+    assert '119 misses: 119 waited' in capsys.readouterr().out
+    assert '119 misses: 119 waited' in Path(path + '.html').read_text()
