@@ -27,7 +27,15 @@ from __future__ import annotations
 
 from heapq import heapify, heappop, heappush
 
-from mddag_executor.core.state import ABORTED, N_HOLDING, N_STALE, QueueEntry, State, WAITING
+from mddag_executor.core.state import (
+    ABORTED,
+    N_HOLDING,
+    N_STALE,
+    OVERTAKING,
+    QueueEntry,
+    State,
+    WAITING,
+)
 from mddag_executor.core.tables import Tables
 
 SWEEP_AT = 64
@@ -103,6 +111,8 @@ def _drop_stale(s: State, queue: list[QueueEntry]) -> None:
 def interpreter_is_free(s: State, entry: QueueEntry) -> bool:
     """Tell whether nothing that is as urgent or more holds the interpreter (rule 11)."""
     if s.scalars[N_HOLDING] > 0:
+        if s.scalars[OVERTAKING] == 0:
+            return False
         for worker in range(len(s.worker_x)):
             x = s.worker_x[worker]
             if x >= 0 and s.x_holds[x] != 0 and s.x_key[x][0] <= entry[0]:

@@ -62,8 +62,10 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
 11. **The interpreter.**  Python's lock lets one thread compute at a time.  An execution that holds
     the interpreter (the driver says so, ``State.x_holds``) starts only if none on a worker whose
     priority is the same or smaller holds it; until then it is held back, and others go past it.
-    One that is more urgent than all that hold it overtakes them.  An execution that lends its
-    worker, is suspended or turns out to wait (``stop_holding``) holds it no more.
+    One that is more urgent than all that hold it overtakes them, unless the driver says that
+    nothing does for the moment (``OVERTAKING``: live, who computes keeps the lock for a switch
+    interval anyway).  An execution that lends its worker, is suspended or turns out to wait
+    (``stop_holding``) holds it no more.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ ELSEWHERE, HERE, ENDS_HERE = range(3)
 
 # Columns of ``scalars``.
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
- JUDGE_FROM, SKIP, N_HOLDING, N_SCALARS) = range(12)
+ JUDGE_FROM, SKIP, N_HOLDING, OVERTAKING, N_SCALARS) = range(13)
 
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  Each sink of a job is in time,
 # or late: it completed; or missed: it had not completed when the run ended past its deadline; or
@@ -140,6 +140,7 @@ def fill_state(
     s.scalars[SWITCH_OVERHEAD] = switch_overhead
     s.scalars[POLLING] = polling
     s.scalars[JUDGE_FROM] = -NEVER
+    s.scalars[OVERTAKING] = 1
     if polling != 0:
         for _ in range(t.n_entities + 1):
             add_queue(s.entity_queue)

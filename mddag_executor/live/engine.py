@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.jobs import is_judged, judge_from
-from mddag_executor.core.state import IDLE, N_HOLDING, N_IDLE, OPEN, SUSPENDED
+from mddag_executor.core.state import IDLE, N_HOLDING, N_IDLE, OPEN, OVERTAKING, SUSPENDED
 from mddag_executor.live.entity import Entity, TIMER
 from mddag_executor.live.jobs import Jobs, NO_ORIGIN, Origin
 from mddag_executor.live.other_processes import OtherProcesses
@@ -45,6 +45,9 @@ if TYPE_CHECKING:
 
 MOST_MISSED = 1000
 """After a long stop (a suspended machine) at most so many releases are judged one by one."""
+
+OVERTAKE_NS = 8_000_000
+"""Nothing overtakes who holds the interpreter for less than this: the two would share it."""
 
 
 class Engine:
@@ -80,9 +83,13 @@ class Engine:
         self.has_more = False
         self.to_ask_again: list[Entity] = []
         self._state = self.scheduler.state
+        # what waits for the interpreter (rule 11 of ``core.rules``); not to be changed from outside
+        self.held_back = self._state.held_back
         self._work: dict[int, Work] = {}
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
+        self._holders: list[Work] = []
+        self._holds_since = 0
 
     # --- what became ready -----------------------------------------------------------------------
 
@@ -279,11 +286,6 @@ class Engine:
         return bool(state.ready or state.unpolled or state.held_back)
 
     @property
-    def holds_back(self) -> bool:
-        """Return whether anything waits for the interpreter (rule 11 of ``core.rules``)."""
-        return bool(self._state.held_back)
-
-    @property
     def idle_workers(self) -> int:
         """Return how many workers run nothing."""
         return self._state.scalars[N_IDLE]
@@ -304,29 +306,55 @@ class Engine:
             if not state.scalars[N_IDLE]:
                 return None
             worker = state.worker_x.index(-1)
+        if state.scalars[N_HOLDING]:
+            state.scalars[OVERTAKING] = self._may_be_overtaken(now)
         x = self.scheduler.take(worker, now)
         if state.decisions:
             self._decided(now)
-        self.has_more = bool(state.ready or state.held_back or state.unpolled)
         if x < 0:
+            self.has_more = bool(state.ready or state.held_back or state.unpolled)
             return None
         work = self._work.pop(x)
         work.entity.waiting.pop(x, None)
         work.worker = worker
+        if state.x_holds[x]:
+            self._holders = [w for w in self._holders if self._holds(w)]
+            self._holders.append(work)
+            self._holds_since = now
+            self.has_more = bool(state.ready or state.unpolled)  # what is held back stays there
+        else:
+            self.has_more = bool(state.ready or state.held_back or state.unpolled)
         return work
 
-    def interpreter_holder(self) -> tuple[int, int]:
-        """Return the most urgent execution that holds the interpreter, and its worker; or -1."""
-        state = self._state
-        if state.scalars[N_HOLDING] == 0:
-            return -1, -1
-        x = min((x for x in state.worker_x if x >= 0 and state.x_holds[x]),
-                key=lambda x: state.x_key[x])
-        return x, state.x_worker[x]
+    # --- the interpreter -------------------------------------------------------------------------
 
-    def stop_holding(self, x: int) -> None:
+    def _holds(self, work: Work) -> bool:
+        state, x = self._state, work.x
+        return x >= 0 and state.x_worker[x] >= 0 and state.x_holds[x] != 0
+
+    def _may_be_overtaken(self, now: int) -> bool:
+        """Return whether who began last to hold the interpreter holds it for long."""
+        held = now - self._holds_since
+        work = self._holders[-1] if self._holders else None
+        if held >= OVERTAKE_NS or work is None or not self._holds(work):
+            return True
+        entity = work.entity
+        usual = entity.habit.computed_ns or entity.busy_ns / max(1, entity.ran)
+        return usual >= held + OVERTAKE_NS
+
+    def interpreter_holder(self) -> Work | None:
+        """Return the most urgent execution that holds the interpreter."""
+        if self._state.scalars[N_HOLDING] == 0:
+            return None
+        last = self._holders[-1]
+        if self._state.scalars[N_HOLDING] == 1 and self._holds(last):
+            return last
+        holders = [work for work in self._holders if self._holds(work)]
+        return min(holders, key=lambda work: self._state.x_key[work.x], default=None)
+
+    def stop_holding(self, work: Work) -> None:
         """Give the interpreter back for an execution that does not need it now."""
-        self.scheduler.stop_holding(x)
+        self.scheduler.stop_holding(work.x)
 
     def lend(self, work: Work) -> None:
         """Free the worker of an execution that goes on without one."""

@@ -7,11 +7,12 @@ Theory of operation
 -------------------
 After an execution its CPU time is compared with its duration; after the first executions for a
 sample of them only, because reading the clocks costs some microseconds.  Left out of the duration
-is what other executions computed meanwhile, and what other processes took: if two callbacks fight
-for the lock, each computes for half of the time, but for all of the time that the other one
-leaves.  A callback that computed for over four fifths of that time, lately, holds the interpreter;
-one that computed for less than half of it does not.  Executions of less than ``SHORT_NS`` of CPU
-are not worth an order.
+is what other processes took.  What other executions computed meanwhile may have kept the lock from
+it, or may have run beside it: so there is a least and a most that it had for itself.  A callback
+that computed for over four fifths of the most, lately, holds the interpreter, also one that waited
+for ``GAP_NS`` at most.  One that computed for less than half of the least does not.  An execution
+between the two says nothing; but as long as nothing is known, and now and then, the next execution
+is taken as one that holds it, because that one runs by itself and shows what is true.
 
 One that computes with the lock released (numpy, hashlib) does not hold the interpreter, either:
 ``interpreter`` finds that out while others wait for it.  One of ``TRY_EVERY`` measured executions
@@ -20,13 +21,20 @@ is looked at again.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from mddag_executor.live.thread_clock import Reading
+
+LOOK_NS = 2_000_000
+"""How often it is looked at who keeps others from the interpreter (see ``interpreter``)."""
+PROVEN = 32
+"""Who has waited is trusted again after so many executions; who has not, after ``LATELY``."""
+MOST_PATIENCE_NS = 20_000_000
 
 COMPUTES = 0.8
 WAITS = 0.5
-SHORT_NS = 20_000
+SHORT_NS = 2_000
+"""Executions of less CPU time are not worth an order."""
+GAP_NS = 100_000
+"""Who waits for less than this may as well keep the interpreter meanwhile."""
 LATELY = 8
 """The last execution counts for one in so many."""
 FIRST = 16
@@ -42,69 +50,96 @@ class Habit:
 
     :param declared: what the declaration says, or None: it is learnt.
     :ivar holds: 1 or 0, for its next execution.
+    :ivar computed_ns: how long it computes, lately; 0 where that is not learnt.
     """
 
     __slots__ = (
-        'holds', '_declared', '_computed_ns', '_own_ns', '_released', '_passed', '_runs', '_close')
+        'holds', '_declared', 'computed_ns', '_own_ns', '_released', '_passed', '_runs', '_close',
+        '_unclear', '_looks', '_trusted_from')
 
     def __init__(self, declared: bool | None = None) -> None:
         self.holds = int(declared or False)
         self._declared = declared is not None
-        self._computed_ns = 0.0
+        self.computed_ns = 0.0
         self._own_ns = 0.0
         self._released = 0.0
         self._passed = 0
         self._runs = 0
         self._close = FIRST
+        self._unclear = 0
+        self._looks = 0
+        self._trusted_from = LATELY
 
     def is_to_be_measured(self) -> bool:
         """Return whether to measure the execution that begins now."""
+        self._runs += 1
         if self._declared:
             return False
         if self._close > 0:
             self._close -= 1
             return True
-        self._runs += 1
         return self._runs % SAMPLE == 0
+
+    @property
+    def patience_ns(self) -> int:
+        """Return after what time to look, while others wait, whether it still computes."""
+        if self._runs < self._trusted_from or self._released > 1 / LATELY:
+            return LOOK_NS
+        return min(MOST_PATIENCE_NS, LOOK_NS + 2 * int(self.computed_ns) // LOOK_NS * LOOK_NS)
+
+    def has_waited(self) -> None:
+        """Learn that it waited though it was thought to compute."""
+        self._trusted_from = self._runs + PROVEN
 
     @property
     def computes_at_all(self) -> bool:
         """Return whether it may be one that holds the interpreter."""
-        return self._computed_ns >= max(SHORT_NS / 2, self._own_ns / 8)
+        return self.computed_ns >= max(SHORT_NS / 2, self._own_ns / 8)
 
-    def ran(
-        self, duration: int, before: Reading, after: Reading, beside: Callable[[], int],
-    ) -> None:
+    def ran(self, duration: int, before: Reading, after: Reading, beside: int) -> None:
         """
         Learn from an execution.
 
         :param duration: how long it took, ns.
         :param before: what its thread's clock read when it began; ``after``: when it ended.
-        :param beside: returns how long other executions computed meanwhile, ns.
+        :param beside: how long other executions computed meanwhile, ns.
         """
         computed = after[0] - before[0]
-        own = duration - (after[1] - before[1])
-        if SHORT_NS <= computed < COMPUTES * own:
-            own -= beside()
-        own = max(computed, own)
-        if self._own_ns == 0.0:
-            self._computed_ns, self._own_ns = computed, own
+        most = max(computed, duration - (after[1] - before[1]))
+        least = max(computed, most - beside)
+        if most - computed <= GAP_NS:
+            most = least = computed
+        if WAITS * least <= computed < COMPUTES * most:
+            self._unclear += 1
+            if self._own_ns == 0.0 or self._unclear >= LATELY:
+                self._unclear = 0
+                self.holds = 1
         else:
-            self._computed_ns += (computed - self._computed_ns) / LATELY
-            self._own_ns += (own - self._own_ns) / LATELY
-        share, least_ns = (WAITS, SHORT_NS / 2) if self.holds else (COMPUTES, SHORT_NS)
-        if (computed >= max(share * own, least_ns)) != self.holds and self._released < RELEASED:
-            self._close = LATELY  # it may have changed
-        self.holds = int(self._computed_ns >= max(share * self._own_ns, least_ns))
+            self._learn(computed, most if computed >= COMPUTES * most else least)
         if self._released >= RELEASED:
             self._passed += 1
             self.holds &= self._passed % TRY_EVERY == 0
 
-    def was_free(self, free: bool) -> bool:
-        """Learn whether the lock was free while it computed; False where a declaration knows."""
-        if self._declared:
-            return False
-        self._released += (free - self._released) / LATELY
+    def _learn(self, computed: int, own: int) -> None:
+        if self._own_ns == 0.0:
+            self.computed_ns, self._own_ns = computed, own
+        else:
+            self.computed_ns += (computed - self.computed_ns) / LATELY
+            self._own_ns += (own - self._own_ns) / LATELY
+        share, shortest = (WAITS, SHORT_NS / 2) if self.holds else (COMPUTES, SHORT_NS)
+        if (computed >= max(share * own, shortest)) != self.holds and self._released < RELEASED:
+            self._close = LATELY  # it may have changed
+        self.holds = int(self.computed_ns >= max(share * self._own_ns, shortest))
+
+    def is_to_be_tried(self) -> bool:
+        """Return whether to find out, at a look, whether it computes with the lock released."""
+        self._looks += 1
+        return not self._declared and (
+            self._looks <= FIRST or self._released > 1 / LATELY or self._looks % SAMPLE == 0)
+
+    def was_released(self, released: bool) -> bool:
+        """Learn whether it computed with the lock released, and return that."""
+        self._released += (released - self._released) / LATELY
         if self._released >= RELEASED:
             self.holds = 0
-        return free
+        return released

@@ -9,15 +9,18 @@ Python's lock lets one thread compute at a time.  The core therefore starts a ca
 the interpreter only if nothing as urgent holds it (rule 11 of ``core.rules``).  Which callbacks
 do is declared or learnt (``habits``).  Here
 
-1.  executions are measured for that, and it is known about how long all have computed;
-2.  while something is held back for more than a moment, a thread looks every ``LOOK_S`` at the
-    most urgent callback that holds the interpreter.  If its CPU clock stands still though no other
-    process has its CPU, it waits: for a lock, an event, a service.  It gives the interpreter back
-    at once, so that nobody is held back for one that waits for him; where the lock was not free
-    meanwhile it may have waited for that, and is given ``IDLE_LOOKS``.  If it computes and the
-    looking thread gets the lock within half a switch interval, ``FREE_LOOKS`` times in a row, it
+1.  executions are measured for that;
+2.  while something is held back, a thread looks every ``LOOK_NS`` at the most urgent callback that
+    holds the interpreter (at one that has never waited yet, only when it takes longer than usual:
+    a look costs who computes a tenth of a millisecond), and so does on the way who takes in
+    something that arrives.  If its CPU clock stands still though no other process has its CPU, it
+    waits: for a lock, an event, a service.  It gives the interpreter back at once, so that nobody
+    is held back for one that waits for him; where others computed meanwhile it may have waited for
+    the lock, and is looked at once more.  If it computes while the looking thread has the lock, it
     computes with the lock released (numpy, hashlib): it gives the interpreter back, too, and that
     is remembered.
+3.  while nothing is held back nobody looks, and nobody is woken: an alarm is set when something is
+    held back for the first time, and called off when nothing is any more.
 
 Between two threads that compute, Python switches every ``sys.getswitchinterval()``, 5 ms by
 default; while an executor spins it is shorter, so that an arrival is seen sooner.
@@ -27,24 +30,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 import sys
 import threading
-from time import monotonic_ns, sleep
+from time import monotonic_ns
 
+from mddag_executor.live.alarm import Alarm
 from mddag_executor.live.engine import Engine
-from mddag_executor.live.habits import Habit, WAITS
+from mddag_executor.live.habits import COMPUTES, Habit, LOOK_NS
 from mddag_executor.live.seat import Seat
+from mddag_executor.live.thread_clock import ThreadClock
 from mddag_executor.live.work import Work
 
-LOOK_S = 0.002
-QUIET_LOOKS = 3
-GLANCE_S = 0.02
-"""While nothing is held back for longer, it is looked whether anything is only so often."""
-QUIET_GLANCES = 50
-"""After so many glances at which nothing was held back nobody looks any more."""
-FREE_LOOKS = 3
-IDLE_LOOKS = 10
+SOON_NS = 100_000
+IDLE_LOOKS = 2
+LITTLE = 0.05
+TRIAL_NS = 30_000
+"""For so long a looking thread keeps the lock, to see who computes without it."""
 
 SWITCH_INTERVAL_S = 0.001
 
@@ -58,6 +59,7 @@ class Interpreter:
     :param lock: that of the engine.
     :param seats: the seat of each worker.
     :param hand_out: called, under the lock, when somebody has given the interpreter back.
+    :ivar rings_at: when it is looked next; 0: never.
     """
 
     def __init__(
@@ -68,14 +70,12 @@ class Interpreter:
         self._lock = lock
         self._seats = seats
         self._hand_out = hand_out
-        # what all that have ended computed, about
-        self._computed_ns = 0
-        self._looking = False
-        self._wanted = threading.Event()
+        self._alarm = Alarm(LOOK_NS)
+        self.rings_at = 0
         self._thread: threading.Thread | None = None
         self._closed = False
+        # whom to look at, when that was done last, and what he had computed then
         self._seen: tuple[Work | None, int, int] = (None, 0, 0)
-        self._free = 0
         self._idle = 0
 
     # --- measuring -------------------------------------------------------------------------------
@@ -83,106 +83,126 @@ class Interpreter:
     def begins(self, seat: Seat, habit: Habit) -> None:
         """Measure, in its thread, a seat's execution that begins."""
         assert seat.cpu_clock is not None
+        seat.others_before = self._computed_by_all() - seat.cpu_clock.computed()
         seat.reading = seat.cpu_clock.read(habit.computes_at_all)
-        seat.began_ns = seat.reading[0]
-        seat.computed_before = self._computed_ns
 
-    def ended(self, seat: Seat, habit: Habit, start: int, end: int) -> None:
+    def ended(self, seat: Seat, habit: Habit, duration: int) -> None:
         """Learn, in its thread, from a seat's execution."""
         before, clock = seat.reading, seat.cpu_clock
-        if before is not None and clock is not None:
-            after = clock.read(before[1] > 0)
-            habit.ran(end - start, before, after, partial(self._computed_beside, seat, end))
-            self._computed_ns += after[0] - before[0]
-        elif habit.holds:
-            self._computed_ns += end - start
+        assert before is not None and clock is not None
+        after = clock.read(before[1] > 0)
+        beside = self._computed_by_all() - after[0] - seat.others_before
+        habit.ran(duration, before, after, beside)
 
-    def _computed_beside(self, seat: Seat, now: int) -> int:
-        """Return how long others have computed since a seat's execution began; about."""
-        computed = self._computed_ns - seat.computed_before
-        for other in self._seats:
-            work, clock = other.work, other.cpu_clock
-            if other is seat or work is None or clock is None:
-                continue
-            if other.reading is not None:
-                computed += clock.computed() - other.began_ns
-            elif work.entity.habit.holds:
-                computed += now - other.began_ns
-        return computed
+    def _computed_by_all(self) -> int:
+        """Return how long the workers' threads have computed."""
+        return sum([seat.cpu_clock.computed() for seat in self._seats
+                    if seat.cpu_clock is not None])
 
     # --- looking ---------------------------------------------------------------------------------
 
-    def watch(self) -> None:
-        """Look until nothing is held back any more; the caller holds the lock."""
-        if self._looking:
-            return
-        self._looking = True
+    def look_after(self) -> None:
+        """Look soon if anything is held back; the caller holds the lock."""
+        engine = self._engine
+        holder = engine.interpreter_holder() if engine.held_back else None
+        if holder is None:
+            if self.rings_at:
+                self.rings_at = 0
+                self._alarm.start(0)
+        elif holder is not self._seen[0]:
+            self._idle = 0
+            self._note(holder)
+            self._watch(holder.entity.habit.patience_ns)
+        elif not self.rings_at:
+            self._watch(LOOK_NS)
+        elif monotonic_ns() - self._seen[1] >= LOOK_NS:  # seen on the way: nobody is woken for it
+            self._watch(holder.entity.habit.patience_ns if self._has_computed(holder) else SOON_NS)
+
+    def _watch(self, ns: int) -> None:
+        """Set the alarm for the next look."""
+        self.rings_at = monotonic_ns() + ns
+        self._alarm.start(ns)
         if self._thread is None and not self._closed:
             self._thread = threading.Thread(
                 target=self._look_on, daemon=True, name='mddag-interpreter')
             self._thread.start()
-        self._wanted.set()
 
     def close(self) -> None:
         """End the thread."""
-        self._closed = True
-        self._wanted.set()
-        thread = self._thread
+        with self._lock:
+            self._closed = True
+            thread = self._thread
         if thread is not None and thread is not threading.current_thread():
+            self._alarm.ring()
             thread.join()
 
     def _look_on(self) -> None:
-        while not self._closed:
-            self._wanted.wait()
-            self._wanted.clear()
-            pause, quiet = GLANCE_S, 0
-            while self._looking and not self._closed:
-                due = monotonic_ns() + int(pause * 1e9)
-                sleep(pause)
-                late = monotonic_ns() - due
-                with self._lock:
-                    if self._engine.holds_back:
-                        if pause == LOOK_S:
-                            self._look(due + late, late)
-                        pause, quiet = LOOK_S, 0
-                    else:
-                        quiet += 1
-                        pause = LOOK_S if quiet < QUIET_LOOKS and pause == LOOK_S else GLANCE_S
-                        self._looking = quiet < QUIET_GLANCES
+        while True:
+            self._alarm.wait()
+            with self._lock:
+                if self._closed:
+                    break
+                if self.rings_at:
+                    free = monotonic_ns() - self.rings_at < sys.getswitchinterval() * 0.5e9
+                    self.rings_at = 0
+                    self._look(free)
+                    self._hand_out()
+        self._alarm.close()
 
-    def _look(self, now: int, late: int) -> None:
-        """Take the interpreter from the most urgent holder if it does not need it."""
-        x, worker = self._engine.interpreter_holder()
-        if x < 0:
-            return
-        seat = self._seats[worker] if worker < len(self._seats) else None
-        if seat is not None and seat.work is not None and seat.work.x == x:
-            needs = self._needs_it(seat, seat.work, now, late)
-        else:
-            needs = False  # it runs in an intake's thread, and was expected to end at once
-        if not needs:
-            self._engine.stop_holding(x)
-            self._hand_out()
+    def _look(self, free: bool) -> None:
+        """
+        Take the interpreter from the most urgent holder if it does not need it.
 
-    def _needs_it(self, seat: Seat, work: Work, now: int, late: int) -> bool:
-        if seat.cpu_clock is None:
-            return True  # its thread has just been started
-        computed = seat.cpu_clock.computed()
-        seen, since, before = self._seen
+        :param free: whether the lock was free.
+        """
+        holder = self._engine.interpreter_holder()
+        if holder is not None and holder is self._seen[0] and not self._needs_it(holder, free):
+            self._engine.stop_holding(holder)
+
+    def _clock(self, work: Work) -> ThreadClock | None:
+        """Return the CPU clock of the worker's thread in which an execution runs."""
+        seat = self._seats[work.worker] if work.worker < len(self._seats) else None
+        return seat.cpu_clock if seat is not None and seat.work is work else None
+
+    def _note(self, work: Work) -> tuple[int, int]:
+        """Return how long the last look was ago, and for how long it has computed since."""
+        _, then, before = self._seen
+        clock, now = self._clock(work), monotonic_ns()
+        computed = clock.computed() if clock is not None else 0
         self._seen = work, now, computed
-        if seen is not work:
-            self._free = self._idle = 0
-            return True
-        free = late < sys.getswitchinterval() * 0.5e9
-        if computed - before >= WAITS * (now - since):
-            self._idle = 0
-            self._free = self._free + 1 if work.entity.habit.was_free(free) else 0
-            return self._free < FREE_LOOKS
-        if seat.cpu_clock.is_runnable():  # other processes have the CPUs
-            return True
-        # Where the lock was not free it may wait for that alone.
+        return now - then, computed - before
+
+    def _has_computed(self, work: Work) -> bool:
+        """Return whether it has computed at all since the last look; else it may wait."""
+        passed, computed = self._note(work)
+        if computed < LITTLE * passed:
+            return False
+        self._idle = 0
+        return True
+
+    def _needs_it(self, work: Work, free: bool) -> bool:
+        clock, habit = self._clock(work), work.entity.habit
+        if clock is None:  # in an intake's thread, where it was expected to end at once
+            return False
+        if habit.is_to_be_tried() and habit.was_released(self._computes_now(clock)):
+            return False
+        if self._has_computed(work) or clock.is_runnable():
+            return True  # or other processes have the CPUs
+        # Where the lock was not free it may have waited for that alone.
         self._idle += IDLE_LOOKS if free else 1
-        return self._idle < IDLE_LOOKS
+        if self._idle < IDLE_LOOKS:
+            return True
+        habit.has_waited()
+        return False
+
+    @staticmethod
+    def _computes_now(clock: ThreadClock) -> bool:
+        """Return whether a thread computes though the calling one has the lock."""
+        begin, before = monotonic_ns(), clock.computed()
+        now = begin
+        while now - begin < TRIAL_NS:
+            now = monotonic_ns()
+        return clock.computed() - before >= COMPUTES * (now - begin)
 
 
 _switching = threading.Lock()

@@ -269,8 +269,6 @@ class Pool:
             work = engine.dispatch(now)
             more = engine.has_more and work is not None
             if work is None:
-                if engine.has_more and engine.holds_back:
-                    self._interpreter.watch()
                 break
             if own is not None and chosen is None and not work.entity.is_brief.debt:
                 chosen = own
@@ -280,6 +278,8 @@ class Pool:
             seat = self._seats[work.worker]
             seat.work = work
             seat.wake.release()
+        if engine.held_back or self._interpreter.rings_at:
+            self._interpreter.look_after()
         return chosen
 
     def _hand_out_now(self) -> None:
@@ -332,8 +332,8 @@ class Pool:
             seat.published = 0
         if entity.is_brief.debt or end - start > BRIEF_NS:
             entity.is_brief.took(end - start)
-        if seat.reading is not None or entity.habit.holds:
-            self._interpreter.ended(seat, entity.habit, start, end)
+        if seat.reading is not None:
+            self._interpreter.ended(seat, entity.habit, end - start)
         with self.lock:
             now = self._last = end if end > self._last else self._last
             if raised is None and waits_for is None:
@@ -352,6 +352,8 @@ class Pool:
                 seat.work = engine.dispatch(now, seat.worker)
                 if engine.has_more:
                     self._hand_out(now)
+                elif engine.held_back or self._interpreter.rings_at:
+                    self._interpreter.look_after()
         let_run = type(raised) is not Refused
         if waits_for is not None:
             self._resume_when_done(work, waits_for)

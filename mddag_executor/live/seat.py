@@ -51,7 +51,7 @@ class Seat:
 
     __slots__ = (
         'worker', 'wake', 'work', 'ended', 'thread', 'vtid', 'cpu_clock', 'waits', 'relieved',
-        'reading', 'began_ns', 'computed_before', 'engine', '_clock', '_lend', 'published')
+        'reading', 'began_ns', 'others_before', 'engine', '_clock', '_lend', 'published')
 
     def __init__(
         self, engine: Engine, clock: TraceClock, worker: int,
@@ -66,12 +66,12 @@ class Seat:
         self.vtid = 0
         self.waits = False
         self.relieved = False
-        # for ``interpreter``: the CPU clock of its thread, and what that read when its execution
-        # began, where it is measured; when that was, by the thread's clock or else the trace's
+        # for ``interpreter``: the CPU clock of its thread, and what that and those of the others
+        # read when its execution began, where it is measured; when that was, on the trace's clock
         self.cpu_clock: ThreadClock | None = None
         self.reading: Reading | None = None
         self.began_ns = 0
-        self.computed_before = 0
+        self.others_before = 0
         self.engine = engine
         self._clock = clock
         self._lend = lend

@@ -24,14 +24,18 @@ class ThreadClock:
         self._clock = pthread_getcpuclockid(threading.get_ident())
         self._folder = Path(f'/proc/self/task/{threading.get_native_id()}')  # proc(5)
         self._file = -1
+        self._at_end = 0
         try:  # not everywhere
             self._file = os.open(self._folder / 'schedstat', os.O_RDONLY)
         except OSError:
             pass
 
     def computed(self) -> int:
-        """Return its CPU time, ns; from any thread."""
-        return clock_gettime_ns(self._clock)
+        """Return its CPU time, ns; from any thread, also when it has ended."""
+        try:
+            return clock_gettime_ns(self._clock)
+        except OSError:
+            return self._at_end
 
     def read(self, closely: bool) -> Reading:
         """Return what it reads now, in the thread itself; 0 for waiting, unless ``closely``."""
@@ -48,7 +52,8 @@ class ThreadClock:
             return False
 
     def close(self) -> None:
-        """Close what it reads."""
+        """Close what it reads, in the thread itself."""
+        self._at_end = thread_time_ns()
         if self._file >= 0:
             os.close(self._file)
             self._file = -1

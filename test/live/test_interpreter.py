@@ -188,7 +188,7 @@ def learnt(
             continue
         duration, computed, process_computed = (int(ms * MS) for ms in execution)
         beside = process_computed - computed
-        habit.ran(duration, (0, 0), (computed, waited * MS), lambda beside=beside: beside)
+        habit.ran(duration, (0, 0), (computed, waited * MS), beside)
     return habit.holds
 
 
@@ -198,7 +198,7 @@ def test_the_share_of_cpu_in_the_duration_decides():
     assert learnt((10, 0.2, 0.3)) == 0
     assert learnt(*[(10, 9.5, 9.6)] * 3, *[(10, 0.2, 0.3)] * 20) == 0
     assert learnt(*[(10, 0.2, 0.3)] * 3, *[(10, 9.5, 9.6)] * 30) == 1
-    assert learnt(*[(0.01, 0.01, 0.01)] * 20) == 0  # too short to matter
+    assert learnt(*[(0.001, 0.001, 0.001)] * 20) == 0  # too short to matter
 
 
 def test_two_that_fight_for_the_lock_are_both_found_out():
@@ -221,12 +221,12 @@ def test_computing_with_the_lock_released_is_noticed_and_looked_at_again():
     habit = Habit()
     assert learnt((10, 9.5, 9.6), habit=habit) == 1
     for _ in range(20):
-        habit.was_free(True)
+        habit.was_released(True)
     assert habit.holds == 0
     assert learnt((10, 9.5, 9.6), habit=habit) == 0
     assert any(learnt((10, 9.5, 9.6), habit=habit) for _ in range(200))
-    habit.was_free(True)
+    habit.was_released(True)
     assert habit.holds == 0
     for _ in range(20):
-        habit.was_free(False)
+        habit.was_released(False)
     assert any(learnt((10, 9.5, 9.6), habit=habit) for _ in range(20))

@@ -1,0 +1,60 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""A thread's alarm that others set and call off without waking it."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+
+_CLOEXEC = os.O_CLOEXEC  # TFD_CLOEXEC of timerfd_create(2)
+_ENDING_NS = 1
+
+
+class Alarm:
+    """
+    One thread waits until it rings; others set it, anew or off, in a microsecond.
+
+    It is a timerfd of Linux: nobody is woken before it rings.  Where there is none, it rings every
+    ``period_ns`` whether it is set or not.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._file = -1
+        self._times: dict[int, ctypes.Array[ctypes.c_long]] = {}
+        try:
+            library = ctypes.PyDLL(None, use_errno=True)
+            self._set = library.timerfd_settime
+            self._file = library.timerfd_create(time.CLOCK_MONOTONIC, _CLOEXEC)
+        except (AttributeError, OSError):
+            return
+        self._set.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p]
+
+    def start(self, ns: int) -> None:
+        """Have it ring so much later, and not when it was to ring before; 0: never."""
+        if self._file < 0:
+            return
+        value = self._times.get(ns)
+        if value is None:  # period and time: seconds, nanoseconds
+            value = (ctypes.c_long * 4)(0, 0, *divmod(ns, 1_000_000_000))
+            self._times[ns] = value
+        self._set(self._file, 0, value, None)
+
+    def wait(self) -> None:
+        """Wait until it rings."""
+        if self._file < 0:
+            time.sleep(self._period_ns / 1e9)
+        else:
+            os.read(self._file, 8)
+
+    def ring(self) -> None:
+        """Have it ring now."""
+        self.start(_ENDING_NS)
+
+    def close(self) -> None:
+        """Give its file back; nobody waits any more."""
+        if self._file >= 0:
+            file, self._file = self._file, -1
+            os.close(file)
