@@ -83,7 +83,7 @@ class Engine:
         self.has_more = False
         self.to_ask_again: list[Entity] = []
         self._state = self.scheduler.state
-        # what waits for the interpreter (rule 11 of ``core.rules``); not to be changed from outside
+        # what waits for the interpreter (rule 11); not to be changed from outside
         self.held_back = self._state.held_back
         self._work: dict[int, Work] = {}
         self._next_job = [0] * self.tables.n_dags
