@@ -17,6 +17,7 @@ from msg_graph.model import (
     Dag,
     ExecutionTime,
     Path,
+    Process,
     QueueEdge,
     TaskSet,
     Vertex,
@@ -24,5 +25,6 @@ from msg_graph.model import (
 
 __all__ = [
     'Callback', 'Dag', 'DurationError', 'ExecutionTime', 'GraphError', 'GraphErrors',
-    'Path', 'QueueEdge', 'TaskSet', 'Vertex', 'format_duration', 'load', 'loads', 'parse_duration',
+    'Path', 'Process', 'QueueEdge', 'TaskSet', 'Vertex', 'format_duration', 'load', 'loads',
+    'parse_duration',
 ]

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Declarations: from YAML to callbacks and paths, each entry checked by itself.
+Declarations: from YAML to callbacks, paths and processes, each entry checked by itself.
 
 Entries do not depend on each other, so the first error of each is collected and all are raised
 together. What needs more than one entry to judge (publishers, cycles, sinks, sources, …) is
@@ -10,15 +10,18 @@ together. What needs more than one entry to judge (publishers, cycles, sinks, so
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from msg_graph.duration import format_duration
 from msg_graph.entries import Entry
-from msg_graph.errors import Collector, printable, shown
+from msg_graph.errors import Collector, did_you_mean, GraphError, printable, shown
 from msg_graph.include import Assembler, is_composed, Part, top_of
 from msg_graph.language import CALLBACK_KEYS, NODE_KEYS, PATH_KEYS, TRIGGERS
-from msg_graph.model import Callback, Path
-from msg_graph.yamltext import yaml_lines
+from msg_graph.model import Callback, Path, Process
+from msg_graph.yamltext import plain_scalar, yaml_lines
+
+_WIDTH = 99
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +39,7 @@ class Declaration:
     workers: int | None
     callbacks: list[Callback]
     paths: list[Path]
+    processes: tuple[Process, ...]
     entries: dict[str, Entry]
 
 
@@ -59,6 +63,7 @@ def parse_declaration(text: str, file: str, path: str | None = None) -> Declarat
     callbacks: list[Callback] = []
     declared_paths: list[Path] = []
     entries: dict[str, Entry] = {}
+    processes: tuple[Process, ...] = ()
     with found:
         nodes = nodes or [(each, file) for each in top.get('nodes')]
         callbacks = _callbacks(nodes, file, entries)
@@ -66,9 +71,13 @@ def parse_declaration(text: str, file: str, path: str | None = None) -> Declarat
         paths = paths if composed else [(each, file) for each in top.get('paths') or ()]
         declared_paths = _paths(paths, entries)
     found.check()
+    with found:
+        processes = read_processes(top, (callback.node for callback in callbacks))
+    found.check()
     if composed:
         text = _one_text(file, workers, nodes, paths)
-    return Declaration(file, text, workers, callbacks, declared_paths, entries)
+        text += processes_text(processes) if processes else ''
+    return Declaration(file, text, workers, callbacks, declared_paths, processes, entries)
 
 
 def _one_text(file: str, workers: int | None, nodes: list[Part], paths: list[Part]) -> str:
@@ -82,6 +91,59 @@ def _one_text(file: str, workers: int | None, nodes: list[Part], paths: list[Par
         for tree, _ in parts:
             first, *rest = yaml_lines(tree)
             lines += [f'  - {first}', *(f'    {line}' for line in rest)]
+    return '\n'.join(lines) + '\n'
+
+
+def read_processes(entry: Entry, nodes: Iterable[str]) -> tuple[Process, ...]:
+    """
+    Return the processes that an entry declares.
+
+    :param nodes: the declared ones, in file order.
+    :raises GraphError: it names a node twice, one that is not declared, or a process has none.
+    """
+    said: dict[str, dict[str, int]] = entry.get('processes')
+    nodes = list(dict.fromkeys(nodes))
+    place: dict[str, str] = {}
+    found = Collector()
+    for process, lines in said.items():
+        for node, line in lines.items():
+            with found:
+                other = place.setdefault(node, process)
+                if node not in nodes:
+                    raise _error(entry, line, f'there is no node {shown(node)}',
+                                 did_you_mean(node, nodes, 'name a node of the declaration'))
+                if other != process:
+                    raise _error(
+                        entry, line, f'node {shown(node)} is in process {shown(other)}, too',
+                        'remove one of them: a node runs in one process')
+    found.check()
+    processes = []
+    for i, process in enumerate(said):
+        here = tuple(n for n in nodes if place.get(n, process if i == 0 else None) == process)
+        if not here:
+            raise entry.error('processes', f'no node runs in process {shown(process)}',
+                              'name one, or remove the process')
+        processes.append(Process(process, here))
+    return tuple(processes)
+
+
+def _error(entry: Entry, line: int, problem: str, remedy: str) -> GraphError:
+    return GraphError(entry.file, line, f"{entry.name}: 'processes': {problem}", remedy)
+
+
+def processes_text(processes: Iterable[Process]) -> str:
+    """Return ``processes:`` of a declaration."""
+    lines = ['processes:']
+    for process in processes:
+        line = f'  {plain_scalar(process.name)}: ['
+        for i, node in enumerate(process.nodes):
+            piece = node + (']' if i == len(process.nodes) - 1 else ',')
+            if len(line) + 1 + len(piece) > _WIDTH:
+                lines.append(line.rstrip())
+                line = '    ' + piece
+            else:
+                line += ('' if line.endswith('[') else ' ') + piece
+        lines.append(line)
     return '\n'.join(lines) + '\n'
 
 

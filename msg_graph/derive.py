@@ -89,6 +89,7 @@ def derive_task_set(
         workers=declaration.workers,
         file=declaration.file,
         text=declaration.text,
+        processes=declaration.processes,
     )
 
 

@@ -17,8 +17,9 @@ The rules, for live runs and for recordings alike. What was seen comes as counts
    its messages come together is not declared.
 4. *never ran*: a callback never ran, while it should have done so at least twice. Where something
    undeclared ran that may be meant (``binding.meant``), that is asked.
-5. Where all DAGs of a callback may span processes (``release_from: header_stamp``) and its node
-   was not seen here, it may well run elsewhere, and nothing is said of it.
+5. Where all DAGs of a callback may span processes (``release_from: header_stamp``), or the
+   declaration has ``processes:``, and its node was not seen here, it may well run elsewhere, and
+   nothing is said of it.
 6. Of callbacks that follow each other only the first that disagrees by rule 2, 3 or 4 is
    reported: what comes after it has no messages because of it.
 """
@@ -130,7 +131,8 @@ def _suspects(task_set: TaskSet, observed: Observed) -> dict[str, Drift]:
     for callback in task_set.callbacks:
         of_callback = dags.get(callback.key, [])
         if (observed.nodes is not None and callback.node not in observed.nodes
-                and all(dag.release_from == 'header_stamp' for dag in of_callback)):
+                and (task_set.processes
+                     or all(dag.release_from == 'header_stamp' for dag in of_callback))):
             continue
         why = _never_ran(callback, of_callback, observed)
         if why is None:

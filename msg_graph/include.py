@@ -6,7 +6,8 @@ Declarations that are put together from several files.
 Theory of operation
 -------------------
 1. ``include:`` lists files. Their nodes and paths come before those of the file itself, in that
-   order, each time that the file is listed. A ``workers:`` of an included file does not count.
+   order, each time that the file is listed. ``workers:`` and ``processes:`` of an included file do
+   not count: they are about the whole system.
 2. ``arguments:`` names what a file can be told, with default values (none: it must be told).
    ``set:`` of an include tells it, and ``$(name)`` in any value of the file stands for it.
 3. Names in an included file (nodes, topics, services, DAGs and, with dots, paths) are put below

@@ -32,7 +32,7 @@ from msg_graph.entries import (
     truth,
     whole,
 )
-from msg_graph.errors import shown
+from msg_graph.errors import GraphError, shown
 from msg_graph.model import ExecutionTime
 from msg_graph.names import (
     CALLBACK,
@@ -42,10 +42,11 @@ from msg_graph.names import (
     GROUP,
     NODE,
     PATH,
+    PROCESS,
     SERVICE,
     TOPIC,
 )
-from msg_graph.yamltext import Scalar, Tree
+from msg_graph.yamltext import Mapping, Scalar, Sequence, Tree
 
 FORMAT = '1'
 
@@ -88,6 +89,20 @@ def _read_execution_time(entry: Entry, key: str, value: Tree) -> ExecutionTime:
                          _percent(inner, len(quantiles_us)))
 
 
+def _read_processes(entry: Entry, key: str, value: Tree) -> dict[str, dict[str, int]]:
+    """Return of each process its nodes, and of each of these its line."""
+    found: dict[str, dict[str, int]] = {}
+    for process, _, line in _NODES_BY_PROCESS.read(entry, key, value):
+        wrong = PROCESS.check(process)
+        if wrong is not None:
+            problem, remedy = wrong
+            raise GraphError(entry.file, line, f'{entry.name}: {shown(key)}: {problem}', remedy)
+        nodes = value.entries[process] if isinstance(value, Mapping) else None
+        assert isinstance(nodes, Sequence)
+        found[process] = {each.text: each.line for each in nodes.items if isinstance(each, Scalar)}
+    return found
+
+
 def _percent(entry: Entry, count: int) -> tuple[float, ...]:
     """Return the shares that the quantiles belong to, declared or the default for their number."""
     percent = entry.get('percent')
@@ -117,6 +132,10 @@ def _mapping(keys: dict[str, Key]) -> Schema:
                            for word, key in keys.items()}}
 
 
+_NODES_BY_PROCESS = pairs(texts(name(NODE)))
+_PROCESSES = Kind(_read_processes, {
+    **_NODES_BY_PROCESS.schema, 'propertyNames': {'pattern': f'^(?:{PROCESS.pattern.pattern})$'}},
+    {})
 _VALUES = pairs(text(lambda _: None, {'type': ['string', 'number', 'boolean', 'null']}))
 
 QUANTILES = {
@@ -136,6 +155,8 @@ FILE = {
     'nodes': Key(_entries('node'),
                  'The nodes; a node may have several entries, and their order counts for ties.',
                  needed=True),
+    'processes': Key(_PROCESSES, 'The processes that the nodes run in, each with its nodes; those '
+                     'that are not named run in the first.'),
     'paths': Key(_entries('path'), 'End-to-end paths over trigger and queue edges.'),
 }
 INCLUDE = {

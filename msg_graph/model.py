@@ -192,6 +192,19 @@ class Path:
 
 
 @dataclass(frozen=True, slots=True)
+class Process:
+    """
+    A process that nodes run in.
+
+    :ivar name: unique among the processes.
+    :ivar nodes: the declared nodes in it, in file order.
+    """
+
+    name: str
+    nodes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class TaskSet:
     """
     The DAG tasks of a declaration.
@@ -203,6 +216,7 @@ class TaskSet:
     :ivar workers: declared number of workers, or None.
     :ivar file: name of the file that this was read from.
     :ivar text: the declaration as it was read; put together to one where it includes others.
+    :ivar processes: those that the nodes run in, each declared node in one; none: nobody says.
     :ivar vertices: the vertices of all DAGs, DAG by DAG.
     """
 
@@ -213,6 +227,7 @@ class TaskSet:
     workers: int | None
     file: str
     text: str
+    processes: tuple[Process, ...] = ()
     vertices: tuple[Vertex, ...] = field(init=False, repr=False, compare=False)
     _vertex: dict[str, Vertex] = field(init=False, repr=False, compare=False)
     _dag: dict[str, Dag] = field(init=False, repr=False, compare=False)
@@ -225,6 +240,11 @@ class TaskSet:
         object.__setattr__(self, '_vertex', {vertex.name: vertex for vertex in every})
         object.__setattr__(self, '_dag', {dag.name: dag for dag in self.dags})
         object.__setattr__(self, '_callback', {c.key: c for c in self.callbacks})
+
+    def process_of(self, node: str) -> str | None:
+        """Return the name of the process that a node runs in; None: nobody says."""
+        return next((p.name for p in self.processes if node in p.nodes),
+                    self.processes[0].name if self.processes else None)
 
     def vertex(self, name: str) -> Vertex:
         """

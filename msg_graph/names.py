@@ -59,6 +59,7 @@ CALLBACK = Name('callback')
 GROUP = Name('callback group')
 DAG = Name('DAG', re.compile(r'/?[A-Za-z0-9_.-]+(?:/[A-Za-z0-9_.-]+)*'))
 PATH = Name('path')
+PROCESS = Name('process')
 
 
 def check_read(text: str) -> tuple[str, str] | None:

@@ -7,6 +7,8 @@ Everything that can be wrong with the command line is found before a node starts
 the names of policy and nodes, whether trace and result can be written.  A run ends after
 `--duration`, with Ctrl-C (or SIGTERM), when a callback calls `rclpy.shutdown`, or when all
 programs have ended; however it ends, its summary is printed.
+
+A run of several processes (`run_processes`) starts this verb once for each of them, with `--part`.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
+from dataclasses import replace
 import os
 from pathlib import Path
 import re
@@ -35,12 +38,15 @@ from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.report.live_runs import summary
 from mddag_executor.report.tables import sink_table
 from mddag_executor.report.text import listed
+from msg_graph import loads
 
 if TYPE_CHECKING:
     from mddag_executor.live.execution import ExecutionPlan
     from mddag_executor.live.executor import MultiDeadlineExecutor
     from mddag_executor.live.loading import Program
+    from mddag_executor.live.measure import Books
     from mddag_executor.live.session import Session
+    from mddag_executor.live.supervisor import Supervisor
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -83,7 +89,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
         help="publish the executor's state on /diagnostics so often, for mddag top and other "
         "tools; 'off': not at all (default: 1s)")
-    add('--trace', metavar='OUT.mcap', help='record the run to this file')
+    add('--trace', metavar='OUT.mcap',
+        help='record the run to this file; of several processes each to OUT.NAME.mcap, or to '
+        'NAME.mcap in OUT where that is a directory')
+    add('--processes', metavar='N|FILE',
+        help='run the nodes in N processes, or in those of a YAML file with `processes:` '
+        "(default: those of the declaration); '1': in this process")
+    add('--process', metavar='NAME',
+        help='run only the nodes of this declared process, for a launch file that starts each; '
+        'give those --node that bring them')
+    add('--on-exit', choices=('end', 'continue', 'restart'), default='end',
+        help='when one of several processes ends by itself: end the run, go on without it, or '
+        'start it again (default: end)')
+    add('--part', help=argparse.SUPPRESS)  # the folder of a run of several processes
     options.add_json(parser)
     add('--ros-args', nargs=argparse.REMAINDER, metavar='…',
         help='the rest of the command line goes to rclpy.init, as -r from:=to')
@@ -108,7 +126,58 @@ def main(args: argparse.Namespace) -> int:
     """
     common.check_output(args.json)
     _check_arguments(args)
+    if args.part is not None:
+        return part(args)
     task_set = common.load_graph(args.graph)
+    if args.processes not in (None, '1') or (task_set.processes and args.processes is None):
+        from mddag_executor.cli.run_processes import run_processes, with_declared
+        if args.process is None:
+            return run_processes(args, task_set)
+        task_set = with_declared(args, task_set)
+    elif task_set.processes:
+        task_set = replace(task_set, processes=())
+    result, error, _ = run_here(args, task_set)
+    _report(args, result)
+    _leave_threads_behind(error)
+    if error is not None:
+        raise error
+    return 0
+
+
+def part(args: argparse.Namespace) -> int:
+    """Run one process of several, and leave what came of it in the folder of the run."""
+    from mddag_executor.live.parts import Part
+    from mddag_executor.live.supervisor import end_with_parent
+    the_part = Part.read(args.part)
+    end_with_parent(the_part.parent)
+    task_set = loads(the_part.text, name=args.graph)
+    if args.process is None:
+        from mddag_executor.live.hosting import nodes_of
+        from mddag_executor.live.loading import resolve
+        with _rclpy(args.ros_args or []):
+            ros = _ros_arguments(args)
+            names = nodes_of([resolve(spec, ros) for spec in args.node], ros)
+        the_part.leave(names)
+        sys.stdout.flush()
+        os._exit(0)  # without the ends of programs that were only looked at
+    result, error, rest = run_here(args, task_set)
+    the_part.leave({**result, **rest})
+    _leave_threads_behind(error)
+    if error is not None:
+        raise error
+    return 0
+
+
+def run_here(
+    args: argparse.Namespace, task_set: TaskSet
+) -> tuple[dict[str, Any], BaseException | None, dict[str, Any]]:
+    """
+    Run nodes in this process.
+
+    :return: the result, what a node raised, and what the results of several processes are put
+        together from beside (``parts``).
+    """
+    common.check_output(args.trace)
     workers = defaults.workers(args.workers, task_set)
     plan = None
     programs: list[Program] = []
@@ -118,26 +187,21 @@ def main(args: argparse.Namespace) -> int:
     else:
         from mddag_executor.live.loading import resolve
         programs = [resolve(spec, _ros_arguments(args)) for spec in args.node]
-    with told_when_stuck() as ends, _Signals() as signals, _rclpy(args.ros_args or []):
+    with told_when_stuck() as ends, Signals() as signals, _rclpy(args.ros_args or []):
         from mddag_executor.live.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
             intake=args.intake, freeze_gc=True,
-            diagnostics_period=args.diagnostics)
+            diagnostics_period=args.diagnostics, process=args.process)
         # With `--json -` what nodes print must not get into the JSON.
         output = sys.stdout if common.wants_tables(args) else sys.stderr
         try:
             with redirect_stdout(output):
-                result, error = _run(args, task_set, executor, programs, plan, signals, ends)
+                return _run(args, task_set, executor, programs, plan, signals, ends)
         except MddagError:
             if args.trace is not None:  # nothing ran: leave no empty trace behind
                 Path(args.trace).unlink(missing_ok=True)
             raise
-        _report(args, result)
-    _leave_threads_behind(error)
-    if error is not None:
-        raise error
-    return 0
 
 
 def _leave_threads_behind(error: BaseException | None) -> None:
@@ -158,25 +222,28 @@ def _check_arguments(args: argparse.Namespace) -> None:
     diagnostics_period_ns(args.diagnostics)
     if args.trace == '-':
         raise UsageError('--trace -: a trace is not written to standard output: name a file')
-    common.check_output(args.trace)
+    if args.processes is not None and args.processes.isdecimal() and not int(args.processes):
+        raise UsageError('--processes 0: give 1 or more, or a file')
     if args.synthetic is None and args.utilisation is not None:
         raise UsageError(
             '--utilisation: it scales synthetic nodes only: add --synthetic or leave it out')
 
 
-def _warn(plan: ExecutionPlan, remapped: bool) -> None:
+def warn_of(
+    plan: ExecutionPlan, ros_args: Sequence[str] | None, n_processes: int = 1
+) -> None:
     """Tell what the draw makes impossible, whatever the executor does, and what is in vain."""
     for sink in plan.infeasible():
         warn(f'{sink.vertex}: no scheduler can keep its deadline of '
              f'{sink.deadline_ns / 1e6:.1f} ms: with seed {plan.seed} its critical path takes '
              f'{sink.critical_path_ns / 1e6:.1f} ms')
-    if remapped:
+    if not {'-r', '--remap'}.isdisjoint(ros_args or ()):
         warn('--ros-args: remappings do not apply to synthetic nodes: they keep the names of the '
              'declaration')
-    if plan.mode == 'spin' and plan.utilisation * plan.workers > 0.9:
-        warn('spinning callbacks share the interpreter lock, and so one core; these need '
-             f'{plan.utilisation * plan.workers:.2f} cores: lower --utilisation, or use '
-             '--synthetic sleep')
+    if plan.mode == 'spin' and plan.utilisation * plan.workers > 0.9 * n_processes:
+        warn('spinning callbacks share the interpreter lock, and so one core for each process; '
+             f'these need {plan.utilisation * plan.workers:.2f} cores: lower --utilisation, give '
+             'more --processes, or use --synthetic sleep')
 
 
 @contextmanager
@@ -220,45 +287,51 @@ def _init(arguments: list[str]) -> None:
 
 def _run(
     args: argparse.Namespace, task_set: TaskSet, executor: MultiDeadlineExecutor,
-    programs: list[Program], plan: ExecutionPlan | None, signals: _Signals,
+    programs: list[Program], plan: ExecutionPlan | None, signals: Signals,
     ends: Callable[[], None],
-) -> tuple[dict[str, Any], BaseException | None]:
-    """Run until the end; return the result, and what a node raised."""
-    from mddag_executor.live.session import Session
+) -> tuple[dict[str, Any], BaseException | None, dict[str, Any]]:
+    """Run until the end; see ``run_here``."""
+    from mddag_executor.live.parts import plain
+    from mddag_executor.live.session import measured, Session
     from mddag_executor.live.watch import Watch
     session = Session(executor, on_end=ends)
     watch = Watch(executor, task_set)
     seconds = None if args.duration is None else args.duration / 1e9
-    measured: dict[str, Any] | None = None
+    books: Books | None = None
     signals.end_of(session)
     with Progress('running', seconds) as progress:
         if plan is not None:
-            _warn(plan, not {'-r', '--remap'}.isdisjoint(args.ros_args or ()))
-            measured = _run_synthetic(session, task_set, plan, seconds, progress)
+            if args.part is None:
+                warn_of(plan, args.ros_args)
+            books = _run_synthetic(args, session, task_set, plan, seconds, progress)
         else:
             _run_programs(session, executor, programs, _ros_arguments(args), seconds, progress)
     result = {
         'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
-        **executor.statistics(), 'measured': measured}
+        **executor.statistics(),
+        'measured': None if books is None or plan is None else measured(books, plan)}
     result['drift'] = [each.result() for each in watch.drift(result)]
     if not session.clean:
         warn('a callback has not ended in time; it is left behind')
-    return result, session.error
+    rest = {} if args.part is None else {
+        'observed': plain(watch.observed(result)), 'books': books and books.plain()}
+    return result, session.error, rest
 
 
 def _run_synthetic(
-    session: Session, task_set: TaskSet, plan: ExecutionPlan, seconds: float | None,
-    progress: Progress,
-) -> dict[str, Any] | None:
+    args: argparse.Namespace, session: Session, task_set: TaskSet, plan: ExecutionPlan,
+    seconds: float | None, progress: Progress,
+) -> Books | None:
     from mddag_executor.live import current_job
-    from mddag_executor.live.session import run_synthetic
+    from mddag_executor.live.session import run_and_note
     from mddag_executor.live.synthetic import SyntheticWorkload
-    workload = SyntheticWorkload(task_set, plan, current_job=current_job)
+    workload = SyntheticWorkload(
+        task_set, plan, current_job=current_job, process=args.process)
     for node in workload.nodes:
         session.executor.add_node(node)
     try:
         with session:
-            return run_synthetic(session, workload, seconds, progress.update)
+            return run_and_note(session, workload, seconds, progress.update)
     finally:
         workload.destroy()
 
@@ -289,7 +362,7 @@ def _run_programs(
                  'behind')
 
 
-class _Signals:
+class Signals:
     """
     Let SIGINT and SIGTERM end the run, and its report be written; a context manager.
 
@@ -297,14 +370,14 @@ class _Signals:
     """
 
     def __init__(self) -> None:
-        self._session: Session | None = None
+        self._session: Session | Supervisor | None = None
         self._first: float | None = None
         self._before: dict[int, Any] = {}
 
-    def __enter__(self) -> _Signals:
+    def __enter__(self) -> Signals:
         return self
 
-    def end_of(self, session: Session) -> None:
+    def end_of(self, session: Session | Supervisor) -> None:
         """From now on they end this session."""
         self._session = session
         if threading.current_thread() is threading.main_thread():

@@ -102,6 +102,47 @@ def never_due(dags: Mapping[str, Any]) -> list[str]:
             if not counts(sink).due]
 
 
+def of_processes(
+    task_set: TaskSet, results: Iterable[tuple[str, Mapping[str, Any]]]
+) -> dict[str, Any]:
+    """
+    Return the verdicts of a run (``Tally.result``) from those of its processes.
+
+    A sink is judged in its node's process, a job counted in its source's.  A process that was
+    started again has several results; the response times of these have no quantiles in common.
+
+    :param results: the name of the process, and its result.
+    """
+    results = list(results)
+    dags: dict[str, Any] = {}
+    for dag in task_set.dags:
+        home = task_set.process_of(dag.vertices[dag.source].callback.node)
+        sinks = {}
+        for index in dag.sinks:
+            vertex = dag.vertices[index]
+            judge = task_set.process_of(vertex.callback.node)
+            parts = [r['dags'][dag.name]['sinks'].get(vertex.name)
+                     for name, r in results if name == judge]
+            sinks[vertex.name] = _added(vertex.deadline_ns or 0, [p for p in parts if p])
+        dags[dag.name] = {'jobs': sum(r['dags'][dag.name]['jobs']
+                                      for name, r in results if name == home), 'sinks': sinks}
+    misses = [r['first_miss'] for _, r in results if r['first_miss'] is not None]
+    first = min(misses, key=lambda miss: int(miss['deadline_ns']), default=None)
+    return {'deadline_missed': first is not None, 'first_miss': first,
+            'never_due': never_due(dags), 'dags': dags}
+
+
+def _added(deadline: int, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the result of one sink from several."""
+    if len(parts) == 1:
+        return dict(parts[0])
+    result = SinkTally(deadline, None).result()
+    for part in parts:
+        for key in ('completed', 'late', 'overdue', 'expired', 'failed', 'aborted'):
+            result[key] += part[key]
+    return result
+
+
 class Latest:
     """
     The last ``keep`` of a series of numbers (None: all), 8 bytes each.

@@ -192,6 +192,6 @@ def attributed(role: Role, release: int, ledger: Ledger, current_job: CurrentJob
         ledger.unattributed.append(role.vertex.name)
     elif not role.vertex.predecessors:
         return int(job.release_ns)
-    elif job.release_ns != release:
+    elif abs(job.release_ns - release) > ledger.tolerance_ns:
         ledger.misattributed.append((role.vertex.name, release, job.release_ns))
     return release

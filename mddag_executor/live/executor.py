@@ -49,6 +49,7 @@ from mddag_executor.live.registry import Registry
 from mddag_executor.live.settings import (
     check_callable,
     check_context,
+    check_process,
     check_thresholds,
     diagnostics_period_ns,
     MOST_JOBS,
@@ -122,6 +123,8 @@ class MultiDeadlineExecutor(BareExecutor):
     :param diagnostics_period: how often to publish on ``/diagnostics`` while it spins: ns, or text
         as ``1s``; None or 0: not at all.
     :param thresholds: what makes a status of the diagnostics worse than OK.
+    :param process: which of the declared ``processes`` this is; what runs in the others is not
+        counted as missing.
     :raises msg_graph.GraphError: when the declaration is not right.
     :raises mddag_executor.errors.MddagError: on an unknown policy, intake or thread setting, a
         value of the wrong kind, and when the trace cannot be written.
@@ -146,6 +149,7 @@ class MultiDeadlineExecutor(BareExecutor):
         freeze_gc: bool = False,
         diagnostics_period: int | str | None = None,
         thresholds: Thresholds | None = None,
+        process: str | None = None,
     ) -> None:
         task_set, num_workers, deadline_ns = resolve(
             graph, num_workers, default_deadline, intake)
@@ -155,6 +159,7 @@ class MultiDeadlineExecutor(BareExecutor):
         check_callable('on_deadline_miss', on_deadline_miss)
         find_policy(policy)
         check_context(context)
+        check_process(process, task_set)
         thresholds = check_thresholds(thresholds)
         # All is checked by now: nothing below leaves a trace or a thread of what can't be made.
         hooks.install()
@@ -162,6 +167,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._recorder = None if trace is None else Recorder(
             trace, task_set, policy, num_workers, deadline_ns, max_active_jobs, self._trace_clock)
         self._errors: deque[BaseException] = deque()
+        self._process = process
         self._unclaimed = Unclaimed(self._fail)
         self._attention = threading.Event()
         self._spinning = threading.Lock()
@@ -567,4 +573,4 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def statistics(self) -> dict[str, Any]:
         """Return a snapshot of what has happened so far (see the module ``statistics``)."""
-        return statistics(self._pool, self._registry, self._recorder)
+        return statistics(self._pool, self._registry, self._recorder, self._process)

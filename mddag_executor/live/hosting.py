@@ -31,7 +31,7 @@ from mddag_executor.live.intake.entities import alive
 from mddag_executor.live.interception import Interception
 from mddag_executor.live.loading import describe, LoadingError, Program
 from mddag_executor.live.shutdown import is_over
-from rclpy.executors import Executor
+from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 
 START_TIMEOUT_S = 10.0
@@ -231,6 +231,26 @@ class Host:
             left = 0.05 if end is None else min(0.05, end - time.monotonic())
             if left <= 0 or guest is not None and guest.ended.is_set() or waits_for.wait(left):
                 return
+
+
+def nodes_of(programs: Iterable[Program], arguments: Iterable[str] = ()) -> list[list[str]]:
+    """
+    Run programs until their nodes are there, and no further; return the names of these.
+
+    Nothing of the nodes runs; the process is to be ended after that.
+
+    :raises LoadingError: as ``Host.start``, or when a program hands no node over in time.
+    """
+    host = Host(SingleThreadedExecutor(), lambda: None)
+    with host:
+        host.start(programs, arguments)
+        for guest in host.guests:
+            if not guest.nodes:
+                raise LoadingError(
+                    guest.program.spec, f'it has made no node in {START_TIMEOUT_S:g} s, so nobody '
+                    'knows its process', f'name that: PROCESS={guest.program.spec}')
+        return [[node.get_fully_qualified_name() for node in guest.nodes]
+                for guest in host.guests]
 
 
 def _nodes_in(program: Program, value: Any) -> list[Node]:

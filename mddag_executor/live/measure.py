@@ -26,7 +26,8 @@ that do not complete the join are not counted as callbacks: their cost is overhe
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 import time
 from typing import Any
 
@@ -74,6 +75,8 @@ class Ledger:
         self.clock_offset_ns = epoch_offset_ns()
         #: Executions up to this long were emulated busily, longer ones by sleep.
         self.busy_below_ns = 0
+        #: By so much the same release may differ: each process has a trace clock of its own.
+        self.tolerance_ns = 0
 
     def reading(self) -> Reading:
         """Read the counters now."""
@@ -81,6 +84,55 @@ class Ledger:
             at_ns=time.monotonic_ns() + self.clock_offset_ns,
             cpu_ns=time.process_time_ns(),
             bodies=tuple(len(vertex) for dag in self.durations for vertex in dag))
+
+
+@dataclass(frozen=True)
+class Books:
+    """The ledger of a run, the readings between which it is measured, the joins given up."""
+
+    ledger: Ledger
+    start: Reading
+    end: Reading
+    evicted_joins: int = 0
+
+    def plain(self) -> dict[str, Any]:
+        """Return what ``add`` takes of another process, as JSON has it."""
+        return {
+            **{name: [[list(vertex) for vertex in dag] for dag in getattr(self.ledger, name)]
+               for name in ('durations', 'completions')},
+            **{name: list(getattr(self.ledger, name))
+               for name in ('misattributed', 'unattributed', 'first_release')},
+            'delays': [list(delays) for delays in self.ledger.delays],
+            'busy_below_ns': self.ledger.busy_below_ns, 'evicted_joins': self.evicted_joins,
+            'start': asdict(self.start), 'end': asdict(self.end)}
+
+    @classmethod
+    def of_processes(cls, task_set: TaskSet, parts: Sequence[dict[str, Any]]) -> Books:
+        """
+        Return the books of a run from those of its processes (``plain``), of one at least.
+
+        The window is that in which all of them measured.
+        """
+        ledger = Ledger(task_set)
+        for part in parts:
+            for name in ('durations', 'completions'):
+                for dag, vertices in zip(getattr(ledger, name), part[name]):
+                    for vertex, entries in zip(dag, vertices):
+                        vertex.extend(entries)
+            for delays, more in zip(ledger.delays, part['delays']):
+                delays.extend(more)
+            ledger.misattributed.extend(part['misattributed'])
+            ledger.unattributed.extend(part['unattributed'])
+            ledger.busy_below_ns = max(ledger.busy_below_ns, part['busy_below_ns'])
+            for dag, first in enumerate(part['first_release']):
+                if first is not None:
+                    ledger.first_release[dag] = first
+        readings = [[Reading(**part[name]) for part in parts] for name in ('start', 'end')]
+        start, end = (Reading(
+            latest(r.at_ns for r in several), sum(r.cpu_ns for r in several),
+            tuple(map(sum, zip(*(r.bodies for r in several)))))
+            for latest, several in zip((max, min), readings))
+        return cls(ledger, start, end, sum(part['evicted_joins'] for part in parts))
 
 
 def measure(

@@ -179,6 +179,12 @@ class Registry:
             entity.callback.key for entity in self.by_id.values()
             if entity.callback is not None}
 
+    def elsewhere(self, process: str | None) -> set[str]:
+        """Return the declared callbacks that run in other processes than this one."""
+        if self._task_set is None or process is None:
+            return set()
+        return {c.key for c in self.declared if self._task_set.process_of(c.node) != process}
+
     def undeclared(self) -> list[binding.Entity]:
         """Return the timers, subscriptions and services there were that are not declared."""
         return list(self._undeclared)

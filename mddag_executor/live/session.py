@@ -26,7 +26,8 @@ import time
 from typing import Any
 
 from mddag_executor.errors import MddagError
-from mddag_executor.live.measure import measure, Reading
+from mddag_executor.live.execution import ExecutionPlan
+from mddag_executor.live.measure import Books, measure, Reading
 from mddag_executor.live.synthetic import SyntheticWorkload
 from mddag_executor.text import counted
 from rclpy.executors import Executor, ExternalShutdownException
@@ -169,9 +170,31 @@ def run_synthetic(
     """
     Run a synthetic workload in a session that spins already, and end the session.
 
+    :return: the figures of ``measured``; None when the run was stopped before the window began.
+    :raises SessionError: when publishers and subscriptions do not find each other.
+    """
+    books = run_and_note(session, workload, duration_s, tick, warm_up_s)
+    return None if books is None else measured(books, workload.plan, warm_up_s)
+
+
+def measured(books: Books, plan: ExecutionPlan, warm_up_s: float = WARM_UP_S) -> dict[str, Any]:
+    """Return the figures of ``measure``, and those of the run."""
+    result = measure(books.ledger, plan, books.start, books.end)
+    result['warm_up_ns'] = round(warm_up_s * 1e9)
+    result['incomplete_joins_dropped'] = books.evicted_joins
+    return result
+
+
+def run_and_note(
+    session: Session, workload: SyntheticWorkload, duration_s: float | None,
+    tick: Tick | None = None, warm_up_s: float = WARM_UP_S,
+) -> Books | None:
+    """
+    Run a synthetic workload as ``run_synthetic`` does.
+
     :param duration_s: length of the measured window, which begins ``warm_up_s`` after the timers;
         None: until the session is stopped.
-    :return: the figures of ``measure``; None when the run was stopped before the window began.
+    :return: the books about it; None when the run was stopped before the window began.
     :raises SessionError: when publishers and subscriptions do not find each other.
     """
     window: tuple[Reading, Reading] | None = None
@@ -186,9 +209,4 @@ def run_synthetic(
     finally:
         workload.stop()
         session.end()
-    if window is None:
-        return None
-    result = measure(workload.ledger, workload.plan, *window)
-    result['warm_up_ns'] = round(warm_up_s * 1e9)
-    result['incomplete_joins_dropped'] = workload.evicted_joins
-    return result
+    return None if window is None else Books(workload.ledger, *window, workload.evicted_joins)

@@ -14,6 +14,7 @@ from mddag_executor.defaults import workers
 from mddag_executor.errors import UsageError
 from msg_graph import load, parse_duration, TaskSet
 from msg_graph.duration import DAY
+from msg_graph.errors import did_you_mean, listed, shown
 from rclpy.context import Context
 from rclpy.exceptions import NotInitializedException
 from rclpy.utilities import get_default_context
@@ -77,6 +78,19 @@ def check_context(context: Any) -> None:
         raise UsageError(f'context: {context!r} is no rclpy context: give one, or None')
     if (get_default_context() if context is None else context).handle is None:
         raise NotInitializedException('an executor needs a context: call rclpy.init() before')
+
+
+def check_process(name: str | None, task_set: TaskSet | None) -> None:
+    """
+    Look at the name of a declared process.
+
+    :raises UsageError: when there is none of that name.
+    """
+    names = [process.name for process in task_set.processes] if task_set is not None else []
+    if name is not None and name not in names:
+        remedy = did_you_mean(name, names, f'give one of {listed(names)}') if names else (
+            "declare 'processes:', or leave it out")
+        raise UsageError(f'process {shown(name)}: the declaration has no such process: {remedy}')
 
 
 @dataclass(frozen=True)

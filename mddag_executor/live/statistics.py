@@ -13,7 +13,7 @@ from mddag_executor.live.registry import Registry
 
 
 def statistics(
-    pool: Pool, registry: Registry, recorder: Recorder | None
+    pool: Pool, registry: Registry, recorder: Recorder | None, process: str | None = None
 ) -> dict[str, Any]:
     """
     Return the counts of a run.
@@ -25,6 +25,8 @@ def statistics(
     publication was not found; they ran as undeclared ones.  ``stops`` has how often and for how
     long no thread of the process ran while it spun, how many misses fell into these stops, and
     the times of the last ones (ns since the epoch).
+
+    :param process: which of the declared processes this is; what runs in others is left out.
     """
     engine = pool.engine
     with pool.lock:
@@ -34,6 +36,7 @@ def statistics(
         idle = engine.scheduler.idle_workers
         undeclared = engine.undeclared
         elsewhere = set() if engine.other_processes is None else engine.other_processes.elsewhere()
+    elsewhere |= registry.elsewhere(process)
     callbacks = registry.counts()
     never_ran = [c.key for c in registry.declared
                  if c.key not in elsewhere

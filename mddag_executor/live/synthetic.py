@@ -79,6 +79,8 @@ QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=10)
 SENSORS_NODE = '/mddag_sensors'
 _LEAD_NS = 20_000_000
+_CLOCKS_NS = 1_000_000
+"""Well above what the clocks of two processes differ by, and below any period."""
 
 
 def quiet_node(full_name: str, context: Context | None = None, **parameters: bool) -> Node:
@@ -114,16 +116,19 @@ class SyntheticWorkload:
         others.
     :param context: where the nodes belong to; None is rclpy's default context.
     :param keep: how much of each series the ledger keeps; None: all.
+    :param process: make only the nodes that the declaration puts into this process.
     :ivar timers: by the DAG that they release.
     """
 
     def __init__(
         self, task_set: TaskSet, plan: ExecutionPlan, *, current_job: CurrentJob = no_job,
-        context: Context | None = None, keep: int | None = None,
+        context: Context | None = None, keep: int | None = None, process: str | None = None,
     ) -> None:
         self.task_set = task_set
         self.plan = plan
         self.ledger = Ledger(task_set, keep)
+        if process is not None:
+            self.ledger.tolerance_ns = _CLOCKS_NS
         self._joins: dict[str, list[Join]] = {}
         self._current_job = current_job
         self._context = context
@@ -134,7 +139,10 @@ class SyntheticWorkload:
         self._nodes: dict[str, Node] = {}
         self._sensor_node: Node | None = None
         self._publishers: dict[tuple[str, str], Publisher] = {}
+        self._process = process
         self._n_subscribers = Counter(t for c in task_set.callbacks for t in c.topics)
+        self._n_publishers = Counter(
+            t for _, t in {(c.node, t) for c in task_set.callbacks for t in c.publishes})
         self._vertices: dict[str, list[Vertex]] = {}
         for vertex in task_set.vertices:
             self._vertices.setdefault(vertex.callback.key, []).append(vertex)
@@ -144,10 +152,9 @@ class SyntheticWorkload:
         self._sensor_thread: threading.Thread | None = None
         self._stop = threading.Event()
         for name in dict.fromkeys(callback.node for callback in task_set.callbacks):
-            self.make(name)
-        for vertex in task_set.vertices:
-            if not vertex.predecessors and vertex.callback.kind != 'timer':
-                self._add_sensor(vertex)
+            if self._is_here(name):
+                self.make(name)
+        self._add_sensors()
 
     @property
     def nodes(self) -> list[Node]:
@@ -161,15 +168,13 @@ class SyntheticWorkload:
 
     def unmatched(self) -> list[str]:
         """Return the topics whose publishers and subscriptions have not all met yet."""
-        n_publishers: dict[str, int] = {}
         found = set()
         for (_, topic), publisher in self._publishers.items():
-            n_publishers[topic] = n_publishers.get(topic, 0) + 1
             if publisher.get_subscription_count() < self._n_subscribers[topic]:
                 found.add(topic)
         for node in self._nodes.values():
             for subscription in node.subscriptions:
-                wanted = n_publishers.get(subscription.topic_name, 0)
+                wanted = self._n_publishers[subscription.topic_name]
                 if subscription.get_publisher_count() < wanted:
                     found.add(subscription.topic_name)
         return sorted(found)
@@ -317,14 +322,26 @@ class SyntheticWorkload:
         for topic in callback.topics:
             node.create_subscription(Header, topic, on_message, QOS, callback_group=group)
 
-    def _add_sensor(self, source: Vertex) -> None:
-        """Make what starts a DAG whose source is no timer."""
+    def _is_here(self, node: str) -> bool:
+        return self._process in (None, self.task_set.process_of(node))
+
+    def _add_sensors(self) -> None:
+        """Make what starts the DAGs whose sources are no timers."""
+        first: dict[str, Callback] = {}
+        for vertex in self.task_set.vertices:
+            if vertex.predecessors or vertex.callback.kind == 'timer':
+                continue
+            # One message on a topic releases all DAGs that wait for it, in other processes, too.
+            start = vertex.callback.service or vertex.callback.topics[0]
+            self._n_publishers[start] += start not in first
+            if self._is_here(first.setdefault(start, vertex.callback).node):
+                self._add_sensor(start, vertex)
+
+    def _add_sensor(self, start: str, source: Vertex) -> None:
         callback = source.callback
         if self._sensor_node is None:
             self._sensor_node = quiet_node(SENSORS_NODE, self._context)
-        # One message on a topic releases all DAGs that wait for it.  (Of two periods the shorter
-        # one sets the pace.)
-        start = callback.service or callback.topics[0]
+        # (Of two periods the shorter one sets the pace.)
         if start not in self._sensors:
             send = self._requests(start) if callback.service else self._messages(start)
             self._sensors[start] = Sensor([], callback.period_ns or 0, send)

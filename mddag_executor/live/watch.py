@@ -37,14 +37,18 @@ class Watch:
 
     def drift(self, statistics: dict[str, Any]) -> list[Drift]:
         """Return where the run and the declaration disagree; ``statistics`` are its counts."""
+        return drift(self._task_set, self.observed(statistics))
+
+    def observed(self, statistics: dict[str, Any]) -> Observed:
+        """Return what was seen; ``statistics`` are the counts of the run."""
         first = min((r.first for r in self._releases if r.count), default=self._begin)
         counts = statistics['callbacks']
         sources = (dag.vertices[dag.source].callback.key for dag in self._task_set.dags)
-        return drift(self._task_set, Observed(
+        return Observed(
             duration_ns=max(0, self._now() - first),
             releases=dict(zip(sources, self._releases)),
             got={key: count['ready'] for key, count in counts.items()},
             ran={key: count['ran'] for key, count in counts.items()},
             publishes={**self._executor._registry.publishes()},
             nodes={key.rpartition(':')[0] for key in counts},
-            undeclared=self._executor._registry.undeclared()))
+            undeclared=self._executor._registry.undeclared())

@@ -49,10 +49,17 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
     yield from drift_lines(drift)
     if never and not any(each['kind'] == 'never ran' for each in drift):
         yield f'{counted(len(never), "declared callback")} never ran: ' + listed(never)
-    if result['trace'] is not None:
-        lost = result['trace']['lost']
-        yield (f'trace: {printable(str(Path(result["trace"]["path"]).absolute()))}'
-               + (f' ({counted(lost, "event")} lost: the disk was too slow)' if lost else ''))
+    for trace in (result['trace'], *(p['trace'] for p in result.get('processes', ()))):
+        if trace is not None:
+            lost = trace['lost']
+            yield (f'trace: {printable(str(Path(trace["path"]).absolute()))}'
+                   + (f' ({counted(lost, "event")} lost: the disk was too slow)' if lost else ''))
+
+
+def ended_line(process: dict[str, Any]) -> str:
+    """Return the line about a process of a run that has died."""
+    return printable(f'process {process["name"]} {process["how"]}: '
+                     f'{process["said"] or "it said nothing"}')
 
 
 def measured_lines(measured: dict[str, Any]) -> Iterator[str]:

@@ -265,7 +265,7 @@ def test_a_later_sigint_interrupts_the_program(monkeypatch: pytest.MonkeyPatch) 
     ending, now = Ending(), iter([10.0, 10.4, 12.0])
     monkeypatch.setattr(run, 'time', SimpleNamespace(monotonic=lambda: next(now)))
     try:
-        with run._Signals() as signals:
+        with run.Signals() as signals:
             signals.end_of(ending)  # type: ignore[arg-type]
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)

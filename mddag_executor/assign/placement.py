@@ -1,0 +1,163 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which node runs in which process: packed by the time that nodes need the interpreter.
+
+Theory of operation
+-------------------
+One process computes Python on one core, so what a process can take is bounded by its interpreter.
+
+1. The *load* of a node is the share of time that its callbacks hold the interpreter: execution
+   time over period, of all vertices that do not say ``holds_interpreter: false``.
+2. A message that leaves its process costs ``TRANSPORT_NS`` more at either end.
+3. Nodes that stay together are one *block*.  Blocks are placed, the largest first, where the
+   largest load of a process is least; then single blocks are moved, and pairs exchanged, as long
+   as that lowers the largest load, or the sum of all loads at an equal largest one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import combinations
+
+from mddag_executor.errors import UsageError
+from mddag_executor.text import counted
+from msg_graph import Process, TaskSet
+
+TRANSPORT_NS = 150_000
+"""What a message costs the interpreters of its publisher and of each subscriber, between two."""
+
+
+class Placing:
+    """
+    Places the nodes of a task set.
+
+    :param execution_ns: the execution time of each vertex, by DAG and local index.
+    :param together: nodes that run in one process, group by group.
+    :param apart: nodes of which no two run in one process, group by group.
+    :raises UsageError: when a node is not declared, or is to be together with and apart from one.
+    """
+
+    def __init__(
+        self, task_set: TaskSet, n_processes: int, execution_ns: Sequence[Sequence[int]],
+        together: Iterable[Sequence[str]] = (), apart: Iterable[Sequence[str]] = (),
+    ) -> None:
+        self._task_set = task_set
+        self._n = n_processes
+        self.nodes = list(dict.fromkeys(callback.node for callback in task_set.callbacks))
+        self._block = {node: i for i, node in enumerate(self.nodes)}
+        for group in together:
+            self._check(group)
+            joined = {self._block[node] for node in group}
+            for node, block in self._block.items():
+                if block in joined:
+                    self._block[node] = min(joined)
+        self._apart: set[tuple[int, int]] = set()
+        for group in apart:
+            self._check(group)
+            for one, other in combinations(group, 2):
+                pair = self._block[one], self._block[other]
+                if pair[0] == pair[1]:
+                    raise UsageError(f'--apart {one},{other}: they are to run together, too: '
+                                     'leave out one of both')
+                self._apart |= {pair, pair[::-1]}
+        self._blocks = sorted(set(self._block.values()))
+        if n_processes > len(self._blocks):
+            raise UsageError(
+                f'--processes {n_processes}: there are only {counted(len(self._blocks), "node")} '
+                'to place, or groups of nodes: give fewer processes')
+        self._own = dict.fromkeys(self._blocks, 0.0)
+        self._between: dict[int, dict[int, float]] = {block: {} for block in self._blocks}
+        self._measure(execution_ns)
+
+    def _check(self, group: Iterable[str]) -> None:
+        for node in group:
+            if node not in self._block:
+                raise UsageError(f"node '{node}': {self._task_set.file} does not declare it: name "
+                                 'one of its nodes')
+
+    def _measure(self, execution_ns: Sequence[Sequence[int]]) -> None:
+        """Sum up what blocks compute, and what passes between two of them (rules 1 and 2)."""
+        for dag in self._task_set.dags:
+            for vertex in dag.vertices:
+                block = self._block[vertex.callback.node]
+                if vertex.callback.holds_interpreter is not False:
+                    self._own[block] += execution_ns[dag.index][vertex.index] / dag.period_ns
+                for after in vertex.successors:
+                    other = self._block[dag.vertices[after].callback.node]
+                    for a, b in ((block, other), (other, block)):
+                        if a != b:
+                            self._between[a][b] = (
+                                self._between[a].get(b, 0.0) + TRANSPORT_NS / dag.period_ns)
+
+    def loads(self, place: dict[int, int]) -> list[float]:
+        """Return the load of each process; of blocks that are placed."""
+        loads = [0.0] * self._n
+        for block, process in place.items():
+            loads[process] += self._own[block] + sum(
+                cost for other, cost in self._between[block].items()
+                if place.get(other, process) != process)
+        return loads
+
+    def place(self) -> dict[int, int]:
+        """
+        Return the process of each block (rule 3).
+
+        :raises UsageError: when too many nodes are to run apart.
+        """
+        place: dict[int, int] = {}
+        # Where no load is declared blocks still spread out: the least of all counts for something.
+        for block in sorted(self._blocks, key=lambda b: (-self._own[b], b)):
+            allowed = [p for p in range(self._n) if self._fits(place, block, p)]
+            if not allowed:
+                raise UsageError(f'--apart: {counted(self._n, "process", "processes")} cannot '
+                                 'keep all these nodes apart: give more processes')
+            left = len(self._blocks) - len(place)
+            empty = [p for p in allowed if p not in place.values()]
+            choice = empty if left <= self._n - len(set(place.values())) else allowed
+            place[block] = min(choice or allowed, key=lambda p: (
+                self._cost({**place, block: p}), sum(q == p for q in place.values()), p))
+        while better := next(self._better(place), None):
+            place = better
+        return place
+
+    def _fits(self, place: dict[int, int], block: int, process: int) -> bool:
+        return all((block, other) not in self._apart
+                   for other, where in place.items() if where == process)
+
+    def _cost(self, place: dict[int, int]) -> tuple[float, float]:
+        loads = self.loads(place)
+        return round(max(loads), 9), round(sum(loads), 9)
+
+    def _better(self, place: dict[int, int]) -> Iterator[dict[int, int]]:
+        """Yield placements that are better than one, and differ in one or two blocks."""
+        now = self._cost(place)
+        for changed in self.neighbours(place):
+            if self._cost(changed) < now:
+                yield changed
+
+    def neighbours(self, place: dict[int, int]) -> Iterator[dict[int, int]]:
+        """Yield the allowed placements that differ in one block, or in two exchanged ones."""
+        for block in self._blocks:
+            for process in range(self._n):
+                if process != place[block]:
+                    yield from self._allowed({**place, block: process}, (block,))
+        for one, other in combinations(self._blocks, 2):
+            if place[one] != place[other]:
+                yield from self._allowed(
+                    {**place, one: place[other], other: place[one]}, (one, other))
+
+    def _allowed(
+        self, place: dict[int, int], changed: tuple[int, ...]
+    ) -> Iterator[dict[int, int]]:
+        others = {b: p for b, p in place.items() if b not in changed}
+        if len(set(place.values())) == self._n and all(
+                self._fits(others, block, place[block]) for block in changed):
+            yield place
+
+    def processes(self, place: dict[int, int]) -> tuple[Process, ...]:
+        """Return the processes of a placement, ``p1`` with the node that is declared first."""
+        order = list(dict.fromkeys(place[self._block[node]] for node in self.nodes))
+        return tuple(
+            Process(f'p{i}', tuple(n for n in self.nodes if place[self._block[n]] == process))
+            for i, process in enumerate(order, 1))

@@ -1,0 +1,237 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+`mddag run` over several processes: which node runs where, and their run as if it was one.
+
+A program says only when it runs which nodes it brings. So each `--node` is started once ahead of
+the run, in a process that ends when the nodes are made, unless it says itself where it is to run:
+`PROCESS=SPEC`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+import os
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+from typing import Any
+
+from mddag_executor import defaults
+from mddag_executor.cli import common
+from mddag_executor.cli.run import Signals, warn_of
+from mddag_executor.cli.text import warn
+from mddag_executor.errors import UsageError
+from mddag_executor.report.live_runs import ended_line, summary
+from mddag_executor.report.tables import sink_table
+from msg_graph import TaskSet
+from msg_graph.errors import listed, shown
+from msg_graph.processes import load_processes, with_processes
+
+EXIT_DIED = 70
+_PROBE_TIMEOUT_S = 120.0
+
+
+def with_declared(args: argparse.Namespace, task_set: TaskSet) -> TaskSet:
+    """
+    Return the task set with the processes that `--processes FILE` or the declaration says.
+
+    :raises msg_graph.GraphError: when the file is wrong
+    :raises mddag_executor.errors.UsageError: when nothing says where nodes run
+    """
+    if args.processes is None:
+        return task_set
+    if args.processes.isdecimal():
+        raise UsageError(f'--process {args.process}: with --processes {args.processes} no process '
+                         'has a name of its own: name a file')
+    name, text = common.read_text(args.processes)
+    return with_processes(task_set, load_processes(text, name, task_set))
+
+
+def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
+    """
+    Run nodes in several processes until the run ends, and print what came of the deadlines.
+
+    :raises msg_graph.GraphError: when the declaration is wrong
+    :raises mddag_executor.errors.MddagError: when anything else cannot be used
+    """
+    from mddag_executor.live.execution import ExecutionPlan
+    from mddag_executor.live.parts import left, Part, together
+    from mddag_executor.live.supervisor import Supervisor
+    plan = None
+    if args.synthetic is not None:
+        workers = defaults.workers(args.workers, task_set)
+        plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
+    with tempfile.TemporaryDirectory(prefix='mddag-') as folder, Signals() as signals:
+        Part.make(folder, task_set.text)
+        task_set, specs = _placed(args, task_set, plan, folder)
+        Part.make(folder, task_set.text)
+        names = [process.name for process in task_set.processes]
+        traces = _Traces(args.trace)
+        for name in names:
+            common.check_output(traces.of(name, 1))
+        if plan is not None:
+            warn_of(plan, args.ros_args, len(names))
+
+        def command(name: str, nth: int) -> list[str]:
+            trace = traces.of(name, nth)
+            return [*_command(args, folder, specs.get(name, ())), '--process', name,
+                    *(() if trace is None else ('--trace', trace)), *_ros_args(args)]
+
+        out = sys.stdout if common.wants_tables(args) else sys.stderr
+        supervisor = Supervisor(
+            command, args.on_exit, out, sys.stderr,
+            lambda run: warn(f'process {run.name} {run.how}: {run.said}'))
+        signals.end_of(supervisor)
+        supervisor.run(names, None if args.duration is None else args.duration / 1e9)
+        parts = [left(folder, run.process.pid) for run in supervisor.runs]
+    results = [(run.name, each) for run, each in zip(supervisor.runs, parts) if each is not None]
+    result = {
+        'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
+        'policy': args.policy, 'workers': defaults.workers(args.workers, task_set),
+        **together(task_set, results, plan), 'trace': None,
+        'processes': [{
+            'name': run.name, 'nodes': next(
+                p.nodes for p in task_set.processes if p.name == run.name),
+            'pid': run.process.pid, 'status': run.status, 'died': run.died, 'how': run.how,
+            'said': run.said if run.died else None,
+            'trace': traces.result(run.name, run.nth) if part is None else part['trace']}
+            for run, part in zip(supervisor.runs, parts)]}
+    if common.write_result(args, result):
+        print(sink_table(result['dags']))
+        for line in summary(result):
+            print(line)
+        for process in result['processes']:
+            if process['died']:
+                print(ended_line(process))
+    return EXIT_DIED if any(run.died for run in supervisor.runs) else 0
+
+
+def _placed(
+    args: argparse.Namespace, task_set: TaskSet, plan: Any, folder: str
+) -> tuple[TaskSet, dict[str, list[str]]]:
+    """Return the task set with its processes, and the SPECs of each process."""
+    number = args.processes if args.processes and args.processes.isdecimal() else None
+    if number is None:
+        task_set = with_declared(args, task_set)
+    names = {process.name for process in task_set.processes} if number is None else set()
+    said: dict[str, str] = {}  # where a SPEC is to run, as it says itself
+    for spec in args.node:
+        name, equals, _ = spec.partition('=')
+        if equals and name in names:
+            said[spec] = name
+    unsaid = [spec for spec in args.node if spec not in said]
+    nodes = _probe(args, folder, unsaid) if unsaid else {}
+    if number is not None:
+        task_set = _place(args, task_set, int(number), plan, list(nodes.values()))
+    specs: dict[str, list[str]] = {process.name: [] for process in task_set.processes}
+    for spec in args.node:
+        name = said.get(spec) or _process_of(task_set, spec, nodes[spec])
+        specs[name].append(spec.removeprefix(f'{name}=') if spec in said else spec)
+    for process in task_set.processes:
+        if args.node and not specs[process.name]:
+            raise UsageError(f'process {shown(process.name)}: no --node brings one of its nodes '
+                             f'({listed(process.nodes)}): give it, or remove the process')
+    return task_set, specs
+
+
+def _place(
+    args: argparse.Namespace, task_set: TaskSet, n: int, plan: Any,
+    together: Sequence[Sequence[str]],
+) -> TaskSet:
+    """Place the nodes in N processes; what one program brings stays together."""
+    from mddag_executor.assign.placement import Placing
+    from mddag_executor.simulate.workload import draw_execution_times
+    times = draw_execution_times(task_set, args.seed, undeclared=0) if plan is None else [
+        [plan.execution_ns(v.dag, v.index) for v in dag.vertices] for dag in task_set.dags]
+    declared = {callback.node for callback in task_set.callbacks}
+    placing = Placing(task_set, n, times, [
+        group for each in together if (group := [node for node in each if node in declared])])
+    return with_processes(task_set, placing.processes(placing.place()))
+
+
+def _process_of(task_set: TaskSet, spec: str, nodes: Sequence[str]) -> str:
+    """Return the process that a SPEC is to run in: that of its declared nodes."""
+    declared = {callback.node for callback in task_set.callbacks}
+    found = {str(task_set.process_of(node)): node for node in nodes if node in declared}
+    if len(found) > 1:
+        (one, a), (other, b), *_ = found.items()
+        raise UsageError(
+            f'--node {spec}: it brings {a}, which is to run in process {shown(one)}, and {b}, in '
+            f'{shown(other)}: put both into one process')
+    return next(iter(found), task_set.processes[0].name)
+
+
+def _probe(
+    args: argparse.Namespace, folder: str, specs: Sequence[str]
+) -> Mapping[str, Sequence[str]]:
+    """Return the names of the nodes that each SPEC brings."""
+    from mddag_executor.live.parts import left
+    from mddag_executor.live.supervisor import ProcessError
+    # Nobody is to hear of these nodes.
+    environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
+    with subprocess.Popen(
+        [*_command(args, folder, specs), *_ros_args(args)], stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors='replace',
+        env=environment,
+    ) as process:
+        try:
+            said, _ = process.communicate(timeout=_PROBE_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            said = 'it has not made its nodes'
+        finally:
+            process.kill()
+    names = left(folder, process.pid)
+    if names is None:
+        lines = [line for line in said.splitlines() if line.strip()]
+        error = next((line for line in reversed(lines) if line.startswith('error: ')), None)
+        raise ProcessError((error or (lines or ['the nodes cannot be made'])[-1])
+                           .removeprefix('error: '))
+    return dict(zip(specs, names))
+
+
+def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> list[str]:
+    """Return the command line of a part, up to its name."""
+    command = [sys.executable, '-m', 'mddag_executor', 'run', args.graph, '--part', folder,
+               '--policy', args.policy, '--intake', args.intake,
+               '--diagnostics', f'{args.diagnostics}ns' if args.diagnostics else 'off']
+    if args.synthetic is None:
+        for spec in specs:
+            command += ['--node', spec]
+    else:
+        command += ['--synthetic', args.synthetic, '--seed', str(args.seed)]
+    for option, value in (('--utilisation', args.utilisation), ('--workers', args.workers),
+                          ('--duration', args.duration and f'{args.duration}ns')):
+        if value is not None:
+            command += [option, str(value)]
+    return command
+
+
+def _ros_args(args: argparse.Namespace) -> list[str]:
+    return ['--ros-args', *args.ros_args] if args.ros_args else []
+
+
+class _Traces:
+    """Where each process records to."""
+
+    def __init__(self, given: str | None) -> None:
+        self._given = given
+
+    def of(self, name: str, nth: int) -> str | None:
+        """Return the path of a process' trace; of one that was started again it is another."""
+        if self._given is None:
+            return None
+        path = Path(self._given)
+        label = name if nth == 1 else f'{name}.{nth}'
+        if path.is_dir():
+            return str(path / f'{label}.mcap')
+        return str(path.with_name(f'{path.stem}.{label}{path.suffix}'))
+
+    def result(self, name: str, nth: int) -> dict[str, Any] | None:
+        """Return what there is to say of the trace of a process that has left no result."""
+        path = self.of(name, nth)
+        if path is None or not Path(path).exists():
+            return None
+        return {'path': path, 'lost': 0, 'error': 'the process has died'}

@@ -1,0 +1,148 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What passes between a run of several processes and each of these, and the result of all.
+
+Theory of operation
+-------------------
+The run makes a folder with the declaration as all processes are to have it.  Each process leaves
+there, under its process id, what came of it.  Sinks are judged where they are, so the run's
+verdicts are put together by the core (``core.tally.of_processes``); callbacks are counted where
+they are; rules that need all of them (drift, what the synthetic nodes measured) get the sum of
+what was observed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.core.tally import of_processes
+from mddag_executor.live.execution import ExecutionPlan
+from mddag_executor.live.measure import Books
+from mddag_executor.live.session import measured
+from msg_graph import TaskSet
+from msg_graph.binding import Entity
+from msg_graph.drift import drift, Observed, Releases
+
+Results = Sequence[tuple[str, Mapping[str, Any]]]
+"""The name of each process that has left a result, and that."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """
+    A process of a run, as it sees itself.
+
+    :ivar parent: the process id of the run.
+    :ivar text: the declaration.
+    """
+
+    folder: Path
+    parent: int
+    text: str
+
+    @classmethod
+    def make(cls, folder: str, text: str) -> None:
+        """Prepare the folder of a run."""
+        Path(folder, 'run.json').write_text(json.dumps({'parent': os.getpid(), 'text': text}))
+
+    @classmethod
+    def read(cls, folder: str) -> Part:
+        """Return what a process is to know."""
+        return cls(Path(folder), **json.loads(Path(folder, 'run.json').read_text()))
+
+    def leave(self, result: Any) -> None:
+        """Leave what came of this process."""
+        path = self.folder / f'{os.getpid()}.json'
+        part = path.with_suffix('.part')
+        part.write_text(json.dumps(result))
+        part.replace(path)
+
+
+def left(folder: str, pid: int) -> Any:
+    """Return what a process has left, None where that is nothing."""
+    try:
+        return json.loads(Path(folder, f'{pid}.json').read_text())
+    except FileNotFoundError:
+        return None
+
+
+def plain(observed: Observed) -> dict[str, Any]:
+    """Return what was observed as JSON has it."""
+    return {
+        **asdict(observed), 'nodes': sorted(observed.nodes or ()),
+        'publishes': {key: sorted(topics) for key, topics in observed.publishes.items()},
+        'undeclared': [list(entity) for entity in observed.undeclared]}
+
+
+def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) -> dict[str, Any]:
+    """
+    Return the result of a run from those of its processes.
+
+    :param plan: of the synthetic nodes, where they are such.
+    """
+    parts = [result for _, result in results]
+    callbacks = _callbacks(parts)
+    books = [part['books'] for part in parts if part['books'] is not None]
+    every = {process.name for process in task_set.processes}
+    return {
+        **of_processes(task_set, results),
+        'stops': {key: sum(part['stops'][key] for part in parts)
+                  for key in ('count', 'total_ns', 'misses')},
+        'callbacks': callbacks,
+        **{key: sum(part[key] for part in parts)
+           for key in ('undeclared', 'queue', 'idle_workers', 'lent')},
+        'dropped': {name: c['dropped'] for name, c in callbacks.items() if c['dropped']},
+        'unattributed': {key: sum(part['unattributed'][key] for part in parts)
+                         for key in ('unknown', 'doubtful')},
+        'never_ran': [c.key for c in task_set.callbacks
+                      if not callbacks.get(c.key, {'ran': 0})['ran']],
+        # only what all of them measured has a window
+        'measured': None if plan is None or {
+            name for name, part in results if part['books'] is not None} != every else measured(
+                Books.of_processes(task_set, books), plan),
+        'drift': [each.result() for each in drift(task_set, _observed(task_set, results))]}
+
+
+def _callbacks(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the counts of all callbacks; some of the executors' own have the same names."""
+    callbacks: dict[str, Any] = {}
+    for part in parts:
+        for name, counts in part['callbacks'].items():
+            mine = callbacks.setdefault(name, dict.fromkeys(counts, 0))
+            for key, value in counts.items():
+                if isinstance(value, bool):
+                    mine[key] = bool(mine[key]) or value
+                else:
+                    mine[key] = value if isinstance(value, str) else mine[key] + value
+    return callbacks
+
+
+def _observed(task_set: TaskSet, results: Results) -> Observed:
+    """Return what was observed of the whole system: releases, where they happened."""
+    whole = Observed()
+    homes = {dag.vertices[dag.source].callback.key: task_set.process_of(
+        dag.vertices[dag.source].callback.node) for dag in task_set.dags}
+    undeclared: list[Entity] = []
+    publishes: dict[str, set[str]] = {}
+    for name, result in results:
+        part = result['observed']
+        whole.duration_ns = max(whole.duration_ns, part['duration_ns'])
+        for key, releases in part['releases'].items():
+            if homes.get(key) == name:
+                whole.releases[key] = Releases(**releases)
+        for field in ('got', 'ran'):
+            sums = getattr(whole, field)
+            for key, count in part[field].items():
+                sums[key] = sums.get(key, 0) + count
+        for key, topics in part['publishes'].items():
+            publishes.setdefault(key, set()).update(topics)
+        undeclared += [Entity(*entity) for entity in part['undeclared']]
+    whole.publishes = {**publishes}
+    whole.undeclared = undeclared
+    return whole
