@@ -26,7 +26,7 @@ SHARE = f'share/{NAME}'
 OPTIONAL = ('bokeh', 'distributed', 'llvmlite', 'matplotlib', 'numba', 'perfetto', 'pyarrow',
             'rich')
 ROS = ('ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'launch', 'launch_ros',
-       'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'std_msgs')
+       'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'rosidl_parser', 'std_msgs')
 BLOCKER = """
 import sys
 

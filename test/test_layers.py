@@ -3,7 +3,7 @@
 """
 The parts of the program know one another in one direction only.
 
-    cli -> report -> (live | replay | assign | simulate | analysis) -> trace, core, generate
+    cli -> report, rerun -> (live | replay | assign | simulate | analysis) -> trace, core, generate
         -> msg_graph
 
 Imports are read from the sources, those inside functions and for type checkers included. So are
@@ -39,6 +39,7 @@ LEVELS = {
     'mddag_executor.live': 6,
     'mddag_executor.replay': 6,
     'mddag_executor.report': 7,
+    'mddag_executor.rerun': 7,
     'mddag_executor.cli': 8,
     'mddag_executor.__main__': 9,
 }
@@ -52,8 +53,8 @@ NOT_IN_CORE = {
 }
 # Offline parts work on a machine without ROS.
 ROS = {'rclpy', 'rcl_interfaces', 'std_msgs', 'diagnostic_msgs', 'builtin_interfaces', 'launch',
-       'launch_ros', 'ament_index_python'}
-MAY_USE_ROS = {'mddag_executor.live', 'mddag_executor.cli'}
+       'launch_ros', 'ament_index_python', 'rosidl_parser'}
+MAY_USE_ROS = {'mddag_executor.live', 'mddag_executor.rerun', 'mddag_executor.cli'}
 
 
 def part_of(module: str) -> str | None:

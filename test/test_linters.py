@@ -51,6 +51,7 @@ THIRD_PARTY: dict[str, tuple[str | None, str | None]] = {
     'rich': ('python3-rich', 'rich'),
     'rosbags': ('python3-rosbags-pip', 'rosbags'),
     'rosgraph_msgs': ('rosgraph_msgs', None),
+    'rosidl_parser': ('rosidl_parser', None),
     'std_msgs': ('std_msgs', None),
     'yaml': ('python3-yaml', 'PyYAML'),
     'zstandard': ('mcap-ros2-support', 'zstandard'),

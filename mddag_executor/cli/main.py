@@ -55,6 +55,7 @@ class Verb(NamedTuple):
 VERBS = {
     'demo': Verb('demo', 'run the whole Autoware workload, record it and replay the recording'),
     'run': Verb('run', 'run rclpy nodes, or nodes made from the declaration, and record them'),
+    'rerun': Verb('rerun', 'run real nodes again from a recording, in virtual time'),
     'replay': Verb('replay', 'check a recorded run against its deadlines, or reschedule it'),
     'explain': Verb('explain', 'tell why each deadline of a recorded run was missed'),
     'simulate': Verb('simulate', 'run a declaration in virtual time'),

@@ -54,6 +54,11 @@ def positive_float(text: str) -> float:
         text, float, lambda value: value > 0 and math.isfinite(value), 'number above zero')
 
 
+def not_negative(text: str) -> float:
+    """Return a finite number from 0 up."""
+    return _parsed(text, float, lambda value: 0 <= value < math.inf, 'number from 0 up')
+
+
 def ratio(text: str) -> float:
     """Return a number from 0 to 1."""
     return _parsed(text, float, lambda value: 0 <= value <= 1, 'number from 0 to 1')

@@ -32,7 +32,15 @@ from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.jobs import is_judged, judge_from
-from mddag_executor.core.state import IDLE, N_HOLDING, N_IDLE, OPEN, OVERTAKING, SUSPENDED
+from mddag_executor.core.state import (
+    DONE,
+    IDLE,
+    N_HOLDING,
+    N_IDLE,
+    OPEN,
+    OVERTAKING,
+    SUSPENDED,
+)
 from mddag_executor.live.entity import Entity, TIMER
 from mddag_executor.live.jobs import Jobs, NO_ORIGIN, Origin
 from mddag_executor.live.other_processes import OtherProcesses
@@ -355,6 +363,15 @@ class Engine:
     def stop_holding(self, work: Work) -> None:
         """Give the interpreter back for an execution that does not need it now."""
         self.scheduler.stop_holding(work.x)
+
+    def makes_whole(self, work: Work) -> bool:
+        """Return whether the end of a running execution completes its vertex: the last leg's."""
+        if work.origin is None:
+            return True
+        state, vertex = self._state, work.origin.vertex
+        first = state.job_base[work.origin.slot] + self.tables.region_offset[vertex]
+        return all(state.x_state[x] == DONE
+                   for x in range(first, first + self.tables.n_legs[vertex]) if x != work.x)
 
     def lend(self, work: Work) -> None:
         """Free the worker of an execution that goes on without one."""

@@ -37,14 +37,14 @@ Two executors in one process that share a graph are to each other as two process
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 import threading
 
 from mddag_executor.core import Scheduler, Tables
 from mddag_executor.live.entity import Entity
 from mddag_executor.live.jobs import Jobs, Origin
 from mddag_executor.live.verdicts import Record
-from msg_graph import TaskSet
+from msg_graph import Dag, TaskSet
 
 KEEP = 4096
 """The jobs of so many stamps are remembered."""
@@ -55,12 +55,17 @@ class OtherProcesses:
     The DAGs that may reach beyond this process, and the jobs of their stamps.
 
     ``update`` and ``find`` are called under the engine's lock; ``note`` from any thread.
+
+    :param dags: those that may; None: whose source declares ``release_from: header_stamp``.
     """
 
     def __init__(
         self, task_set: TaskSet, tables: Tables, scheduler: Scheduler, jobs: Jobs,
+        dags: Sequence[Dag] | None = None,
     ) -> None:
-        self._dags = [d for d in task_set.dags if d.release_from == 'header_stamp']
+        if dags is None:
+            dags = [d for d in task_set.dags if d.release_from == 'header_stamp']
+        self._dags = dags
         self._crossing = {d.index for d in self._dags}
         self._tables = tables
         self._scheduler = scheduler

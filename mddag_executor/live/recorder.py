@@ -6,16 +6,40 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 import threading
-from typing import Any
+from typing import Any, Protocol
 import weakref
 
-from mddag_executor.clocks import TraceClock
 from mddag_executor.live.entity import Entity, SERVICE, SUBSCRIPTION, TIMER
 from mddag_executor.trace.errors import TraceError
 from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
 from rclpy.logging import get_logger
 from rclpy.utilities import get_rmw_implementation_identifier
+
+
+class Clock(Protocol):
+    """The trace's clock."""
+
+    offset_ns: int
+
+    def now(self) -> int:
+        """Return the time."""
+
+
+class Writer(Protocol):
+    """Writes a trace; see ``trace.TraceWriter``."""
+
+    error: TraceError | None
+
+    @property
+    def dropped(self) -> int:
+        """Return how many recorded events are not in the file and will not be."""
+
+    def record(self, *event: Any) -> None:
+        """Record an event."""
+
+    def close(self) -> None:
+        """Complete the file."""
 
 
 class Recorder:
@@ -25,15 +49,18 @@ class Recorder:
     Addresses are those of Python objects: the node, the entity, and, for callbacks, what is kept
     for the entity (``Entity``).
 
+    :param writer: writes the file; None: one that keeps nobody waiting.
     :raises mddag_executor.trace.TraceError: when the file cannot be written.
     """
 
     def __init__(
         self, path: str, task_set: TaskSet | None, policy: str, workers: int,
-        default_deadline: int, max_active_jobs: int, clock: TraceClock,
+        default_deadline: int, max_active_jobs: int, clock: Clock, writer: Writer | None = None,
     ) -> None:
-        from mddag_executor.trace.writer import TraceWriter  # late: it loads the compression
-        self.writer = TraceWriter(path, clock_offset=clock.offset_ns)
+        if writer is None:
+            from mddag_executor.trace.writer import TraceWriter  # late: it loads the compression
+            writer = TraceWriter(path, clock_offset=clock.offset_ns)
+        self.writer: Writer = writer
         self.record = self.writer.record
         self.path = path
         self._clock = clock

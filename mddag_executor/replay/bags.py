@@ -21,7 +21,7 @@ Theory of operation
 from __future__ import annotations
 
 from array import array
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
 import io
 from itertools import compress
@@ -81,6 +81,8 @@ class Bag:
     """
     What a bag says about some topics.
 
+    :param keep: told of each message of these topics: its topic, with an absolute name, when it
+        came, when it was published (or `UNKNOWN`), and its bytes.
     :ivar topics: every topic in it.
     :ivar stamps: by topic that was asked for and is in it.
     :ivar stretches: from when to when messages came, of any topic, without a gap (``times``).
@@ -90,10 +92,12 @@ class Bag:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], topics: Collection[str], name: str | None = None
+        self, path: str | os.PathLike[str], topics: Collection[str], name: str | None = None,
+        keep: Callable[[Topic, int, int, bytes], None] | None = None,
     ) -> None:
         self.path = os.fspath(path)
         self.name = name or self.path
+        self._keep = keep
         self.count = 0
         self.topics: set[str] = set()
         self.stamps: dict[str, Stamps] = {}
@@ -238,6 +242,11 @@ class Bag:
         if stamps is None:
             stamps = self.stamps[name] = Stamps()
             stamps.type = topic.message_type
+        if self._keep is not None:
+            content = bytes(data)
+            if content.startswith(_ZSTD):
+                content = _unpacked_message(content, _SPARE)
+            self._keep(topic._replace(name=name), arrival, published, content)
         stamps.arrival.append(arrival)
         different = 0 < published < NEVER and published != arrival
         stamps.published.append(published if different else UNKNOWN)
@@ -252,7 +261,7 @@ class Bag:
             return UNKNOWN
         head = bytes(data[:_STAMP])
         if head.startswith(_ZSTD):      # compressed message by message
-            head = _beginning(bytes(data))
+            head = _unpacked_message(bytes(data), _STAMP)
         if len(head) < _STAMP or head[0] or head[1] > 1:
             return UNKNOWN
         seconds, nanoseconds = struct.unpack('<iI' if head[1] else '>iI', head[4:])
@@ -368,11 +377,11 @@ def _kind(file: Path) -> bytes:
     return next((kind for kind in (_MCAP, _SQLITE, _ZSTD) if head.startswith(kind)), b'')
 
 
-def _beginning(data: bytes) -> bytes:
-    """Return the first bytes of a compressed message."""
+def _unpacked_message(data: bytes, size: int) -> bytes:
+    """Return a compressed message, so many bytes of it at most; nothing where it is damaged."""
     try:
         packed = zstandard.ZstdDecompressor(max_window_size=_WINDOW)
-        return bytes(packed.stream_reader(io.BytesIO(data)).read(_STAMP))
+        return bytes(packed.stream_reader(io.BytesIO(data)).read(size))
     except zstandard.ZstdError:
         return b''
 

@@ -146,3 +146,11 @@ def test_third_party(tmp_path: Path) -> None:
     assert found['never_ran'] == []
     for program in (EXAMPLES / 'third_party' / 'install' / 'lib').rglob('*.py'):
         assert 'mddag' not in program.read_text(encoding='utf-8').split('"""', 1)[1]
+
+
+def test_rerun() -> None:
+    """A changed constant changes contents, a slower callback only times."""
+    _, constant, slower = run('rerun').split(':\n')[1:]
+    assert re.findall(r'^(/\w+): (\w+), first', constant, re.MULTILINE) == [('/track', 'content')]
+    assert re.findall(r'^(/\w+): (\w+), first', slower, re.MULTILINE) == [
+        ('/brake', 'timing'), ('/track', 'timing')]

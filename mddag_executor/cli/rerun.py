@@ -1,0 +1,162 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The verb `rerun`: real nodes again from a recording, in virtual time, the same every time.
+
+Exit status: 0 done; 1 with `--expect` when the outputs differ; 2 bad input, or a callback raised.
+"""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack, redirect_stdout
+import os
+import sys
+import traceback
+from typing import Any, BinaryIO, TYPE_CHECKING
+
+from mddag_executor import defaults
+from mddag_executor.cli import common, options
+from mddag_executor.cli.text import printable, Progress, warn
+from mddag_executor.core import POLICIES
+from mddag_executor.core import policy as find_policy
+from mddag_executor.errors import UsageError
+from mddag_executor.text import counted
+
+if TYPE_CHECKING:
+    from mddag_executor.rerun import Difference, Result
+
+EXAMPLE = """\
+mddag rerun drive.mcap graph.yaml --node my_package/tracker -o before.mcap
+mddag rerun drive.mcap graph.yaml --node my_package/tracker --expect before.mcap
+mddag rerun drive.mcap graph.yaml --node my_package.tracker:main --times run.mcap --workers 2
+
+exit status: 0 done; 1 the outputs are not those of --expect; 2 bad input, or a callback raised"""
+
+_PROGRAMS = ('bin/mddag', 'mddag_executor/__main__.py')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add('recording', metavar='BAG|TRACE',
+        help="a bag with the messages that the nodes take, or a trace of mddag run ('-': standard "
+        'input)')
+    options.add_graph(parser)
+    add('--node', metavar='SPEC', action='append', required=True,
+        help='run this node, as mddag run does; repeat it for more nodes')
+    add('-o', '--output', metavar='OUT.mcap',
+        help='write what the nodes publish to this bag, with virtual times')
+    add('--trace', metavar='RUN.mcap', help='record the run to this file, for mddag replay')
+    add('--expect', metavar='OUT.mcap',
+        help='compare what the nodes publish with this bag, and exit with status 1 where it '
+        'differs')
+    add('--tolerance', type=options.not_negative, default=0.0, metavar='X',
+        help='with --expect: numbers with a point may differ by so much, or by this share of the '
+        'larger one (default: 0)')
+    add('--times', metavar='WHICH',
+        help='how long callbacks take: recorded (the default for a trace), declared (the default '
+        'for a bag), or a file: a trace, or JSON with execution times')
+    options.add_workers(parser)
+    add('--policy', default='rad', metavar='P',
+        help=f'one of {", ".join(POLICIES)} (default: rad)')
+    options.add_seed(
+        parser, "the seed of Python's and numpy's random numbers and of declared times", int)
+    add('--all-clocks', action='store_true',
+        help='steady and system clocks and the functions of time are virtual, too')
+    options.add_json(parser)
+    add('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='…',
+        help='the rest of the command line goes to rclpy.init, as -r from:=to')
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Run the nodes, and say what came of it.
+
+    :raises msg_graph.GraphError: when the declaration is wrong
+    :raises mddag_executor.errors.MddagError: when anything else cannot be used, or a node fails
+    """
+    _check(args)
+    _fix_hashes()
+    # With `--json -` what nodes print must not get into the JSON.
+    with redirect_stdout(sys.stdout if common.wants_tables(args) else sys.stderr):
+        result, found = _run(args)
+    for warning in result.warnings:
+        warn(warning)
+    values = result.result()
+    if found is not None:
+        values['differences'] = [each._asdict() for each in found]
+    tables = common.write_result(args, values)
+    if tables:
+        _show(args, result, values)
+    for difference in found or ():
+        print(printable(difference.line()), file=sys.stdout if tables else sys.stderr)
+    return int(bool(found))
+
+
+def _check(args: argparse.Namespace) -> None:
+    find_policy(args.policy)
+    for option in ('output', 'trace', 'json'):
+        common.check_output(getattr(args, option))
+    if args.trace == '-':
+        raise UsageError('--trace -: a trace is not written to standard output: name a file')
+    if args.output == args.json == '-':
+        raise UsageError('-: standard output can be only one of -o and --json: name a file')
+    if args.recording == args.graph == '-':
+        raise UsageError('-: standard input can be only one of BAG and GRAPH: name the other')
+
+
+def _fix_hashes() -> None:
+    """
+    Begin anew with fixed hashes of strings, where they are drawn anew by each process.
+
+    The order of a set depends on them. (Not where something else calls this.)
+    """
+    if sys.flags.hash_randomization and sys.argv[0].endswith(_PROGRAMS):
+        os.execve(
+            sys.executable, [sys.executable, *sys.orig_argv[1:]],
+            {**os.environ, 'PYTHONHASHSEED': '0'})
+
+
+def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
+    from mddag_executor.rerun import CallbackFailed, compare, programs
+    from mddag_executor.rerun.run import Rerun, Settings
+    from mddag_executor.rerun.sources import open_source
+    task_set = common.load_graph(args.graph)
+    settings = Settings(
+        defaults.workers(args.workers, task_set), args.policy, args.seed, args.all_clocks,
+        ros_args=tuple(args.ros_args))
+    with ExitStack() as files:
+        path, name = files.enter_context(common.input_trace(args.recording))
+        source = open_source(path, task_set, args.times, args.seed, name)
+        output: BinaryIO | None = None
+        if args.output is not None:
+            output = files.enter_context(common.output_file(args.output))
+        trace = None
+        if args.trace is not None:
+            trace = files.enter_context(common.output_trace(args.trace))
+        run = Rerun(source, task_set, settings, output, trace, keep=args.expect is not None)
+        with Progress('running', (source.end - source.start) / 1e9) as line:
+            try:
+                result = run.run(
+                    lambda: programs(args.node, args.ros_args),
+                    lambda done: line.update(done / 1e9))
+            except CallbackFailed as error:
+                traceback.print_exception(error.__cause__)
+                raise
+        if args.expect is None:
+            return result, None
+        return result, compare(result, args.expect, args.tolerance)
+
+
+def _show(args: argparse.Namespace, result: Result, values: dict[str, Any]) -> None:
+    from mddag_executor.report.tables import sink_table
+    print(sink_table(values['dags']))
+    speed = result.virtual_ns / 1e9 / max(result.elapsed_s, 1e-9)
+    print(f'{counted(result.callbacks, "callback")}, {result.virtual_ns / 1e9:.3f} s in '
+          f'{result.elapsed_s:.3f} s ({speed:.1f} times as fast as real time)')
+    print(f'{counted(sum(result.counts.values()), "message")} published, {result.digest}')
+    for difference in result.recorded:
+        print(f'recorded, too: {printable(difference.line())}')
+    if args.expect is not None and not values['differences']:
+        print(f'the same as {printable(args.expect)}')

@@ -1,0 +1,121 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Run real nodes again from a recording, in virtual time, the same every time.
+
+In a test::
+
+    from mddag_executor.rerun import assert_same, rerun
+
+    def test_tracker(tmp_path):
+        result = rerun('drive.mcap', 'graph.yaml', ['my_robot.tracker:main'])
+        assert_same(result, 'expected.mcap', tolerance=1e-6)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+import os
+from typing import Any
+
+from mddag_executor import defaults
+from mddag_executor.core import policy as find_policy
+from mddag_executor.live.loading import Program, resolve
+from mddag_executor.rerun.compare import Difference, differences
+from mddag_executor.rerun.errors import CallbackFailed, RerunError
+from mddag_executor.rerun.outputs import Output
+from mddag_executor.rerun.recording import Recording
+from mddag_executor.rerun.run import PATIENCE_S, Rerun, Result, Settings
+from mddag_executor.rerun.sources import open_source
+from msg_graph import load, TaskSet
+
+__all__ = [
+    'assert_same', 'CallbackFailed', 'compare', 'Difference', 'Output', 'rerun', 'RerunError',
+    'Result']
+
+NodeSpec = str | Callable[[], Any]
+
+
+def rerun(
+    recording: str | os.PathLike[str],
+    graph: str | os.PathLike[str] | TaskSet,
+    nodes: Sequence[NodeSpec],
+    *,
+    times: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    policy: str = 'rad',
+    seed: int = 0,
+    all_clocks: bool = False,
+    ros_args: Sequence[str] = (),
+    output: str | os.PathLike[str] | None = None,
+    trace: str | os.PathLike[str] | None = None,
+    patience_s: float = PATIENCE_S,
+) -> Result:
+    """
+    Run nodes from a recording in virtual time.
+
+    rclpy must not be initialised before; nodes that programs make live in a context of this run.
+
+    :param recording: a bag, or a trace of this executor.
+    :param graph: the declaration: a file, or a task set.
+    :param nodes: as for ``mddag run --node``; or classes of nodes, or functions that return nodes.
+    :param times: ``recorded``, ``declared``, or a file (see ``sources.open_source``).
+    :param output: a file that gets the outputs as a bag; ``trace``: one that gets the run.
+    :param patience_s: a callback that uses no CPU for so long is blocked for ever.
+    :raises mddag_executor.errors.MddagError: on whatever keeps the run from going on; a
+        ``CallbackFailed`` for what a callback raised, which is its cause.
+    :raises msg_graph.GraphError: when the declaration is wrong.
+    """
+    task_set = graph if isinstance(graph, TaskSet) else load(os.fspath(graph))
+    find_policy(policy)
+    settings = Settings(
+        defaults.workers(workers, task_set), policy, seed, all_clocks, patience_s,
+        tuple(ros_args))
+    source = open_source(
+        os.fspath(recording), task_set, None if times is None else os.fspath(times), seed)
+    where = None if trace is None else os.fspath(trace)
+    with ExitStack() as files:
+        file = None if output is None else files.enter_context(open(output, 'wb'))
+        run = Rerun(source, task_set, settings, file, where)
+        return run.run(lambda: programs(nodes, ros_args))
+
+
+def programs(nodes: Sequence[NodeSpec], ros_args: Sequence[str] = ()) -> list[Program]:
+    """Find the programs that bring nodes."""
+    arguments = ['--ros-args', *ros_args] if ros_args else []
+    return [
+        resolve(node, arguments) if isinstance(node, str)
+        else Program(getattr(node, '__name__', repr(node)), 'rerun', node) for node in nodes]
+
+
+def compare(
+    result: Result, expected: str | os.PathLike[str], tolerance: float = 0.0
+) -> list[Difference]:
+    """
+    Return how the outputs of a run differ from those in a bag, topic by topic.
+
+    :raises mddag_executor.errors.MddagError: when the bag cannot be read.
+    """
+    recording = Recording(os.fspath(expected))
+    try:
+        recording.load(recording.topics)
+        return differences(
+            result.outputs, recording.messages(), result.start_ns, tolerance)
+    finally:
+        recording.close()
+
+
+def assert_same(
+    result: Result, expected: str | os.PathLike[str], tolerance: float = 0.0
+) -> None:
+    """
+    Check that the outputs of a run are those in a bag.
+
+    :raises AssertionError: where they are not; it says where each topic differs first.
+    """
+    found = compare(result, expected, tolerance)
+    if found:
+        raise AssertionError('\n'.join(
+            [f'the outputs are not those of {os.fspath(expected)}:',
+             *(difference.line() for difference in found)]))

@@ -1,0 +1,183 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Whether two runs have published the same: message by message, field by field.
+
+Theory of operation
+-------------------
+The messages of a topic are compared one by one, in their order.  What is told of a topic is where
+it differs first, and whether only in *timing*: the same messages, but at other times, or with
+other stamps in them (fields of type ``builtin_interfaces/Time``).
+
+Numbers with a point are equal within a tolerance ``x``: where their difference is at most ``x``,
+or ``x`` times the larger one.  What is not a number equals itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+import math
+from typing import Any, NamedTuple
+
+from mddag_executor.rerun.outputs import Output
+from mddag_executor.rerun.recording import Recorded
+from mddag_executor.rerun.types import type_name
+from rclpy.serialization import deserialize_message
+
+CONTENT, TIMING, MISSING = 'content', 'timing', 'missing'
+
+
+class Difference(NamedTuple):
+    """
+    How a topic differs.
+
+    :ivar kind: ``content``, ``timing`` (only times differ), or ``missing`` (one side has none).
+    :ivar number: which of its messages is the first that differs, from 0; -1: none, there are
+        only more or fewer.
+    :ivar time: the virtual time of that message in this run, ns after its start.
+    :ivar field: the first field that differs; empty: when it was published.
+    """
+
+    topic: str
+    kind: str
+    number: int
+    time: int
+    field: str
+    expected: str
+    found: str
+    messages: int
+    expected_messages: int
+
+    def line(self) -> str:
+        """Return it on one line."""
+        counts = ''
+        if self.messages != self.expected_messages:
+            counts = f'; {self.messages} messages, expected {self.expected_messages}'
+        if self.number < 0:
+            return f'{self.topic}: {self.kind}{counts}'
+        what = self.field or 'the time of publication'
+        return (
+            f'{self.topic}: {self.kind}, first in message {self.number} at '
+            f'{self.time / 1e9:.6f} s: {what} is {self.found}, expected {self.expected}{counts}')
+
+
+def differences(
+    outputs: Iterable[Output], expected: Iterable[Recorded], start: int, tolerance: float = 0.0,
+) -> list[Difference]:
+    """
+    Compare what was published with what is expected, topic by topic.
+
+    :param start: the virtual time at which the run began.
+    """
+    found: dict[str, list[Output]] = {}
+    for output in outputs:
+        found.setdefault(output.topic, []).append(output)
+    wanted: dict[str, list[Recorded]] = {}
+    for message in expected:
+        wanted.setdefault(message.topic, []).append(message)
+    results = []
+    for topic in sorted({*found, *wanted}):
+        one = _Topic(topic, start, tolerance).compare(
+            found.get(topic, []), wanted.get(topic, []))
+        if one is not None:
+            results.append(one)
+    return results
+
+
+class _Topic:
+    """Compares the messages of one topic."""
+
+    def __init__(self, topic: str, start: int, tolerance: float) -> None:
+        self._topic = topic
+        self._start = start
+        self._tolerance = tolerance
+
+    def compare(
+        self, found: Sequence[Output], expected: Sequence[Recorded]
+    ) -> Difference | None:
+        counts = len(found), len(expected)
+        timing: Difference | None = None
+        for number, (one, other) in enumerate(zip(found, expected)):
+            at = one.time - self._start
+            if other.kind != type_name(one.kind):
+                return Difference(self._topic, CONTENT, number, at, 'its type', other.kind,
+                                  type_name(one.kind), *counts)
+            for path, a, b, is_time in self._fields(one, other):
+                difference = Difference(
+                    self._topic, TIMING if is_time else CONTENT, number, at, path, _shown(b),
+                    _shown(a), *counts)
+                if not is_time:
+                    return difference
+                timing = timing or difference
+            if timing is None and one.time != other.time:
+                timing = Difference(
+                    self._topic, TIMING, number, at, '',
+                    f'{(other.time - self._start) / 1e9:.6f} s', f'{at / 1e9:.6f} s', *counts)
+        if len(found) == len(expected):
+            return timing
+        if timing is not None:
+            return timing._replace(kind=MISSING)
+        number = min(counts)
+        time = found[number].time if len(found) > number else expected[number].time
+        sides = ('nothing', 'there') if len(found) > number else ('a message', 'missing')
+        return Difference(
+            self._topic, MISSING, number, time - self._start, 'it', *sides, *counts)
+
+    def _fields(
+        self, one: Output, other: Recorded
+    ) -> Iterator[tuple[str, Any, Any, bool]]:
+        if one.data == other.data:
+            return
+        try:
+            expected = deserialize_message(other.data, one.kind)
+        except Exception:
+            yield 'its content', 'a message', 'what does not decode', False
+            return
+        yield from self._unequal('', deserialize_message(one.data, one.kind), expected, False)
+
+    def _unequal(
+        self, path: str, a: Any, b: Any, is_time: bool
+    ) -> Iterator[tuple[str, Any, Any, bool]]:
+        """Yield the fields that differ: path, both values, whether it is of a time."""
+        if hasattr(a, 'get_fields_and_field_types'):
+            kind = type_name(type(a))
+            is_time = is_time or kind == 'builtin_interfaces/msg/Time'
+            for name in a.get_fields_and_field_types():
+                yield from self._unequal(
+                    f'{path}.{name}' if path else name, getattr(a, name), getattr(b, name),
+                    is_time)
+        elif isinstance(a, (str, bytes)) or not hasattr(a, '__len__'):
+            if not self._same(a, b):
+                yield path, a, b, is_time
+        elif len(a) != len(b):
+            yield f'the length of {path}', len(a), len(b), is_time
+        elif not _same_array(a, b):
+            for i, (x, y) in enumerate(zip(a, b)):
+                yield from self._unequal(f'{path}[{i}]', x, y, is_time)
+
+    def _same(self, a: Any, b: Any) -> bool:
+        if a == b:
+            return True
+        try:
+            if math.isnan(a) and math.isnan(b):
+                return True
+            difference = abs(a - b)
+        except TypeError:
+            return False
+        if not self._tolerance or float(a).is_integer() and isinstance(a, int):
+            return False
+        limit = self._tolerance * max(1.0, abs(a), abs(b))
+        return bool(difference <= limit)
+
+
+def _same_array(a: Any, b: Any) -> bool:
+    """Return whether arrays are the same without a look at each number."""
+    try:
+        return bool(a.tobytes() == b.tobytes())
+    except AttributeError:
+        return bool(type(a) is bytes and a == b)
+
+
+def _shown(value: Any) -> str:
+    text = repr(value.item() if hasattr(value, 'item') else value)
+    return text if len(text) <= 60 else f'{text[:57]}...'

@@ -1,0 +1,25 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What can go wrong in a rerun."""
+
+from __future__ import annotations
+
+from mddag_executor.errors import MddagError
+
+
+class RerunError(MddagError):
+    """A run that cannot go on; its text is `PLACE: what is wrong: what to do`."""
+
+
+class CallbackFailed(RerunError):
+    """
+    A callback, or a program's main, has raised: the cause of this exception.
+
+    :ivar at_ns: the virtual time, ns after the start of the recording.
+    """
+
+    def __init__(self, name: str, error: BaseException, at_ns: int) -> None:
+        what = ' '.join(f'{type(error).__name__}: {error}'.split())
+        super().__init__(
+            f'{name}: it raised {what} at {at_ns / 1e9:.6f} s: correct it, or see its traceback')
+        self.at_ns = at_ns

@@ -1,0 +1,110 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What the nodes of a run have as their executor: it spins nothing, the loop runs them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from mddag_executor.live.compat import BareExecutor
+from mddag_executor.live.entity import Entity, TASK
+from mddag_executor.live.hosting import Guest, Host
+from mddag_executor.live.tasks import make_task, Unclaimed
+from mddag_executor.live.work import QuickCallback, Work
+from mddag_executor.rerun.loop import Loop
+from rclpy.node import Node
+from rclpy.task import Future, Task
+
+
+class NodeHolder(BareExecutor):
+    """
+    The executor of the nodes of a run.
+
+    :ivar task_entity: what the run keeps for tasks.
+    """
+
+    def __init__(self, context: Any) -> None:
+        super().__init__(context=context)
+        self.task_entity = Entity(TASK, None, '', None, -1, 0, '')
+        self.loop: Loop | None = None
+        self._unclaimed = Unclaimed(self._fail)
+
+    def _fail(self, error: BaseException) -> None:
+        raise error
+
+    def ordered_nodes(self) -> list[Node]:
+        """Return the nodes, by name: their order must not depend on the machine."""
+        return sorted(self.get_nodes(), key=lambda node: node.get_fully_qualified_name())
+
+    def wake(self) -> None:
+        """Take note that entities have come or gone."""
+        if self.loop is not None:
+            self.loop.changed = True
+
+    def add_node(self, node: Node) -> bool:
+        """Add a node."""
+        added: bool = super().add_node(node)
+        self.wake()
+        return added
+
+    def remove_node(self, node: Node) -> None:
+        """Remove a node."""
+        super().remove_node(node)
+        self.wake()
+
+    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
+        """Run a function or coroutine in the run; return its task, which is a future."""
+        if type(callback) is QuickCallback:
+            task = Task(callback, args, kwargs)
+            task()
+            return task
+        task, work = make_task(
+            self.task_entity, self, self._resume, self._unclaimed, callback, args, kwargs)
+        assert self.loop is not None
+        self.loop.soon(partial(self._ready, work))
+        return task
+
+    def _ready(self, work: Work) -> None:
+        assert self.loop is not None
+        self.loop.engine.ready(work, self.loop.now)
+
+    def _resume(self, work: Work) -> None:
+        assert self.loop is not None
+        self.loop.soon(partial(self.loop.engine.resume, work))
+
+    def create_future(self) -> Future:
+        """Return a future whose callbacks run in the run."""
+        return Future(executor=self)
+
+
+class RerunHost(Host):
+    """Runs programs as strands: their waiting takes virtual time."""
+
+    def __init__(self, executor: NodeHolder, end_run: Callable[[], None], loop: Loop) -> None:
+        super().__init__(executor, end_run)
+        self._loop = loop
+
+    def wait(
+        self, timeout_s: float | None, event: Any = None, guest: Guest | None = None,
+    ) -> None:
+        """Wait in virtual time for an event, the end of the run or of a program, or for a time."""
+        loop = self._loop
+        if loop.strands.mine() is None:
+            super().wait(timeout_s, event, guest)
+            return
+        if self.current_guest() is None and event is not None and event is self.guests[-1].settled:
+            thread = self.guests[-1].thread
+            loop.wait(lambda: event.is_set() or loop.strands.has_waiting(thread), None,
+                      'for a program to start')
+            return
+        deadline = None if timeout_s is None or timeout_s < 0 else loop.now + round(
+            timeout_s * 1e9)
+
+        def over() -> bool:
+            return (guest is not None and guest.ended.is_set()
+                    or event is not None and event.is_set())
+
+        nothing = event is None and guest is None
+        loop.wait(None if nothing else over, deadline, 'for the end of the run')

@@ -1,0 +1,334 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The run in virtual time: what happens next, and which callback runs.
+
+Theory of operation
+-------------------
+Time jumps from event to event.  At one instant first executions end, workers in ascending order;
+then messages arrive, in the order in which they were sent; then come the recorded messages, in
+their order, and the timers that are due; then strands go on whose time is over (``strands``); then
+the core dispatches until it has nothing left to do.  All that this causes at the same instant is
+done before time goes on.
+
+A callback runs, for real and at once, when the core dispatches it.  In virtual time it takes as
+long as ``times`` says, or as long as it has waited, if that is more.  What it sends is *held*
+until its virtual end, or until it begins to wait, for others may have to answer it.  A message
+whose recorded transport time is negative left before the end, and does so here.
+
+What threads of others send has no virtual time: it is taken as of when it comes, and a warning
+says so.
+
+The run is over when nothing is left to happen, or at ``end``.  Then no timer fires any more, but
+what has begun is completed, for ``DRAIN_NS`` at most.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from heapq import heappop, heappush
+import itertools
+from typing import Any, Protocol
+
+from mddag_executor.live.compat import UNKNOWN
+from mddag_executor.live.engine import Engine
+from mddag_executor.live.gates import Refused
+from mddag_executor.live.jobs import Origin
+from mddag_executor.live.work import Destroyed, QuickCallback, Work
+from mddag_executor.rerun.errors import CallbackFailed, RerunError
+from mddag_executor.rerun.strands import Strands
+from mddag_executor.rerun.times import Times
+
+DRAIN_NS = 10_000_000_000
+"""So long what has begun may go on after the end of the recording."""
+POLL_NS = 1_000_000
+"""How often a coroutine looks again that waits for something unknown."""
+MOST_AT_ONCE = 20_000
+"""So many callbacks at one instant are a circle in which nothing takes any time."""
+
+_WORKER_BITS = 48
+_LENT = 1 << 20
+# What happens at one instant, in this order.
+ENDED, ARRIVED, RECORDED, TIMER = range(4)
+
+
+class Held(Protocol):
+    """Something that an execution has sent."""
+
+    def record(self, thread: int) -> None:
+        """Be recorded, as sent by a thread of the trace."""
+
+    def early(self, origin: Origin, release: int) -> int:
+        """Return how long before the end of its execution it leaves, ns, as a negative number."""
+
+    def leave(self, origin: Origin | None, release: int, end: int) -> None:
+        """Be sent: now; the execution ends (or begins to wait) at ``end``."""
+
+
+class Execution:
+    """A callback that runs, or has run for real and not ended in virtual time."""
+
+    __slots__ = ('work', 'start', 'held', 'worker', 'thread', 'waits_for', 'origin', 'release')
+
+    def __init__(self, work: Work, start: int, release: int) -> None:
+        self.work = work
+        self.start = start
+        self.held: list[Held] = []
+        self.worker = work.worker
+        self.thread = work.worker + 1
+        self.waits_for: Any = None
+        self.origin = work.origin
+        self.release = release
+
+
+class Loop:
+    """
+    Runs callbacks in virtual time.
+
+    :param start: the virtual time at which it begins, ns since the epoch.
+    :param end: when the recording ends.
+    :param refresh: brings up to date which entities there are.
+    :param begin: is called once, in the first strand: it starts the programs; ``over``: at the
+        end, before the strands end that still wait.
+    :ivar now: the virtual time.
+    :ivar callbacks: how many callbacks have run.
+    :ivar changed: whether there may be new entities, or some are gone.
+    """
+
+    def __init__(
+        self, engine: Engine, times: Times, start: int, end: int, refresh: Callable[[], None],
+        begin: Callable[[], None], over: Callable[[], None],
+    ) -> None:
+        self.engine = engine
+        self.now = self.start = start
+        self.end = end
+        self.callbacks = 0
+        self.changed = True
+        self.strands = Strands(self._step, over)
+        self._times = times
+        self._refresh = refresh
+        self._begin: Callable[[], None] | None = begin
+        self._events: list[tuple[int, int, int, Callable[..., None], tuple[Any, ...]]] = []
+        self._order = itertools.count()
+        self._foreign: deque[Callable[[], None]] = deque()
+        self._current: Execution | None = None
+        self._resumed: set[int] = set()
+        self._at_once = 0
+        self._stopped = False
+
+    # --- what is to happen -----------------------------------------------------------------------
+
+    def at(self, time: int, kind: int, function: Callable[..., None], *args: Any) -> None:
+        """Have something happen; at one instant, in the order of kinds, then of these calls."""
+        heappush(self._events, (time, kind, next(self._order), function, args))
+
+    def soon(self, function: Callable[[], None]) -> None:
+        """Do something at once, or, where a thread of others calls, as soon as possible."""
+        if self.strands.mine() is not None:
+            function()
+        else:
+            self._foreign.append(function)
+
+    def stop(self) -> None:
+        """End the run at this instant, from any thread."""
+        self._stopped = True
+
+    @property
+    def stopped(self) -> bool:
+        """Tell whether the run is over, or about to be."""
+        return self._stopped or self.strands.over
+
+    @property
+    def current(self) -> Execution | None:
+        """Return the execution whose callback runs in the calling thread; None for no callback."""
+        return self._current if self.strands.mine() is not None else None
+
+    def here(self) -> str:
+        """Return what runs, for messages."""
+        if self._current is not None:
+            return self._current.work.entity.name
+        strand = self.strands.owner
+        return 'the run' if strand is None else strand.name
+
+    # --- the steps -------------------------------------------------------------------------------
+
+    def _step(self) -> bool:
+        """Do the next thing; False: there is none."""
+        if self._begin is not None:
+            begin, self._begin = self._begin, None
+            begin()
+            return True
+        while self._foreign:
+            self._foreign.popleft()()
+        if self.changed:
+            self.changed = False
+            self._refresh()
+        if self._stopped:
+            return False
+        events, now = self._events, self.now
+        if events and events[0][0] <= now:
+            _, _, _, function, args = heappop(events)
+            function(*args)
+            return True
+        deadline = self.strands.next_deadline() if self.strands.waiting else None
+        if deadline is not None and deadline <= now:
+            self.strands.expire(now)
+            return True
+        engine = self.engine
+        work = engine.dispatch(now) if engine.has_waiting else None
+        if work is not None:
+            self._execute(work)
+            return True
+        return self._advance(deadline)
+
+    def _advance(self, deadline: int | None) -> bool:
+        """Let time go on to what comes next."""
+        next_at = self._events[0][0] if self._events else None
+        if deadline is not None and deadline <= self.end and (
+                next_at is None or deadline < next_at):
+            next_at = deadline
+        if next_at is None or next_at > self.end + DRAIN_NS:
+            return False
+        self.now = next_at
+        self._at_once = 0
+        return True
+
+    # --- callbacks -------------------------------------------------------------------------------
+
+    def _execute(self, work: Work) -> None:
+        """Run a callback that the core has dispatched, as far as it goes without waiting."""
+        entity = work.entity
+        self._at_once += 1
+        if self._at_once > MOST_AT_ONCE:
+            raise RerunError(
+                f'{entity.name}: virtual time stands still at '
+                f'{(self.now - self.start) / 1e9:.6f} s: callbacks start one another and take no '
+                'time: declare their execution_time')
+        origin = work.origin
+        release = 0 if origin is None else self.engine.release_of(work)
+        execution = self._current = Execution(work, self.now, release)
+        takes = self._execution_time(work, origin, release)
+        try:
+            execution.waits_for = work.step() if entity.gate is None else entity.gate.step(work)
+        except Destroyed:
+            self.engine.destroyed(work, self.now)
+            return
+        except Refused:
+            self.engine.refused(work, self.now)
+            return
+        except SystemExit as error:
+            if error.code not in (None, 0):
+                raise CallbackFailed(entity.name, error, self.now - self.start) from error
+            self.stop()
+        except Exception as error:
+            raise CallbackFailed(entity.name, error, self.now - self.start) from error
+        finally:
+            self._current = None
+        self.callbacks += 1
+        end = max(self.now, execution.start + takes)
+        if end > self.now:
+            self._let_leave_early(execution, end)
+        order = (work.worker << _WORKER_BITS) + next(self._order)
+        heappush(self._events, (end, ENDED, order, self._ended, (execution, end)))
+
+    def _execution_time(self, work: Work, origin: Origin | None, release: int) -> int:
+        """Return how long a callback takes: its first piece all of it, a sync its last leg."""
+        if origin is None:
+            return 0
+        if work.x in self._resumed:
+            self._resumed.discard(work.x)
+            return 0
+        if not self.engine.makes_whole(work):
+            return 0
+        return self._times.execution(origin.dag, origin.vertex, release)
+
+    def _let_leave_early(self, execution: Execution, end: int) -> None:
+        """Have messages leave before the end that did so in the recording."""
+        origin = execution.origin
+        if origin is None:
+            return
+        kept = []
+        for held in execution.held:
+            early = held.early(origin, execution.release)
+            if early < 0:
+                held.record(execution.thread)
+                self.at(max(self.now, end + early), ARRIVED, held.leave, origin,
+                        execution.release, end)
+            else:
+                kept.append(held)
+        execution.held = kept
+
+    def _ended(self, execution: Execution, now: int) -> None:
+        """End an execution in virtual time, or suspend it."""
+        work, engine, worker = execution.work, self.engine, execution.worker
+        start, waits_for = execution.start, execution.waits_for
+        work.entity.busy_ns += now - start
+        held = execution.held
+        for each in held:
+            each.record(execution.thread)  # before its callback's end
+        if waits_for is None:
+            engine.finished(work, start, now, now, execution.thread, worker)
+        else:
+            engine.suspended(work, start, now, execution.thread, worker)
+            self._resumed.add(work.x)
+            self._resume_when_done(work, waits_for)
+        for each in held:
+            each.leave(execution.origin, execution.release, now)
+        if engine.to_ask_again:
+            engine.ask_again()
+
+    def _resume_when_done(self, work: Work, waits_for: Any) -> None:
+        resume = partial(self.engine.resume, work)
+        if waits_for is UNKNOWN or not hasattr(waits_for, 'add_done_callback'):
+            self.at(self.now + POLL_NS, ARRIVED, resume)
+        else:
+            waits_for.add_done_callback(QuickCallback(partial(self.soon, resume)))
+
+    def send(self, held: Held) -> None:
+        """Send something: when the callback that runs ends, or else at once."""
+        execution = self.current
+        if execution is not None:
+            execution.held.append(held)
+        else:
+            self.soon(partial(held.leave, None, 0, self.now))
+
+    # --- waiting ---------------------------------------------------------------------------------
+
+    def wait(
+        self, until: Callable[[], bool] | None, deadline: int | None, place: str,
+        lends: bool = False,
+    ) -> bool:
+        """
+        Wait in virtual time, in the strand that calls; return whether it came true.
+
+        :param deadline: when not to wait any longer; None: never.
+        :param lends: whether its worker may run something else meanwhile.
+        """
+        if until is not None and until():
+            return True
+        execution = self._current
+        if execution is not None:
+            held, execution.held = execution.held, []
+            for each in held:
+                each.record(execution.thread)
+                each.leave(execution.origin, execution.release, self.now)
+            if lends and execution.worker >= 0 and execution.work.x >= 0:
+                self.engine.lend(execution.work)
+                execution.worker = -1
+                execution.thread = _LENT + next(self._order)
+        strand = self.strands.mine()
+        assert strand is not None
+        strand.execution, self._current = execution, None
+        try:
+            return self.strands.wait(until, deadline, place)
+        finally:
+            self._current, strand.execution = strand.execution, None
+
+    def blocked(self) -> list[str]:
+        """Return which callbacks wait for something that has not come."""
+        return [
+            f'{strand.execution.work.entity.name}: it still waits ({strand.place})'
+            for strand in self.strands.waiting
+            if strand.execution is not None and strand.deadline is None]

@@ -1,0 +1,114 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the nodes of a run have published: its digest, and the bag that has it.
+
+The digest is that of all messages in their order: of each its virtual time, the name of its topic,
+that of its type, and its bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from typing import Any, BinaryIO, NamedTuple
+
+from mddag_executor.rerun.types import definition, type_name
+
+_HEAD = struct.Struct('<qII')
+PROFILE = 'ros2'
+
+
+class Output(NamedTuple):
+    """A message that was published."""
+
+    time: int
+    topic: str
+    kind: Any
+    data: bytes
+
+
+class Outputs:
+    """
+    Collects what is published.
+
+    :param file: gets it as a bag, where one is wanted.
+    :param keep: whether to keep the messages.
+    :ivar messages: what was kept.
+    :ivar counts: how many messages were published, by topic.
+    """
+
+    def __init__(self, file: BinaryIO | None, keep: bool) -> None:
+        self.messages: list[Output] = []
+        self.counts: dict[str, int] = {}
+        self._keep = keep
+        self._hash = hashlib.sha256()
+        self._bag = None if file is None else _Bag(file)
+
+    def add(self, time: int, topic: str, kind: Any, data: bytes, publisher: Any) -> None:
+        """Add a message."""
+        self.counts[topic] = self.counts.get(topic, 0) + 1
+        if self._keep:
+            self.messages.append(Output(time, topic, kind, data))
+        name = type_name(kind)
+        head = f'{topic}\n{name}\n'.encode()
+        self._hash.update(_HEAD.pack(time, len(head), len(data)))
+        self._hash.update(head)
+        self._hash.update(data)
+        if self._bag is not None:
+            self._bag.add(time, topic, kind, data, publisher)
+
+    @property
+    def digest(self) -> str:
+        """Return the digest of all messages so far."""
+        return f'sha256:{self._hash.hexdigest()}'
+
+    def finish(self) -> None:
+        """Complete the bag."""
+        if self._bag is not None:
+            self._bag.finish()
+
+
+class _Bag:
+    """An MCAP file as rosbag2 writes it."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        from mcap.writer import CompressionType, Writer
+        self._writer: Any = Writer(file, compression=CompressionType.ZSTD)
+        self._writer.start(profile=PROFILE, library='mddag_executor rerun')
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+        self._sequence = 0
+
+    def add(self, time: int, topic: str, kind: Any, data: bytes, publisher: Any) -> None:
+        name = type_name(kind)
+        channel = self._channels.get((topic, name))
+        if channel is None:
+            channel = self._channels[topic, name] = self._writer.register_channel(
+                topic, 'cdr', self._schema(name, kind),
+                {'offered_qos_profiles': _qos(publisher.qos_profile)})
+        self._sequence += 1
+        self._writer.add_message(channel, time, data, time, self._sequence)
+
+    def _schema(self, name: str, kind: Any) -> int:
+        schema = self._schemas.get(name)
+        if schema is None:
+            schema = self._schemas[name] = self._writer.register_schema(
+                name, 'ros2msg', definition(kind).encode())
+        return schema
+
+    def finish(self) -> None:
+        self._writer.finish()
+
+
+def _qos(profile: Any) -> str:
+    """Return a QoS profile as rosbag2 writes it, so that it plays the topic with it."""
+    return ''.join((
+        f'- history: {profile.history.short_key}\n  depth: {profile.depth}\n',
+        f'  reliability: {profile.reliability.short_key}\n',
+        f'  durability: {profile.durability.short_key}\n',
+        '  deadline:\n    sec: 9223372036\n    nsec: 854775807\n',
+        '  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n',
+        f'  liveliness: {profile.liveliness.short_key}\n',
+        '  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n',
+        '  avoid_ros_namespace_conventions: false\n'))

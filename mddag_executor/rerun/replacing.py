@@ -1,0 +1,34 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Functions and methods that do something else for as long as a run lasts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+
+class Replacements:
+    """What has been replaced, so that it can be put back."""
+
+    def __init__(self) -> None:
+        self._saved: list[tuple[Any, str, Any]] = []
+
+    def replace(self, owner: Any, name: str, make: Callable[[Any], Any]) -> None:
+        """
+        Replace a function of a module, or a method or property of a class.
+
+        :param make: returns what stands there from now on, given what stood there.
+        """
+        original = vars(owner)[name]
+        self._saved.append((owner, name, original))
+        replacement = make(original)
+        if callable(original) and replacement.__doc__ is None:
+            replacement.__doc__ = original.__doc__
+        setattr(owner, name, replacement)
+
+    def undo(self) -> None:
+        """Put everything back."""
+        while self._saved:
+            owner, name, original = self._saved.pop()
+            setattr(owner, name, original)

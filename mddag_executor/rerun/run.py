@@ -1,0 +1,391 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+A rerun: real nodes, a recording, virtual time.
+
+``rerun`` puts the parts together: what is recorded (``recording``), the engine of live runs, the
+loop that drives it (``loop``), what carries messages (``messages``, ``services``), and what nodes
+see of time (``clocks``, ``timers``).  The nodes are rclpy's own, in a context of their own that
+discovers nobody: for the middleware they do nothing at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+import os
+import random
+import time
+from typing import Any, BinaryIO
+
+from mddag_executor import defaults
+from mddag_executor.live import hooks
+from mddag_executor.live.engine import Engine
+from mddag_executor.live.loading import Program
+from mddag_executor.live.other_processes import OtherProcesses
+from mddag_executor.live.recorder import Recorder
+from mddag_executor.live.registry import Registry
+from mddag_executor.live.shutdown import is_over
+from mddag_executor.rerun.clocks import replace_timers, VirtualTime
+from mddag_executor.rerun.compare import Difference, differences
+from mddag_executor.rerun.errors import CallbackFailed, RerunError
+from mddag_executor.rerun.executor import NodeHolder, RerunHost
+from mddag_executor.rerun.loop import Loop, RECORDED
+from mddag_executor.rerun.messages import Messages
+from mddag_executor.rerun.outputs import Output, Outputs
+from mddag_executor.rerun.recording import Recorded
+from mddag_executor.rerun.replacing import Replacements
+from mddag_executor.rerun.services import Services
+from mddag_executor.rerun.sources import Source
+from mddag_executor.rerun.strands import Stuck
+from mddag_executor.rerun.timers import Timers
+from mddag_executor.rerun.trace import VirtualTraceWriter
+from mddag_executor.rerun.types import type_name
+from msg_graph import TaskSet
+import rclpy
+from rclpy.publisher import Publisher
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rclpy.utilities import get_default_context, try_shutdown
+
+CLOCK = '/clock'
+CLOCK_EVERY_NS = 10_000_000
+DEFAULT_DEADLINE = 100_000_000
+MAX_ACTIVE_JOBS = 64
+EXPIRE_AFTER = 1_000_000_000
+PATIENCE_S = 30.0
+_OF_ALL_NODES = {'/parameter_events'}
+_NO_DISCOVERY = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    How nodes are run again.
+
+    :ivar seed: of Python's ``random``, of numpy's legacy generator and of what is drawn.
+    :ivar all_clocks: whether steady and system clocks and Python's ``time`` are virtual, too.
+    :ivar patience_s: a callback that uses no CPU for so long is blocked for ever.
+    """
+
+    workers: int = defaults.WORKERS
+    policy: str = 'rad'
+    seed: int = 0
+    all_clocks: bool = False
+    patience_s: float = PATIENCE_S
+    ros_args: tuple[str, ...] = ()
+
+
+@dataclass
+class Result:
+    """
+    What came of a rerun.
+
+    :ivar digest: that of all outputs, see ``outputs``.
+    :ivar outputs: what was published, in order.
+    :ivar counts: how many messages were published, by topic.
+    :ivar start_ns: the virtual time at which it began.
+    :ivar recorded: how topics differ that are in the recording, too.
+    :ivar warnings: what is not the same in each run, or doubtful, one line each.
+    """
+
+    digest: str
+    outputs: list[Output]
+    counts: dict[str, int]
+    callbacks: int
+    start_ns: int
+    virtual_ns: int
+    elapsed_s: float
+    verdicts: dict[str, Any]
+    recorded: list[Difference] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def result(self) -> dict[str, Any]:
+        """Return the result format of ``rerun --json``."""
+        return {
+            'digest': self.digest, 'messages': sum(self.counts.values()),
+            'callbacks': self.callbacks, 'virtual_s': self.virtual_ns / 1e9,
+            'elapsed_s': self.elapsed_s, 'topics': dict(sorted(self.counts.items())),
+            **self.verdicts, 'recorded': [each._asdict() for each in self.recorded],
+            'warnings': self.warnings}
+
+
+class Rerun:
+    """
+    One run; ``run`` runs it.
+
+    :param output: gets the outputs as a bag.
+    :param trace: the file that the run is recorded to.
+    :param keep: whether the result has the outputs.
+    """
+
+    def __init__(
+        self, source: Source, task_set: TaskSet, settings: Settings,
+        output: BinaryIO | None = None, trace: str | None = None, keep: bool = True,
+    ) -> None:
+        self._source = source
+        self._task_set = task_set
+        self._settings = settings
+        self._trace = trace
+        self._replacements = Replacements()
+        self.warnings: list[str] = []
+        self._outputs = Outputs(output, keep or bool(source.topics))
+        self._programs: Callable[[], Sequence[Program]] = tuple
+
+    # --- parts -----------------------------------------------------------------------------------
+
+    def _make(self, context: Any) -> None:
+        settings, source, task_set = self._settings, self._source, self._task_set
+        self._holder = NodeHolder(context)
+        writer = None if self._trace is None else VirtualTraceWriter(self._trace)
+        clock = _TraceTime(source.start)
+        self._recorder = None if writer is None else Recorder(
+            writer.path, task_set, settings.policy, settings.workers, DEFAULT_DEADLINE,
+            MAX_ACTIVE_JOBS, clock, writer)
+        self._engine = Engine(
+            task_set, settings.workers, settings.policy, default_deadline=DEFAULT_DEADLINE,
+            max_active_jobs=MAX_ACTIVE_JOBS, expire_after=EXPIRE_AFTER,
+            record=None if writer is None else writer.record)
+        self._engine.other_processes = OtherProcesses(
+            task_set, self._engine.tables, self._engine.scheduler, self._engine.jobs,
+            task_set.dags)
+        self._loop = loop = Loop(
+            self._engine, source.times, source.start, source.end, self._refresh, self._begin,
+            self._over)
+        clock.loop = self._holder.loop = loop
+        self._registry = Registry(task_set, self._engine, self._engine.leave_group)
+        self._messages = Messages(
+            loop, source.times, self._outputs, task_set, self._recorder, self._warn)
+        self._services = Services(loop, self._holder, self._warn)
+        self._timers = Timers(loop, source.first_release)
+        self._host = RerunHost(self._holder, loop.stop, loop)
+        if self._recorder is not None:
+            self._recorder.entities((), [self._holder.task_entity])
+
+    def _warn(self, text: str) -> None:
+        if text not in self.warnings:
+            self.warnings.append(text)
+
+    # --- the run ---------------------------------------------------------------------------------
+
+    def run(
+        self, programs: Callable[[], Sequence[Program]], tick: Callable[[int], None] | None = None
+    ) -> Result:
+        """
+        Run the programs from the start of the recording to its end.
+
+        :param programs: finds them, with virtual time in place.
+        :param tick: told now and then how far the run is, ns.
+        :raises RerunError: on whatever keeps it from going on.
+        """
+        begin = time.monotonic()
+        self._programs = programs
+        with _context(self._settings.ros_args) as context:
+            hooks.install()
+            self._make(context)
+            loop = self._loop
+            try:
+                self._install()
+                with self._host:
+                    self._seed()
+                    loop.strands.run(
+                        self._settings.patience_s,
+                        lambda: tick(loop.now - loop.start) if tick is not None else None)
+            except Stuck as stuck:
+                raise self._blocked(stuck) from None
+            finally:
+                self._replacements.undo()
+                if self._recorder is not None:
+                    self._recorder.close(loop.now)
+        self._check_programs()
+        self._outputs.finish()
+        return self._result(time.monotonic() - begin)
+
+    def _install(self) -> None:
+        replace = self._replacements.replace
+        messages = self._messages
+        virtual = VirtualTime(
+            self._loop, self._settings.all_clocks, CLOCK in self._source.topics,
+            self._settings.seed, self._warn)
+        virtual.install(replace)
+        replace_timers(self._replacements, self._timers)
+        self._services.install(self._replacements)
+        replace(Publisher, 'publish', lambda original: (
+            lambda publisher, msg: messages.publish(publisher, msg)))
+        replace(Publisher, 'get_subscription_count', lambda original: (
+            lambda publisher: messages.subscription_count(publisher)))
+        replace(Publisher, 'wait_for_all_acked', lambda original: lambda *args, **more: True)
+        replace(Subscription, 'get_publisher_count', lambda original: (
+            lambda subscription: messages.publisher_count(subscription.topic_name)))
+
+    def _seed(self) -> None:
+        random.seed(self._settings.seed)
+        try:
+            import numpy
+        except ImportError:
+            return
+        numpy.random.seed(self._settings.seed % 2 ** 32)
+
+    def _begin(self) -> None:
+        """Start the programs, one after the other; each runs until it waits for something."""
+        self._host.start(self._programs(), self._settings.ros_args)
+        self._refresh()
+        self._check_topics()
+        self._play_from(self._loop.start)
+
+    def _check_topics(self) -> None:
+        hosted = self._registry.hosted()
+        name = self._source.name
+        if not hosted:
+            raise RerunError(
+                f'{self._task_set.file}: none of its callbacks is in the nodes that run: give the '
+                'nodes that it declares')
+        there = {*self._source.topics, *self._messages.offered, CLOCK}
+        for callback in self._task_set.callbacks:
+            for topic in callback.topics:
+                if callback.key in hosted and topic not in there:
+                    raise RerunError(
+                        f'{name}: {topic}, which {callback.key} needs, is not recorded: record '
+                        'it, or run the node that publishes it with --node')
+
+    def _refresh(self) -> None:
+        """Take in which entities there are."""
+        nodes = self._holder.ordered_nodes()
+        registry, engine, now = self._registry, self._engine, self._loop.now
+        added, gone = registry.refresh(nodes)
+        if added or gone:
+            assert engine.other_processes is not None
+            engine.other_processes.host(
+                registry.hosted(), registry.subscriptions(), engine.record, now)
+        for entity in added:
+            entity.since = now
+        for entity in gone:
+            engine.remove(entity, now)
+        self._timers.refresh(registry.timers())
+        self._services.refresh(registry.by_id.values())
+        if self._recorder is not None:
+            self._recorder.entities(nodes, added)
+        new = self._messages.refresh(nodes, registry.subscriptions())
+        if new and self._messages_wanted() and now > self._loop.start:
+            self._play_from(now)
+
+    # --- what is recorded ------------------------------------------------------------------------
+
+    def _messages_wanted(self) -> bool:
+        """Load what the nodes need of the recording; return whether that is more than before."""
+        recording = self._source.messages
+        if recording is None:
+            return False
+        topics = self._messages.topics()
+        more = recording.load({*topics, *self._messages.offered})
+        for topic, kind in topics.items():
+            recorded = recording.kinds.get(topic)
+            if recorded is not None and topic not in self._messages.offered and (
+                    recorded != type_name(kind)):
+                raise RerunError(
+                    f'{recording.name}: {topic} was recorded as {recorded}, and the node '
+                    f'subscribes to it as {type_name(kind)}: record it anew, or correct the node')
+        return more
+
+    def _play_from(self, since: int) -> None:
+        """Deliver the recorded messages from a time on."""
+        self._messages_wanted()
+        recording = self._source.messages
+        if recording is not None:
+            self._playing = recording.messages(since)
+            self._next(self._playing)
+
+    def _next(self, playing: Iterator[Recorded]) -> None:
+        message = next(playing, None)
+        if message is not None:
+            self._loop.at(message.time, RECORDED, self._deliver, playing, message)
+
+    def _deliver(self, playing: Iterator[Recorded], message: Recorded) -> None:
+        if playing is not self._playing:
+            return  # it begins anew, with more topics
+        self._messages.recorded(message.topic, message.data, message.published)
+        self._next(playing)
+
+    # --- the end ---------------------------------------------------------------------------------
+
+    def _over(self) -> None:
+        """Judge what is open; then let programs end, whose context has ended."""
+        self.warnings += self._loop.blocked()
+        self._engine.finish(self._loop.now)
+        self._host.close()
+        self._holder.context.try_shutdown()
+
+    def _blocked(self, stuck: Stuck) -> RerunError:
+        at = (self._loop.now - self._loop.start) / 1e9
+        return RerunError(
+            f'{self._loop.here()}: it has been blocking at {stuck.place} for '
+            f'{self._settings.patience_s:g} s, at {at:.6f} s of the run: let it wait with '
+            'rclpy or threading, or correct it')
+
+    def _check_programs(self) -> None:
+        for guest in self._host.guests:
+            if guest.error is not None:
+                raise CallbackFailed(
+                    f'--node {guest.program.spec}', guest.error, self._loop.now - self._loop.start
+                ) from guest.error
+
+    def _result(self, elapsed_s: float) -> Result:
+        loop, recording = self._loop, self._source.messages
+        recorded: list[Difference] = []
+        if recording is not None:
+            both = recording.topics & self._outputs.counts.keys() - _OF_ALL_NODES
+            recorded = differences(
+                [each for each in self._outputs.messages if each.topic in both],
+                (each for each in recording.messages() if each.topic in both), loop.start)
+            recording.close()
+            self.warnings = [*recording.warnings, *self.warnings]
+        verdicts = {
+            'policy': self._settings.policy, 'workers': self._settings.workers,
+            'preemptive': False, 'duration_ns': loop.now - loop.start,
+            **self._engine.verdicts.tally.result()}
+        return Result(
+            self._outputs.digest, self._outputs.messages, self._outputs.counts, loop.callbacks,
+            loop.start, loop.now - loop.start, elapsed_s, verdicts, recorded, self.warnings)
+
+
+class _TraceTime:
+    """The clock of a trace: virtual time."""
+
+    offset_ns = 0
+
+    def __init__(self, start: int) -> None:
+        self._start = start
+        self.loop: Loop | None = None
+
+    def now(self) -> int:
+        return self._start if self.loop is None else self.loop.now
+
+
+@contextmanager
+def _context(ros_args: Sequence[str]) -> Iterator[Any]:
+    """Initialise rclpy, without discovery, and end it."""
+    context = get_default_context()
+    if not is_over(context):
+        raise RerunError(
+            'rclpy: it is initialised already: call rclpy.shutdown before, a rerun has a context '
+            'of its own')
+    before = os.environ.get(_NO_DISCOVERY)
+    os.environ[_NO_DISCOVERY] = 'OFF'
+    try:
+        rclpy.init(
+            args=['--ros-args', *ros_args] if ros_args else [],
+            signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:
+        raise RerunError(
+            f'--ros-args {" ".join(ros_args)}: {" ".join(str(error).split())[:200]}: correct it'
+        ) from error
+    finally:
+        if before is None:
+            del os.environ[_NO_DISCOVERY]
+        else:
+            os.environ[_NO_DISCOVERY] = before
+    try:
+        yield get_default_context()
+    finally:
+        try_shutdown()

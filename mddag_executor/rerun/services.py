@@ -1,0 +1,158 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Services between nodes of the run: requests and responses without a middleware.
+
+A request goes to the service of its name when the callback that sends it ends or waits; its
+response goes back when the service's callback ends.  Both are copied, as if they had been sent.
+A request to a service that no node of the run offers is never answered, and a warning says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+import copy
+from functools import partial
+import itertools
+from typing import Any
+
+from mddag_executor.live.compat import complete_request, service_name
+from mddag_executor.live.compat.in_process import new_request
+from mddag_executor.live.entity import Entity, SERVICE
+from mddag_executor.live.jobs import Origin
+from mddag_executor.live.work import Work
+from mddag_executor.rerun.loop import Loop
+from mddag_executor.rerun.replacing import Replacements
+from rclpy.client import Client
+from rclpy.exceptions import InvalidHandle
+from rclpy.service import Service
+from rclpy.task import Future
+
+
+class Call:
+    """Something that is sent, and does something when it leaves."""
+
+    __slots__ = ('_function',)
+
+    def __init__(self, function: Callable[[], None]) -> None:
+        self._function = function
+
+    def record(self, thread: int) -> None:
+        """Be recorded: there is no event for it."""
+
+    def early(self, origin: Origin, release: int) -> int:
+        """Return that it leaves at the end of its execution."""
+        return 0
+
+    def leave(self, origin: Origin | None, release: int, end: int) -> None:
+        """Do it."""
+        self._function()
+
+
+class _Header:
+    """What a request's header is to a service: who has sent it."""
+
+    __slots__ = ('client', 'number')
+
+    def __init__(self, client: Client, number: int) -> None:
+        self.client = client
+        self.number = number
+
+
+class Services:
+    """
+    Carries requests and responses.
+
+    :param executor: runs the callbacks of futures.
+    """
+
+    def __init__(self, loop: Loop, executor: Any, warn: Callable[[str], None]) -> None:
+        self._loop = loop
+        self._executor = executor
+        self._warn = warn
+        self._offered: dict[str, Entity] = {}
+        self._numbers = itertools.count(1)
+
+    def refresh(self, entities: Iterable[Entity]) -> None:
+        """Take in which services there are."""
+        self._offered = {e.label: e for e in entities if e.kind == SERVICE}
+
+    def install(self, replacements: Replacements) -> None:
+        """Have clients and services use this."""
+        replace = replacements.replace
+        replace(Client, 'call_async', lambda original: self.call_async)
+        replace(Client, 'call', lambda original: self.call)
+        replace(Client, 'service_is_ready', lambda original: self.is_offered)
+        replace(Client, 'wait_for_service', lambda original: self.wait_for_service)
+        replace(Service, 'send_response', lambda original: self.send_response)
+
+    def is_offered(self, client: Client) -> bool:
+        """Return whether a node of the run offers a client's service."""
+        entity = self._offered.get(service_name(client))
+        return entity is not None and not entity.removed
+
+    def wait_for_service(self, client: Client, timeout_sec: float | None = None) -> bool:
+        """Wait until a client's service is offered."""
+        return self._loop.wait(
+            lambda: self.is_offered(client), self._deadline(timeout_sec),
+            f'for service {service_name(client)}')
+
+    def _deadline(self, timeout_sec: float | None) -> int | None:
+        if timeout_sec is None or timeout_sec == float('inf'):
+            return None
+        return self._loop.now + max(0, round(timeout_sec * 1e9))
+
+    def call_async(self, client: Any, request: Any) -> Future:
+        """Send a request; return the future of its response."""
+        if not isinstance(request, client.srv_type.Request):
+            raise TypeError()
+        with client.handle:  # else it has been destroyed
+            pass
+        number = next(self._numbers)
+        future = new_request(client, number)
+        self._loop.send(Call(partial(self._ask, client, number, copy.deepcopy(request))))
+        return future
+
+    def call(
+        self, client: Client, request: Any, timeout_sec: float | None = None
+    ) -> Any:
+        """Send a request and wait for its response; None where it does not come in time."""
+        future = self.call_async(client, request)
+        if not self._loop.wait(
+                future.done, self._deadline(timeout_sec),
+                f'for service {service_name(client)}', lends=True):
+            client.remove_pending_request(future)
+        error = future.exception()
+        if error is not None:
+            raise error
+        return future.result()
+
+    def _ask(self, client: Client, number: int, request: Any) -> None:
+        name = service_name(client)
+        entity = self._offered.get(name)
+        if entity is None or entity.removed:
+            self._warn(f'{name}: it is called, and no node of the run offers this service')
+            return
+        service = entity.rclpy
+        work = Work(
+            service, service.callback, (request, service.srv_type.Response()),
+            partial(service.send_response, header=_Header(client, number)), entity=entity)
+        engine, now = self._loop.engine, self._loop.now
+        if entity.source >= 0:
+            engine.arrived(work, None, now, -1, now)
+        else:
+            engine.ready(work, now)
+
+    def send_response(self, service: Any, response: Any, header: _Header) -> None:
+        """Send a response."""
+        if not isinstance(response, service.srv_type.Response):
+            raise TypeError()
+        self._loop.send(Call(partial(self._answer, header, copy.deepcopy(response))))
+
+    def _answer(self, header: _Header, response: Any) -> None:
+        try:
+            with header.client.handle:
+                pass
+        except InvalidHandle:
+            return  # destroyed meanwhile
+        complete_request(header.client, header.number, response, self._executor)

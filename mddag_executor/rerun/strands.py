@@ -1,0 +1,329 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Threads of which one runs at a time, in an order that does not depend on the machine.
+
+Theory of operation
+-------------------
+A callback that waits (for a service, a rate, a time) needs a thread of its own for as long: others
+run meanwhile, and may end before or after it.  So do a program's ``main`` and the threads that
+nodes start.  All of these are *strands*.  One of them has its *turn*; the others wait for theirs,
+each at a lock of its own, and so the operating system has nothing to choose.
+
+Whoever has the turn either runs code of a node, or drives the run: it does the next thing in
+virtual time (``step``), over and over.  When code of a node waits, its strand gives the turn to
+another thread that drives (an idle one, or a new one).  That gives the turn back as soon as what
+the strand waits for has come true, or its time is over.  A callback that does not wait runs in the
+thread that drives, and no thread is switched.
+
+Threads that do not belong to the run (the middleware's) are no strands: what they call does what
+it always does.
+
+A strand that waits for something else than this (a socket, a lock that another strand has) keeps
+its turn, and the run stands still.  Whoever has started the run watches for that: a strand that
+has used no CPU for as long as ``patience_s`` is *stuck*.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+import sys
+import threading
+import time
+from typing import Any
+
+_LOOK_S = 0.05
+_END_S = 2.0
+"""So much real time strands have to end when the run is over."""
+
+
+class Strand:
+    """
+    A thread of the run, and what it waits for.
+
+    :ivar until: tells whether that has come true; None: it waits for a time, or for the end.
+    :ivar deadline: the virtual time at which it waits no longer; None: there is none.
+    :ivar execution: what it runs: kept for whoever drives the run.
+    :ivar ended: whether its function has ended.
+    """
+
+    __slots__ = ('name', 'until', 'deadline', 'place', 'execution', 'came_true', 'lock', 'ident',
+                 'clock', 'leaves', 'ended')
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.until: Callable[[], bool] | None = None
+        self.deadline: int | None = None
+        self.place = ''
+        self.execution: Any = None
+        self.came_true = False
+        self.lock = threading.Lock()
+        self.lock.acquire()
+        self.ident = 0
+        self.clock = -1
+        self.leaves = False
+        self.ended = False
+
+
+class Stuck(Exception):
+    """A strand that neither goes on nor waits in virtual time: its name, and where it is."""
+
+    def __init__(self, strand: Strand, place: str) -> None:
+        super().__init__(strand.name, place)
+        self.strand = strand
+        self.place = place
+
+
+class Strands:
+    """
+    The strands of a run.
+
+    :param step: does the next thing in virtual time; False: the run is over.
+    :param at_end: called then, before the strands end that still wait.
+    """
+
+    def __init__(self, step: Callable[[], bool], at_end: Callable[[], None]) -> None:
+        self._step = step
+        self._at_end = at_end
+        self._owner: Strand | None = None
+        self._idle: list[Strand] = []
+        self._ready: deque[Strand] = deque()
+        self.waiting: list[Strand] = []
+        self._here = threading.local()
+        self._done = threading.Lock()
+        self._done.acquire()
+        self._turns = 0
+        self.over = False
+        self.error: BaseException | None = None
+
+    # --- who has the turn ------------------------------------------------------------------------
+
+    def mine(self) -> Strand | None:
+        """Return the strand that calls, if it has the turn; None for threads of others."""
+        strand: Strand | None = getattr(self._here, 'strand', None)
+        return strand if strand is not None and strand is self._owner else None
+
+    @contextmanager
+    def set_aside(self) -> Iterator[None]:
+        """Let the calling strand wait for something real, of Python's own, while entered."""
+        strand, self._here.strand = self._here.strand, None
+        try:
+            yield
+        finally:
+            self._here.strand = strand
+
+    def _give(self, strand: Strand) -> None:
+        self._turns += 1
+        self._owner = strand
+        strand.lock.release()
+
+    def _pass_on(self) -> None:
+        """Give the turn to a thread that drives."""
+        if self._idle:
+            self._give(self._idle.pop())
+            return
+        driver = Strand('driver')
+        self._turns += 1
+        self._owner = driver
+        driver.lock.release()
+        threading.Thread(
+            target=self._run_driver, args=(driver,), daemon=True, name='mddag-rerun').start()
+
+    def _begin(self, strand: Strand) -> None:
+        self._here.strand = strand
+        strand.ident = threading.get_ident()
+        strand.clock = time.pthread_getcpuclockid(strand.ident)
+        strand.lock.acquire()
+
+    # --- driving ---------------------------------------------------------------------------------
+
+    def _run_driver(self, me: Strand) -> None:
+        self._begin(me)
+        try:
+            self._drive(me)
+        except BaseException as error:  # what a node raised, or a defect: the run ends with it
+            self.error = self.error or error
+            self._end()
+            self._drive(me)
+
+    def _end(self) -> None:
+        if not self.over:
+            try:
+                self._at_end()
+            except BaseException as error:
+                self.error = self.error or error
+            self.over = True
+
+    def _drive(self, me: Strand) -> None:
+        while not me.leaves:
+            strand = self._next()
+            if strand is not None:
+                self._idle.append(me)
+                self._give(strand)
+                me.lock.acquire()
+            elif self.over:
+                self._finish(me)
+            elif not self._step():
+                self._end()
+            self._turns += 1
+
+    def _next(self) -> Strand | None:
+        """Return a strand that goes on now."""
+        if self._ready:
+            return self._ready.popleft()
+        for place, strand in enumerate(self.waiting):
+            if self.over or strand.until is not None and strand.until():
+                del self.waiting[place]
+                strand.came_true = not self.over
+                return strand
+        return None
+
+    def _finish(self, me: Strand) -> None:
+        """Let all threads that drive end: no strand waits any more."""
+        me.leaves = True
+        for each in self._idle:
+            each.leaves = True
+            each.lock.release()
+        self._idle.clear()
+        self._owner = None
+        self._done.release()
+
+    # --- what strands do -------------------------------------------------------------------------
+
+    def make(self, name: str) -> Strand:
+        """Make a strand; its thread is to call ``run_as``, and has its turn after the others."""
+        strand = Strand(name)
+        self._ready.append(strand)
+        return strand
+
+    def run_as(self, strand: Strand, function: Callable[[], Any]) -> None:
+        """Run a function as a strand, in a thread of its own."""
+        self._begin(strand)
+        try:
+            function()
+        finally:
+            self._here.strand = None
+            strand.ended = True
+            if not self.over or self._owner is strand:
+                self._pass_on()
+
+    def wait(self, until: Callable[[], bool] | None, deadline: int | None, place: str) -> bool:
+        """
+        Wait in the calling strand, which has the turn; return whether what it waits for is true.
+
+        :param deadline: the virtual time at which it waits no longer; None: there is none.
+        :param place: says what it waits for.
+        """
+        strand = self.mine()
+        assert strand is not None
+        if until is not None and until():
+            return True
+        if self.over:
+            return False
+        strand.until, strand.deadline, strand.place = until, deadline, place
+        strand.came_true = False
+        self.waiting.append(strand)
+        self._pass_on()
+        strand.lock.acquire()
+        return strand.came_true
+
+    def has_waiting(self, thread: threading.Thread | None) -> bool:
+        """Return whether a thread is a strand that waits."""
+        return thread is not None and any(s.ident == thread.ident for s in self.waiting)
+
+    def next_deadline(self) -> int | None:
+        """Return the earliest time at which a strand waits no longer."""
+        return min((s.deadline for s in self.waiting if s.deadline is not None), default=None)
+
+    def expire(self, now: int) -> None:
+        """Let strands go on whose time is over."""
+        late = [s for s in self.waiting if s.deadline is not None and s.deadline <= now]
+        for strand in sorted(late, key=lambda s: s.deadline or 0):
+            self.waiting.remove(strand)
+            self._ready.append(strand)
+
+    # --- from outside ----------------------------------------------------------------------------
+
+    def run(self, patience_s: float, tick: Callable[[], None]) -> None:
+        """
+        Run all until the run is over, watched by the calling thread, which is no strand.
+
+        :param patience_s: a strand that uses no CPU for so long is stuck.
+        :param tick: called now and then.
+        :raises Stuck: where one is; its thread is left behind.
+        :raises BaseException: what ended the run.
+        """
+        self._pass_on()
+        watch = _Watch(self, patience_s)
+        ending_at = 0.0
+        try:
+            while not self._done.acquire(timeout=_LOOK_S):
+                tick()
+                if not self.over:
+                    watch.look()
+                elif not ending_at:
+                    ending_at = time.monotonic() + _END_S
+                elif time.monotonic() > ending_at:
+                    break  # what does not end is left behind
+        finally:
+            self.over = True
+        if self.error is not None:
+            raise self.error
+
+    @property
+    def turns(self) -> int:
+        """Return a number that grows while the run goes on."""
+        return self._turns
+
+    @property
+    def owner(self) -> Strand | None:
+        """Return the strand that has the turn."""
+        return self._owner
+
+
+class _Watch:
+    """Finds out whether a run stands still."""
+
+    def __init__(self, strands: Strands, patience_s: float) -> None:
+        self._strands = strands
+        self._patience_s = patience_s
+        self._seen: tuple[int, int] | None = None
+        self._since = time.monotonic()
+
+    def look(self) -> None:
+        owner = self._strands.owner
+        now = time.monotonic()
+        if owner is None or owner.clock == -1:
+            self._since = now
+            return
+        # in ms: a thread that waits in small steps computes a little
+        seen = self._strands.turns, time.clock_gettime_ns(owner.clock) // 1_000_000
+        if seen != self._seen:
+            self._seen, self._since = seen, now
+        elif now - self._since > self._patience_s:
+            raise Stuck(owner, place_of(owner.ident))
+
+
+def place_of(ident: int) -> str:
+    """Return where a thread is: file and line of the innermost code that is no library's."""
+    frame = sys._current_frames().get(ident)
+    found = ''
+    while frame is not None:
+        name = frame.f_code.co_filename
+        here = f'{name}:{frame.f_lineno}'
+        if not found:
+            found = here
+        module = frame.f_globals.get('__name__', '')
+        if not is_library(module):
+            return here
+        frame = frame.f_back
+    return found
+
+
+def is_library(module: str) -> bool:
+    """Return whether a module is part of Python, of rclpy or of this program."""
+    top = module.partition('.')[0]
+    return top in sys.stdlib_module_names and top != '__main__' or top in (
+        'rclpy', 'mddag_executor', 'numpy')

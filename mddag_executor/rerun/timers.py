@@ -1,0 +1,135 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Timers, whatever their clock, fire at their virtual due times.
+
+Theory of operation
+-------------------
+What rcl knows of a timer's time is not asked for; only whether it is cancelled.  A timer is due a
+period after it was made or reset, and each period after that.  Where a recorded run has jobs of
+the timer's DAG, it is due first when the first of these was released, so that it keeps their
+phase.
+No timer is due any more when the recording ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from mddag_executor.live.compat import ends_sleep, with_timer_info
+from mddag_executor.live.entity import Entity
+from mddag_executor.live.work import Work
+from mddag_executor.rerun.loop import Loop, TIMER
+from rclpy.exceptions import InvalidHandle
+from rclpy.timer import Timer
+
+ZERO_PERIOD_NS = 1_000_000
+"""How often a timer is due whose period is zero."""
+
+
+class _Known:
+    """What is kept for a timer: when it is due next (-1: never), and was last."""
+
+    __slots__ = ('entity', 'due', 'last')
+
+    def __init__(self, entity: Entity, now: int) -> None:
+        self.entity = entity
+        self.due = -1
+        self.last = now
+
+
+class Timers:
+    """
+    The timers of a run.
+
+    :param first_release: returns when the first job of a DAG was released in the recording.
+    """
+
+    def __init__(self, loop: Loop, first_release: Callable[[int], int | None]) -> None:
+        self._loop = loop
+        self._first_release = first_release
+        self._known: dict[int, _Known] = {}
+
+    def refresh(self, entities: Iterable[Entity]) -> None:
+        """Take in which timers there are."""
+        before, self._known = self._known, {}
+        now = self._loop.now
+        for entity in entities:
+            known = before.get(id(entity.rclpy))
+            if known is None or known.entity.rclpy is not entity.rclpy:
+                known = _Known(entity, now)
+                self._aim(known, self._first_due(entity))
+            known.entity = entity
+            self._known[id(entity.rclpy)] = known
+
+    def _first_due(self, entity: Entity) -> int:
+        now, period = self._loop.now, _period(entity.rclpy)
+        first = None
+        if entity.source >= 0:
+            first = self._first_release(self._loop.engine.tables.dag_of[entity.source])
+        if first is None:
+            return now + period
+        return first if first >= now else now + (first - now) % period
+
+    def _aim(self, known: _Known, due: int) -> None:
+        """Have a timer fire at a time, unless it is cancelled."""
+        try:
+            known.due = -1 if known.entity.rclpy.is_canceled() else due
+        except InvalidHandle:
+            known.due = -1
+        if 0 <= known.due < self._loop.end:
+            self._loop.at(due, TIMER, self._fire, known, due)
+
+    def _fire(self, known: _Known, due: int) -> None:
+        timer, engine = known.entity.rclpy, self._loop.engine
+        if known.due != due or self._known.get(id(timer)) is not known:
+            return  # it was reset or cancelled meanwhile, or is gone
+        try:
+            self._aim(known, due + _period(timer))
+        except InvalidHandle:
+            return
+        if known.due < 0:
+            return
+        info = {'expected_call_time': due, 'actual_call_time': due}
+        callback = timer.callback
+        known.last = due
+        if callback is None:
+            return
+        if ends_sleep(callback):
+            callback()
+            return
+        work = Work(
+            timer, with_timer_info(timer, callback, info), (), due=due, entity=known.entity)
+        engine.timer_due(work, due, due)
+
+    # --- what nodes do with them -----------------------------------------------------------------
+
+    def reset(self, timer: Timer) -> None:
+        """Take in that a timer was reset."""
+        known = self._known.get(id(timer))
+        if known is not None:
+            known.last = self._loop.now
+            self._aim(known, self._loop.now + _period(timer))
+
+    def cancelled(self, timer: Timer) -> None:
+        """Take in that a timer was cancelled."""
+        known = self._known.get(id(timer))
+        if known is not None:
+            known.due = -1
+
+    def until_next(self, timer: Timer) -> int | None:
+        """Return how long it is until a timer is due; None where it is cancelled."""
+        if timer.is_canceled():
+            return None
+        known = self._known.get(id(timer))
+        return _period(timer) if known is None or known.due < 0 else known.due - self._loop.now
+
+    def since_last(self, timer: Timer) -> int:
+        """Return how long ago a timer was due last, or was made."""
+        known = self._known.get(id(timer))
+        return 0 if known is None else self._loop.now - known.last
+
+
+def _period(timer: Any) -> int:
+    return int(timer.timer_period_ns) or ZERO_PERIOD_NS

@@ -1,0 +1,116 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+How long callbacks and messages take in virtual time.
+
+Theory of operation
+-------------------
+*Declared* (or drawn, or from a file of execution times): each vertex takes the same time in every
+job, its messages leave at its end and arrive at once.
+
+*Recorded*: the k-th job of the rerun is not always the k-th of the recording.  So a job takes the
+times of that recorded job of its DAG whose release is nearest, if it is no further away than half
+a period.  Where there is none, each vertex takes the median of its recorded times.  The time from
+a vertex's end to the arrival of its message is the recorded one, too; it is negative where the
+callback published before its end.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from typing import Protocol
+
+from mddag_executor.core import quantile, Tables
+from mddag_executor.replay.load import RecordedLoad
+from mddag_executor.simulate.deliveries import edge_numbers
+
+
+class Times(Protocol):
+    """How long everything takes, ns; vertices are global."""
+
+    def execution(self, dag: int, vertex: int, release: int) -> int:
+        """Return how long a vertex of the job with that release executes."""
+
+    def transport(self, dag: int, before: int, after: int, release: int) -> int:
+        """Return how long after the end of a vertex its message to another one arrives."""
+
+
+class SameInEachJob:
+    """
+    The same time in every job.
+
+    :param times: the execution time of each vertex, by DAG and local index.
+    """
+
+    def __init__(self, times: Sequence[Sequence[int]]) -> None:
+        self._times = [time for row in times for time in row]
+
+    def execution(self, dag: int, vertex: int, release: int) -> int:
+        """Return how long a vertex executes."""
+        return self._times[vertex]
+
+    def transport(self, dag: int, before: int, after: int, release: int) -> int:
+        """Return that messages take no time."""
+        return 0
+
+
+class AsRecorded:
+    """The times of the job of a recording that was released at about the same time."""
+
+    def __init__(self, tables: Tables, work: RecordedLoad) -> None:
+        self._tables = tables
+        self._load, self._transports = work.load, work.transports
+        load = work.load
+        self._releases: list[list[tuple[int, int]]] = [[] for _ in range(tables.n_dags)]
+        for dag, job, release in zip(load.dags, load.jobs, load.releases or load.times):
+            if dag < tables.n_dags:
+                self._releases[dag].append((release, job))
+        for rows in self._releases:
+            rows.sort()
+        self._edges = edge_numbers(tables)
+        self._usual: dict[tuple[int, int], int] = {}
+
+    def first_release(self, dag: int) -> int | None:
+        """Return when the first job of a DAG was released; None: there was none."""
+        rows = self._releases[dag]
+        return rows[0][0] if rows else None
+
+    def execution(self, dag: int, vertex: int, release: int) -> int:
+        """Return how long a vertex of the job with that release executed."""
+        load = self._load
+        local = vertex - self._tables.first_vertex[dag]
+        first, stride = load.cost_base[dag] + local, load.cost_stride[dag]
+        return self._value(load.costs, first, stride, dag, release, (vertex, -1))
+
+    def transport(self, dag: int, before: int, after: int, release: int) -> int:
+        """Return how long after the end of a vertex its message arrived."""
+        edge = self._edges.get((before, after))
+        if edge is None:
+            return 0
+        t = self._transports
+        return self._value(
+            t.delays, t.base[dag] + edge, t.stride[dag], dag, release, (before, after))
+
+    def _value(
+        self, values: Sequence[int], first: int, stride: int, dag: int, release: int,
+        of: tuple[int, int],
+    ) -> int:
+        row = self._row(dag, release)
+        if row >= 0:
+            return int(values[first + row * stride])
+        usual = self._usual.get(of)
+        if usual is None:
+            every = sorted(values[first + job * stride] for _, job in self._releases[dag])
+            usual = self._usual[of] = int(quantile(every, 0.5)) if every else 0
+        return usual
+
+    def _row(self, dag: int, release: int) -> int:
+        """Return the place of the recorded job that was released about then; -1: there is none."""
+        rows = self._releases[dag]
+        place = bisect_left(rows, (release,))
+        near = [rows[i] for i in (place - 1, place) if 0 <= i < len(rows)]
+        if not near:
+            return -1
+        at, job = min(near, key=lambda row: abs(row[0] - release))
+        return job if abs(at - release) * 2 <= self._tables.period[dag] else -1

@@ -1,0 +1,202 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a message type looks like: its definition for a bag, and its bytes without chance in them.
+
+Theory of operation
+-------------------
+The middleware leaves what lies between two fields, to align the second one, and what follows the
+last one, as it was in memory.  So equal messages have unequal bytes.  ``canonical`` walks through
+a message (CDR, little endian) and sets these bytes to zero.  How to walk is found out once for
+each type, from what its Python class tells of its fields.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+import struct
+from typing import Any
+
+from rosidl_parser.definition import (
+    AbstractNestedType,
+    AbstractString,
+    AbstractWString,
+    Array,
+    BasicType,
+    BoundedSequence,
+    NamespacedType,
+)
+
+HEAD = 4
+"""Bytes before the content: how it is encoded."""
+_WIDTHS = {
+    'boolean': 1, 'octet': 1, 'char': 1, 'int8': 1, 'uint8': 1, 'int16': 2, 'uint16': 2,
+    'int32': 4, 'uint32': 4, 'float': 4, 'wchar': 4, 'int64': 8, 'uint64': 8, 'double': 8}
+_NAMES = {'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': 'float64'}
+_LENGTH = struct.Struct('<I')
+
+Walk = Callable[[bytearray, int], int]
+"""Sets what is between fields to zero from a place on; returns where the field ends."""
+
+
+def type_name(kind: Any) -> str:
+    """Return the name of a message class, as ``std_msgs/msg/Header``."""
+    package, folder = kind.__module__.split('.')[:2]
+    return f'{package}/{folder}/{kind.__name__}'
+
+
+def canonical(data: bytes, kind: Any) -> bytes:
+    """Return a serialised message with nothing in it that is not of its fields."""
+    if data[1:2] != b'\x01':  # big endian: of somebody who serialised it himself
+        return data
+    filled = bytearray(data)
+    end = _walk_of(kind)(filled, HEAD)
+    return bytes(filled[:end])
+
+
+@cache
+def _walk_of(kind: Any) -> Walk:
+    walks = [_walk(slot) for slot in kind.SLOT_TYPES] or [_Numbers(1, 1)]
+    walks = _merged(walks)
+    if len(walks) == 1:
+        return walks[0]
+
+    def walk(data: bytearray, at: int) -> int:
+        for each in walks:
+            at = each(data, at)
+        return at
+
+    return walk
+
+
+class _Numbers:
+    """Walks over so many numbers of one width."""
+
+    def __init__(self, width: int, count: int) -> None:
+        self.width = width
+        self.count = count
+
+    def __call__(self, data: bytearray, at: int) -> int:
+        start = _align(data, at, self.width)
+        return start + self.width * self.count
+
+
+def _merged(walks: list[Walk]) -> list[Walk]:
+    """Return the same with numbers of one width that follow one another as one."""
+    found: list[Walk] = []
+    for walk in walks:
+        last = found[-1] if found else None
+        if (isinstance(walk, _Numbers) and isinstance(last, _Numbers)
+                and walk.width == last.width):
+            found[-1] = _Numbers(walk.width, walk.count + last.count)
+        else:
+            found.append(walk)
+    return found
+
+
+def _align(data: bytearray, at: int, width: int) -> int:
+    gap = (HEAD - at) % width
+    if gap:
+        data[at:at + gap] = bytes(gap)
+    return at + gap
+
+
+def _walk(slot: Any) -> Walk:
+    if isinstance(slot, BasicType):
+        return _Numbers(_WIDTHS[slot.typename], 1)
+    if isinstance(slot, (AbstractString, AbstractWString)):
+        return _string(4 if isinstance(slot, AbstractWString) else 1)
+    if isinstance(slot, NamespacedType):
+        return _walk_of(_class_of(slot))
+    assert isinstance(slot, AbstractNestedType)
+    inner = slot.value_type
+    if isinstance(slot, Array):
+        if isinstance(inner, BasicType):
+            return _Numbers(_WIDTHS[inner.typename], slot.size)
+        return _repeated(_walk(inner), slot.size)
+    if isinstance(inner, BasicType):
+        return _numbers(_WIDTHS[inner.typename])
+    return _repeated(_walk(inner), None)
+
+
+def _class_of(slot: Any) -> Any:
+    return getattr(import_module('.'.join(slot.namespaces)), slot.name)
+
+
+def _string(width: int) -> Walk:
+    def walk(data: bytearray, at: int) -> int:
+        at = _align(data, at, 4)
+        return at + 4 + width * int(_LENGTH.unpack_from(data, at)[0])
+
+    return walk
+
+
+def _numbers(width: int) -> Walk:
+    def walk(data: bytearray, at: int) -> int:
+        at = _align(data, at, 4)
+        count = int(_LENGTH.unpack_from(data, at)[0])
+        return _align(data, at + 4, width) + width * count if count else at + 4
+
+    return walk
+
+
+def _repeated(walk_one: Walk, count: int | None) -> Walk:
+    def walk(data: bytearray, at: int) -> int:
+        n = count
+        if n is None:
+            at = _align(data, at, 4)
+            n = int(_LENGTH.unpack_from(data, at)[0])
+            at += 4
+        for _ in range(n):
+            at = walk_one(data, at)
+        return at
+
+    return walk
+
+
+# --- definitions ---------------------------------------------------------------------------------
+
+@cache
+def definition(kind: Any) -> str:
+    """Return the definition of a message type with all that it consists of, as bags have it."""
+    parts = [_own_definition(kind)]
+    known = {kind}
+    waiting = _inner(kind)
+    while waiting:
+        inner = waiting.pop(0)
+        if inner not in known:
+            known.add(inner)
+            name = type_name(inner).replace('/msg/', '/')
+            parts.append(f'{"=" * 80}\nMSG: {name}\n{_own_definition(inner)}')
+            waiting += _inner(inner)
+    return ''.join(parts)
+
+
+def _own_definition(kind: Any) -> str:
+    names = kind.get_fields_and_field_types()
+    return ''.join(f'{_text(slot)} {name}\n' for name, slot in zip(names, kind.SLOT_TYPES))
+
+
+def _inner(kind: Any) -> list[Any]:
+    slots = (getattr(slot, 'value_type', slot) for slot in kind.SLOT_TYPES)
+    return [_class_of(slot) for slot in slots if isinstance(slot, NamespacedType)]
+
+
+def _text(slot: Any) -> str:
+    """Return a field's type as a definition has it."""
+    if isinstance(slot, BasicType):
+        name: str = slot.typename
+        return _NAMES.get(name, name)
+    if isinstance(slot, (AbstractString, AbstractWString)):
+        bound = slot.maximum_size if slot.has_maximum_size() else None
+        name = 'wstring' if isinstance(slot, AbstractWString) else 'string'
+        return name if bound is None else f'{name}<={bound}'
+    if isinstance(slot, NamespacedType):
+        return f'{slot.namespaces[0]}/{slot.name}'
+    inner = _text(slot.value_type)
+    if isinstance(slot, Array):
+        return f'{inner}[{slot.size}]'
+    bound = f'<={slot.maximum_size}' if isinstance(slot, BoundedSequence) else ''
+    return f'{inner}[{bound}]'

@@ -1,0 +1,350 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes run again from a bag: what they see, what they publish, and when."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+import random
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from mddag_executor.replay import replay
+from mddag_executor.rerun import (
+    assert_same,
+    CallbackFailed,
+    compare,
+    rerun,
+    RerunError,
+    Result,
+)
+from mddag_executor.rerun.types import canonical
+import pytest
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Header, String
+
+from .helpers import GRAPH, MS, START, write_bag
+
+GAIN = 2.0
+
+
+class Filter(Node):
+    """Passes on what comes, with the time at which it came."""
+
+    def __init__(self) -> None:
+        super().__init__('filter')
+        self.publisher = self.create_publisher(Header, '/filtered', 10)
+        self.create_subscription(Header, '/points', self.take, 10)
+
+    def take(self, message: Header) -> None:
+        now = self.get_clock().now()
+        self.publisher.publish(Header(stamp=now.to_msg(), frame_id=message.frame_id))
+
+
+class Sink(Node):
+
+    def __init__(self) -> None:
+        super().__init__('sink')
+        self.publisher = self.create_publisher(Float64, '/out', 10)
+        self.create_subscription(Header, '/filtered', self.take, 10)
+
+    def take(self, message: Header) -> None:
+        self.publisher.publish(Float64(data=GAIN * int(message.frame_id)))
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> str:
+    return write_bag(tmp_path / 'in.mcap', [
+        (i * 100 * MS, '/points', Header(frame_id=str(i))) for i in range(20)])
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Path:
+    path = tmp_path / 'graph.yaml'
+    path.write_text(GRAPH)
+    return path
+
+
+def published(result: Result, topic: str) -> list[tuple[float, Any]]:
+    """Return what was published on a topic: when (ms after the start), and the message."""
+    return [((each.time - START) / MS, deserialize_message(each.data, each.kind))
+            for each in result.outputs if each.topic == topic]
+
+
+def test_nodes_run_in_virtual_time(bag: str, graph: Path) -> None:
+    result = rerun(bag, graph, [Filter, Sink])
+    filtered = published(result, '/filtered')
+    assert [time for time, _ in filtered] == [100.0 * i + 10 for i in range(20)]
+    assert filtered[3][1] == Header(
+        frame_id='3', stamp=Time(sec=START // 10 ** 9, nanosec=300 * MS))
+    out = published(result, '/out')
+    assert [(time, message.data) for time, message in out] == [
+        (100.0 * i + 15, 2.0 * i) for i in range(20)]
+    sink = result.result()['dags']['main']['sinks']['/sink:take']
+    assert (sink['completed'], sink['late'], sink['response_ns']['max']) == (20, 0, 15 * MS)
+
+
+def test_the_same_again_and_with_other_workers(bag: str, graph: Path) -> None:
+    first = rerun(bag, graph, [Filter, Sink])
+    assert rerun(bag, graph, [Filter, Sink]).digest == first.digest
+    assert rerun(bag, graph, [Filter, Sink], workers=7).digest == first.digest
+
+
+def test_outputs_are_a_bag_that_others_read(bag: str, graph: Path, tmp_path: Path) -> None:
+    from rosbags.highlevel import AnyReader
+    out = tmp_path / 'out.mcap'
+    result = rerun(bag, graph, [Filter, Sink], output=out)
+    with AnyReader([out]) as reader:
+        found = [(time, reader.deserialize(data, connection.msgtype).data)  # type: ignore
+                 for connection, time, data in reader.messages() if connection.topic == '/out']
+    assert found == [(each.time, 2.0 * i) for i, each in enumerate(
+        each for each in result.outputs if each.topic == '/out')]
+    assert_same(result, out)
+
+
+def test_the_trace_replays(bag: str, graph: Path, tmp_path: Path) -> None:
+    trace = tmp_path / 'run.mcap'
+    result = rerun(bag, graph, [Filter, Sink], trace=trace)
+    again = replay(trace)
+    assert not again.warnings
+    mine, theirs = result.result()['dags']['main'], again.result()['dags']['main']
+    assert theirs['jobs'] == mine['jobs'] == 20
+    sink = theirs['sinks']['/sink:take']
+    assert sink['response_ns'] == mine['sinks']['/sink:take']['response_ns']
+
+
+def test_recorded_times_come_from_a_trace(bag: str, graph: Path, tmp_path: Path) -> None:
+    trace = tmp_path / 'run.mcap'
+    rerun(bag, graph, [Filter, Sink], trace=trace)
+    graph.write_text(GRAPH.replace('10ms', '30ms'))
+    result = rerun(bag, graph, [Filter, Sink], times=trace)
+    assert [time for time, _ in published(result, '/filtered')] == [
+        100.0 * i + 10 for i in range(20)]
+
+
+def test_times_from_a_file(bag: str, graph: Path, tmp_path: Path) -> None:
+    times = tmp_path / 'times.json'
+    times.write_text(
+        '{"main": {"/driver:drive": 1, "/filter:take": 20000, "/sink:take": 1000}}')
+    result = rerun(bag, graph, [Filter, Sink], times=times)
+    assert [time for time, _ in published(result, '/out')] == [100.0 * i + 21 for i in range(20)]
+
+
+def test_an_overload_shows_in_the_outputs(bag: str, graph: Path) -> None:
+    text = GRAPH.replace('execution_time: 10ms', 'execution_time: 150ms')
+    graph.write_text(text)
+    result = rerun(bag, graph, [Filter, Sink])
+    # The callback's group lets one run at a time: each message waits for those before it.
+    assert [time for time, _ in published(result, '/filtered')][:4] == [150, 300, 450, 600]
+    assert result.result()['deadline_missed']
+    assert rerun(bag, graph, [Filter, Sink]).digest == result.digest
+
+
+# --- timers, seeds, what is kept -----------------------------------------------------------------
+
+def node_with(function: Callable[[Node], None], name: str = 'filter') -> Callable[[], Node]:
+    def make() -> Node:
+        node = rclpy.create_node(name)
+        function(node)
+        return node
+
+    return make
+
+
+def test_timers_fire_at_their_virtual_times(bag: str, graph: Path) -> None:
+    seen: list[float] = []
+
+    def fill(node: Node) -> None:
+        node.create_subscription(Header, '/points', lambda message: None, 10)
+
+        def tick() -> None:
+            seen.append((node.get_clock().now().nanoseconds - START) / MS)
+            if len(seen) == 3:
+                timer.timer_period_ns = 500 * MS
+            elif len(seen) == 5:
+                timer.cancel()
+                node.create_timer(0.3, again)
+
+        def again() -> None:
+            seen.append(-(node.get_clock().now().nanoseconds - START) / MS)
+
+        timer = node.create_timer(0.03, tick)
+
+    rerun(bag, graph, [node_with(fill)])
+    assert seen == [30, 60, 90, 120, 620, -920, -1220, -1520, -1820]
+
+
+def test_random_numbers_are_those_of_the_seed(bag: str, graph: Path) -> None:
+    seen: list[float] = []
+
+    def fill(node: Node) -> None:
+        node.create_subscription(
+            Header, '/points', lambda message: seen.append(random.random()), 10)
+
+    for seed in (1, 1, 2):
+        rerun(bag, graph, [node_with(fill)], seed=seed)
+    assert seen[:20] == seen[20:40] != seen[40:]
+
+
+def test_a_message_is_as_it_was_published(bag: str, graph: Path) -> None:
+    """Who publishes may change a message afterwards, and who receives it has one of his own."""
+    seen: list[str] = []
+
+    def publishing(node: Node) -> None:
+        publisher = node.create_publisher(String, '/names', 10)
+        message = String()
+
+        def take(header: Header) -> None:
+            message.data = header.frame_id
+            publisher.publish(message)
+            message.data = 'changed'
+
+        node.create_subscription(Header, '/points', take, 10)
+
+    def taking(node: Node) -> None:
+        def take(message: String) -> None:
+            seen.append(message.data)
+            message.data = 'mine'
+
+        node.create_subscription(String, '/names', take, 10)
+        node.create_subscription(String, '/names', take, 10)
+
+    rerun(bag, graph, [node_with(publishing), node_with(taking, 'other')])
+    assert seen == [str(i) for i in range(20) for _ in range(2)]
+
+
+def test_late_subscriptions_get_what_is_latched(bag: str, graph: Path) -> None:
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    seen: list[str] = []
+
+    def fill(node: Node) -> None:
+        node.create_publisher(String, '/map', latched).publish(String(data='a map'))
+
+        def take(message: Header) -> None:
+            if message.frame_id == '3':
+                node.create_subscription(String, '/map', lambda m: seen.append(m.data), latched)
+                node.create_subscription(String, '/map', lambda m: seen.append('?'), 10)
+
+        node.create_subscription(Header, '/points', take, 10)
+
+    rerun(bag, graph, [node_with(fill)])
+    assert seen == ['a map']
+
+
+def test_padding_is_no_difference() -> None:
+    data = serialize_message(JointState(name=['a', 'bcd'], position=[1.0]))
+    whole = canonical(data, JointState)
+    changed = bytearray(data)
+    for place in range(len(whole)):
+        changed[place] ^= 0xFF
+        try:
+            same = deserialize_message(bytes(changed), JointState) == deserialize_message(
+                data, JointState)
+        except Exception:
+            same = False
+        changed[place] ^= 0xFF
+        if same and place >= 4:
+            assert whole[place] == 0
+    assert deserialize_message(whole, JointState) == deserialize_message(data, JointState)
+
+
+# --- comparing -----------------------------------------------------------------------------------
+
+def test_a_changed_constant_is_found(
+    bag: str, graph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / 'out.mcap'
+    rerun(bag, graph, [Filter, Sink], output=out)
+    monkeypatch.setattr(f'{__name__}.GAIN', 2.0001)
+    result = rerun(bag, graph, [Filter, Sink])
+    difference, = compare(result, out)
+    assert difference.line() == (
+        '/out: content, first in message 1 at 0.115000 s: data is 2.0001, expected 2.0')
+    assert not compare(result, out, 1e-3)
+    with pytest.raises(AssertionError, match='/out: content, first in message 1'):
+        assert_same(result, out)
+
+
+def test_changed_timing_is_told_as_such(bag: str, graph: Path, tmp_path: Path) -> None:
+    out = tmp_path / 'out.mcap'
+    rerun(bag, graph, [Filter, Sink], output=out)
+    graph.write_text(GRAPH.replace('execution_time: 5ms', 'execution_time: 6ms'))
+    difference, = compare(rerun(bag, graph, [Filter, Sink]), out)
+    assert (difference.topic, difference.kind) == ('/out', 'timing')
+    assert difference.line().endswith('the time of publication is 0.016000 s, expected 0.015000 s')
+
+
+def test_missing_messages_are_told(bag: str, graph: Path, tmp_path: Path) -> None:
+    out = tmp_path / 'out.mcap'
+    rerun(bag, graph, [Filter, Sink], output=out)
+    without = compare(rerun(bag, graph, [Filter]), out)
+    assert {each.topic: each.kind for each in without}['/out'] == 'missing'
+    assert {each.topic: each.messages for each in without}['/out'] == 0
+
+
+def test_what_is_recorded_too_is_compared(tmp_path: Path, graph: Path) -> None:
+    """The messages of the node under rerun count, not the recorded ones."""
+    bag = write_bag(tmp_path / 'in.mcap', [
+        message for i in range(5) for message in (
+            (i * 100 * MS, '/points', Header(frame_id=str(i))),
+            (i * 100 * MS + 15 * MS, '/out', Float64(data=2.0 * i + (i == 3))))])
+    result = rerun(bag, graph, [Filter, Sink])
+    difference, = result.recorded
+    assert difference.line() == (
+        '/out: content, first in message 3 at 0.315000 s: data is 6.0, expected 7.0')
+
+
+# --- what goes wrong -----------------------------------------------------------------------------
+
+def test_a_topic_that_is_not_recorded(bag: str, graph: Path) -> None:
+    with pytest.raises(RerunError, match='/filtered, which /sink:take needs, is not recorded'):
+        rerun(bag, graph, [Sink])
+
+
+def test_another_type_than_recorded(bag: str, graph: Path) -> None:
+    def fill(node: Node) -> None:
+        node.create_subscription(String, '/points', lambda message: None, 10)
+
+    with pytest.raises(RerunError, match='recorded as std_msgs/msg/Header, and the node sub'):
+        rerun(bag, graph, [node_with(fill)])
+
+
+def test_a_message_that_does_not_decode(tmp_path: Path, graph: Path) -> None:
+    bag = write_bag(tmp_path / 'in.mcap', [
+        (0, '/points', Header()), (MS, '/points', (Header, b'\0\1\0\0\1'))])
+    with pytest.raises(RerunError, match='/points: a message of it does not decode as std_msgs'):
+        rerun(bag, graph, [Filter, Sink])
+
+
+def test_a_callback_that_raises(bag: str, graph: Path) -> None:
+    def fill(node: Node) -> None:
+        def take(message: Header) -> None:
+            if message.frame_id == '7':
+                raise ValueError('seven')
+
+        node.create_subscription(Header, '/points', take, 10)
+
+    with pytest.raises(CallbackFailed) as caught:
+        rerun(bag, graph, [node_with(fill)])
+    assert str(caught.value).startswith('/filter:take: it raised ValueError: seven at 0.700000 s')
+    assert isinstance(caught.value.__cause__, ValueError)
+
+
+def test_a_circle_that_takes_no_time(bag: str, graph: Path) -> None:
+    def fill(node: Node) -> None:
+        publisher = node.create_publisher(Header, '/round', 10)
+        node.create_subscription(Header, '/round', publisher.publish, 10)
+        node.create_subscription(Header, '/points', publisher.publish, 10)
+
+    with pytest.raises(RerunError, match='virtual time stands still at 0.010000 s'):
+        rerun(bag, graph, [node_with(fill)])
+
+
+def test_other_nodes_than_declared(bag: str, graph: Path) -> None:
+    with pytest.raises(RerunError, match='none of its callbacks is in the nodes that run'):
+        rerun(bag, graph, [node_with(lambda node: None, 'unknown')])
