@@ -29,6 +29,8 @@ from mddag_executor.live.bench.spec import (
     NONE,
     parse_executors,
     PHASES,
+    ROBOT,
+    ROBOT_GRAPH,
     Spec,
 )
 from mddag_executor.report.tables import percent
@@ -40,6 +42,7 @@ DESCRIPTION = 'Measure executors of rclpy nodes, this one and those of rclpy, si
 EXAMPLE = """\
 mddag bench live --load autoware --utilisation 0.3,0.6,0.8 --seconds 10 --plot live.png
 mddag bench live --load autoware --executors rad-events,multi --policies rad,fifo,rm,wc,gedf
+mddag bench live --load robot --scale 1,1.2 --seconds 20
 mddag bench live --load topics --topics 50 --rate 100 --repeat 3 --json topics.json
 """
 
@@ -53,7 +56,7 @@ _LOADS_OF_OPTIONS = {
     'graph': ('autoware', 'reference-system'), 'utilisation': ('autoware', 'reference-system'),
     'bodies': ('autoware', 'reference-system'), 'topics': ('topics',),
     'rate': ('topics', 'entities'), 'idle': ('entities',), 'groups': ('topics', 'entities'),
-    'phases': ('topics',)}
+    'phases': ('topics',), 'scale': (ROBOT,)}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('--load', choices=LOADS, required=True,
         help='autoware and reference-system: the synthetic nodes of these declarations; topics: '
-        'empty callbacks of many topics; entities: one active topic beside idle subscriptions')
+        'empty callbacks of many topics; entities: one active topic beside idle subscriptions; '
+        'robot: the ordinary nodes of examples/robot')
     add('--executors', default=','.join(EXECUTORS), metavar='E[,E…]',
         help=f'some of {", ".join(EXECUTORS)}; the first two are this one, by intake, also with a '
         'policy as rad-events:fifo (default: all); and none: what the nodes of a declaration cost '
@@ -87,6 +91,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--phases', choices=PHASES,
         help='with --load topics: each topic at a phase of its own, or all published in a row, '
         'as one timer does (default: drawn)')
+    add('--scale', type=options.list_of(options.positive_float), metavar='F[,F…]',
+        help='with --load robot: how much more than written its nodes compute (default: 1)')
     add('--workers', type=options.positive_int, default=defaults.WORKERS, metavar='M',
         help='threads of this executor and of MultiThreadedExecutor (default: %(default)s)')
     add('--seconds', type=options.positive_float, default=10.0, metavar='S',
@@ -152,6 +158,9 @@ def _check(args: argparse.Namespace) -> None:
 @contextmanager
 def _graph(args: argparse.Namespace) -> Iterator[str | None]:
     """Give the path of the declaration, checked with all utilisations; None: the load has none."""
+    if args.load == ROBOT:
+        yield str(find(ROBOT_GRAPH))
+        return
     if args.load not in DECLARED:
         yield None
         return
@@ -188,7 +197,9 @@ def make_specs(
     """Return the measurements that a command line asks for, in the order of the table."""
     variants: list[dict[str, Any]]
     groups = args.groups or 'shared'
-    if graph is not None:
+    if args.load == ROBOT:
+        variants = [{'graph': graph, 'scale': scale} for scale in args.scale or [1.0]]
+    elif graph is not None:
         variants = [{'graph': graph, 'utilisation': utilisation, 'bodies': args.bodies or 'sleep'}
                     for utilisation in _utilisations(args)]
     elif args.load == 'topics':
@@ -221,6 +232,8 @@ def _measure(specs: Sequence[Spec], repeat: int) -> list[dict[str, Any]]:
 def result_table(results: Sequence[dict[str, Any]]) -> str:
     """Return the table for people: a row for each measurement."""
     load = results[0]['load']
+    if load == ROBOT:
+        return robot_table(results)
     header = {'topics': ['topics', 'rate'], 'entities': ['idle']}.get(load, ['utilisation'])
     header += ['executor']
     header += ['due', 'in time'] if load in DECLARED else ['published', 'lost']
@@ -229,6 +242,24 @@ def result_table(results: Sequence[dict[str, Any]]) -> str:
     if load == 'reference-system':
         header += ['hot path p50', 'p99', 'max']
     return table(header, [_row(load, result) for result in results])
+
+
+def robot_table(results: Sequence[dict[str, Any]]) -> str:
+    """Return the table of the robot's sinks: a row for each, a measurement after the other."""
+    rows: list[list[Cell]] = []
+    for result in results:
+        lead: list[Cell] = [f'{result["scale"]:g}', result['executor'],
+                            _number(result['cpu_cores'], '.2f')]
+        for name, sink in result['sinks'].items():
+            times = sink['response_ns'] or {}
+            rows.append([
+                *lead, name, sink['due'],
+                percent(sink['on_time'], sink['due']) if sink['due'] else None,
+                *(_number(times[key] / 1e6, '.1f', ' ms') if key in times else None
+                  for key in ('median', 'p99', 'max'))])
+            lead = [None, None, None]
+    header = ['scale', 'executor', 'cores', 'sink', 'due', 'in time', 'median', 'p99', 'max']
+    return table(header, rows)
 
 
 def _row(load: str, result: dict[str, Any]) -> list[Cell]:
@@ -271,7 +302,9 @@ def notes(results: Sequence[dict[str, Any]]) -> Iterator[str]:
            + counted(first['workers'], 'worker')
            + (f', {first["groups"]} callback groups' if 'groups' in first else '')
            + (', published together' if first.get('phases') == 'together' else ''))
-    if first['load'] in DECLARED:
+    if first['load'] == ROBOT:
+        yield "in time: by the nodes' own stamps, of what was due; cores: CPU of the whole process"
+    elif first['load'] in DECLARED:
         yield ('in time: of the sink jobs that were due, noticed by the executor or not; CPU: of '
                'the whole process')
     else:

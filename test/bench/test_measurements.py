@@ -275,3 +275,15 @@ def test_the_help_shows_an_example(mddag: Mddag) -> None:
     process = mddag('bench', 'live', '--help')
     assert process.returncode == 0
     assert 'mddag bench live --load topics' in process.stdout
+
+
+@pytest.mark.parametrize('executor', ['rad-events', 'events'])
+def test_the_robots_nodes_are_judged_by_their_own_stamps(executor: str) -> None:
+    graph = str(find('examples/robot/graph.yaml'))
+    result = measure(Spec('robot', executor, graph=graph, seconds=1.0, scale=0.2))
+    assert list(result['sinks']) == [
+        dag.vertices[i].name for dag in load(graph).dags for i in dag.sinks]
+    assert result['sink_jobs_due'] == sum(s['due'] for s in result['sinks'].values()) > 100
+    assert result['on_time'] > 0
+    for sink in result['sinks'].values():
+        assert sink['on_time'] + sink['late'] + sink['missing'] == sink['due']

@@ -136,6 +136,16 @@ def test_numpy_pipeline() -> None:
         assert int(printed[2]) == workers  # with two of them, two filters at once
 
 
+def test_robot() -> None:
+    *sinks, computing = run('robot').splitlines()
+    found = {m[1]: int(m[2]) for m in (re.match(r'(\S+): (\d+) times', s) for s in sinks) if m}
+    assert set(found) == {
+        'brake:check', 'fusion:keep', 'planner:locate', 'controller:locate', 'controller:follow',
+        'controller:control', 'operator:adjust'}
+    assert min(found.values()) >= 2
+    assert '/planner:plan' in computing
+
+
 def test_third_party(tmp_path: Path) -> None:
     output = run('third_party', '--json', tmp_path / 'result.json')
     heard = re.search(r'^heard (\d+) messages$', output, re.MULTILINE)

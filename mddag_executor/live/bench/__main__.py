@@ -22,15 +22,18 @@ from typing import Any, TextIO
 from mddag_executor.errors import MddagError
 from mddag_executor.live.bench.declared import run_declared
 from mddag_executor.live.bench.messages import run_messages
-from mddag_executor.live.bench.spec import DECLARED, Spec
+from mddag_executor.live.bench.robot import run_robot
+from mddag_executor.live.bench.spec import DECLARED, ROBOT, Spec
 from msg_graph import GraphError
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 
 def run(spec: Spec) -> dict[str, Any]:
-    """Make a measurement; see ``run_declared`` and ``run_messages``."""
+    """Make a measurement; see ``run_declared``, ``run_messages`` and ``run_robot``."""
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    if spec.load == ROBOT:
+        return run_robot(spec)
     return run_declared(spec) if spec.load in DECLARED else run_messages(spec)
 
 

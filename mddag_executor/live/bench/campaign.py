@@ -22,7 +22,7 @@ import tempfile
 import time
 from typing import Any
 
-from mddag_executor.live.bench.spec import BenchError, DECLARED, Spec
+from mddag_executor.live.bench.spec import BenchError, DECLARED, ROBOT, Spec
 
 PATIENCE_S = 90.0
 """What a process may take besides its window and warm-up: discovery and the end."""
@@ -142,8 +142,11 @@ def combine(spec: Spec, runs: Sequence[dict[str, Any]], repeat: int = 1) -> dict
         'load': spec.load, 'executor': spec.name, 'workers': spec.workers,
         'seconds': spec.seconds, 'seed': spec.seed, 'repeat': repeat,
         'crashed': repeat - len(runs)}
-    declared = spec.load in DECLARED
-    if declared:
+    declared = spec.load in DECLARED or spec.load == ROBOT
+    if spec.load == ROBOT:
+        result.update(graph=spec.graph, scale=spec.scale, sinks=_sinks(runs))
+        result['cpu_cores'] = _median(run['cpu_cores'] for run in runs)
+    elif declared:
         result['graph'] = spec.graph
         result['bodies'] = spec.bodies
     else:
@@ -162,9 +165,19 @@ def combine(spec: Spec, runs: Sequence[dict[str, Any]], repeat: int = 1) -> dict
     for name in () if declared else _COUNTS:
         result[name] = sum(run[name] for run in runs)
     kept = {*_VERDICTS, *_FIGURES, *_QUANTILES, *_COUNTS, 'on_time_ratio', 'callbacks',
-            'window_ns', 'attribution', 'infeasible_sinks'}
+            'window_ns', 'attribution', 'infeasible_sinks', 'sinks', 'cpu_cores'}
     result['runs'] = [{k: v for k, v in run.items() if k in kept} for run in runs]
     return result
+
+
+def _sinks(runs: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return for each sink of the robot the medians of what was due and on time, and of times."""
+    return {
+        name: {
+            **{key: _median(run['sinks'][name][key] for run in runs) for key in (
+                'due', 'on_time', 'late', 'missing')},
+            'response_ns': _medians([run['sinks'][name]['response_ns'] for run in runs])}
+        for name in (runs[0]['sinks'] if runs else ())}
 
 
 def _median(values: Iterable[float | None]) -> float | None:

@@ -21,10 +21,13 @@ NONE = 'none'
 """No executor: what the nodes of a declared load cost by themselves (see ``unmanaged``)."""
 
 EXECUTORS = (*OURS, *PEERS)
-LOADS = ('autoware', 'topics', 'entities', 'reference-system')
+ROBOT = 'robot'
+"""The load that is the ordinary nodes of an example."""
+LOADS = ('autoware', 'topics', 'entities', 'reference-system', ROBOT)
 DECLARED = {
     'autoware': 'config/autoware.yaml', 'reference-system': 'config/reference_system.yaml'}
 """The loads that are synthetic nodes, and the declarations that ship for them."""
+ROBOT_GRAPH = 'examples/robot/graph.yaml'
 GROUPS = ('shared', 'own', 'reentrant')
 """
 The callback groups of message loads: the node's default one, in which one callback runs at a time;
@@ -55,6 +58,7 @@ class Spec:
     :ivar idle: how many subscriptions there are besides, whose topics nobody publishes.
     :ivar groups: the callback groups of the subscriptions, one of ``GROUPS``.
     :ivar phases: when the topics are published, one of ``PHASES``.
+    :ivar scale: of how much the robot's nodes compute.
     """
 
     load: str
@@ -72,6 +76,7 @@ class Spec:
     idle: int = 0
     groups: str = 'shared'
     phases: str = 'drawn'
+    scale: float = 1.0
 
     @property
     def name(self) -> str:
