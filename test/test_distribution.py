@@ -161,7 +161,9 @@ def test_the_executor_loads_little_besides_rclpy() -> None:
     more = loaded('from mddag_executor import MultiDeadlineExecutor') - rclpy
     foreign = {name.split('.')[0] for name in more}
     # It takes declarations, and calls into rcl; traces, plots and compilers come when asked for.
-    assert foreign & (HEAVY | {'json', 'asyncio', 'multiprocessing', 'http'}) <= {'ctypes', 'yaml'}
+    assert foreign & (HEAVY | {'json', 'asyncio', 'multiprocessing', 'http'}) <= {
+        'ctypes', 'mcap', 'yaml'}
+    assert {name for name in more if name.startswith('mcap')} == {'mcap', 'mcap.opcode'}
     parts = {name.split('.')[1] for name in more if name.startswith(f'{NAME}.')}
     assert parts == {'clocks', 'core', 'defaults', 'errors', 'live', 'text', 'trace'}
     assert {f'{NAME}.trace.writer', f'{NAME}.trace.reader', f'{NAME}.trace.ctf'} & more == set()

@@ -9,11 +9,10 @@ The spinning thread mostly waits, and it does that in slices of ``SLICE_NS``.  I
 late, either other threads of the process kept the interpreter's lock, or nothing of the process
 ran.  The CPU time of the process tells which: in a stop it does not grow.
 
-* A stop is a lateness of ``LEAST_NS`` or more, and the process took less CPU time than
-  ``1 / CPU_SHARE`` of it.  CPU time before and after the stop counts, too, so in doubt there was
-  none.
-* It begins when the slice was due.  So a stop is noted as shorter than it was, by up to a slice,
-  and a very short one is not noted.
+* A stop is as long as the lateness, less the CPU time that the process took since the slice
+  began.  Its end is known, so its begin is taken that much before it.  CPU time before and after
+  the stop counts, too, and that of threads beside each other, so it was longer, if anything.
+* What is shorter than ``LEAST_NS`` is not noted.
 
 Nothing is added to the way of a message or a timer.  If a callback waits while it keeps the
 interpreter's lock, no thread runs either: that looks the same.
@@ -28,7 +27,6 @@ import time
 from mddag_executor.core.stops import LEAST_NS
 
 SLICE_NS = 20_000_000
-CPU_SHARE = 4
 
 
 class StopWatch:
@@ -62,6 +60,7 @@ class StopWatch:
             due = min(end, now + SLICE_NS)
             is_set = self._event.wait((due - now) / 1e9)
             now, before, used = self._clock(), used, self._cpu()
-            if now - due >= LEAST_NS and (used - before) * CPU_SHARE < now - due:
-                self._stopped(due, now)
+            begin = due + used - before
+            if now - begin >= LEAST_NS:
+                self._stopped(begin, now)
             self._look()

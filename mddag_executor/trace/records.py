@@ -16,9 +16,6 @@ from __future__ import annotations
 
 import struct
 
-from mcap.data_stream import RecordBuilder
-from mcap.records import McapRecord
-
 MAGIC = b'\x89MCAP0\r\n'
 LIBRARY = 'mddag_executor'
 """Stands in the header of files that this program wrote."""
@@ -39,14 +36,6 @@ UINT64 = struct.Struct('<Q')
 def record(opcode: int, content: bytes) -> bytes:
     """Return a whole record."""
     return RECORD.pack(opcode, len(content)) + content
-
-
-def written(what: McapRecord) -> bytes:
-    """Return one of mcap's records as it stands in a file."""
-    builder = RecordBuilder()
-    what.write(builder)
-    data: bytes = builder.end()  # type: ignore[no-untyped-call]
-    return data
 
 
 class Cursor:

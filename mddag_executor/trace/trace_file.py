@@ -30,6 +30,7 @@ from types import TracebackType
 from typing import Any
 import zlib
 
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Channel,
@@ -38,6 +39,7 @@ from mcap.records import (
     DataEnd,
     Footer,
     Header,
+    McapRecord,
     Schema,
     Statistics,
 )
@@ -52,6 +54,14 @@ _TWICE = 'mddag:task_set'
 _COMPRESSION_LEVEL = 1      # of zstd; higher levels cost more than they save on such data
 
 
+def written(what: McapRecord) -> bytes:
+    """Return one of mcap's records as it stands in a file."""
+    builder = RecordBuilder()
+    what.write(builder)
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data
+
+
 class _Channel:
     """What the writer knows of one kind of event."""
 
@@ -62,9 +72,9 @@ class _Channel:
         self.event = event
         self.schema_name = schema_name
         self.number = number            # of the channel and of its schema
-        self.schema = records.written(
+        self.schema = written(
             Schema(number, event.text.encode(), 'ros2msg', schema_name))
-        self.channel = records.written(Channel(number, event.topic, 'cdr', {}, number))
+        self.channel = written(Channel(number, event.topic, 'cdr', {}, number))
         self.undefined = len(self.schema) + len(self.channel)   # 0 once they are in the file
         self.count = 0                  # messages so far
         self.index: list[int] = []      # log_time and offset of each message in the open chunk
@@ -174,7 +184,7 @@ class TraceFile:
             reason = getattr(error, 'strerror', None) or str(error)
             raise TraceError(self.path, f'cannot be written ({reason})',
                              'name a file in an existing folder that you may write') from None
-        self._write(records.MAGIC + records.written(Header('ros2', records.LIBRARY)))
+        self._write(records.MAGIC + written(Header('ros2', records.LIBRARY)))
 
     def define(self, event: EventType) -> str:
         """
@@ -310,7 +320,7 @@ class TraceFile:
         end = max(max(channel.index[::2]) for channel in used)
         data = b''.join(self._records)
         packed = self._zstd.compress(data)
-        chunk = records.written(Chunk('zstd', packed, end, start, zlib.crc32(data), len(data)))
+        chunk = written(Chunk('zstd', packed, end, start, zlib.crc32(data), len(data)))
         messages = 0
         indexes = b''
         offsets = {}
@@ -322,7 +332,7 @@ class TraceFile:
                 Opcode.MESSAGE_INDEX, struct.pack('<HI', channel.number, len(entries)) + entries)
             messages += len(channel.index) // 2
             channel.index = []
-        self._chunk_indexes.append(records.written(ChunkIndex(
+        self._chunk_indexes.append(written(ChunkIndex(
             chunk_length=len(chunk), chunk_start_offset=self._offset, compression='zstd',
             compressed_size=len(packed), message_end_time=end, message_index_length=len(indexes),
             message_index_offsets=offsets, message_start_time=start,
@@ -343,10 +353,10 @@ class TraceFile:
         if self._stream.closed:
             return
         self.flush()
-        self._write(records.written(DataEnd(0)))
+        self._write(written(DataEnd(0)))
         summary_start = self._offset
         summary = self._summary()
-        footer = records.written(Footer(summary_start, 0, 0))[:-4]
+        footer = written(Footer(summary_start, 0, 0))[:-4]
         crc = zlib.crc32(summary + footer)      # of all from the summary's start to the CRC itself
         self._write(summary + footer + records.UINT32.pack(crc) + records.MAGIC)
         self._stream.close()
@@ -362,7 +372,7 @@ class TraceFile:
         return b''.join((
             *(channel.schema for channel in defined),
             *(channel.channel for channel in defined),
-            records.written(statistics),
+            written(statistics),
             *self._chunk_indexes))
 
     def abandon(self) -> None:

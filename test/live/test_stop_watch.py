@@ -7,7 +7,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from mddag_executor.live.stop_watch import CPU_SHARE, LEAST_NS, SLICE_NS, StopWatch
+from mddag_executor.live.stop_watch import LEAST_NS, SLICE_NS, StopWatch
 import pytest
 
 from .conftest import Spinning, wait_for
@@ -63,11 +63,11 @@ def test_it_waits_no_longer_than_until_the_event() -> None:
 
 
 @pytest.mark.parametrize(('late', 'cpu', 'stop'), [
-    (300 * MS, 0, True), (300 * MS, 300 * MS // CPU_SHARE - 1, True),
-    (300 * MS, 300 * MS // CPU_SHARE, False), (300 * MS, 600 * MS, False),
-    (LEAST_NS, MS, True), (LEAST_NS - 1, 0, False)])
+    (300 * MS, 0, True), (300 * MS, 200 * MS, True), (300 * MS, 300 * MS - LEAST_NS, True),
+    (300 * MS, 300 * MS - LEAST_NS + 1, False), (300 * MS, 600 * MS, False),
+    (LEAST_NS, 0, True), (LEAST_NS - 1, 0, False)])
 def test_a_stop_is_long_and_takes_no_cpu_time(late: int, cpu: int, stop: bool) -> None:
-    expected = [(SLICE_NS, SLICE_NS + late)] if stop else []
+    expected = [(SLICE_NS + cpu, SLICE_NS + late)] if stop else []
     assert Machine((late, cpu)).stops(0.02) == expected
     assert Machine((late, cpu), set_after=1).stops(0.1) == expected
 

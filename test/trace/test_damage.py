@@ -23,6 +23,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 from mddag_executor.trace import records, TraceError, TraceFile, TraceReader
 from mddag_executor.trace.schema import EVENTS
+from mddag_executor.trace.trace_file import written
 import pytest
 import zstandard
 
@@ -363,12 +364,12 @@ def chunk(content: bytes, **changes: Any) -> bytes:
 def definitions(text: str = EVENTS['ros2:callback_end'].text) -> bytes:
     """Return the records that make channel 1 one of callback_end."""
     schema = Schema(1, text.encode(), 'ros2msg', 'a')
-    return records.written(schema) + channel('/trace/ros2/callback_end')
+    return written(schema) + channel('/trace/ros2/callback_end')
 
 
 def channel(topic: str) -> bytes:
     """Return the record that makes channel 1 one of a topic."""
-    return records.written(Channel(1, topic, 'cdr', {}, 1))
+    return written(Channel(1, topic, 'cdr', {}, 1))
 
 
 def message(fields: bytes) -> bytes:
