@@ -86,6 +86,12 @@ class RerunHost(Host):
         super().__init__(executor, end_run)
         self._loop = loop
 
+    def program_ended(self, guest: Guest) -> None:
+        """Take a program's nodes away; end the run where it has failed, or after the last."""
+        super().program_ended(guest)
+        if guest.error is not None:
+            self.end_run()
+
     def wait(
         self, timeout_s: float | None, event: Any = None, guest: Guest | None = None,
     ) -> None:

@@ -217,8 +217,9 @@ class Messages:
         """Return how many subscribe to a publisher's topic: nodes, and the rerun itself."""
         return 1 + len(self._inlets_of(self._outlet(publisher)))
 
-    def publisher_count(self, topic: str) -> int:
-        """Return how many publishers a topic has: in the recording, or nodes of the run."""
+    def publisher_count(self, subscription: Any) -> int:
+        """Return how many publish to a subscription: nodes of the run, or the recording."""
+        topic = subscription.topic_name
         here = sum(outlet.topic == topic for outlet in self._outlets.values())
         return max(here, int(topic in self.offered or topic in self._last))
 

@@ -8,6 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 
+def instead(function: Callable[..., Any]) -> Callable[[Any], Any]:
+    """Return what puts a function, or a bound method, in the place of a method."""
+    return lambda original: lambda *args, **more: function(*args, **more)
+
+
 class Replacements:
     """What has been replaced, so that it can be put back."""
 

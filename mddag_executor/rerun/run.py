@@ -22,7 +22,8 @@ from typing import Any, BinaryIO
 from mddag_executor import defaults
 from mddag_executor.live import hooks
 from mddag_executor.live.engine import Engine
-from mddag_executor.live.loading import Program
+from mddag_executor.live.hosting import Guest
+from mddag_executor.live.loading import describe, Program
 from mddag_executor.live.other_processes import OtherProcesses
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
@@ -31,11 +32,11 @@ from mddag_executor.rerun.clocks import replace_timers, VirtualTime
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.executor import NodeHolder, RerunHost
-from mddag_executor.rerun.loop import Loop, RECORDED
+from mddag_executor.rerun.loop import ENDED, Loop, RECORDED
 from mddag_executor.rerun.messages import Messages
 from mddag_executor.rerun.outputs import Output, Outputs
 from mddag_executor.rerun.recording import Recorded
-from mddag_executor.rerun.replacing import Replacements
+from mddag_executor.rerun.replacing import instead, Replacements
 from mddag_executor.rerun.services import Services
 from mddag_executor.rerun.sources import Source
 from mddag_executor.rerun.strands import Stuck
@@ -44,6 +45,8 @@ from mddag_executor.rerun.trace import VirtualTraceWriter
 from mddag_executor.rerun.types import type_name
 from msg_graph import TaskSet
 import rclpy
+from rclpy.exceptions import ROSInterruptException
+from rclpy.executors import ExternalShutdownException
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
@@ -56,6 +59,7 @@ MAX_ACTIVE_JOBS = 64
 EXPIRE_AFTER = 1_000_000_000
 PATIENCE_S = 30.0
 _OF_ALL_NODES = {'/parameter_events'}
+_ENDS = (ExternalShutdownException, KeyboardInterrupt, ROSInterruptException)
 _NO_DISCOVERY = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 
 
@@ -132,6 +136,8 @@ class Rerun:
         self.warnings: list[str] = []
         self._outputs = Outputs(output, keep or bool(source.topics))
         self._programs: Callable[[], Sequence[Program]] = tuple
+        self._failed: list[Guest] = []
+        self._hosted: set[str] = set()
 
     # --- parts -----------------------------------------------------------------------------------
 
@@ -199,6 +205,7 @@ class Rerun:
                 if self._recorder is not None:
                     self._recorder.close(loop.now)
         self._check_programs()
+        self._check_hosted()
         self._outputs.finish()
         return self._result(time.monotonic() - begin)
 
@@ -211,13 +218,10 @@ class Rerun:
         virtual.install(replace)
         replace_timers(self._replacements, self._timers)
         self._services.install(self._replacements)
-        replace(Publisher, 'publish', lambda original: (
-            lambda publisher, msg: messages.publish(publisher, msg)))
-        replace(Publisher, 'get_subscription_count', lambda original: (
-            lambda publisher: messages.subscription_count(publisher)))
-        replace(Publisher, 'wait_for_all_acked', lambda original: lambda *args, **more: True)
-        replace(Subscription, 'get_publisher_count', lambda original: (
-            lambda subscription: messages.publisher_count(subscription.topic_name)))
+        replace(Publisher, 'publish', instead(messages.publish))
+        replace(Publisher, 'get_subscription_count', instead(messages.subscription_count))
+        replace(Publisher, 'wait_for_all_acked', instead(lambda *args, **more: True))
+        replace(Subscription, 'get_publisher_count', instead(messages.publisher_count))
 
     def _seed(self) -> None:
         random.seed(self._settings.seed)
@@ -230,23 +234,28 @@ class Rerun:
     def _begin(self) -> None:
         """Start the programs, one after the other; each runs until it waits for something."""
         self._host.start(self._programs(), self._settings.ros_args)
-        self._refresh()
+        self._loop.at(self._loop.start, ENDED, self._started)
+
+    def _started(self) -> None:
+        """Begin to deliver, when each program has come to where it waits for something."""
+        if all(guest.settled.is_set() for guest in self._host.guests):
+            self._check_hosted()
         self._check_topics()
         self._play_from(self._loop.start)
 
-    def _check_topics(self) -> None:
-        hosted = self._registry.hosted()
-        name = self._source.name
-        if not hosted:
+    def _check_hosted(self) -> None:
+        if not self._hosted:
             raise RerunError(
                 f'{self._task_set.file}: none of its callbacks is in the nodes that run: give the '
                 'nodes that it declares')
+
+    def _check_topics(self) -> None:
         there = {*self._source.topics, *self._messages.offered, CLOCK}
         for callback in self._task_set.callbacks:
             for topic in callback.topics:
-                if callback.key in hosted and topic not in there:
+                if callback.key in self._hosted and topic not in there:
                     raise RerunError(
-                        f'{name}: {topic}, which {callback.key} needs, is not recorded: record '
+                        f'{self._source.name}: {topic}, which {callback.key} needs, is not recorded: record '
                         'it, or run the node that publishes it with --node')
 
     def _refresh(self) -> None:
@@ -254,10 +263,12 @@ class Rerun:
         nodes = self._holder.ordered_nodes()
         registry, engine, now = self._registry, self._engine, self._loop.now
         added, gone = registry.refresh(nodes)
+        hosted = registry.hosted()
+        self._hosted |= hosted
         if added or gone:
             assert engine.other_processes is not None
             engine.other_processes.host(
-                registry.hosted(), registry.subscriptions(), engine.record, now)
+                hosted, registry.subscriptions(), engine.record, now)
         for entity in added:
             entity.since = now
         for entity in gone:
@@ -311,6 +322,7 @@ class Rerun:
 
     def _over(self) -> None:
         """Judge what is open; then let programs end, whose context has ended."""
+        self._failed = [guest for guest in self._host.guests if guest.error is not None]
         self.warnings += self._loop.blocked()
         self._engine.finish(self._loop.now)
         self._host.close()
@@ -324,11 +336,16 @@ class Rerun:
             'rclpy or threading, or correct it')
 
     def _check_programs(self) -> None:
+        for guest in self._failed:
+            assert guest.error is not None
+            raise CallbackFailed(
+                f'--node {guest.program.spec}', guest.error, self._loop.now - self._loop.start
+            ) from guest.error
         for guest in self._host.guests:
-            if guest.error is not None:
-                raise CallbackFailed(
-                    f'--node {guest.program.spec}', guest.error, self._loop.now - self._loop.start
-                ) from guest.error
+            if guest.error is not None and not isinstance(guest.error, _ENDS):
+                self._warn(
+                    f'--node {guest.program.spec}: after the end of the run its main raised '
+                    f'{describe(guest.error)}')
 
     def _result(self, elapsed_s: float) -> Result:
         loop, recording = self._loop, self._source.messages

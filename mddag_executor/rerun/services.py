@@ -22,7 +22,7 @@ from mddag_executor.live.entity import Entity, SERVICE
 from mddag_executor.live.jobs import Origin
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.loop import Loop
-from mddag_executor.rerun.replacing import Replacements
+from mddag_executor.rerun.replacing import instead, Replacements
 from rclpy.client import Client
 from rclpy.exceptions import InvalidHandle
 from rclpy.service import Service
@@ -80,11 +80,11 @@ class Services:
     def install(self, replacements: Replacements) -> None:
         """Have clients and services use this."""
         replace = replacements.replace
-        replace(Client, 'call_async', lambda original: self.call_async)
-        replace(Client, 'call', lambda original: self.call)
-        replace(Client, 'service_is_ready', lambda original: self.is_offered)
-        replace(Client, 'wait_for_service', lambda original: self.wait_for_service)
-        replace(Service, 'send_response', lambda original: self.send_response)
+        replace(Client, 'call_async', instead(self.call_async))
+        replace(Client, 'call', instead(self.call))
+        replace(Client, 'service_is_ready', instead(self.is_offered))
+        replace(Client, 'wait_for_service', instead(self.wait_for_service))
+        replace(Service, 'send_response', instead(self.send_response))
 
     def is_offered(self, client: Client) -> bool:
         """Return whether a node of the run offers a client's service."""

@@ -1,0 +1,349 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What waits, and what asks others: services, parameters, rates, sleeps, threads, programs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+import queue
+import threading
+import time
+from typing import Any
+
+from mddag_executor.rerun import rerun, RerunError, Result
+import pytest
+from rcl_interfaces.srv import GetParameters
+import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_msgs.msg import Header, String
+from std_srvs.srv import Trigger
+
+from .helpers import GRAPH, MS, START, write_bag
+
+Seen = list[tuple[float, Any]]
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> str:
+    return write_bag(tmp_path / 'in.mcap', [
+        (i * 100 * MS, '/points', Header(frame_id=str(i))) for i in range(20)])
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Path:
+    path = tmp_path / 'graph.yaml'
+    path.write_text(GRAPH)
+    return path
+
+
+class Filter(Node):
+    """The declared node; what it does with each message is given."""
+
+    def __init__(self, take: Callable[[Filter, int], Any], **more: Any) -> None:
+        super().__init__('filter', **more)
+        self.group = ReentrantCallbackGroup()
+        self.seen: Seen = []
+        self.create_subscription(
+            Header, '/points', lambda message: take(self, int(message.frame_id)), 10,
+            callback_group=self.group)
+
+    def note(self, what: Any) -> None:
+        """Note something with the virtual time, ms after the start."""
+        self.seen.append(((self.get_clock().now().nanoseconds - START) / MS, what))
+
+
+def run_filter(
+    bag: str, graph: Path, take: Callable[[Filter, int], Any], *others: Any,
+    fill: Callable[[Filter], None] = lambda node: None, **more: Any,
+) -> tuple[Seen, Result]:
+    """Rerun the node; return what it noted."""
+    nodes: list[Filter] = []
+
+    def make() -> Node:
+        node = Filter(take)
+        fill(node)
+        nodes.append(node)
+        return node
+
+    result = rerun(bag, graph, [make, *others], **more)
+    return nodes[0].seen, result
+
+
+def server(answers_after_ms: float | None = None) -> Node:
+    """Return a node with a service, which takes its time with a rate."""
+    node = rclpy.create_node('server')
+
+    def answer(request: Any, response: Any) -> Any:
+        if answers_after_ms is not None:
+            node.get_clock().sleep_for(Duration(nanoseconds=round(answers_after_ms * MS)))
+        response.message = 'hello'
+        return response
+
+    node.create_service(Trigger, '/greet', answer)
+    return node
+
+
+def test_a_service_answers_in_virtual_time(bag: str, graph: Path) -> None:
+    def take(node: Filter, number: int) -> None:
+        if number == 3:
+            client = node.create_client(Trigger, '/greet')
+            assert client.wait_for_service(timeout_sec=1.0)
+            future = client.call_async(Trigger.Request())
+            future.add_done_callback(lambda done: node.note(done.result().message))
+
+    seen, _ = run_filter(bag, graph, take, lambda: server(7))
+    # The request leaves with the end of the callback, after 10 ms.
+    assert seen == [(317.0, 'hello')]
+
+
+def test_a_synchronous_call_lends_its_worker(bag: str, graph: Path) -> None:
+    def take(node: Filter, number: int) -> None:
+        if number == 3:
+            client = node.create_client(Trigger, '/greet')
+            node.note(client.call(Trigger.Request()).message)
+
+    seen, result = run_filter(bag, graph, take, lambda: server(20), workers=1)
+    assert seen == [(320.0, 'hello')]
+    assert not result.warnings
+
+
+def test_a_service_that_nobody_offers(bag: str, graph: Path) -> None:
+    def take(node: Filter, number: int) -> None:
+        client = node.create_client(Trigger, '/nobody')
+        if number == 3:
+            node.note(client.wait_for_service(timeout_sec=0.25))
+            node.note(client.call(Trigger.Request(), timeout_sec=0.5))
+        elif number == 8:
+            client.call(Trigger.Request())
+
+    seen, result = run_filter(bag, graph, take)
+    assert seen == [(550.0, False), (1050.0, None)]
+    assert result.warnings == [
+        '/nobody: it is called, and no node of the run offers this service',
+        '/filter:take: it still waits (for service /nobody)']
+
+
+def test_parameters_of_another_node(bag: str, graph: Path) -> None:
+    def take(node: Filter, number: int) -> None:
+        if number == 1:
+            client = node.create_client(GetParameters, '/server/get_parameters')
+            answer = client.call(GetParameters.Request(names=['use_sim_time', 'speed']))
+            node.note([value.type for value in answer.values])
+
+    def other() -> Node:
+        node = rclpy.create_node('server')
+        node.declare_parameter('speed', 3)
+        return node
+
+    seen, result = run_filter(bag, graph, take, other)
+    assert seen == [(100.0, [Parameter.Type.BOOL.value, Parameter.Type.INTEGER.value])]
+    assert result.counts['/parameter_events'] == 5
+
+
+def test_coroutines(bag: str, graph: Path) -> None:
+    async def take(node: Filter, number: int) -> None:
+        if number in (3, 4):
+            client = node.create_client(Trigger, '/greet')
+            answer = await client.call_async(Trigger.Request())
+            node.note(f'{answer.message} {number}')
+
+    seen, _ = run_filter(bag, graph, take, lambda: server(150))
+    assert seen == [(460.0, 'hello 3'), (610.0, 'hello 4')]
+
+
+def test_rates_and_clocks_sleep_in_virtual_time(bag: str, graph: Path) -> None:
+    def take(node: Filter, number: int) -> None:
+        if number == 2:
+            rate = node.create_rate(100.0)
+            rate.sleep()
+            node.note('rate')
+            node.get_clock().sleep_for(Duration(seconds=0.5))
+            node.note('clock')
+
+    seen, _ = run_filter(bag, graph, take)
+    assert seen == [(210.0, 'rate'), (710.0, 'clock')]
+
+
+def test_threads_of_nodes_are_in_virtual_time_too(bag: str, graph: Path) -> None:
+    def fill(node: Filter) -> None:
+        numbers = queue.Queue[int]()
+        node.numbers = numbers  # type: ignore[attr-defined]
+        publisher = node.create_publisher(String, '/doubled', 10)
+
+        def work() -> None:
+            while True:
+                number = numbers.get()
+                node.get_clock().sleep_for(Duration(seconds=0.005))
+                publisher.publish(String(data=str(2 * number)))
+                node.note(2 * number)
+                if number == 4:
+                    node.note(pool.submit(lambda: 'pooled').result())
+                    return
+
+        pool = ThreadPoolExecutor(2)
+        threading.Thread(target=work, daemon=True).start()
+
+    def take(node: Filter, number: int) -> None:
+        node.numbers.put(number)  # type: ignore[attr-defined]
+
+    seen, result = run_filter(bag, graph, take, fill=fill)
+    assert seen == [(100.0 * i + 5, 2 * i) for i in range(5)] + [(405.0, 'pooled')]
+    assert result.counts['/doubled'] == 5
+    assert not result.warnings
+
+
+def test_joining_a_thread(bag: str, graph: Path) -> None:
+    def take(node: Filter, number: int) -> None:
+        if number == 1:
+            event = threading.Event()
+            thread = threading.Thread(
+                target=lambda: node.note(event.wait(0.02)), daemon=True)
+            thread.start()
+            thread.join()
+            node.note('joined')
+
+    seen, _ = run_filter(bag, graph, take)
+    assert seen == [(120.0, False), (120.0, 'joined')]
+
+
+# --- programs ------------------------------------------------------------------------------------
+
+def test_a_program_with_a_loop_of_its_own(bag: str, graph: Path) -> None:
+    seen: Seen = []
+
+    def main() -> None:
+        rclpy.init()
+        node = Filter(lambda node, number: node.note(number) if number % 5 == 0 else None)
+        thread = threading.Thread(target=rclpy.spin, args=(node,), daemon=True)
+        thread.start()
+        rate = node.create_rate(2)
+        try:
+            while rclpy.ok():
+                rate.sleep()
+                node.note('loop')
+        except ExternalShutdownException:
+            pass
+        finally:
+            seen.extend(node.seen)
+
+    rerun(bag, graph, [main])
+    assert seen[:8] == [
+        (0.0, 0), (500.0, 'loop'), (500.0, 5), (1000.0, 'loop'), (1000.0, 10), (1500.0, 'loop'),
+        (1500.0, 15)]
+
+
+def test_spin_until_future_complete_with_a_timeout(bag: str, graph: Path) -> None:
+    seen: Seen = []
+
+    def main() -> None:
+        rclpy.init()
+        node = Filter(lambda node, number: done.set_result(number) if number == 7 else None)
+        done, never = rclpy.Future(), rclpy.Future()
+        rclpy.spin_until_future_complete(node, never, timeout_sec=0.25)
+        node.note('timeout')
+        rclpy.spin_until_future_complete(node, done)
+        node.note(done.result())
+        for _ in range(3):
+            rclpy.spin_once(node, timeout_sec=0.1)
+        node.note('three steps')
+        executor = MultiThreadedExecutor()
+        executor.add_node(node)
+        executor.spin_until_future_complete(never, timeout_sec=0.1)
+        node.note('executor')
+        seen.extend(node.seen)
+        node.destroy_node()
+        rclpy.shutdown()
+
+    rerun(bag, graph, [main])
+    assert seen == [(250.0, 'timeout'), (700.0, 7), (1000.0, 'three steps'), (1100.0, 'executor')]
+
+
+def test_a_program_waits_for_a_service_of_the_next_one(bag: str, graph: Path) -> None:
+    seen: Seen = []
+
+    def main() -> None:
+        rclpy.init()
+        node = Filter(lambda node, number: None)
+        client = node.create_client(Trigger, '/greet')
+        assert client.wait_for_service(timeout_sec=5.0)
+        future = client.call_async(Trigger.Request())
+        rclpy.spin_until_future_complete(node, future)
+        node.note(future.result().message)
+        seen.extend(node.seen)
+        rclpy.spin(node)
+
+    rerun(bag, graph, [main, lambda: server(30)])
+    assert seen == [(30.0, 'hello')]
+
+
+def test_shutdown_from_a_callback_ends_the_run(bag: str, graph: Path) -> None:
+    def take(node: Filter, number: int) -> None:
+        node.note(number)
+        if number == 3:
+            rclpy.shutdown()
+
+    seen, result = run_filter(bag, graph, take)
+    assert [number for _, number in seen] == [0, 1, 2, 3]
+    assert result.virtual_ns == 300 * MS
+
+
+def test_what_a_program_raises(bag: str, graph: Path) -> None:
+    def main() -> None:
+        rclpy.init()
+        node = Filter(lambda node, number: None)
+        rclpy.spin_once(node, timeout_sec=0.5)
+        raise RuntimeError('no more')
+
+    with pytest.raises(RerunError, match='--node main: it raised RuntimeError: no more'):
+        rerun(bag, graph, [main])
+
+
+# --- clocks --------------------------------------------------------------------------------------
+
+def test_all_clocks(bag: str, graph: Path) -> None:
+    def take(node: Filter, number: int) -> None:
+        if number in (1, 2):
+            before = time.monotonic(), time.time_ns(), time.perf_counter()
+            time.sleep(0.03)
+            after = time.monotonic(), time.time_ns(), time.perf_counter()
+            node.note([round(1000 * (after[0] - before[0])), (after[1] - before[1]) // MS,
+                       round(1000 * (after[2] - before[2]))])
+
+    seen, result = run_filter(bag, graph, take, all_clocks=True)
+    assert seen == [(130.0, [30, 30, 30]), (230.0, [30, 30, 30])]
+    assert not result.warnings
+
+
+def test_what_is_not_the_same_each_time_is_warned_of(bag: str, graph: Path) -> None:
+    def take(node: Filter, number: int) -> None:
+        time.time()
+        time.sleep(0.0)
+
+    _, result = run_filter(bag, graph, take)
+    assert [warning.partition(': ')[2] for warning in result.warnings] == [
+        'time.time() is not the same in each run: give --all-clocks',
+        'time.sleep() takes real time: give --all-clocks']
+    assert all(warning.startswith(f'{__file__}:') for warning in result.warnings)
+
+
+# --- what blocks ---------------------------------------------------------------------------------
+
+def test_a_node_that_blocks_for_ever_is_named(bag: str, graph: Path) -> None:
+    lock = threading.Lock()
+
+    def take(node: Filter, number: int) -> None:
+        if number == 3:
+            lock.acquire()
+            lock.acquire(timeout=5.0)
+
+    with pytest.raises(RerunError) as caught:
+        run_filter(bag, graph, take, patience_s=0.3)
+    assert str(caught.value).startswith(
+        f'/filter:take: it has been blocking at {__file__}:')
+    assert 'at 0.300000 s of the run' in str(caught.value)
