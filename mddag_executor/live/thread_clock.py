@@ -46,10 +46,7 @@ class ThreadClock:
 
     def is_runnable(self) -> bool:
         """Return whether it runs or waits for a CPU, and for nothing else; from any thread."""
-        try:
-            return (self._folder / 'stat').read_bytes().rpartition(b')')[2].split()[0] == b'R'
-        except (OSError, IndexError):
-            return False
+        return is_runnable(self._folder)
 
     def close(self) -> None:
         """Close what it reads, in the thread itself."""
@@ -57,3 +54,11 @@ class ThreadClock:
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
+
+
+def is_runnable(folder: Path) -> bool:
+    """Return whether a thread runs or waits for a CPU, by its folder in /proc (proc(5))."""
+    try:
+        return (folder / 'stat').read_bytes().rpartition(b')')[2].split()[0] == b'R'
+    except (OSError, IndexError):
+        return False

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any
 
 from mddag_executor.live.compat import callback_type, WITH_INFO
@@ -102,8 +101,7 @@ class Sent:
 
     def early(self, origin: Origin, release: int) -> int:
         """Return how long before the end of its execution it leaves: the earliest of its ways."""
-        return min((delay for _, delay in self._messages.ways(self.outlet, origin, release)),
-                   default=0)
+        return self._messages.earliest(self.outlet, origin, release)
 
     def leave(self, origin: Origin | None, release: int, end: int) -> None:
         """Go to the outputs and to the subscriptions."""
@@ -197,7 +195,7 @@ class Messages:
     def publish(self, publisher: Any, msg: Any) -> None:
         """Publish a message, in place of ``Publisher.publish``."""
         with publisher.handle:  # else it has been destroyed
-            pass
+            outlet = self._outlet(publisher)
         if isinstance(msg, publisher.msg_type):
             data = canonical(serialize_message(msg), publisher.msg_type)
         elif isinstance(msg, bytes):
@@ -206,12 +204,12 @@ class Messages:
             raise TypeError(f'Expected {publisher.msg_type}, got {type(msg)}')
         if self._loop.strands.mine() is None:
             self._warn(
-                f'{publisher.topic_name}: a thread publishes on it that is not of the run: when '
+                f'{outlet.topic}: a thread publishes on it that is not of the run: when '
                 'that happens depends on the machine')
         current = self._loop.current
         if current is not None:
-            current.work.entity.publishes.add(publisher.topic_name)
-        self._loop.send(Sent(self, self._outlet(publisher), data))
+            current.work.entity.publishes.add(outlet.topic)
+        self._loop.send(Sent(self, outlet, data))
 
     def subscription_count(self, publisher: Publisher) -> int:
         """Return how many subscribe to a publisher's topic: nodes, and the rerun itself."""
@@ -221,7 +219,7 @@ class Messages:
         """Return how many publish to a subscription: nodes of the run, or the recording."""
         topic = subscription.topic_name
         here = sum(outlet.topic == topic for outlet in self._outlets.values())
-        return max(here, int(topic in self.offered or topic in self._last))
+        return here or int(topic in self.offered or topic in self._last)
 
     def record(self, sent: Sent, thread: int) -> None:
         """Record a publication."""
@@ -230,18 +228,18 @@ class Messages:
             self._engine.record(
                 PUBLICATION, self._loop.now, thread, id(sent.outlet.publisher), self._sequence)
 
-    def ways(
-        self, outlet: Outlet, origin: Origin | None, release: int
-    ) -> list[tuple[Inlet, int]]:
-        """Return which subscriptions get a message, and how long after its execution's end."""
-        found = []
-        for inlet in self._inlets_of(outlet):
-            target = None if origin is None else inlet.entity.targets.get(origin.vertex)
-            delay = 0
-            if origin is not None and target is not None:
-                delay = self._times.transport(origin.dag, origin.vertex, target[0], release)
-            found.append((inlet, delay))
-        return found
+    def earliest(self, outlet: Outlet, origin: Origin, release: int) -> int:
+        """Return when the first subscription gets a message, after its execution's end."""
+        if self._times.at_once:
+            return 0
+        return min((self._delay(inlet, origin, release) for inlet in self._inlets_of(outlet)),
+                   default=0)
+
+    def _delay(self, inlet: Inlet, origin: Origin | None, release: int) -> int:
+        target = None if origin is None else inlet.entity.targets.get(origin.vertex)
+        if origin is None or target is None or self._times.at_once:
+            return 0
+        return self._times.transport(origin.dag, origin.vertex, target[0], release)
 
     def leave(self, sent: Sent, origin: Origin | None, release: int, end: int) -> None:
         """Send a message to the outputs and to the subscriptions."""
@@ -250,12 +248,13 @@ class Messages:
         outlet.count += 1
         if outlet.kept.maxlen:
             outlet.kept.append((now, sent.data))
-        for inlet, delay in self.ways(outlet, origin, release):
-            if end + delay <= now:
+        for inlet in self._inlets_of(outlet):
+            time = end + self._delay(inlet, origin, release)
+            if time <= now:
                 self._arrive(inlet, sent.data, now, origin, outlet.count)
             else:
-                self._loop.at(end + delay, ARRIVED, partial(
-                    self._arrive, inlet, sent.data, now, origin, outlet.count))
+                self._loop.at(
+                    time, ARRIVED, self._arrive, inlet, sent.data, now, origin, outlet.count)
 
     # --- what arrives ----------------------------------------------------------------------------
 

@@ -42,6 +42,7 @@ class Outputs:
         self.messages: list[Output] = []
         self.counts: dict[str, int] = {}
         self._keep = keep
+        self._heads: dict[tuple[str, Any], bytes] = {}
         self._hash = hashlib.sha256()
         self._bag = None if file is None else _Bag(file)
 
@@ -50,11 +51,10 @@ class Outputs:
         self.counts[topic] = self.counts.get(topic, 0) + 1
         if self._keep:
             self.messages.append(Output(time, topic, kind, data))
-        name = type_name(kind)
-        head = f'{topic}\n{name}\n'.encode()
-        self._hash.update(_HEAD.pack(time, len(head), len(data)))
-        self._hash.update(head)
-        self._hash.update(data)
+        head = self._heads.get((topic, kind))
+        if head is None:
+            head = self._heads[topic, kind] = f'{topic}\n{type_name(kind)}\n'.encode()
+        self._hash.update(_HEAD.pack(time, len(head), len(data)) + head + data)
         if self._bag is not None:
             self._bag.add(time, topic, kind, data, publisher)
 

@@ -28,6 +28,7 @@ from mddag_executor.live.other_processes import OtherProcesses
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 from mddag_executor.live.shutdown import is_over
+from mddag_executor.rerun.actions import Actions
 from mddag_executor.rerun.clocks import replace_timers, VirtualTime
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
@@ -89,6 +90,8 @@ class Result:
     :ivar digest: that of all outputs, see ``outputs``.
     :ivar outputs: what was published, in order.
     :ivar counts: how many messages were published, by topic.
+    :ivar started_s: how long it took, really, until all programs had started; ``elapsed_s``: with
+        that, until the end.
     :ivar start_ns: the virtual time at which it began.
     :ivar recorded: how topics differ that are in the recording, too.
     :ivar warnings: what is not the same in each run, or doubtful, one line each.
@@ -98,6 +101,7 @@ class Result:
     outputs: list[Output]
     counts: dict[str, int]
     callbacks: int
+    started_s: float
     start_ns: int
     virtual_ns: int
     elapsed_s: float
@@ -110,7 +114,7 @@ class Result:
         return {
             'digest': self.digest, 'messages': sum(self.counts.values()),
             'callbacks': self.callbacks, 'virtual_s': self.virtual_ns / 1e9,
-            'elapsed_s': self.elapsed_s, 'topics': dict(sorted(self.counts.items())),
+            'elapsed_s': self.elapsed_s, 'started_s': self.started_s, 'topics': dict(sorted(self.counts.items())),
             **self.verdicts, 'recorded': [each._asdict() for each in self.recorded],
             'warnings': self.warnings}
 
@@ -138,6 +142,7 @@ class Rerun:
         self._programs: Callable[[], Sequence[Program]] = tuple
         self._failed: list[Guest] = []
         self._hosted: set[str] = set()
+        self._begun = self._started_s = 0.0
 
     # --- parts -----------------------------------------------------------------------------------
 
@@ -164,6 +169,8 @@ class Rerun:
         self._messages = Messages(
             loop, source.times, self._outputs, task_set, self._recorder, self._warn)
         self._services = Services(loop, self._holder, self._warn)
+        self._actions = Actions(
+            loop, self._holder, lambda: self._registry.by_id, self._warn)
         self._timers = Timers(loop, source.first_release)
         self._host = RerunHost(self._holder, loop.stop, loop)
         if self._recorder is not None:
@@ -185,7 +192,7 @@ class Rerun:
         :param tick: told now and then how far the run is, ns.
         :raises RerunError: on whatever keeps it from going on.
         """
-        begin = time.monotonic()
+        self._begun = time.monotonic()
         self._programs = programs
         with _context(self._settings.ros_args) as context:
             hooks.install()
@@ -207,7 +214,7 @@ class Rerun:
         self._check_programs()
         self._check_hosted()
         self._outputs.finish()
-        return self._result(time.monotonic() - begin)
+        return self._result(time.monotonic() - self._begun)
 
     def _install(self) -> None:
         replace = self._replacements.replace
@@ -218,6 +225,7 @@ class Rerun:
         virtual.install(replace)
         replace_timers(self._replacements, self._timers)
         self._services.install(self._replacements)
+        self._actions.install(self._replacements)
         replace(Publisher, 'publish', instead(messages.publish))
         replace(Publisher, 'get_subscription_count', instead(messages.subscription_count))
         replace(Publisher, 'wait_for_all_acked', instead(lambda *args, **more: True))
@@ -238,6 +246,7 @@ class Rerun:
 
     def _started(self) -> None:
         """Begin to deliver, when each program has come to where it waits for something."""
+        self._started_s = time.monotonic() - self._begun
         if all(guest.settled.is_set() for guest in self._host.guests):
             self._check_hosted()
         self._check_topics()
@@ -255,8 +264,8 @@ class Rerun:
             for topic in callback.topics:
                 if callback.key in self._hosted and topic not in there:
                     raise RerunError(
-                        f'{self._source.name}: {topic}, which {callback.key} needs, is not recorded: record '
-                        'it, or run the node that publishes it with --node')
+                        f'{self._source.name}: {topic}, which {callback.key} needs, is not '
+                        'recorded: record it, or run the node that publishes it with --node')
 
     def _refresh(self) -> None:
         """Take in which entities there are."""
@@ -363,7 +372,7 @@ class Rerun:
             **self._engine.verdicts.tally.result()}
         return Result(
             self._outputs.digest, self._outputs.messages, self._outputs.counts, loop.callbacks,
-            loop.start, loop.now - loop.start, elapsed_s, verdicts, recorded, self.warnings)
+            self._started_s, loop.start, loop.now - loop.start, elapsed_s, verdicts, recorded, self.warnings)
 
 
 class _TraceTime:

@@ -29,10 +29,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 import sys
 import threading
 import time
 from typing import Any
+
+from mddag_executor.live.thread_clock import is_runnable
 
 _LOOK_S = 0.05
 _END_S = 2.0
@@ -50,7 +53,7 @@ class Strand:
     """
 
     __slots__ = ('name', 'until', 'deadline', 'place', 'execution', 'came_true', 'lock', 'ident',
-                 'clock', 'leaves', 'ended')
+                 'clock', 'folder', 'leaves', 'ended')
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -63,6 +66,7 @@ class Strand:
         self.lock.acquire()
         self.ident = 0
         self.clock = -1
+        self.folder = Path()
         self.leaves = False
         self.ended = False
 
@@ -134,6 +138,7 @@ class Strands:
     def _begin(self, strand: Strand) -> None:
         self._here.strand = strand
         strand.ident = threading.get_ident()
+        strand.folder = Path(f'/proc/self/task/{threading.get_native_id()}')
         strand.clock = time.pthread_getcpuclockid(strand.ident)
         strand.lock.acquire()
 
@@ -302,6 +307,8 @@ class _Watch:
         seen = self._strands.turns, time.clock_gettime_ns(owner.clock) // 1_000_000
         if seen != self._seen:
             self._seen, self._since = seen, now
+        elif is_runnable(owner.folder):
+            self._since = now
         elif now - self._since > self._patience_s:
             raise Stuck(owner, place_of(owner.ident))
 

@@ -27,7 +27,13 @@ from mddag_executor.simulate.deliveries import edge_numbers
 
 
 class Times(Protocol):
-    """How long everything takes, ns; vertices are global."""
+    """
+    How long everything takes, ns; vertices are global.
+
+    :ivar at_once: whether messages take no time.
+    """
+
+    at_once: bool
 
     def execution(self, dag: int, vertex: int, release: int) -> int:
         """Return how long a vertex of the job with that release executes."""
@@ -43,6 +49,8 @@ class SameInEachJob:
     :param times: the execution time of each vertex, by DAG and local index.
     """
 
+    at_once = True
+
     def __init__(self, times: Sequence[Sequence[int]]) -> None:
         self._times = [time for row in times for time in row]
 
@@ -57,6 +65,8 @@ class SameInEachJob:
 
 class AsRecorded:
     """The times of the job of a recording that was released at about the same time."""
+
+    at_once = False
 
     def __init__(self, tables: Tables, work: RecordedLoad) -> None:
         self._tables = tables

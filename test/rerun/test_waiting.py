@@ -12,10 +12,12 @@ import threading
 import time
 from typing import Any
 
+from action_msgs.msg import GoalStatus
 from mddag_executor.rerun import rerun, RerunError, Result
 import pytest
 from rcl_interfaces.srv import GetParameters
 import rclpy
+from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
@@ -23,6 +25,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
 
 from .helpers import GRAPH, MS, START, write_bag
 
@@ -212,6 +215,70 @@ def test_joining_a_thread(bag: str, graph: Path) -> None:
     assert seen == [(120.0, False), (120.0, 'joined')]
 
 
+# --- actions -------------------------------------------------------------------------------------
+
+def fibonacci() -> Node:
+    """Return a node with an action that feeds back each 10 ms, and may be cancelled."""
+    node = rclpy.create_node('fibonacci')
+
+    def execute(goal: Any) -> Any:
+        sequence = [0, 1]
+        for _ in range(goal.request.order):
+            node.get_clock().sleep_for(Duration(nanoseconds=10 * MS))
+            if goal.is_cancel_requested:
+                goal.canceled()
+                return Fibonacci.Result()
+            sequence.append(sequence[-1] + sequence[-2])
+            goal.publish_feedback(Fibonacci.Feedback(sequence=sequence))
+        goal.succeed()
+        return Fibonacci.Result(sequence=sequence)
+
+    node.server = ActionServer(
+        node, Fibonacci, 'fibonacci', execute, callback_group=ReentrantCallbackGroup(),
+        cancel_callback=lambda goal: CancelResponse.ACCEPT)
+    return node
+
+
+def test_an_action(bag: str, graph: Path) -> None:
+    async def take(node: Filter, number: int) -> None:
+        if number == 3:
+            assert node.client.wait_for_server(1.0)  # type: ignore[attr-defined]
+            goal = await node.client.send_goal_async(  # type: ignore[attr-defined]
+                Fibonacci.Goal(order=3),
+                lambda message: node.note(list(message.feedback.sequence)))
+            node.note(goal.accepted)
+            answer = await goal.get_result_async()
+            node.note((answer.status, list(answer.result.sequence)))
+
+    def fill(node: Filter) -> None:
+        node.client = ActionClient(node, Fibonacci, 'fibonacci')  # type: ignore[attr-defined]
+
+    for _ in range(2):
+        seen, result = run_filter(bag, graph, take, fibonacci, fill=fill)
+        assert seen == [
+            (310.0, True), (320.0, [0, 1, 1]), (330.0, [0, 1, 1, 2]), (340.0, [0, 1, 1, 2, 3]),
+            (340.0, (GoalStatus.STATUS_SUCCEEDED, [0, 1, 1, 2, 3]))]
+        assert not result.warnings
+
+
+def test_cancelling_a_goal(bag: str, graph: Path) -> None:
+    async def take(node: Filter, number: int) -> None:
+        if number == 3:
+            node.goal = await node.client.send_goal_async(  # type: ignore[attr-defined]
+                Fibonacci.Goal(order=40))
+        elif number == 5:
+            answer = await node.goal.cancel_goal_async()  # type: ignore[attr-defined]
+            node.note(len(answer.goals_canceling))
+            result = await node.goal.get_result_async()  # type: ignore[attr-defined]
+            node.note(result.status)
+
+    def fill(node: Filter) -> None:
+        node.client = ActionClient(node, Fibonacci, 'fibonacci')  # type: ignore[attr-defined]
+
+    seen, _ = run_filter(bag, graph, take, fibonacci, fill=fill)
+    assert seen == [(510.0, 1), (520.0, GoalStatus.STATUS_CANCELED)]
+
+
 # --- programs ------------------------------------------------------------------------------------
 
 def test_a_program_with_a_loop_of_its_own(bag: str, graph: Path) -> None:
@@ -340,10 +407,10 @@ def test_a_node_that_blocks_for_ever_is_named(bag: str, graph: Path) -> None:
     def take(node: Filter, number: int) -> None:
         if number == 3:
             lock.acquire()
-            lock.acquire(timeout=5.0)
+            lock.acquire(timeout=60.0)
 
     with pytest.raises(RerunError) as caught:
-        run_filter(bag, graph, take, patience_s=0.3)
+        run_filter(bag, graph, take, patience_s=0.5)
     assert str(caught.value).startswith(
         f'/filter:take: it has been blocking at {__file__}:')
     assert 'at 0.300000 s of the run' in str(caught.value)
