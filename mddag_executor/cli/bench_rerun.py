@@ -53,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
         same = 'the same outputs each time' if result['same'] else 'NOT the same outputs each time'
         print(f'{counted(result["callbacks"], "callback")} and '
               f'{counted(result["messages"], "message")}, {result["virtual_s"]:.3f} s in '
-              f'{result["elapsed_s"]:.3f} s: {result["times_real_time"]:.1f} times as fast as real '
-              f'time; {result["started_s"]:.3f} s of it to make the nodes, then '
+              f'{result["elapsed_s"]:.3f} s: {result["times_real_time"]:.1f} times as fast as '
+              f'real time; {result["started_s"]:.3f} s of it to make the nodes, then '
               f'{result["us_per_callback"]:.0f} us a callback; {same}')
     return 0

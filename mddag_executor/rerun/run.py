@@ -114,8 +114,9 @@ class Result:
         return {
             'digest': self.digest, 'messages': sum(self.counts.values()),
             'callbacks': self.callbacks, 'virtual_s': self.virtual_ns / 1e9,
-            'elapsed_s': self.elapsed_s, 'started_s': self.started_s, 'topics': dict(sorted(self.counts.items())),
-            **self.verdicts, 'recorded': [each._asdict() for each in self.recorded],
+            'elapsed_s': self.elapsed_s, 'started_s': self.started_s,
+            'topics': dict(sorted(self.counts.items())), **self.verdicts,
+            'recorded': [each._asdict() for each in self.recorded],
             'warnings': self.warnings}
 
 
@@ -372,7 +373,8 @@ class Rerun:
             **self._engine.verdicts.tally.result()}
         return Result(
             self._outputs.digest, self._outputs.messages, self._outputs.counts, loop.callbacks,
-            self._started_s, loop.start, loop.now - loop.start, elapsed_s, verdicts, recorded, self.warnings)
+            self._started_s, loop.start, loop.now - loop.start, elapsed_s, verdicts, recorded,
+            self.warnings)
 
 
 class _TraceTime:
