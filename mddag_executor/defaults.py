@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -24,3 +25,11 @@ def workers(asked: int | None, task_set: TaskSet | None) -> int:
     """Return the number of workers: what was asked for, else what is declared, else seven."""
     declared = None if task_set is None else task_set.workers
     return asked or declared or WORKERS
+
+
+def processors() -> int:
+    """Count the processors that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not every system has it
+        return os.cpu_count() or 1

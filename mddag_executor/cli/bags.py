@@ -83,4 +83,4 @@ def reschedule_bag(
         return run(
             path, task_set, policy=args.policy, workers=args.workers,
             preemptive=bool(args.preemptive), times=times, seed=args.seed or 0,
-            dispatch_overhead=args.overheads or 0, name=name, skip=args.skip)
+            dispatch_overhead=args.overheads or 0, name=name, skip=args.skip, cpus=args.cpus)

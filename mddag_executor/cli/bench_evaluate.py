@@ -74,7 +74,7 @@ def _measure(
     from mddag_executor.simulate.measure import time_runs, time_vertex_jobs
     task_set = common.load_workload(args.graph)
     experiment = Experiment(task_set, policies, workers=defaults.workers(None, task_set))
-    jobs = args.jobs or sorted({1, common.processors()})
+    jobs = args.jobs or sorted({1, defaults.processors()})
     runs: list[dict[str, Any]] = []
     sizes: list[dict[str, Any]] = []
     steps = len(cores) * (len(jobs) + len(args.vertices))

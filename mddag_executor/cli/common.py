@@ -285,11 +285,3 @@ def write_result(args: argparse.Namespace, result: Any) -> bool:
 def wants_tables(args: argparse.Namespace) -> bool:
     """Tell whether standard output is for people, and not taken by a result."""
     return '-' not in (getattr(args, 'json', None), getattr(args, 'report', None))
-
-
-def processors() -> int:
-    """Count the processors that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not every system has it
-        return os.cpu_count() or 1

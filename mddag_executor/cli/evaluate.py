@@ -157,7 +157,7 @@ def _evaluate(
     checkpoint = None
     if args.resume is not None:
         checkpoint = Checkpoint(args.resume, lambda: common.output_file(args.resume))
-    jobs, cluster = args.jobs or common.processors(), None
+    jobs, cluster = args.jobs or defaults.processors(), None
     with ExitStack() as stack:
         if args.dask is not None:
             from mddag_executor.simulate.cluster import Cluster

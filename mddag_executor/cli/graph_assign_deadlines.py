@@ -107,7 +107,7 @@ def _assign(
         task_set, (args.policy,), workers=defaults.workers(args.workers, task_set),
         duration_ns=args.duration, seed=args.seed, overhead_ns=args.overhead,
         preemptive=False if args.non_preemptive else None)
-    jobs = args.jobs or common.processors()
+    jobs = args.jobs or defaults.processors()
     if args.by == 'path':
         deadlines = proportional(
             task_set, args.budget, args.factor or 1.0, args.base or 'period')

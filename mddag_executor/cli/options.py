@@ -135,6 +135,13 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
         help=f"threads that run callbacks (default: the declaration's, else {defaults.WORKERS})")
 
 
+def add_cpus(parser: argparse.ArgumentParser, default: str) -> None:
+    """Declare `--cpus` of what is computed in virtual time."""
+    parser.add_argument(
+        '--cpus', type=positive_int, metavar='C',
+        help=f'CPUs that callbacks which compute share (default: {default})')
+
+
 def add_virtual_time(parser: argparse.ArgumentParser) -> None:
     """Declare `--duration` of simulated runs."""
     parser.add_argument(
@@ -162,7 +169,7 @@ def add_seed(
 
 
 def add_jobs(parser: argparse.ArgumentParser) -> None:
-    """Declare `--jobs`, whose default is `common.processors()`."""
+    """Declare `--jobs`, whose default is `defaults.processors()`."""
     parser.add_argument(
         '--jobs', type=positive_int, metavar='N',
         help='runs to simulate at a time (default: the number of processors)')

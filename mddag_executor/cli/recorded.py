@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from msg_graph import TaskSet
 
 _ONLY_RESCHEDULED = (
-    'workers', 'policy', 'preemptive', 'overheads', 'execution_times', 'seed')
+    'workers', 'cpus', 'policy', 'preemptive', 'overheads', 'execution_times', 'seed')
 
 
 def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
@@ -36,6 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
     add('--reschedule', action='store_true', help=what)
     add('--workers', type=options.positive_int, metavar='M',
         help='with --reschedule: threads that run callbacks (default: as recorded)')
+    add('--cpus', type=options.positive_int, metavar='C',
+        help='with --reschedule: CPUs that callbacks which compute share (default: as recorded, '
+        'else enough for all)')
     add('--policy', metavar='P',
         help=f'with --reschedule: one of {", ".join(POLICIES)} (default: as recorded)')
     add('--preemptive', action=argparse.BooleanOptionalAction,
@@ -133,4 +136,4 @@ def rescheduled(
         return reschedule(
             path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
             overheads=recorded, dispatch_overhead=0 if recorded else args.overheads, name=name,
-            progress=line.events, skip=args.skip)
+            progress=line.events, skip=args.skip, cpus=args.cpus)

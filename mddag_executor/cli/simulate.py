@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--policy', default='rad', metavar='P',
         help=f'one of {", ".join(POLICIES)} (default: rad)')
     options.add_workers(parser)
+    options.add_cpus(parser, 'enough for all')
     options.add_virtual_time(parser)
     add('--preemptive', action='store_true',
         help='what is more urgent takes the worker of what runs')
@@ -73,7 +74,7 @@ def main(args: argparse.Namespace) -> int:
     settings = Settings(
         policy=args.policy, workers=workers, duration_ns=args.duration,
         preemptive=args.preemptive, judge=args.judge,
-        stop_at_first_miss=args.stop_at_first_miss)
+        stop_at_first_miss=args.stop_at_first_miss, cpus=args.cpus)
     load = periodic_load(task_set, times, args.duration)
     run = _simulate(task_set, load, settings, utilisation(task_set, times, workers),
                     log=args.trace is not None or args.report is not None)

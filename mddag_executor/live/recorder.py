@@ -9,6 +9,7 @@ import threading
 from typing import Any, Protocol
 import weakref
 
+from mddag_executor import defaults
 from mddag_executor.live.entity import Entity, SERVICE, SUBSCRIPTION, TIMER
 from mddag_executor.trace.errors import TraceError
 from msg_graph import TaskSet
@@ -68,7 +69,7 @@ class Recorder:
         self._known: weakref.WeakSet[Any] = weakref.WeakSet()
         self._say(
             'task_set', task_set.text if task_set else '', task_set.file if task_set else '',
-            policy, workers, default_deadline, max_active_jobs, False)
+            policy, workers, default_deadline, max_active_jobs, False, defaults.processors())
         self._say('caret_init', clock.offset_ns, 'jazzy')
         self._say('rmw_implementation', get_rmw_implementation_identifier())
         self._say('construct_executor', id(self), 'multi_deadline_executor')

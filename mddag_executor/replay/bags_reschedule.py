@@ -33,6 +33,8 @@ from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import Load, LogEntry, SimulationError
 from mddag_executor.simulate.engine import busy_times, run
+from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.workload import declared_holds
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
@@ -61,9 +63,10 @@ class BagReschedule:
     def __init__(
         self, bag: Bag, task_set: TaskSet, *, policy: str, workers: int, preemptive: bool,
         times: Sequence[Sequence[int]] | None, seed: int, dispatch_overhead: int,
-        skip: int = 0,
+        skip: int = 0, cpus: int | None = None,
     ) -> None:
         self._bag = bag
+        self.cpus = cpus
         self.task_set = task_set
         self.policy = policy
         self.workers = workers
@@ -86,7 +89,9 @@ class BagReschedule:
         generator = random.Random(seed)
         releases: list[tuple[int, int, int, int]] = []
         costs: list[int] = []
+        holds: list[int] = []
         bases: list[int] = []
+        declared = declared_holds(self.task_set)
         for dag in self.task_set.dags:
             source = self._source(dag)
             self.notes.append(f'{dag.name}: {source.note}')
@@ -96,6 +101,7 @@ class BagReschedule:
             for job, (ready, release) in enumerate(source.jobs):
                 releases.append((ready, dag.index, job, release))
                 costs.extend(_costs(dag, times, generator))
+                holds += declared[dag.index] if declared else []
         bases.append(len(costs))
         if not releases:
             raise BagError(
@@ -106,7 +112,7 @@ class BagReschedule:
         return Load(
             [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases], costs,
             bases, [*(len(dag.vertices) for dag in self.task_set.dags), 1],
-            [r[3] for r in releases])
+            [r[3] for r in releases], holds)
 
     def _source(self, dag: Dag) -> Source:
         callback = dag.vertices[dag.source].callback
@@ -172,7 +178,9 @@ class BagReschedule:
             dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
         state.scalars[JUDGE_FROM] = self.judge_from
         log: list[LogEntry] = []
-        run(self.tables, state, policy.key, load, self.end, False, log)
+        stops = bool(load.holds) or self.cpus is not None
+        machine = Machine(self.tables, state, load, self.cpus) if stops else None
+        run(self.tables, state, policy.key, load, self.end, False, log, machine=machine)
         finish(self.tables, state, self.end)
         for dag, release in zip(load.dags, load.releases):
             if release >= self.judge_from:
@@ -200,6 +208,7 @@ class BagReschedule:
         busy = self.worker_busy()
         return {
             'policy': self.policy, 'workers': self.workers, 'preemptive': self.preemptive,
+            **({} if self.cpus is None else {'cpus': self.cpus}),
             'duration_ns': self.duration_ns,
             'utilisation': share(self.demand, self.workers, self.duration_ns),
             **self.tally.result(), 'rescheduled': True, 'skip_ns': self.skip,
@@ -242,6 +251,7 @@ def reschedule_bag(
     dispatch_overhead: int = 0,
     skip: int = 0,
     name: str | None = None,
+    cpus: int | None = None,
 ) -> BagReschedule:
     """
     Run the core over the messages of an ordinary bag.
@@ -253,6 +263,7 @@ def reschedule_bag(
     :param dispatch_overhead: added to each execution, ns.
     :param skip: how long after the bag's first message jobs are not judged (a warm-up), ns.
     :param name: what messages call the bag, where that is not its path.
+    :param cpus: that those who compute share; None: enough for all.
     :raises BagError: where there is no bag, or none of the sources is in it.
     :raises mddag_executor.simulate.SimulationError: where an execution time is not known.
     :raises mddag_executor.errors.MddagError: on a policy that cannot be.
@@ -274,4 +285,4 @@ def reschedule_bag(
     return BagReschedule(
         bag, task_set, policy=policy, workers=workers or task_set.workers or DEFAULT_WORKERS,
         preemptive=preemptive, times=times, seed=seed, dispatch_overhead=dispatch_overhead,
-        skip=skip)
+        skip=skip, cpus=cpus)

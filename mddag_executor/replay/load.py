@@ -17,6 +17,9 @@ Theory of operation
 * Of a sync vertex that is the leg that made it whole.  The legs before it, which only keep their
   message, load the workers as what no DAG declares does: each piece is a job of the undeclared
   DAG, ready when it was in the recording.  Callback groups of undeclared callbacks are not kept.
+* Where CPU times are recorded, an execution time is what the execution would have taken alone (see
+  ``alone``), and the load says what it computed and whether it held the interpreter: as recorded,
+  or as the declaration says.
 * *Transport*: a message is there some time after the callback that published it has ended (or
   before that: it published early).  That is the time from its end to the successor's readiness.
 * *Dispatch*: the time from when an execution could have started to when it did (see
@@ -33,7 +36,8 @@ indices that were recorded.
 from __future__ import annotations
 
 from array import array
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of, quantile, Tables
 from mddag_executor.replay.dispatches import Dispatches
@@ -55,6 +59,7 @@ class RecordedLoad(NamedTuple):
     declared jobs, ns; ``estimated`` counts vertices of jobs whose execution time was not recorded,
     ``executions`` all of them; ``unknown`` names callbacks of which no time is known at all.
     ``dispatch_ns`` and ``transport_ns`` are medians of what was measured, None where nothing was.
+    ``computed`` has the CPU times, as ``load.costs``; it is empty where none is recorded.
     """
 
     load: Load
@@ -67,6 +72,7 @@ class RecordedLoad(NamedTuple):
     dispatch_ns: int | None = None
     transport_ns: int | None = None
     failed: frozenset[tuple[int, int]] = frozenset()
+    computed: Sequence[int] = ()
 
 
 class _Jobs:
@@ -81,7 +87,8 @@ class _Jobs:
         self.release = array('q')
         self.noticed = array('q')
         self.round = array('q')
-        self.took, self.start, self.end, self.dispatch = (array('q') for _ in range(4))
+        self.took, self.start, self.end, self.dispatch, self.cpu, self.held = (
+            array('q') for _ in range(6))
         self.arrived = array('q')
         self._new = array('q', [_UNKNOWN]) * self.size
         self._new_edges = array('q', [_UNKNOWN]) * n_edges
@@ -93,7 +100,7 @@ class _Jobs:
         self.release.append(release)
         self.noticed.append(max(release, now))
         self.round.append(number)
-        for column in (self.took, self.start, self.end, self.dispatch):
+        for column in (self.took, self.start, self.end, self.dispatch, self.cpu, self.held):
             column.extend(self._new)
         self.arrived.extend(self._new_edges)
 
@@ -104,15 +111,17 @@ class LoadBuilder(Observer):
 
     :param who: who is who, as far as the recording has told.
     :param n_workers: how many workers it was recorded with.
+    :param cpus: how many there were; 0: not known.
     """
 
     def __init__(
-        self, task_set: TaskSet, tables: Tables, who: Census, n_workers: int
+        self, task_set: TaskSet, tables: Tables, who: Census, n_workers: int, cpus: int = 0
     ) -> None:
         self._task_set = task_set
         self._first = tables.first_vertex
         self._declared_group = tables.group
         self._who = who
+        self._cpus = cpus
         self._jobs = [_Jobs(dag, n) for dag, n in zip(task_set.dags, edges_of(tables))]
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
         # when each round of timers ended
@@ -192,6 +201,8 @@ class LoadBuilder(Observer):
             return
         place = row * jobs.size + vertex - self._first[dag]
         jobs.took[place] = busy
+        jobs.cpu[place] = cpu
+        jobs.held[place] = held
         jobs.start[place] = start
         jobs.end[place] = ended
         if several:
@@ -218,10 +229,13 @@ class LoadBuilder(Observer):
         if self._leg is not None:
             self._others.append(self._leg[1])
             self._leg = None
+        self._take_back()
         typical = self._typical()
         unknown: dict[str, None] = {}
         estimated = 0
         costs: list[int] = []
+        computed: list[int] = []
+        holds: list[int] = []
         bases: list[int] = []
         late = self._dispatches.late()
         measured = np.concatenate([np.asarray(jobs.dispatch) for jobs in self._jobs])
@@ -241,6 +255,7 @@ class LoadBuilder(Observer):
                         unknown[key] = None
                     took[missing[:, vertex.index], vertex.index] = typical.get(key, 0)
             demand += int(took.sum())
+            self._computing(dag, jobs, took, missing, computed, holds)
             if overheads:
                 took += late[np.array(jobs.dispatch, dtype=np.int64).reshape(-1, jobs.size)]
             costs.extend(took.ravel().tolist())
@@ -249,12 +264,55 @@ class LoadBuilder(Observer):
         others = sorted(self._others)
         costs.extend(max(0, took) + (int(late[number]) if number >= 0 else 0)
                      for _, took, number in others)
+        computed += [_UNKNOWN] * len(others)
+        holds += [0] * len(others)
         transports, transport = self._transports(overheads)
         return RecordedLoad(
-            self._load(costs, bases, [ready for ready, _, _ in others], overheads),
+            self._load(costs, bases, [ready for ready, _, _ in others], overheads)._replace(
+                holds=holds if any(holds) else []),
             [jobs.numbers for jobs in self._jobs], demand, executions, estimated, list(unknown),
             transports, usual if len(measured) else None, transport,
-            frozenset(self._failed))
+            frozenset(self._failed), computed if max(computed, default=-1) >= 0 else ())
+
+    def _take_back(self) -> None:
+        """Make the execution times those that the executions would have taken alone."""
+        from mddag_executor.replay.alone import alone
+        import numpy as np
+        took, start, cpu, held = (
+            np.concatenate([np.asarray(getattr(jobs, name)) for jobs in self._jobs])
+            for name in ('took', 'start', 'cpu', 'held'))
+        ran = took >= 0
+        if not (cpu[ran] >= 0).any():
+            return
+        took[ran] = alone(start[ran], took[ran], cpu[ran], held[ran], self._cpus)
+        first = 0
+        for jobs in self._jobs:
+            n = len(jobs.took)
+            jobs.took = array('q', took[first:first + n].tobytes())
+            first += n
+
+    def _computing(
+        self, dag: Dag, jobs: _Jobs, took: Any, missing: Any, computed: list[int],
+        holds: list[int],
+    ) -> None:
+        """Add what the executions of a DAG computed, and which held the interpreter."""
+        import numpy as np
+        cpu, held = (np.array(column, dtype=np.int64).reshape(-1, jobs.size)
+                     for column in (jobs.cpu, jobs.held))
+        held[held < 0] = 0
+        for vertex in dag.vertices:
+            v = vertex.index
+            known = cpu[:, v] >= 0
+            if known.any():     # those that did not complete are like the others
+                share = cpu[known, v].sum() / max(1, took[known, v].sum())
+                cpu[missing[:, v], v] = took[missing[:, v], v] * min(1.0, share)
+                held[missing[:, v], v] = held[known, v].mean() >= 0.5
+            if vertex.callback.holds_interpreter is not None:
+                held[:, v] = vertex.callback.holds_interpreter
+                if vertex.callback.holds_interpreter:
+                    cpu[~known, v] = took[~known, v]
+        computed.extend(cpu.ravel().tolist())
+        holds.extend(held.ravel().tolist())
 
     def _load(
         self, costs: list[int], bases: list[int], others: list[int], overheads: bool

@@ -21,7 +21,11 @@ class ReplayError(InputError):
 
 
 class Head(NamedTuple):
-    """What the executor wrote when it began to record: its declaration and its settings."""
+    """
+    What the executor wrote when it began to record: its declaration and its settings.
+
+    :ivar cpus: how many the process might use; 0: not known.
+    """
 
     time: int
     yaml: str
@@ -31,6 +35,7 @@ class Head(NamedTuple):
     default_deadline: int
     max_active_jobs: int
     preemptive: bool
+    cpus: int = 0
 
 
 def read_head(reader: TraceReader) -> Head | None:

@@ -30,6 +30,7 @@ from mddag_executor.replay.usage import share
 from mddag_executor.simulate import engine, LogEntry
 from mddag_executor.simulate.deliveries import Deliveries, edge_numbers
 from mddag_executor.simulate.engine import busy_times
+from mddag_executor.simulate.machine import Machine
 from mddag_executor.text import counted, listed
 from msg_graph import TaskSet
 
@@ -49,9 +50,10 @@ class Reschedule:
     def __init__(
         self, recorded: Replay, work: RecordedLoad, tables: Tables, policy: str, workers: int,
         preemptive: bool, overheads: bool, dispatch_overhead: int = 0,
-        judge_from: int = -NEVER, skip: int = 0,
+        judge_from: int = -NEVER, skip: int = 0, cpus: int | None = None,
     ) -> None:
         self._work = work
+        self.cpus = cpus
         self.recorded = recorded
         self.task_set = recorded.task_set
         self.tables = tables
@@ -76,10 +78,16 @@ class Reschedule:
         state.scalars[JUDGE_FROM] = self.judge_from
         load, end = self._work.load, self.recorded.run.end
         self.log = []
+        work = self._work
+        stops = bool(load.holds) or self.cpus is not None
         deliveries = Deliveries(
-            self.tables, state, policy.key, self._work.transports, self._work.failed)
+            self.tables, state, policy.key, work.transports, work.failed, stops)
+        machine = Machine(
+            self.tables, state, load, self.cpus, work.computed, bool(work.computed and load.holds),
+            deliveries)
         engine.run(
-            self.tables, state, policy.key, load, end, False, self.log, deliveries=deliveries)
+            self.tables, state, policy.key, load, end, False, self.log, deliveries=deliveries,
+            machine=machine if stops else None)
         self.decisions = state.decisions
         finish(self.tables, state, end)
         for time, dag, release in zip(load.times, load.dags, load.releases or load.times):
@@ -129,7 +137,7 @@ class Reschedule:
             miss = {**miss, 'job': self.recorded_job(dag, miss['job'])}
         return {
             'policy': self.policy, 'workers': self.workers, 'preemptive': self.preemptive,
-            'duration_ns': duration,
+            **({} if self.cpus is None else {'cpus': self.cpus}), 'duration_ns': duration,
             'utilisation': share(self._work.demand, self.workers, duration),
             **verdicts, 'first_miss': miss, 'rescheduled': True, 'skip_ns': self.skip,
             'executions': self._work.executions, 'estimated_executions': self._work.estimated,
@@ -159,6 +167,7 @@ def reschedule(
     name: str | None = None,
     progress: Progress | None = None,
     skip: int = 0,
+    cpus: int | None = None,
 ) -> Reschedule:
     """
     Run the core over the releases and execution times of a trace.
@@ -175,6 +184,7 @@ def reschedule(
     :param name: what messages call the trace, where that is not its path.
     :param progress: told now and then how many events have been read.
     :param skip: how long after the first release jobs are not judged (a warm-up), ns.
+    :param cpus: that those who compute share; None: as recorded, enough where that is not known.
     :raises mddag_executor.trace.TraceError: when it is no trace.
     :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, none of the
         declaration's callbacks, or an execution time that is neither recorded nor declared.
@@ -187,6 +197,7 @@ def reschedule(
     run = open_run(path, task_set, name, needs_declaration=True)
     policy, workers = _settings(run.head, run.name, policy, workers)
     head = run.head
+    cpus = cpus or head.cpus or None
     if preemptive is None:
         preemptive = head.preemptive and not find_policy(policy).polling
     bound = head.max_active_jobs if head.max_active_jobs > 0 else NEVER
@@ -195,7 +206,8 @@ def reschedule(
     builders: list[LoadBuilder] = []
 
     def build(recorded: Replay) -> list[LoadBuilder]:
-        builders.append(LoadBuilder(run.task_set, tables, run.who, head.workers))
+        builders.append(LoadBuilder(
+            run.task_set, tables, run.who, head.workers, max(0, head.cpus)))
         return builders
 
     recorded = Replay(run, skip, progress, build, paths=False)
@@ -212,7 +224,7 @@ def reschedule(
     with no_garbage():
         return Reschedule(
             recorded, work, tables, policy, workers, preemptive, overheads, dispatch_overhead,
-            recorded.judge.judge_from, skip)
+            recorded.judge.judge_from, skip, cpus)
 
 
 def _settings(

@@ -9,6 +9,8 @@ Where messages take time, what a vertex publishes makes its edge to a successor 
 after the vertex completes; the core is told of each with ``rules.edge``.  A delay may be negative:
 the callback published before its end.  Then the edge comes true that long before the end, as far
 as the execution had begun.  Where executions may be preempted, their edges come true at the end.
+Where they may stand still (see ``machine``), the end is not known in advance; but how far the
+execution is when it publishes, its *place*, is.
 
 A message whose job has ended meanwhile is ignored.
 """
@@ -57,11 +59,12 @@ class Deliveries:
 
     :param state: of the core, empty, made with ``propagate=2``.
     :param failed: the vertices and jobs whose executions fail.
+    :param stops: whether executions may stand still.
     """
 
     def __init__(
         self, tables: Tables, state: State, key: KeyFunction, transports: Transports,
-        failed: Set[tuple[int, int]] = frozenset(),
+        failed: Set[tuple[int, int]] = frozenset(), stops: bool = False,
     ) -> None:
         self._t = tables
         self._s = state
@@ -73,6 +76,10 @@ class Deliveries:
         # (time, order, slot, job, vertex that the message starts)
         self._messages: list[tuple[int, int, int, int, int]] = []
         self._sent = 0
+        self._stops = stops
+        # of those that run and may stand still, by execution: the places at which they publish
+        # before their end, and what that starts; the next one last
+        self._to_come: dict[int, list[tuple[int, int]]] = {}
 
     def next_time(self) -> int:
         """Return when the next message arrives, ns."""
@@ -80,26 +87,49 @@ class Deliveries:
 
     def started(self, x: int, now: int) -> None:
         """Send what an execution that starts publishes before or after its end."""
-        if self._early:
+        if self._early and self._stops:
+            self._find_places(x)
+        elif self._early:
             self._send(x, now + self._s.x_left[x], now)
+
+    def _find_places(self, x: int) -> None:
+        s = self._s
+        cost = s.x_cost[x]
+        found = [(max(0, cost + delay), after) for after, delay in self._edges(x) if delay < 0]
+        if found:
+            self._to_come[x] = sorted(found, reverse=True)
+
+    def next_place(self, x: int) -> int:
+        """Return how far a running execution is when it publishes next."""
+        to_come = self._to_come.get(x)
+        return to_come[-1][0] if to_come else NEVER
+
+    def _edges(self, x: int) -> list[tuple[int, int]]:
+        """Return what an execution starts, and how long after its end."""
+        t, s = self._t, self._s
+        vertex = s.x_vertex[x]
+        first, end = t.first_successor[vertex], t.first_successor[vertex + 1]
+        if first == end:
+            return []
+        base = self._base(t.dag_of[vertex], s.job_index[s.x_slot[x]])
+        delays = self._transports.delays
+        return [(t.successors[i], delays[base + i]) for i in range(first, end)]
 
     def complete(self, x: int, now: int) -> None:
         """End an execution, and send what it publishes."""
         t, s = self._t, self._s
         slot = s.x_slot[x]
         job = s.job_index[slot]
-        vertex = s.x_vertex[x]
-        end = rules.fail if (vertex, job) in self._failed else rules.complete
+        edges = self._edges(x)
+        for _, after in reversed(self._to_come.pop(x, ())):
+            self._arrive(slot, job, after, now)
+        end = rules.fail if (s.x_vertex[x], job) in self._failed else rules.complete
         end(t, s, self._key, x, now)
-        if not self._early:
-            self._send(x, now, now)
-            return
-        first, end_of = t.first_successor[vertex], t.first_successor[vertex + 1]
-        if first < end_of:
-            base = self._base(t.dag_of[vertex], job)
-            for i in range(first, end_of):
-                if self._transports.delays[base + i] == 0:
-                    self._arrive(slot, job, t.successors[i], now)
+        for after, delay in edges:
+            if delay == 0 or (delay < 0 and not self._early):
+                self._arrive(slot, job, after, now)
+            elif delay > 0 and (self._stops or not self._early):
+                self._post(now + delay, slot, job, after)
 
     def arrive(self, now: int) -> None:
         """Make the edges true whose messages arrive now, in the order in which they were sent."""
@@ -107,31 +137,30 @@ class Deliveries:
         while messages and messages[0][0] <= now:
             _, _, slot, job, vertex = heappop(messages)
             self._arrive(slot, job, vertex, now)
+        if self._to_come:
+            self._publish(now)
+
+    def _publish(self, now: int) -> None:
+        """Make the edges true that running executions publish now, before their end."""
+        s = self._s
+        for x in s.worker_x:
+            to_come = self._to_come.get(x)
+            if to_come:
+                at = s.x_cost[x] - s.x_left[x] + now - s.x_started[x]
+                while to_come and to_come[-1][0] <= at:
+                    slot = s.x_slot[x]
+                    self._arrive(slot, s.job_index[slot], to_come.pop()[1], now)
 
     def _base(self, dag: int, job: int) -> int:
         transports = self._transports
         return transports.base[dag] + job * transports.stride[dag] - self._first_edge[dag]
 
     def _send(self, x: int, finish: int, now: int) -> None:
-        """Send what an execution publishes; with ``_early`` what needs no time is left out."""
-        t, s = self._t, self._s
-        vertex = s.x_vertex[x]
-        first, end = t.first_successor[vertex], t.first_successor[vertex + 1]
-        if first == end:
-            return
-        slot = s.x_slot[x]
-        job = s.job_index[slot]
-        base = self._base(t.dag_of[vertex], job)
-        for i in range(first, end):
-            delay = self._transports.delays[base + i]
-            after = t.successors[i]
-            if self._early:
-                if delay:
-                    self._post(max(now, finish + delay), slot, job, after)
-            elif delay > 0:
-                self._post(finish + delay, slot, job, after)
-            else:
-                self._arrive(slot, job, after, now)
+        """Send what an execution publishes and that needs time, or came before its end."""
+        slot = self._s.x_slot[x]
+        for after, delay in self._edges(x):
+            if delay:
+                self._post(max(now, finish + delay), slot, self._s.job_index[slot], after)
 
     def _post(self, time: int, slot: int, job: int, vertex: int) -> None:
         self._sent += 1

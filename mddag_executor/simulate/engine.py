@@ -11,7 +11,8 @@ releases in DAG order, then the core dispatches until it has nothing left to do 
 A completion at the horizon counts; nothing is released or dispatched there any more.
 
 Where messages take time or executions fail, ``deliveries`` ends the executions, and the messages
-of an instant arrive between its completions and its releases.
+of an instant arrive between its completions and its releases.  Where CPUs are few or executions
+hold the interpreter, ``machine`` tells after each instant when those that run finish.
 
 A job's deadlines count from its release, which is the time at which its source becomes ready,
 unless ``releases`` says that it was earlier (a sensor's message that arrived later).
@@ -36,6 +37,7 @@ from mddag_executor.core.tables import NEVER, Tables
 
 if TYPE_CHECKING:
     from mddag_executor.simulate.deliveries import Deliveries
+    from mddag_executor.simulate.machine import Machine
 
 # Kinds of log entries.
 START, END, PREEMPT = range(3)
@@ -49,7 +51,8 @@ class Load(NamedTuple):
     What arrives: releases in order of (time, DAG), with their jobs' indices and execution times.
 
     Times in ns; the cost columns as in the theory of operation.  ``releases`` is empty where each
-    job's source becomes ready (``times``) at its release.
+    job's source becomes ready (``times``) at its release.  ``holds`` tells, as ``costs``, which
+    executions hold the interpreter (1, else 0); it is empty where none does.
     """
 
     times: list[int]
@@ -59,6 +62,7 @@ class Load(NamedTuple):
     cost_base: list[int]
     cost_stride: list[int]
     releases: list[int] = []
+    holds: list[int] = []
 
 
 def run(
@@ -71,6 +75,7 @@ def run(
     log: list[LogEntry] | None = None,
     progress: Callable[[int], None] | None = None,
     deliveries: Deliveries | None = None,
+    machine: Machine | None = None,
 ) -> int:
     """
     Run the core over a load and return the time at which the run ended, ns.
@@ -94,12 +99,16 @@ def run(
                 instant = finish_at[w]
         if deliveries is not None:
             instant = min(instant, deliveries.next_time())
+        if machine is not None:
+            instant = min(instant, machine.next_time)
         if instant > horizon:
             return horizon
         now = instant
         if progress is not None:
             progress(now)
         seen = len(s.decisions)
+        if machine is not None:
+            machine.settle(now)
         for w in range(n_workers):
             if finish_at[w] == now:
                 finish_at[w] = NEVER
@@ -118,7 +127,9 @@ def run(
         while next_release < n_releases and load.times[next_release] == now:
             release_load(t, s, key, load, next_release, now)
             next_release += 1
-        _dispatch(t, s, key, now, finish_at, running, log, deliveries)
+        _dispatch(t, s, key, now, finish_at, running, log, deliveries, machine)
+        if machine is not None:
+            machine.share(now, finish_at)
         if stop_at_first_miss and any_missed(s, seen):
             return now
 
@@ -138,12 +149,15 @@ def release_load(
     cost = load.cost_base[dag] + job * load.cost_stride[dag]
     for place in range(t.n_region[dag]):
         s.x_cost[base + place] = load.costs[cost + place]
+    if len(load.holds) > 0:
+        for place in range(t.n_region[dag]):
+            s.x_holds[base + place] = load.holds[cost + place]
     rules.make_ready(t, s, key, base + t.region_offset[t.source[dag]], now)
 
 
 def _dispatch(
     t: Tables, s: State, key: KeyFunction, now: int, finish_at: list[int], running: list[int],
-    log: list[LogEntry] | None, deliveries: Deliveries | None,
+    log: list[LogEntry] | None, deliveries: Deliveries | None, machine: Machine | None,
 ) -> None:
     """Dispatch what is to run now; ``running`` is kept for the log, which wants the preempted."""
     x = rules.schedule(t, s, key, now)
@@ -157,6 +171,8 @@ def _dispatch(
             _note(t, s, log, now, START, worker, x)
         if deliveries is not None:
             deliveries.started(x, now)
+        if machine is not None:
+            machine.started(x)
         x = rules.schedule(t, s, key, now)
 
 

@@ -31,7 +31,7 @@ from mddag_executor.simulate.acceptance import Bools
 from mddag_executor.simulate.draws import Draws, feasible, Floats, Samples, Times, utilisations
 from mddag_executor.simulate.engine import any_missed, run
 from mddag_executor.simulate.run import check, Settings
-from mddag_executor.simulate.workload import periodic_load
+from mddag_executor.simulate.workload import declared_holds, periodic_load
 from msg_graph import TaskSet
 import numpy as np
 
@@ -158,7 +158,7 @@ class _One:
         self._settings = [experiment.settings(name) for name in experiment.policies]
         self._draws = Draws(experiment.task_set, experiment.seed, experiment.samples)
         self.judge: Judge
-        if compiled:
+        if compiled and not declared_holds(experiment.task_set):
             from mddag_executor.simulate.compiled import CompiledJudge
             self.judge = CompiledJudge(experiment.task_set, experiment.duration_ns)
         else:
@@ -196,7 +196,8 @@ class PlainJudge:
             state, key = settings.start(tables)
             load = self._load._replace(costs=times[row].tolist())
             ended = run(
-                tables, state, key, load, settings.duration_ns, settings.stop_at_first_miss)
+                tables, state, key, load, settings.duration_ns, settings.stop_at_first_miss,
+                machine=settings.machine(tables, state, load))
             if settings.judges_open(ended):
                 finish(tables, state, ended)
             accepted[row] = not any_missed(state, 0)

@@ -16,6 +16,7 @@ from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.state import Decision, new_state, State
 from mddag_executor.simulate.engine import Load, LogEntry, run
 from mddag_executor.simulate.errors import SimulationError
+from mddag_executor.simulate.machine import Machine
 from msg_graph import TaskSet
 
 JUDGES = ('horizon', 'completions')
@@ -31,6 +32,7 @@ class Settings:
         only what completed.
     :param dispatch_overhead_ns: added to an execution at each dispatch.
     :param switch_overhead_ns: added to an execution at each preemption.
+    :param cpus: that those who compute share; None: enough for all.
     """
 
     policy: str = 'rad'
@@ -41,6 +43,7 @@ class Settings:
     stop_at_first_miss: bool = False
     dispatch_overhead_ns: int = 0
     switch_overhead_ns: int = 0
+    cpus: int | None = None
 
     @property
     def preempts(self) -> bool:
@@ -63,6 +66,12 @@ class Settings:
             dispatch_overhead=self.dispatch_overhead_ns,
             switch_overhead=self.switch_overhead_ns, polling=row.polling)
         return state, row.key
+
+    def machine(self, tables: Tables, state: State, load: Load) -> Machine | None:
+        """Return the machine for a run in which all compute; None: nobody ever stands still."""
+        if self.cpus is None and not load.holds:
+            return None
+        return Machine(tables, state, load, self.cpus)
 
     def judges_open(self, ended_ns: int) -> bool:
         """Tell whether what is open at the end is judged: not where the run ended early."""
@@ -91,7 +100,8 @@ class Run:
         return {
             'policy': self.settings.policy, 'workers': self.settings.workers,
             'preemptive': self.preemptive, 'duration_ns': self.settings.duration_ns,
-            'utilisation': self.utilisation, **self.tally.result()}
+            'utilisation': self.utilisation, **self.tally.result(),
+            **({} if self.settings.cpus is None else {'cpus': self.settings.cpus})}
 
 
 def simulate(
@@ -121,7 +131,7 @@ def simulate(
     entries: list[LogEntry] = []
     ended = run(
         tables, state, key, load, settings.duration_ns, settings.stop_at_first_miss,
-        entries if log else None, progress)
+        entries if log else None, progress, machine=settings.machine(tables, state, load))
     if settings.judges_open(ended):
         finish(tables, state, ended)
     tally = Tally(task_set, tables)
@@ -143,6 +153,8 @@ def check(settings: Settings) -> None:
         raise SimulationError(f'workers: {settings.workers} is too few: give at least 1')
     if settings.duration_ns < 1:
         raise SimulationError(f'duration: {settings.duration_ns} ns is too short: give at least 1')
+    if settings.cpus is not None and settings.cpus < 1:
+        raise SimulationError(f'cpus: {settings.cpus} is too few: give at least 1')
     if settings.judge not in JUDGES:
         raise SimulationError(
             f"judge '{settings.judge}': there is no such way: choose one of {', '.join(JUDGES)}")

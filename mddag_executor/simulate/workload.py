@@ -140,6 +140,14 @@ def periodic_load(task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns
     for row in times:
         bases.append(len(costs))
         costs.extend(row)
+    holds = declared_holds(task_set)
     return Load(
         [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases],
-        costs, bases, [0] * len(bases))
+        costs, bases, [0] * len(bases), [], [each for row in holds for each in row])
+
+
+def declared_holds(task_set: TaskSet) -> list[list[int]]:
+    """Return by DAG which vertices are declared to hold the interpreter; empty where none is."""
+    holds = [[int(vertex.callback.holds_interpreter or False) for vertex in dag.vertices]
+             for dag in task_set.dags]
+    return holds if any(map(any, holds)) else []

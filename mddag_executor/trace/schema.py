@@ -130,8 +130,9 @@ _ALL = (
     _event('ros2_caret', 'dds_bind_addr_to_stamp', addr=_U64, source_stamp=_I64),
     _event('ros2_caret', 'sim_time', stamp=_I64),
     # this project
-    _event('mddag', 'task_set', yaml=_STR, file=_STR, policy=_STR, workers=_I32,
-           default_deadline=_I64, max_active_jobs=_I32, preemptive=_BOOL),
+    # the CPUs that the process might use, 0 where that is not known
+    _event('mddag', 'task_set', (0,), yaml=_STR, file=_STR, policy=_STR, workers=_I32,
+           default_deadline=_I64, max_active_jobs=_I32, preemptive=_BOOL, cpus=_I32),
     _event('mddag', 'hosted', dag=_I32, vertices=_STR),
     _event('mddag', 'judge_from', release=_I64),
     _event('mddag', 'job_release', dag=_I32, job=_I64, release=_I64),

@@ -91,8 +91,8 @@ def _encoder(event: EventType, number: int) -> Callable[..., bytes]:
     if layout is not None:
         packer = struct.Struct('<BQHIQQ4s' + layout)
         length = packer.size - records.RECORD.size
-        pack = functools.partial(packer.pack, Opcode.MESSAGE, length, number)
-        return _completed(event, pack) if event.optional else pack
+        return _completed(event, functools.partial(
+            packer.pack, Opcode.MESSAGE, length, number))
 
     types = event.types
 
@@ -101,11 +101,13 @@ def _encoder(event: EventType, number: int) -> Callable[..., bytes]:
         head = records.MESSAGE_HEAD.pack(number, sequence, log_time, publish_time)
         return records.record(Opcode.MESSAGE, head + encapsulation + cdr.encode(types, values))
 
-    return encode
+    return _completed(event, encode)
 
 
 def _completed(event: EventType, pack: Callable[..., bytes]) -> Callable[..., bytes]:
-    """Return a packer that takes the optional fields of an event or leaves them out."""
+    """Return a packer that also does without the optional fields of an event."""
+    if not event.optional:
+        return pack
     whole = len(event.types)
 
     def encode(sequence: int, log_time: int, publish_time: int, encapsulation: bytes,

@@ -1,0 +1,286 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""CPUs and the interpreter in virtual time: by hand, and against a model that goes by ticks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+from mddag_executor.core import policy as find_policy
+from mddag_executor.core import Tables
+from mddag_executor.core.state import new_state
+from mddag_executor.simulate import (
+    END,
+    Load,
+    LogEntry,
+    machine,
+    Settings,
+    simulate,
+    SimulationError,
+    START,
+)
+from mddag_executor.simulate.engine import run
+from mddag_executor.simulate.experiment import Evaluator, Experiment
+from mddag_executor.simulate.machine import Machine
+from msg_graph import loads
+import pytest
+
+from ..core.task_sets import declaration, examples
+from ..core.test_by_hand import single
+
+MS = 1_000_000
+LOCK, CPU, NOTHING = 'lock', 'cpu', 'nothing'
+
+
+@dataclass(eq=False)
+class Job:
+    """One job of a DAG of its own; ``cpu`` is its CPU time, -1: not known."""
+
+    release: int
+    deadline: int
+    cost: int
+    holds: bool = False
+    cpu: int | None = None
+    left: int = 0
+    start: int = -1
+    end: int = -1
+
+
+def times(
+    jobs: Sequence[Job], workers: int, cpus: int | None = None, python: bool = False,
+    preemptive: bool = False,
+) -> list[tuple[int, int]]:
+    """Return when each job starts first, and when it ends."""
+    task_set = declaration([
+        single(f'd{n}', 10 ** 9, job.deadline) for n, job in enumerate(jobs)])
+    tables = Tables.build(task_set)._replace(rad_offset=[job.deadline for job in jobs] + [0])
+    order = sorted(range(len(jobs)), key=lambda n: (jobs[n].release, n))
+    n = len(jobs)
+    load = Load([jobs[i].release for i in order], order, [0] * n, [job.cost for job in jobs],
+                list(range(n)), [0] * n, holds=[int(job.holds) for job in jobs])
+    state = new_state(tables, workers, preemptive=preemptive)
+    computed = [job.cost if job.cpu is None else job.cpu for job in jobs]
+    log: list[LogEntry] = []
+    run(tables, state, find_policy('rad').key, load, 10 ** 12, False, log,
+        machine=Machine(tables, state, load, cpus, computed, python))
+    found = [(-1, -1)] * n
+    for now, kind, _, dag, _, _ in log:
+        if kind == START and found[dag][0] < 0:
+            found[dag] = now, -1
+        elif kind == END:
+            found[dag] = found[dag][0], now
+    return found
+
+
+def of_ms(*jobs: Job) -> list[Job]:
+    for job in jobs:
+        job.release, job.deadline, job.cost = job.release * MS, job.deadline * MS, job.cost * MS
+        job.cpu = None if job.cpu is None else job.cpu * MS
+    return list(jobs)
+
+
+def in_ms(found: Sequence[tuple[int, int]]) -> list[tuple[float, float]]:
+    return [(start / MS, end / MS) for start, end in found]
+
+
+def test_one_after_the_other_where_none_is_more_urgent() -> None:
+    jobs = of_ms(Job(0, 50, 4, True), Job(0, 50, 3, True), Job(1, 90, 2, True), Job(1, 99, 2))
+    assert in_ms(times(jobs, 4)) == [(0, 4), (4, 7), (7, 9), (1, 3)]
+
+
+def test_one_that_is_more_urgent_overtakes_and_they_take_turns() -> None:
+    """It starts at 2, has the lock from 3 to 4, 5 to 6 and 7 to 8; the other one meanwhile."""
+    jobs = of_ms(Job(0, 100, 10, True), Job(2, 20, 3, True))
+    assert in_ms(times(jobs, 2)) == [(0, 13), (2, 8)]
+    # with one worker it waits; where it takes the worker, the other one does
+    assert in_ms(times(jobs, 1)) == [(0, 10), (10, 13)]
+    assert in_ms(times(jobs, 1, preemptive=True)) == [(0, 13), (2, 5)]
+
+
+def test_cpus_are_shared_by_slices() -> None:
+    """Of three at a time the first two, then the third and the first, then all that is left."""
+    jobs = of_ms(*(Job(0, 50, 6) for _ in range(3)))
+    assert in_ms(times(jobs, 3, cpus=2)) == [(0, 6), (0, 9), (0, 9)]
+    assert in_ms(times(jobs, 3)) == [(0, 6)] * 3
+    assert in_ms(times(jobs, 3, cpus=1)) == [(0, 12), (0, 15), (0, 18)]
+
+
+def test_who_waits_needs_nothing() -> None:
+    jobs = of_ms(*(Job(0, 50, 6, cpu=2) for _ in range(2)))
+    assert in_ms(times(jobs, 2, cpus=1)) == [(0, 6), (0, 8)]
+
+
+def test_who_waits_gets_the_lock_back_after_a_switch_interval() -> None:
+    """It publishes from 3.7 on, when the other one has computed for long."""
+    jobs = [Job(0, 90 * MS, 10 * MS, True),
+            Job(0, 50 * MS, 4 * MS, cpu=400_000)]
+    found = in_ms(times(jobs, 2, python=True))
+    # both lose 0.1 ms at the start to one another: the second asks first
+    assert found[0] == (0, 10.4)
+    assert found[1][1] == pytest.approx(4 + 1 + 0.9, abs=1.0)
+
+
+def test_declared_holders_in_the_simulator() -> None:
+    text = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: a, timer: 20ms, deadline: 20ms, dag: a, execution_time: 6ms, holds_interpreter: H}
+      - {name: b, timer: 20ms, deadline: 20ms, dag: b, execution_time: 6ms, holds_interpreter: H}
+"""
+    worst = []
+    for holds, cpus in (('false', None), ('true', None), ('false', 1)):
+        task_set = loads(text.replace('H', holds), 'g.yaml')
+        from mddag_executor.simulate import draw_execution_times, periodic_load
+        load = periodic_load(task_set, draw_execution_times(task_set, 0), 40 * MS)
+        result = simulate(task_set, load, Settings(workers=2, duration_ns=40 * MS, cpus=cpus)
+                          ).result()
+        worst.append([result['dags'][name]['sinks'][f'/n:{name}']['response_ns']['max'] // MS
+                      for name in 'ab'])
+        assert result.get('cpus') == cpus
+    assert worst == [[6, 6], [6, 12], [9, 12]]
+    with pytest.raises(SimulationError, match='cpus: 0 is too few'):
+        simulate(task_set, load, Settings(workers=2, duration_ns=40 * MS, cpus=0))
+
+
+def test_declared_holders_in_an_evaluation() -> None:
+    text = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: a, timer: 20ms, deadline: 10ms, dag: a, execution_time: 6ms, holds_interpreter: H}
+      - {name: b, timer: 20ms, deadline: 10ms, dag: b, execution_time: 6ms, holds_interpreter: H}
+"""
+    accepted = []
+    for holds in ('false', 'true'):
+        experiment = Experiment(
+            loads(text.replace('H', holds), 'g.yaml'), ('rad',), 2, 40 * MS)
+        accepted.append(Evaluator([experiment], 1, compiled=True)(0, 1).accepted.tolist())
+    assert accepted == [[[True]], [[False]]]
+
+
+# --- a model that goes by ticks ------------------------------------------------------------------
+
+SWITCH, SLICE, BRIEF = 3, 5, 2
+
+
+@dataclass(eq=False)
+class Ticks:
+    """The machine, tick by tick; written from its theory of operation."""
+
+    jobs: list[Job]
+    workers: int
+    cpus: int
+    python: bool
+    on: list[Job | None] = field(default_factory=list)
+    waiting: list[Job] = field(default_factory=list)
+    lock: list[Job] = field(default_factory=list)
+    computing: list[Job] = field(default_factory=list)
+    # ticks until who has the lock, or a CPU, gives it up
+    turn: int | None = None
+    slice_left: int | None = None
+
+    def times(self) -> list[tuple[int, int]]:
+        self.on = [None] * self.workers
+        now = 0
+        while any(job.end < 0 for job in self.jobs):
+            self._instant(now)
+            now += 1
+        return [(job.start, job.end) for job in self.jobs]
+
+    def _instant(self, now: int) -> None:
+        for worker, job in enumerate(self.on):
+            if job is not None and job.left == 0:
+                job.end, self.on[worker] = now, None
+        self.waiting += [job for job in self.jobs if job.release == now]
+        for job in sorted(self.waiting, key=lambda j: (j.release + j.deadline)):
+            self._start(job, now)
+        wanted: dict[str, list[Job]] = {LOCK: [], CPU: [], NOTHING: []}
+        for job in filter(None, self.on):
+            wanted[self._needs(job)].append(job)
+        self._pass_lock(wanted[LOCK])
+        self._pass_cpus(wanted[CPU] + self.lock[:1])
+        for job in wanted[NOTHING] + self.computing[:self.cpus]:
+            job.left -= 1
+        self.turn = None if self.turn is None else self.turn - 1
+        self.slice_left = None if self.slice_left is None else self.slice_left - 1
+
+    def _start(self, job: Job, now: int) -> None:
+        urgency = job.release + job.deadline
+        if None not in self.on or (job.holds and any(
+                other is not None and other.holds and other.release + other.deadline <= urgency
+                for other in self.on)):
+            return
+        self.waiting.remove(job)
+        self.on[self.on.index(None)] = job
+        job.start, job.left = now, job.cost
+
+    def _needs(self, job: Job) -> str:
+        cpu = job.cost if job.cpu is None else job.cpu
+        waits = job.cost - cpu
+        if job.holds:
+            if waits * 8 <= cpu:
+                return LOCK
+            parts = [LOCK] * (cpu // 2) + [NOTHING] * waits + [LOCK] * (cpu - cpu // 2)
+        elif not self.python:
+            parts = [CPU] * cpu + [NOTHING] * waits
+        elif cpu >= waits:
+            brief = min(cpu, BRIEF)
+            parts = [CPU] * (cpu - brief) + [NOTHING] * waits + [LOCK] * brief
+        else:
+            parts = [LOCK] * (cpu // 4) + [NOTHING] * waits + [LOCK] * (cpu - cpu // 4)
+        return parts[job.cost - job.left]
+
+    def _pass_lock(self, wanted: list[Job]) -> None:
+        had, several = self.lock[:1], len(self.lock) > 1
+        self.lock = [job for job in self.lock if job in wanted]
+        self.lock += [job for job in wanted if job not in self.lock]
+        if len(self.lock) < 2:
+            self.turn = None
+        elif not several or self.lock[:1] != had:
+            self.turn = SWITCH
+        elif self.turn == 0:
+            self.lock = self.lock[1:] + self.lock[:1]
+            self.turn = SWITCH
+
+    def _pass_cpus(self, wanted: list[Job]) -> None:
+        had = self.computing[:self.cpus]
+        old = [job for job in self.computing if job in wanted]
+        self.computing = [job for job in wanted if job not in old] + old
+        if len(self.computing) <= self.cpus:
+            self.slice_left = None
+        elif self.slice_left is None:
+            self.slice_left = SLICE
+        elif self.slice_left == 0:
+            self.computing.sort(key=lambda job: job in had)
+            self.slice_left = SLICE
+
+
+@st.composite
+def some_jobs(draw: st.DrawFn) -> list[Job]:
+    jobs: list[Job] = []
+    n = draw(st.integers(1, 6))
+    urgencies = draw(st.permutations(range(40, 40 + n)))
+    for urgency in urgencies:
+        release, cost = draw(st.integers(0, 20)), draw(st.integers(1, 25))
+        jobs.append(Job(release, urgency - release, cost, draw(st.booleans()),
+                        draw(st.one_of(st.none(), st.integers(0, cost)))))
+    return jobs
+
+
+@examples(400)
+@given(some_jobs(), st.integers(1, 4), st.integers(1, 4), st.booleans())
+def test_as_the_model_that_goes_by_ticks(
+    jobs: list[Job], workers: int, cpus: int, python: bool
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        for name, ticks in (('SWITCH_NS', SWITCH), ('SLICE_NS', SLICE), ('BRIEF_NS', BRIEF)):
+            patch.setattr(machine, name, ticks)
+        found: Any = times(jobs, workers, cpus, python)
+    assert found == Ticks(jobs, workers, cpus, python).times()
