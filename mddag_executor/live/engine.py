@@ -42,7 +42,7 @@ from mddag_executor.core.state import (
     SUSPENDED,
 )
 from mddag_executor.live.entity import Entity, TIMER
-from mddag_executor.live.jobs import Jobs, NO_ORIGIN, Origin
+from mddag_executor.live.jobs import Announced, Jobs, NO_ORIGIN, Origin
 from mddag_executor.live.other_processes import OtherProcesses
 from mddag_executor.live.verdicts import DeadlineMiss, Record, Verdicts
 from mddag_executor.trace.groups import EXECUTION
@@ -67,13 +67,14 @@ class Engine:
     :param record: where trace events go; None records nothing.
     :param on_miss: gets every miss (see ``Verdicts``).
     :param fail: gets what ``on_miss`` raises.
+    :param process: which of the declared processes this is.
     """
 
     def __init__(
         self, task_set: TaskSet | None, n_workers: int, policy: str, *, default_deadline: int,
         max_active_jobs: int, expire_after: int, record: Record | None = None,
         on_miss: Callable[[DeadlineMiss], None] | None = None,
-        fail: Callable[[BaseException], None] = lambda error: None,
+        fail: Callable[[BaseException], None] = lambda error: None, process: str | None = None,
     ) -> None:
         self.tables = Tables.build(
             task_set, legs=True, groups=False, default_deadline=default_deadline,
@@ -81,7 +82,8 @@ class Engine:
         self.scheduler = Scheduler(self.tables, n_workers, policy, propagate=False)
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss, fail)
         self.jobs = Jobs(task_set)
-        self.other_processes = OtherProcesses.of(task_set, self.tables, self.scheduler, self.jobs)
+        self.other_processes = OtherProcesses.of(
+            task_set, self.tables, self.scheduler, self.jobs, process)
         self.dag_names = [d.name for d in task_set.dags] if task_set else []
         self.n_workers = n_workers
         self.record = record
@@ -131,13 +133,13 @@ class Engine:
                 self._skip_job(entity, min(due + i * period, now), now)
 
     def arrived(
-        self, work: Work, origin: Origin | None, release: int, stamp: int, now: int
+        self, work: Work, origin: Origin | Announced | None, release: int, stamp: int, now: int
     ) -> None:
         """
         Take in a message.
 
         :param origin: the publication that it comes from, where one was found.
-        :param release: the release of the job that it starts, if it starts one.
+        :param release: the release of the job that it starts or enters with, if it does.
         :param stamp: that of its header where it says which job it belongs to, else -1.
         """
         entity = work.entity
@@ -153,7 +155,9 @@ class Engine:
             if stamp >= 0 and self.other_processes is not None and work.origin is not None:
                 self.other_processes.note(stamp, work.origin)
             return
-        if origin is None and stamp >= 0:
+        if isinstance(origin, Announced):
+            origin = self._enter_announced(origin, min(release, now), now)
+        elif origin is None and stamp >= 0:
             origin = self._enter(entity, stamp, min(release, now), now)
         if origin is None or not self._start_successor(work, origin, now):
             if entity.callback is not None:
@@ -191,6 +195,18 @@ class Engine:
         return job._replace(vertex=next(
             (v for v in entity.remote_publishers if self._is_idle(job, *entity.targets[v])),
             entity.remote_publishers[0]))
+
+    def _enter_announced(self, announced: Announced, release: int, now: int) -> Origin | None:
+        """Find or start the job that another process announces (see ``announcements``)."""
+        if self.other_processes is None or announced.dag < 0:
+            return None
+        job = self.other_processes.named(announced.dag, announced.name)
+        if job is None:
+            slot = self._release(announced.dag, release, now)
+            job = Origin(
+                slot, announced.dag, self._state.job_index[slot], announced.vertex)
+            self.other_processes.name(announced.name, job)
+        return job._replace(vertex=announced.vertex)
 
     def _is_idle(self, job: Origin, vertex: int, leg: int) -> bool:
         return self._state.x_state[self.scheduler.execution(job.slot, vertex, leg)] == IDLE

@@ -71,6 +71,7 @@ class Entity:
         'kind', 'rclpy', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
         'busy_ns', 'unattributed', 'removed', 'address', 'handle', 'remote_publishers',
+        'awaits', 'is_own',
         'ends_soon', 'is_brief', 'publishes', 'at_once', 'habit', 'since', 'gate', '__weakref__')
 
     def __init__(
@@ -91,6 +92,9 @@ class Entity:
         self.targets: dict[int, tuple[int, int]] = {}
         # the vertices in other processes whose messages enter here
         self.remote_publishers: list[int] = []
+        # whether other processes announce publications for it; whether it is what hears of these
+        self.awaits = False
+        self.is_own = False
         # its executions that wait, the oldest first
         self.waiting: dict[int, None] = {}
         self.ready = 0

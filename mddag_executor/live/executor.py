@@ -28,6 +28,7 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.live import hooks
+from mddag_executor.live.announcements import Announcements
 from mddag_executor.live.compat import (
     BareExecutor,
     is_called_by_spin,
@@ -177,7 +178,7 @@ class MultiDeadlineExecutor(BareExecutor):
             task_set, num_workers, policy, default_deadline=deadline_ns,
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
             record=self._recorder.record if self._recorder else None, on_miss=on_deadline_miss,
-            fail=self._fail)
+            fail=self._fail, process=process)
         self._pool = Pool(
             self._engine, self._trace_clock, self._fail, self._context_ended, prepare)
         self._pool.pump = self._pump
@@ -193,8 +194,9 @@ class MultiDeadlineExecutor(BareExecutor):
             self._recorder.entities((), [self._task_entity])
         self._rates = RateWatch(self._registry)
         self._groups = Groups(self, self.wake, self._hand_over)
+        self._announcements: Announcements | None = None
         self._upkeep = Upkeep(
-            self._groups.served_nodes, self._registry, self._pool, self._recorder)
+            self._nodes_to_look_after, self._registry, self._pool, self._recorder)
         self._intake: EventsIntake | WaitSetIntake | None = None
         self._stepper: Stepper | None = None
         super().__init__(context=context)
@@ -203,11 +205,23 @@ class MultiDeadlineExecutor(BareExecutor):
             self._diagnostics = Diagnostics(
                 self.context, task_set, self._pool, self._registry, self._recorder, every_ns,
                 thresholds)
+        if process is not None and task_set is not None and (
+                self._engine.other_processes is not None
+                and self._engine.other_processes.announces):
+            self._announcements = Announcements(
+                task_set, process, self.context, self._engine, self._trace_clock,
+                self._receiver.give)
+            self._receiver.announcements = self._announcements
+            self._registry.own = {*self._announcements.subscriptions}
         self._intake_kind = intake
         # What is ready still would run before the spin notices.
         call_at_shutdown(self.context, self._pool.start_no_more)
         call_at_shutdown(self.context, self.wake)
         halt_at_exit(self)
+
+    def _nodes_to_look_after(self) -> list[Any]:
+        nodes = self._groups.served_nodes()
+        return nodes if self._announcements is None else [*nodes, self._announcements.node]
 
     def _context_ended(self) -> bool:
         return is_over(self.context)
@@ -403,6 +417,8 @@ class MultiDeadlineExecutor(BareExecutor):
         self._submit_tasks()
         if self._rates.look() and self._registry.is_stale():
             self._upkeep.changed = True
+        if self._announcements is not None:
+            self._announcements.look()
         if self._diagnostics is not None:
             self._diagnostics.start()
 
@@ -546,6 +562,8 @@ class MultiDeadlineExecutor(BareExecutor):
         if self._diagnostics is not None:
             self._diagnostics.stop()
         self._groups.release()
+        if self._announcements is not None:
+            self._announcements.close()
         with self._pool.lock:
             end = self._pool.tick()
             self._engine.finish(end)
@@ -570,6 +588,10 @@ class MultiDeadlineExecutor(BareExecutor):
     def set_judging(self, judging: bool) -> None:
         """Give verdicts about jobs that are released from now on, or about none until told so."""
         self._pool.tell(self._engine.set_judging, judging)
+
+    def unmatched(self) -> list[str]:
+        """Return the topics on which it has not met the executors of the other processes yet."""
+        return [] if self._announcements is None else self._announcements.unmatched()
 
     def statistics(self) -> dict[str, Any]:
         """Return a snapshot of what has happened so far (see the module ``statistics``)."""

@@ -103,6 +103,8 @@ class Interpreter:
 
     def look_after(self) -> None:
         """Look soon if anything is held back; the caller holds the lock."""
+        if self._closed:
+            return  # the alarm rings for the end, and is not to be set anew
         engine = self._engine
         holder = engine.interpreter_holder() if engine.held_back else None
         if holder is None:

@@ -19,6 +19,8 @@ answer is None and the message runs as an undeclared callback: never dropped, ne
 
 A publisher may have published before anybody counted; the difference to the middleware's number
 is learnt from messages that only one window holds.
+
+Publications of other processes that these announce (``announcements``) are found in the same way.
 """
 
 from __future__ import annotations
@@ -53,6 +55,35 @@ class Origin(NamedTuple):
 
 
 NO_ORIGIN = Origin(-1, -1, -1, -1)
+
+
+class Announced(NamedTuple):
+    """
+    What another process tells of the execution that published.
+
+    :ivar name: of its job: where that was released first, and its number there.
+    :ivar dag: its index, -1 for none.
+    :ivar vertex: the global vertex.
+    :ivar release: of the job, on the machine's steady clock in ns.
+    """
+
+    name: tuple[int, int]
+    dag: int
+    vertex: int
+    release: int
+
+
+class RemotePublisher:
+    """
+    A publisher in another process.
+
+    :ivar offset: from its own count to the middleware's number; None: not known yet.
+    """
+
+    __slots__ = ('offset',)
+
+    def __init__(self) -> None:
+        self.offset: int | None = None
 
 
 class PublisherState:
@@ -90,11 +121,14 @@ class Publication:
 
     __slots__ = ('begin', 'end', 'publisher', 'sequence', 'origin')
 
-    def __init__(self, begin: int, publisher: PublisherState, origin: Origin) -> None:
+    def __init__(
+        self, begin: int, publisher: PublisherState | RemotePublisher,
+        origin: Origin | Announced, sequence: int, end: int = _STILL_PUBLISHING,
+    ) -> None:
         self.begin = begin
-        self.end = _STILL_PUBLISHING
+        self.end = end
         self.publisher = publisher
-        self.sequence = publisher.count
+        self.sequence = sequence
         self.origin = origin
 
 
@@ -104,6 +138,8 @@ class _Topic:
     def __init__(self) -> None:
         self.publications: deque[Publication] = deque(maxlen=KEEP)
         self.open: list[Publication] = []
+        self.announced: deque[Publication] = deque(maxlen=KEEP)
+        self.is_announced = False
         # The longest window of those kept; a maximum of two generations, so that it is forgotten.
         self.longest = 0
         self._longest_lately = 0
@@ -141,6 +177,8 @@ class Jobs:
         self._release_from = [d.release_from for d in task_set.dags] if task_set else []
         self.unknown = 0
         self.doubtful = 0
+        # tells other processes of a publication, once it has returned
+        self.announce: Callable[[Callable[[Any, Any], None], str, Publication], None] | None = None
 
     def publish(
         self, send: Callable[[Any, Any], None], publisher: Any, msg: Any,
@@ -155,28 +193,42 @@ class Jobs:
             return
         if topic.on_header is not None:
             topic.on_header(header_stamp(msg), origin)
-        publication = Publication(time_ns(), state, origin)
+        publication = Publication(time_ns(), state, origin, state.count)
         topic.begun(publication)
         try:
             send(publisher, msg)
         finally:
             topic.ended(publication, time_ns())
+        if topic.is_announced and self.announce is not None:
+            self.announce(send, state.topic, publication)
+
+    def announce_on(self, topics: set[str]) -> None:
+        """Have the publications on these topics announced."""
+        for name, topic in self._topics.items():
+            topic.is_announced = name in topics
+
+    def take_in(self, topic: str, publication: Publication) -> None:
+        """Note a publication that another process has announced."""
+        self._topics[topic].announced.append(publication)
 
     def note_headers(self, on_header: Callable[[int, Origin], None], topics: set[str]) -> None:
         """Have ``on_header`` called for each message on these topics, before it is published."""
         for name, topic in self._topics.items():
             topic.on_header = on_header if name in topics else None
 
-    def find(self, topic: str, stamp: int, sequence: int | None) -> Origin | None:
+    def find(
+        self, topic: str, stamp: int, sequence: int | None, counted: bool = True
+    ) -> Origin | Announced | None:
         """
         Return the origin of a message, or None when nothing or more than one thing fits.
 
         :param stamp: its source timestamp, system time in ns.
         :param sequence: its publication sequence number, where the middleware gives one.
+        :param counted: whether it counts that nothing was found.
         """
         known = self._topics.get(topic)
         if known is None:
-            self.unknown += 1
+            self.unknown += counted
             return None
         fits: list[Publication] = []
         if known.open:
@@ -192,17 +244,21 @@ class Jobs:
             if (publication.begin - ROUNDING_NS <= stamp <= publication.end + ROUNDING_NS
                     and publication not in fits):
                 fits.append(publication)
+        if known.announced:  # by several processes, so in no order
+            fits.extend(p for p in known.announced.copy()
+                        if p.begin - ROUNDING_NS <= stamp <= p.end + ROUNDING_NS)
         if len(fits) == 1:
             if sequence is not None:
                 fits[0].publisher.offset = sequence - fits[0].sequence
             return fits[0].origin
         if not fits:
-            self.unknown += 1
+            self.unknown += counted
             return None
-        matches = [p for p in fits if p.sequence + p.publisher.offset == sequence]
-        if len(matches) == 1:
+        matches = [p for p in fits if p.publisher.offset is None
+                   or p.sequence + p.publisher.offset == sequence]
+        if len(matches) == 1 and matches[0].publisher.offset is not None:
             return matches[0].origin
-        self.doubtful += 1
+        self.doubtful += counted
         return None
 
     def release(

@@ -7,8 +7,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from mddag_executor.live.announcements import Announcements
 from mddag_executor.live.compat import ends_sleep
-from mddag_executor.live.jobs import header_stamp, Origin, steady_time
+from mddag_executor.live.jobs import Announced, header_stamp, Origin, steady_time
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
@@ -37,6 +38,7 @@ class Receiver:
         self.executor = executor
         self._fail = fail
         self._recorder = recorder
+        self.announcements: Announcements | None = None
 
     def take_in(self, arrivals: Sequence[Work]) -> None:
         """Take in what became ready at one instant."""
@@ -51,13 +53,20 @@ class Receiver:
             return
         work.entity = entity
         pool, engine, info = self._pool, self._engine, work.info
-        if entity.callback is None and pool.running and (
+        if entity.is_own:
+            work.function(*work.args)
+        elif entity.callback is None and pool.running and (
                 entity.at_once or work.due is not None and ends_sleep(work.function)):
             self._run(work)
         elif work.due is not None:
             self._timer_due(work)
         elif info is not None:
-            origin: Origin | None = None
+            if self._recorder is not None:
+                self._recorder.taken(entity, work.args[0], info['source_timestamp'])
+            if entity.awaits and self.announcements is not None:
+                self.announcements.take(work)
+                return
+            origin: Origin | Announced | None = None
             release = stamp = -1
             if entity.source >= 0:
                 release, stamp = engine.jobs.release(
@@ -68,15 +77,26 @@ class Receiver:
                     entity.topic, info['source_timestamp'],
                     info.get('publication_sequence_number'))
                 if origin is None and entity.remote_publishers:
-                    stamp = header_stamp(work.args[0])
-                    release = steady_time(stamp, self._clock.now())
-            if self._recorder is not None:
-                self._recorder.taken(entity, work.args[0], info['source_timestamp'])
+                    release, stamp = self._stamp(work)
             pool.tell(engine.arrived, work, origin, release, stamp)
         elif entity.source >= 0:
             pool.tell(engine.arrived, work, None, self._clock.now(), -1)
         else:
             pool.tell(engine.ready, work)
+
+    def give(self, work: Work, origin: Origin | Announced | None) -> None:
+        """Hand a message over that has waited, or could have, for its announcement."""
+        release = stamp = -1
+        if isinstance(origin, Announced):
+            release = origin.release + self._clock.offset_ns
+        elif origin is None and work.entity.remote_publishers:
+            release, stamp = self._stamp(work)
+        self._pool.tell(self._engine.arrived, work, origin, release, stamp)
+
+    def _stamp(self, work: Work) -> tuple[int, int]:
+        """Return release and stamp of a message from another process."""
+        stamp = header_stamp(work.args[0])
+        return steady_time(stamp, self._clock.now()), stamp
 
     def _run(self, work: Work) -> None:
         work.function(*work.args)

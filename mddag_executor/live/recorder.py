@@ -87,6 +87,8 @@ class Recorder:
             except InvalidHandle:
                 continue  # destroyed meanwhile
         for entity in added:
+            if entity.is_own:
+                continue
             try:
                 self._entity(entity, by_name.get(entity.node, 0))
             except InvalidHandle:

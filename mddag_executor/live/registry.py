@@ -60,6 +60,8 @@ class Registry:
         self._groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
         self._numbers: set[int] = set()
         self.by_id: dict[int, Entity] = {}
+        # the executor's own subscriptions
+        self.own: set[Any] = set()
         # destroyed entities whose last executions are not done yet, and the counts of those before
         self._retired: list[Entity] = []
         self._past: dict[str, dict[str, Any]] = {}
@@ -224,8 +226,9 @@ class Registry:
         entity = Entity(kind, rclpy_entity, node, callback, number, depth, label)
         if decides:
             entity.gate = Gate(group, rclpy_entity, self._passed)
+        entity.is_own = rclpy_entity in self.own
         entity.at_once = callback is None and kind == SUBSCRIPTION and keeps_time(rclpy_entity)
-        if callback is None and kind in (TIMER, SUBSCRIPTION, SERVICE):
+        if callback is None and kind in (TIMER, SUBSCRIPTION, SERVICE) and not entity.is_own:
             if len(self._undeclared) < _MOST_UNDECLARED:
                 self._undeclared[bindable] = None
         if callback is not None:

@@ -199,7 +199,8 @@ def run_and_note(
     """
     window: tuple[Reading, Reading] | None = None
     try:
-        session.wait_until_matched(workload.unmatched)
+        executors: Callable[[], list[str]] = getattr(session.executor, 'unmatched', list)
+        session.wait_until_matched(lambda: workload.unmatched() + executors())
         if not session.stopped:
             workload.start(session.executor.wake)
             if not session.wait(warm_up_s):

@@ -7,9 +7,10 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
-from mddag_executor.live.interpreter import Habit
+from mddag_executor.live.interpreter import Habit, Interpreter
 import msg_graph
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -230,3 +231,20 @@ def test_computing_with_the_lock_released_is_noticed_and_looked_at_again():
     for _ in range(20):
         habit.was_released(False)
     assert any(learnt((10, 9.5, 9.6), habit=habit) for _ in range(20))
+
+
+def test_the_alarm_that_rings_for_the_end_is_not_set_anew():
+    engine: Any = SimpleNamespace(held_back=False)
+    interpreter = Interpreter(engine, threading.Lock(), [], lambda: None)
+    interpreter._watch(3600 * 1000 * MS)
+    ring = interpreter._alarm.ring
+
+    def ring_and_look() -> None:
+        ring()
+        interpreter.look_after()
+
+    interpreter._alarm.ring = ring_and_look  # type: ignore[method-assign]
+    closing = threading.Thread(target=interpreter.close, daemon=True)
+    closing.start()
+    closing.join(60)
+    assert not closing.is_alive()

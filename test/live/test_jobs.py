@@ -9,11 +9,13 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.live.jobs import (
+    Announced,
     Jobs,
     KEEP,
     Origin,
     Publication,
     PublisherState,
+    RemotePublisher,
     ROUNDING_NS,
 )
 import msg_graph
@@ -40,7 +42,7 @@ class Bench:
     def published(self, begin: int, end: int | None, job: int, publisher: int = 0) -> None:
         state = self.publishers[publisher]
         state.count += 1
-        publication = Publication(begin, state, Origin(0, 0, job, publisher))
+        publication = Publication(begin, state, Origin(0, 0, job, publisher), state.count)
         self.topic.begun(publication)
         if end is not None:
             self.topic.ended(publication, end)
@@ -161,3 +163,46 @@ def test_a_long_publication_is_forgotten_with_those_of_its_time():
         bench.published(10 ** 12 + 1000 * job, 10 ** 12 + 1000 * job + 10, job)
     assert bench.topic.longest == 10
     assert bench.job(10 ** 12 + 1000 * (2 * KEEP - 1) + 5) == 2 * KEEP - 1
+
+
+# --- publications of other processes -------------------------------------------------------------
+
+def announced(bench: Bench, begin: int, end: int, number: int, sequence: int,
+              publisher: RemotePublisher) -> None:
+    bench.jobs.take_in(TOPIC, Publication(
+        begin, publisher, Announced((1, number), 0, 0, 0), sequence, end))
+
+
+def number(bench: Bench, stamp: int, sequence: int | None = None) -> int | None:
+    found = bench.jobs.find(TOPIC, stamp, sequence, counted=False)
+    return found.name[1] if isinstance(found, Announced) else None
+
+
+def test_an_announced_publication_is_found_by_its_window():
+    bench, publisher = Bench(), RemotePublisher()
+    bench.published(0, 10, 5)
+    announced(bench, 1000, 1010, 7, 1, publisher)
+    assert (bench.job(5), number(bench, 1005, 4), number(bench, 500)) == (5, 7, None)
+    assert publisher.offset == 3
+    assert (bench.jobs.unknown, bench.jobs.doubtful) == (0, 0)
+
+
+def test_the_sequence_number_decides_only_where_its_count_is_known():
+    bench, one, other = Bench(), RemotePublisher(), RemotePublisher()
+    announced(bench, 0, 10, 1, 1, one)
+    announced(bench, 5, 15, 2, 2, other)
+    assert number(bench, 7, 1) is None  # nobody knows what the publishers sent before
+    announced(bench, 100, 110, 3, 2, one)
+    announced(bench, 200, 210, 4, 3, other)
+    assert (number(bench, 105, 2), number(bench, 205, 3)) == (3, 4)
+    assert (number(bench, 7, 1), number(bench, 7, 2)) == (1, 2)
+    assert number(bench, 7, 9) is None
+
+
+def test_a_publication_here_and_one_elsewhere_at_once_are_a_doubt_unless_it_is_known():
+    bench, other = Bench(), RemotePublisher()
+    bench.published(0, 10, 5)
+    announced(bench, 5, 15, 1, 9, other)
+    assert bench.jobs.find(TOPIC, 7, 1) is None and bench.jobs.doubtful == 1
+    other.offset = 0
+    assert bench.job(7, 1) == 5 and number(bench, 7, 9) == 1
