@@ -200,7 +200,7 @@ class PoolWatch:
         values = {
             'policy': scheduler.policy.name, 'workers': str(workers),
             'idle_workers': str(scheduler.idle_workers), 'lent': str(self._pool.lent),
-            'queue': str(scheduler.queue_length),
+            'queue': str(scheduler.queue_length), 'computing': str(self._registry.computing()),
             'callbacks_per_s': f'{step["ran"] * 1e9 / passed:.1f}',
             'busy_ratio': f'{step["busy_ns"] / passed / workers:.3f}',
             'cpu_ratio': f'{cpu_used / passed:.3f}',

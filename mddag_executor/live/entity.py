@@ -156,12 +156,15 @@ class Entity:
             return
         total = counts.setdefault(self.name, {
             'kind': self.kind, 'declared': self.callback is not None, 'waiting': 0,
-            'holds_interpreter': False,
+            'holds_interpreter': False, 'interpreter_share': None,
             **dict.fromkeys(COUNTS, 0)})
         for key in COUNTS:
             total[key] += getattr(self, key)
         total['waiting'] += len(self.waiting)
         total['holds_interpreter'] |= bool(self.habit.holds)
+        share = self.habit.share
+        if share is not None:
+            total['interpreter_share'] = max(total['interpreter_share'] or 0.0, round(share, 3))
 
 
 def link(entity: Entity, task_set: TaskSet, tables: Tables, topic: str) -> None:

@@ -14,9 +14,9 @@ for ``GAP_NS`` at most.  One that computed for less than half of the least does 
 between the two says nothing; but as long as nothing is known, and now and then, the next execution
 is taken as one that holds it, because that one runs by itself and shows what is true.
 
-One that computes with the lock released (numpy, hashlib) does not hold the interpreter, either:
-``interpreter`` finds that out while others wait for it.  One of ``TRY_EVERY`` measured executions
-is looked at again.
+One that computes with the lock released (numpy, hashlib) does not hold the interpreter, either, if
+it does so for a good part of its time: ``interpreter`` finds that out while others wait for it.
+One of ``TRY_EVERY`` measured executions is looked at again.
 """
 
 from __future__ import annotations
@@ -40,7 +40,12 @@ LATELY = 8
 FIRST = 16
 SAMPLE = 8
 """After the first executions one in so many is measured, and more where it behaves otherwise."""
-RELEASED = 0.6
+MIXED, RELEASED, STILL_RELEASED = 0.1, 0.4, 0.25
+"""
+Parts of its time in which a callback computes with the lock released: more than the first, and it
+is looked at often; more than the second, and it does not hold the interpreter, until less than the
+third.
+"""
 TRY_EVERY = 8
 
 
@@ -55,7 +60,7 @@ class Habit:
 
     __slots__ = (
         'holds', '_declared', 'computed_ns', '_own_ns', '_released', '_passed', '_runs', '_close',
-        '_unclear', '_looks', '_trusted_from')
+        '_unclear', '_looks', '_tries', '_trusted_from', '_sampled', '_overlaps')
 
     def __init__(self, declared: bool | None = None) -> None:
         self.holds = int(declared or False)
@@ -68,28 +73,40 @@ class Habit:
         self._close = FIRST
         self._unclear = 0
         self._looks = 0
+        self._tries = 0
         self._trusted_from = LATELY
+        self._sampled = False
+        self._overlaps = False
 
     def is_to_be_measured(self) -> bool:
         """Return whether to measure the execution that begins now."""
         self._runs += 1
+        self._sampled = self._runs % SAMPLE == 0
         if self._declared:
             return False
         if self._close > 0:
             self._close -= 1
             return True
-        return self._runs % SAMPLE == 0
+        return self._sampled
 
     @property
     def patience_ns(self) -> int:
         """Return after what time to look, while others wait, whether it still computes."""
-        if self._runs < self._trusted_from or self._released > 1 / LATELY:
+        if (self._runs < self._trusted_from or self._sampled
+                or self._released > MIXED):
             return LOOK_NS
         return min(MOST_PATIENCE_NS, LOOK_NS + 2 * int(self.computed_ns) // LOOK_NS * LOOK_NS)
 
     def has_waited(self) -> None:
         """Learn that it waited though it was thought to compute."""
         self._trusted_from = self._runs + PROVEN
+
+    @property
+    def share(self) -> float | None:
+        """Return for which part of its time it needs the interpreter; None: not known yet."""
+        if self._own_ns == 0.0:
+            return float(self.holds) if self._declared else None
+        return self.computed_ns / self._own_ns * (1 - self._released)
 
     @property
     def computes_at_all(self) -> bool:
@@ -116,7 +133,7 @@ class Habit:
                 self.holds = 1
         else:
             self._learn(computed, most if computed >= COMPUTES * most else least)
-        if self._released >= RELEASED:
+        if self._overlaps:
             self._passed += 1
             self.holds &= self._passed % TRY_EVERY == 0
 
@@ -127,7 +144,7 @@ class Habit:
             self.computed_ns += (computed - self.computed_ns) / LATELY
             self._own_ns += (own - self._own_ns) / LATELY
         share, shortest = (WAITS, SHORT_NS / 2) if self.holds else (COMPUTES, SHORT_NS)
-        if (computed >= max(share * own, shortest)) != self.holds and self._released < RELEASED:
+        if (computed >= max(share * own, shortest)) != self.holds and not self._overlaps:
             self._close = LATELY  # it may have changed
         self.holds = int(self.computed_ns >= max(share * self._own_ns, shortest))
 
@@ -135,11 +152,13 @@ class Habit:
         """Return whether to find out, at a look, whether it computes with the lock released."""
         self._looks += 1
         return not self._declared and (
-            self._looks <= FIRST or self._released > 1 / LATELY or self._looks % SAMPLE == 0)
+            self._looks <= FIRST or self._released > MIXED or self._looks % SAMPLE == 0)
 
     def was_released(self, released: bool) -> bool:
         """Learn whether it computed with the lock released, and return that."""
-        self._released += (released - self._released) / LATELY
-        if self._released >= RELEASED:
+        self._tries += 1
+        self._released += (released - self._released) / min(LATELY, self._tries)
+        self._overlaps = self._released >= (STILL_RELEASED if self._overlaps else RELEASED)
+        if self._overlaps:
             self.holds = 0
         return released

@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+import os
 import sys
 import threading
 from time import monotonic_ns
@@ -70,6 +71,8 @@ class Interpreter:
         self._lock = lock
         self._seats = seats
         self._hand_out = hand_out
+        # with one CPU nothing computes beside anything
+        self._may_overlap = len(os.sched_getaffinity(0)) > 1
         self._alarm = Alarm(LOOK_NS)
         self.rings_at = 0
         self._thread: threading.Thread | None = None
@@ -186,7 +189,8 @@ class Interpreter:
         clock, habit = self._clock(work), work.entity.habit
         if clock is None:  # in an intake's thread, where it was expected to end at once
             return False
-        if habit.is_to_be_tried() and habit.was_released(self._computes_now(clock)):
+        if self._may_overlap and habit.is_to_be_tried() and habit.was_released(
+                self._computes_now(clock)):
             return False
         if self._has_computed(work) or clock.is_runnable():
             return True  # or other processes have the CPUs

@@ -159,6 +159,10 @@ class Registry:
             entity.count_into(counts)
         return counts
 
+    def computing(self) -> int:
+        """Return how many callbacks that have run hold the interpreter while they run."""
+        return sum(bool(e.ran and e.habit.holds) for e in list(self.by_id.values()))
+
     def totals(self) -> dict[str, int]:
         """
         Return the counts of all callbacks together, from any thread.

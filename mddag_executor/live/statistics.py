@@ -20,13 +20,12 @@ def statistics(
 
     ``dags``, ``deadline_missed`` and ``first_miss`` are as in ``replay --json``.  ``callbacks``
     has for each entity what became ready, ran, failed (raised), waits, was dropped (QoS depth,
-    destroyed, aborted) or skipped (timers), its busy time in ns, and whether it holds the
-    interpreter while it runs.  ``unattributed`` counts messages of declared callbacks whose
-    publication was not found; they ran as undeclared ones.  ``stops`` has how often and for how
-    long no thread of the process ran while it spun, how many misses fell into these stops, and
-    the times of the last ones (ns since the epoch).
-
-    :param process: which of the declared processes this is; what runs in others is left out.
+    destroyed, aborted) or skipped (timers), its busy time in ns, whether it holds the interpreter
+    while it runs, and for which part of its time it needs that (None: not known yet).
+    ``unattributed`` counts messages of declared callbacks whose publication was not found; they
+    ran as undeclared ones.  ``stops`` has how often and for how long no thread of the process ran
+    while it spun, how many misses fell into these stops, and the times of the last ones (ns since
+    the epoch).
     """
     engine = pool.engine
     with pool.lock:

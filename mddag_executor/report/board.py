@@ -27,9 +27,9 @@ _DAG_TITLES = ('process', 'DAG', 'state', 'period ms', 'jobs', 'lately', 'missed
 _DAG_KEYS = ('period_ms', 'jobs', 'window_results', 'window_missed', 'response_p50_ms',
              'response_p99_ms', 'response_max_ms', 'deadline_used_max')
 _POOL_TITLES = ('process', 'workers of', 'state', 'idle', 'queue', 'per s', 'busy', 'CPU',
-                'us each', 'dropped', 'skipped', 'no job', 'message')
+                'us each', 'compute', 'dropped', 'skipped', 'no job', 'message')
 _POOL_KEYS = ('idle_workers', 'queue', 'callbacks_per_s', 'busy_ratio', 'cpu_ratio',
-              'cpu_us_per_callback', 'dropped', 'skipped', 'unattributed')
+              'cpu_us_per_callback', 'computing', 'dropped', 'skipped', 'unattributed')
 
 
 @dataclass(frozen=True)

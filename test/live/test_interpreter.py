@@ -109,6 +109,31 @@ def test_what_is_held_back_runs_in_the_order_of_deadlines(make_executor, make_no
     assert bodies.ran == ['a', 'c', 'd', 'b']
 
 
+def test_a_long_callback_does_not_hold_up_a_more_urgent_one(make_executor, make_node):
+    """A camera computes until the 1 kHz callback has run thrice meanwhile, so it must let it."""
+    node, ticks, seen = make_node(), [], []
+    group = ReentrantCallbackGroup()
+    node.create_timer(0.001, lambda: ticks.append(None), callback_group=group)
+
+    def capture() -> None:
+        before, end = len(ticks), time.monotonic() + 20.0
+        while len(ticks) < before + 3 and time.monotonic() < end:  # computes
+            pass
+        seen.append(len(ticks) - before)
+
+    node.create_timer(0.1, capture, callback_group=group)
+    executor = make_executor(msg_graph.loads(
+        'mddag: 1\nnodes:\n  - node: /node\n    callbacks:\n'
+        '      - {name: step, timer: 1ms, dag: step, deadline: 1ms, holds_interpreter: true}\n'
+        '      - {name: capture, timer: 100ms, dag: camera, deadline: 100ms, '
+        'holds_interpreter: true}\n',
+        'g.yaml'))
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(seen) >= 3, 60.0)
+    assert min(seen) >= 3
+
+
 def test_one_that_waits_for_another_gives_the_interpreter_back(make_executor, make_node):
     """Declared as computing, but it waits for one that is held back: no deadlock."""
     node = make_node()
@@ -150,6 +175,8 @@ def test_who_computes_is_learnt_and_shown(make_executor, make_node):
         assert wait_for(lambda: ran.count('sleeps') > 10 and ran.count('computes') > 10, 20.0)
         found = executor.statistics()['callbacks']
     assert not all(count['holds_interpreter'] for count in found.values())
+    shares = [count['interpreter_share'] for count in found.values()]
+    assert any(share is not None and share > 0.5 for share in shares)
 
 
 def test_the_switch_interval_is_given_back(make_executor, make_node):
@@ -216,6 +243,19 @@ def test_other_processes_do_not_count():
 def test_what_is_declared_is_not_learnt():
     assert learnt(*[(10, 0.2, 0.3)] * 20, habit=Habit(True)) == 1
     assert learnt(*[(10, 9.5, 9.6)] * 20, habit=Habit(False)) == 0
+
+
+def test_who_mixes_numpy_and_python_keeps_nobody_from_the_interpreter():
+    habit = Habit()
+    assert learnt((10, 9.5, 9.6), habit=habit) == 1
+    for _ in range(20):
+        habit.was_released(False)
+        habit.was_released(True)
+    assert habit.holds == 0
+    assert 0.3 < habit.share < 0.7
+    for _ in range(3):
+        habit.was_released(False)
+    assert any(learnt((10, 9.5, 9.6), habit=habit) for _ in range(200))
 
 
 def test_computing_with_the_lock_released_is_noticed_and_looked_at_again():
