@@ -14,7 +14,9 @@ along its critical chain (see ``chains``).  Each piece of it is split:
   *waited* as far as all workers were busy; else, with a free worker, for the *interpreter* as far
   as something else ran; and where nothing ran though a worker was free, for the *machine*;
 * a callback that runs *ran*, and *ran long* beyond what is usual: its own median, or the longest
-  time that is declared, if that is less;
+  time that is declared, if that is less.  Where its CPU time is recorded, and it computes but did
+  not compute longer than usual, it had to share the *interpreter* as far as others held it, too,
+  and else the *machine* gave it no CPU;
 * *transport* is from the end of a callback until the next one is ready;
 * a job that was given up waits for a callback that never ran: its message is *lost*, unless it was
   ready and waited.
@@ -37,6 +39,7 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core.state import SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_LATE
 from mddag_executor.replay.chains import (
+    L_CPU,
     L_END,
     L_GROUP,
     L_READY,
@@ -84,7 +87,8 @@ class Pool(NamedTuple):
     """
     What ran and stood still in the time that is looked at.
 
-    :ivar full: when all workers were busy; ``some``: when anything ran.
+    :ivar full: when all workers were busy; ``some``: when anything ran that may have held the
+        interpreter; ``shared``: when several did hold it.
     :ivar stalls: begin and end of each.
     :ivar knows_workers: whether the number of workers is known, and an idle one takes what is
         ready.
@@ -92,15 +96,22 @@ class Pool(NamedTuple):
 
     full: Spans
     some: Spans
+    shared: Spans
     stalls: list[tuple[int, int]]
     origin: int
     knows_workers: bool
 
 
 class Usual(NamedTuple):
-    """What is usual: by global vertex how long it runs, by DAG how late its release is seen."""
+    """
+    What is usual.
+
+    :ivar runs: by global vertex how long it runs; ``cpu``: how long it computes.
+    :ivar lags: by DAG how late its release is seen.
+    """
 
     runs: Ints
+    cpu: Ints
     lags: Ints
 
 
@@ -153,7 +164,8 @@ def find(
     runs = kinds == _RUN
     normal = usual.runs[spans[:, _S_VERTEX]]
     usually = np.where(left <= normal + (normal >> _ABOUT_BITS), left, normal)
-    times[runs, RAN_USUALLY], times[runs, RAN_LONG] = usually[runs], (left - usually)[runs]
+    times[runs, RAN_USUALLY] = usually[runs]
+    times[runs] += _ran_long(spans[runs], (left - usually)[runs], usual, pool)
     _pending(rows, spans, times, left, never, pool)
     waits = kinds == _WAIT
     if waits.any():
@@ -169,8 +181,9 @@ def find(
     return Found(rows, causes, parts)
 
 
-# A span of time of a miss, at a vertex.
-_S_MISS, _S_VERTEX, _S_KIND, _S_BEGIN, _S_END, _S_GROUP = range(6)
+# A span of time of a miss, at a vertex; of a wait how much of it was for the group, of a run its
+# CPU time.
+_S_MISS, _S_VERTEX, _S_KIND, _S_BEGIN, _S_END, _S_MORE = range(6)
 _LAG, _BEFORE, _WAIT, _RUN, _TRANSPORT, _PENDING = range(6)
 
 
@@ -202,16 +215,30 @@ def _spans(rows: Ints, chain: Ints, is_source: Any) -> Ints:
         columns(everyone[~some], rows[~some, M_AT], _PENDING, rows[~some, M_RELEASE],
                 rows[~some, M_UNTIL], nothing[~some]),
         columns(of, at, _WAIT, ready, start, chain[:, L_GROUP]),
-        columns(of, at, _RUN, start, done, 0),
+        columns(of, at, _RUN, start, done, chain[:, L_CPU]),
         columns(of, after_vertex, onward, done, after, 0)])
     spans = spans[spans[:, _S_END] > spans[:, _S_BEGIN]]
     return spans[np.lexsort((spans[:, _S_BEGIN], spans[:, _S_MISS]))]
 
 
+def _ran_long(spans: Ints, more: Ints, usual: Usual, pool: Pool) -> Ints:
+    """Split the time for which callbacks ran longer than usual."""
+    times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
+    cpu, vertex = spans[:, _S_MORE], spans[:, _S_VERTEX]
+    computed = np.maximum(0, cpu - usual.cpu[vertex])
+    starved = (cpu >= 0) & (2 * usual.cpu[vertex] >= usual.runs[vertex]) & (2 * computed < more)
+    idle = np.where(starved, more - computed, 0)
+    times[:, RAN_LONG] = more - idle
+    times[:, INTERPRETER] = np.minimum(
+        idle, pool.shared.within(spans[:, _S_BEGIN], spans[:, _S_END]))
+    times[:, MACHINE] = idle - times[:, INTERPRETER]
+    return times
+
+
 def _waits(spans: Ints, left: Ints, pool: Pool) -> Ints:
     """Split the time for which callbacks waited, but for stalls."""
     times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
-    times[:, GROUP] = np.minimum(spans[:, _S_GROUP], left)
+    times[:, GROUP] = np.minimum(spans[:, _S_MORE], left)
     left = left - times[:, GROUP]
     if not pool.knows_workers:
         times[:, WAITED] = left

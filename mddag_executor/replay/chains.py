@@ -67,7 +67,7 @@ class Step(NamedTuple):
 
 
 # Columns of a link: a step while it is only counted.
-L_VERTEX, L_LEG, L_READY, L_START, L_END, L_BUSY, L_GROUP, N_LINK = range(8)
+L_VERTEX, L_LEG, L_READY, L_START, L_END, L_BUSY, L_GROUP, L_CPU, N_LINK = range(9)
 
 
 # Columns of a miss; ``M_AT`` is the vertex that the job came to, ``M_LENGTH`` of how many links.
@@ -151,9 +151,10 @@ class Chains:
         table = np.zeros((first + len(completed) + len(started), N_LINK), dtype=np.int64)
         table[:first] = self._kept
         table[first:first + len(completed), :L_GROUP] = completed[:, (1, 3, 6, 7, 8, 9)]
+        table[first:first + len(completed), L_CPU] = completed[:, 11]
         running = table[first + len(completed):]
         running[:, L_VERTEX], running[:, L_READY:L_END] = started[:, 1], started[:, 3:5]
-        running[:, L_LEG], running[:, L_END:L_GROUP] = -1, NEVER
+        running[:, L_LEG], running[:, L_END:L_GROUP], running[:, L_CPU] = -1, NEVER, -1
         self._table = table
         vertex, leg, ready, start, end = table[:, :L_BUSY].T.tolist()
         self.ready, self.first = ready, first
@@ -246,7 +247,7 @@ class Chains:
         chain = table[np.array(self._chains, dtype=np.int64)]
         first = np.cumsum(lengths) - lengths
         of = np.repeat(np.arange(len(lengths)), lengths)
-        at, leg, ready, start, end, busy, group = chain.T
+        at, leg, ready, start, end, busy, group, _ = chain.T
         is_last = np.zeros(len(chain), dtype=np.bool_)      # of its chain: it is told first
         is_last[first[lengths > 0]] = True
         after = np.r_[0, ready[:-1]]

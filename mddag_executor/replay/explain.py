@@ -68,9 +68,9 @@ BLOCK = 65_536
 LATER_NS = 1_000_000_000
 _NO_END = 2 ** 62
 _MOST_DROPS = 1_000_000
-_NAMES = ('pieces', 'took', 'released', 'started', 'times', 'stops')
-_PIECES, _TOOK, _RELEASED, _STARTED, _TIMES, _STOPS = range(len(_NAMES))
-_WIDTHS = (5, 2, 3, 4, 1, 2)
+# What is kept, and how many columns it has.
+_PIECES, _TOOK, _RELEASED, _STARTED, _TIMES, _STOPS, _HELD = range(7)
+_WIDTHS = (5, 3, 3, 4, 1, 2, 2)
 # Columns of pieces.
 _CALLBACK, _VERTEX, _SHARE, _START, _END = range(5)
 
@@ -123,8 +123,9 @@ class Explainer(Observer):
         self._is_timer = np.array(
             [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags] + [False])
         self._runs = Typical(len(places) + 1)
+        self._cpu = Typical(len(places) + 1)
         self._lags = Typical(len(task_set.dags) + 1)
-        self._kept: list[list[Ints]] = [[] for _ in _NAMES]
+        self._kept: list[list[Ints]] = [[] for _ in _WIDTHS]
         self._n_new = 0
         self._misses: list[Misses] = []
         self._dropped: dict[tuple[int, int], str] = {}
@@ -151,7 +152,8 @@ class Explainer(Observer):
         done = done[done[:, 10] >= 0]
         released = batch.columns(RELEASED)
         self._keep(_PIECES, pieces[:, [0, 2, 8, 6, 7]])
-        self._keep(_TOOK, np.column_stack((done[:, 1], done[:, 8] - done[:, 7])))
+        self._keep(_TOOK, np.column_stack((done[:, 1], done[:, 8] - done[:, 7], done[:, 11])))
+        self._keep(_HELD, done[done[:, 12] != 0, 7:9])
         self._keep(_RELEASED, released[:, [0, 2, 3]])
         self._keep(_STARTED, started[:, 1:5])
         self._keep(_TIMES, np.concatenate([
@@ -190,10 +192,12 @@ class Explainer(Observer):
         self._n_new = 0
         took, released = self._table(_TOOK), self._table(_RELEASED)
         self._runs.add(self._place[took[:, 0]], took[:, 1])
+        known = took[took[:, 2] >= 0]
+        self._cpu.add(self._place[known[:, 0]], known[:, 2])
         self._lags.add(released[:, 0], released[:, 2] - released[:, 1])
         self._kept[_TOOK].clear()
         usual = Usual(np.minimum(self._runs.medians()[self._place], self._longest),
-                      self._lags.medians())
+                      self._cpu.medians()[self._place], self._lags.medians())
         pieces = self._table(_PIECES)
         if len(pieces):
             self._look_for_stalls(pieces, usual, until)
@@ -220,9 +224,11 @@ class Explainer(Observer):
         origin = int(misses.rows[:, M_RELEASE].min())
         start, end = pieces[:, _START], pieces[:, _END]
         first = int(start.min()) if len(pieces) else origin
+        since, held = self._table(_HELD).T
         pool = Pool(
             Spans(*crowded(start, end, max(1, self._workers)), origin),
-            Spans(*crowded(start, end, 1), origin),
+            Spans(*(crowded(since, held, 1) if len(held) else crowded(start, end, 1)), origin),
+            Spans(*crowded(since, held, 2), origin),
             [stall for stall in self.stalls if stall[1] >= min(first, origin)], origin,
             self._workers > 0)
         found = find(
@@ -268,7 +274,7 @@ class Explainer(Observer):
         """Forget what is older than the block before."""
         since, self._since = self._since, until
         for what, column in ((_PIECES, _END), (_RELEASED, 2), (_STARTED, 3), (_TIMES, 0),
-                             (_STOPS, 1)):
+                             (_STOPS, 1), (_HELD, 1)):
             rows = self._table(what)
             self._kept[what] = [rows[rows[:, column] >= since]]
 

@@ -220,6 +220,10 @@ class VirtualRun:
         """Return how long a message takes from the end of the callback that published it."""
         return 100_000 + self.random.randrange(2 * MS)
 
+    def cpu(self, work: _Execution, took: int) -> tuple[int, bool]:
+        """Return the CPU time of an execution, and whether it held the interpreter."""
+        return -1, False
+
     def lag(self, dag: int, job: int) -> int:
         """Return how long after its release a job is noticed."""
         return self.random.randrange(MS)
@@ -337,7 +341,7 @@ class VirtualRun:
         if declared:
             self.executions[key] = self.executions.get(key, 0) + 1
             self.record('complete', now, vtid, address, work.dag, vertex, work.job, whole, end,
-                        work.leg)
+                        work.leg, *self.cpu(work, end - start))
         self.decided(now)
 
     def _resume(self, work: _Execution) -> None:
