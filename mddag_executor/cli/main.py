@@ -58,6 +58,7 @@ VERBS = {
     'rerun': Verb('rerun', 'run real nodes again from a recording, in virtual time'),
     'replay': Verb('replay', 'check a recorded run against its deadlines, or reschedule it'),
     'explain': Verb('explain', 'tell why each deadline of a recorded run was missed'),
+    'slack': Verb('slack', 'find how much longer callbacks may take before a deadline is missed'),
     'simulate': Verb('simulate', 'run a declaration in virtual time'),
     'evaluate': Verb('evaluate', 'measure acceptance ratios over many simulated runs'),
     'generate': Verb('generate', 'make random multi-deadline, multi-rate DAG sets'),

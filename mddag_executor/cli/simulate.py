@@ -70,7 +70,7 @@ def main(args: argparse.Namespace) -> int:
     _check_arguments(args)
     task_set = common.load_graph(args.graph)
     workers = defaults.workers(args.workers, task_set)
-    times = _execution_times(args, task_set, workers)
+    times = execution_times(args, task_set, workers)
     settings = Settings(
         policy=args.policy, workers=workers, duration_ns=args.duration,
         preemptive=args.preemptive, judge=args.judge,
@@ -109,9 +109,10 @@ def _check_arguments(args: argparse.Namespace) -> None:
     common.check_report(args.report)
 
 
-def _execution_times(
+def execution_times(
     args: argparse.Namespace, task_set: TaskSet, workers: int
 ) -> list[list[int]]:
+    """Return the execution times that `--execution-times`, `--seed`, `--utilisation` give."""
     from mddag_executor.simulate import (
         draw_execution_times,
         read_execution_times,

@@ -58,6 +58,7 @@ class RecordedLoad(NamedTuple):
     ``jobs`` has, by DAG, the recorded index of each job; ``demand`` the execution times of all
     declared jobs, ns; ``estimated`` counts vertices of jobs whose execution time was not recorded,
     ``executions`` all of them; ``unknown`` names callbacks of which no time is known at all.
+    ``dispatches`` is what of ``load.costs`` is dispatch; it is empty without overheads.
     ``dispatch_ns`` and ``transport_ns`` are medians of what was measured, None where nothing was.
     ``computed`` has the CPU times, as ``load.costs``; it is empty where none is recorded.
     """
@@ -73,6 +74,7 @@ class RecordedLoad(NamedTuple):
     transport_ns: int | None = None
     failed: frozenset[tuple[int, int]] = frozenset()
     computed: Sequence[int] = ()
+    dispatches: Sequence[int] = ()
 
 
 class _Jobs:
@@ -237,6 +239,7 @@ class LoadBuilder(Observer):
         computed: list[int] = []
         holds: list[int] = []
         bases: list[int] = []
+        dispatches: list[int] = []
         late = self._dispatches.late()
         measured = np.concatenate([np.asarray(jobs.dispatch) for jobs in self._jobs])
         measured = measured[measured >= 0]
@@ -257,7 +260,9 @@ class LoadBuilder(Observer):
             demand += int(took.sum())
             self._computing(dag, jobs, took, missing, computed, holds)
             if overheads:
-                took += late[np.array(jobs.dispatch, dtype=np.int64).reshape(-1, jobs.size)]
+                added = late[np.array(jobs.dispatch, dtype=np.int64).reshape(-1, jobs.size)]
+                took += added
+                dispatches.extend(added.ravel().tolist())
             costs.extend(took.ravel().tolist())
         executions = len(costs)
         bases.append(len(costs))
@@ -272,7 +277,8 @@ class LoadBuilder(Observer):
                 holds=holds if any(holds) else []),
             [jobs.numbers for jobs in self._jobs], demand, executions, estimated, list(unknown),
             transports, usual if len(measured) else None, transport,
-            frozenset(self._failed), computed if max(computed, default=-1) >= 0 else ())
+            frozenset(self._failed), computed if max(computed, default=-1) >= 0 else (),
+            dispatches)
 
     def _take_back(self) -> None:
         """Make the execution times those that the executions would have taken alone."""

@@ -11,7 +11,7 @@ took, and how long the executor took to notice, to dispatch and to carry message
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER, POLICIES, Tables
 from mddag_executor.core import policy as find_policy
@@ -35,6 +35,38 @@ from mddag_executor.text import counted, listed
 from msg_graph import TaskSet
 
 MAX_WORKERS = 4096
+
+
+class How(NamedTuple):
+    """How a recorded load is scheduled; see ``Reschedule``."""
+
+    policy: str
+    workers: int
+    preemptive: bool
+    dispatch_overhead: int
+    judge_from: int
+    cpus: int | None
+
+    def schedule(
+        self, work: RecordedLoad, tables: Tables, end: int, log: list[LogEntry] | None = None,
+        stop_at_first_miss: bool = False,
+    ) -> list[Decision]:
+        """Run the core over a load; return what it decided."""
+        policy = find_policy(self.policy)
+        state = new_state(
+            tables, self.workers, preemptive=policy.mode(self.preemptive), propagate=2,
+            dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
+        state.scalars[JUDGE_FROM] = self.judge_from
+        load = work.load
+        stops = bool(load.holds) or self.cpus is not None
+        deliveries = Deliveries(tables, state, policy.key, work.transports, work.failed, stops)
+        machine = Machine(tables, state, load, self.cpus, work.computed,
+                          bool(work.computed and load.holds), deliveries)
+        ended = engine.run(tables, state, policy.key, load, end, stop_at_first_miss, log,
+                           deliveries=deliveries, machine=machine if stops else None)
+        if ended == end:
+            finish(tables, state, end)
+        return state.decisions
 
 
 class Reschedule:
@@ -71,29 +103,19 @@ class Reschedule:
         self._run()
 
     def _run(self) -> None:
-        policy = find_policy(self.policy)
-        state = new_state(
-            self.tables, self.workers, preemptive=policy.mode(self.preemptive), propagate=2,
-            dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
-        state.scalars[JUDGE_FROM] = self.judge_from
         load, end = self._work.load, self.recorded.run.end
         self.log = []
-        work = self._work
-        stops = bool(load.holds) or self.cpus is not None
-        deliveries = Deliveries(
-            self.tables, state, policy.key, work.transports, work.failed, stops)
-        machine = Machine(
-            self.tables, state, load, self.cpus, work.computed, bool(work.computed and load.holds),
-            deliveries)
-        engine.run(
-            self.tables, state, policy.key, load, end, False, self.log, deliveries=deliveries,
-            machine=machine if stops else None)
-        self.decisions = state.decisions
-        finish(self.tables, state, end)
+        self.decisions = self.how.schedule(self._work, self.tables, end, self.log)
         for time, dag, release in zip(load.times, load.dags, load.releases or load.times):
             if time < end and release >= self.judge_from:
                 self.tally.released(dag)
-        self.tally.add(state.decisions)
+        self.tally.add(self.decisions)
+
+    @property
+    def how(self) -> How:
+        """Return how the load is scheduled."""
+        return How(self.policy, self.workers, self.preemptive, self.dispatch_overhead,
+                   self.judge_from, self.cpus)
 
     @property
     def work(self) -> RecordedLoad:

@@ -1,0 +1,151 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The verb `slack`: how much longer callbacks may take before a deadline is missed.
+
+A recorded run is rescheduled (see `replay --reschedule`), a declaration is simulated (see
+`simulate`), as often as it takes; `mddag_executor.replay.slack` says how.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any, TYPE_CHECKING
+
+from mddag_executor import defaults
+from mddag_executor.cli import common, options, recorded, simulate
+from mddag_executor.cli.text import Progress, warn
+from mddag_executor.core import POLICIES
+from mddag_executor.errors import UsageError
+
+if TYPE_CHECKING:
+    from mddag_executor.replay.slack import Problem
+    from msg_graph import TaskSet
+
+EXAMPLE = """\
+mddag slack run.mcap
+mddag slack config/autoware.yaml --utilisation 0.6 --workers 6
+mddag slack run.mcap --fail-under 1.2 --json slack.json --report slack.html"""
+
+_ONLY_GRAPH = ('duration', 'execution_times', 'seed', 'utilisation')
+_GRAPHS = ('.yaml', '.yml')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add('recording', metavar='TRACE|GRAPH',
+        help='a recorded run, an MCAP file, or a declaration, a YAML file')
+    add('graph', metavar='GRAPH', nargs='?',
+        help='with TRACE: the declaration to schedule by (default: the recorded one)')
+    add('--workers', type=options.positive_int, metavar='M',
+        help="threads that run callbacks (default: as recorded, or the declaration's)")
+    options.add_cpus(parser, 'as recorded, or enough for all')
+    add('--policy', metavar='P',
+        help=f'one of {", ".join(POLICIES)} (default: as recorded, or rad)')
+    add('--preemptive', action=argparse.BooleanOptionalAction,
+        help='what is more urgent takes the worker of what runs, or not (default: as recorded)')
+    add('--duration', type=options.duration, metavar='TIME',
+        help=f'with GRAPH: virtual time (default: {defaults.DURATION_NS // 10 ** 9}s)')
+    add('--execution-times', metavar='FILE',
+        help='with GRAPH: JSON with fixed execution times (default: drawn from the declared ones)')
+    add('--seed', type=int, metavar='N', help='with GRAPH: of the draws (default: 0)')
+    add('--utilisation', type=options.positive_float, metavar='U',
+        help='with GRAPH: scale the execution times to this normalised utilisation')
+    recorded.add_skip(parser)
+    add('--jobs', type=options.positive_int, metavar='N',
+        help='processes that search (default: one for each processor)')
+    add('--fail-under', type=options.positive_float, metavar='FACTOR',
+        help='exit with status 1 if a callback may not take so many times as long, or a deadline '
+        'is missed as things are')
+    options.add_report(parser)
+    options.add_json(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Find the slack and print it.
+
+    :raises mddag_executor.trace.TraceError: when the trace cannot be used
+    :raises msg_graph.GraphError: when the declaration is wrong
+    :raises mddag_executor.errors.MddagError: when anything else cannot be used
+    """
+    from mddag_executor.replay.slack import find_slack, slack_result
+    common.check_output(args.json)
+    common.check_output(args.report)
+    is_graph = args.recording.lower().endswith(_GRAPHS)
+    problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
+    callbacks = len(set(problem.callback_of))
+    with Progress('looking for slack', callbacks) as line:
+        slack = find_slack(problem, line.update, args.jobs or common.processors())
+    result = slack_result(slack, task_set, dags)
+    if args.report is not None:
+        from mddag_executor.report.slack import page
+        common.write_text(args.report, ''.join(page(result, args.recording)))
+    if common.write_result(args, result):
+        _show(result)
+    if args.fail_under is None:
+        return 0
+    return int(bool(result['left_out']) or any(
+        one['factor'] is not None and one['factor'] < args.fail_under
+        for one in result['callbacks'].values()))
+
+
+def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any]]:
+    """Return the problem that a recording is."""
+    from mddag_executor.replay import reschedule
+    from mddag_executor.replay.slack import callbacks_of, Problem
+    for option in _ONLY_GRAPH:
+        if getattr(args, option) is not None:
+            raise UsageError(f'--{option.replace("_", "-")}: a recording has its own: leave the '
+                             'option out')
+    task_set = None if args.graph is None else common.load_graph(args.graph)
+    with common.input_trace(args.recording) as (path, name), Progress('replaying') as line:
+        if recorded.is_bag(path):
+            raise UsageError(
+                f'{name}: it has no execution times: give the declaration instead of an ordinary '
+                'bag')
+        outcome = reschedule(
+            path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
+            name=name, progress=line.events, skip=args.skip, cpus=args.cpus)
+    for warning in outcome.warnings:
+        warn(warning)
+    problem = Problem(outcome.work, outcome.how, outcome.tables, outcome.end_ns,
+                      callbacks_of(outcome.task_set))
+    return problem, outcome.task_set, outcome.result()['dags']
+
+
+def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any]]:
+    """Return the problem that a declaration is."""
+    from mddag_executor.core import Tables
+    from mddag_executor.replay.slack import callbacks_of, Problem
+    from mddag_executor.simulate import periodic_load, Settings
+    from mddag_executor.simulate import simulate as simulated
+    if args.graph is not None:
+        raise UsageError(f'{args.graph}: there is a declaration already: give one, or a trace '
+                         'before it')
+    if args.skip:
+        raise UsageError('--skip: a simulation needs no warm-up: leave the option out')
+    task_set = common.load_graph(args.recording)
+    workers = defaults.workers(args.workers, task_set)
+    args.seed = args.seed or 0
+    times = simulate.execution_times(args, task_set, workers)
+    settings = Settings(
+        policy=args.policy or 'rad', workers=workers,
+        duration_ns=args.duration or defaults.DURATION_NS, preemptive=bool(args.preemptive),
+        cpus=args.cpus)
+    load = periodic_load(task_set, times, settings.duration_ns)
+    run = simulated(task_set, load, settings)
+    problem = Problem(load, settings, Tables.build(task_set), settings.duration_ns,
+                      callbacks_of(task_set))
+    return problem, task_set, run.result()['dags']
+
+
+def _show(result: dict[str, Any]) -> None:
+    from mddag_executor.report.slack import margins_table, slack_table, summary
+    print('How many times as long each callback may take, alone:')
+    print(slack_table(result))
+    print('How much before their deadlines the sinks complete as things are:')
+    print(margins_table(result))
+    for line in summary(result):
+        print(line)

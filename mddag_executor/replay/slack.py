@@ -1,0 +1,359 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+How much longer callbacks may take before a deadline is missed.
+
+Theory of operation
+-------------------
+The load, recorded or periodic, is scheduled again and again, each time with the execution times of
+one callback (or of all) a factor longer.  The greatest factor with every deadline met is found by
+bisection, to 1 %.  What dispatch takes does not grow with it.
+
+A run that meets all deadlines takes long, one that misses ends early.  So a miss, once it is
+found, is looked at by itself: the releases of a *window* before it, ``WINDOW`` times the longest
+deadline, are enough to find it again, unless no worker was ever idle meanwhile.  The bisection
+goes over windows only, those that broke before first; the factor that it finds is tried on the
+whole load, which confirms it or finds another window.
+
+Schedules have anomalies: a longer callback may let a deadline be met that a shorter one misses.
+The factor is one below which nothing broke where it was looked.
+
+Sinks that miss with the times as they are, are left out; so their factor says nothing of them.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+import math
+import multiprocessing
+import signal
+import time
+from typing import Any, NamedTuple
+
+from mddag_executor.core import NEVER, Tables
+from mddag_executor.core.jobs import finish
+from mddag_executor.core.state import Decision, DROP, JOB_END, SINK_IN_TIME
+from mddag_executor.memory import no_garbage
+from mddag_executor.replay.as_recorded import slack as margin
+from mddag_executor.replay.load import RecordedLoad
+from mddag_executor.replay.reschedule import How
+from mddag_executor.simulate import engine, Load, Settings
+from msg_graph import TaskSet
+import numpy as np
+
+MOST = 100.0
+EXACT = 1.01
+WINDOW = 3
+LONG = 4
+"""How many windows a load must be long for them to be worth it."""
+_MOST_WINDOWS = 8
+_FEW_S = 3.0
+_NO_DEADLINE = NEVER // 2
+ALL = -1
+"""Stands for all callbacks."""
+NOTHING = -1
+"""Stands for no sink."""
+
+
+class Miss(NamedTuple):
+    """A missed deadline: the global vertex of the sink, the deadline, and the job's release."""
+
+    sink: int
+    deadline: int
+    release: int
+
+
+class Problem(NamedTuple):
+    """
+    A load, and how it is scheduled.
+
+    :ivar work: a recorded load, or a periodic one.
+    :ivar how: how the first is scheduled, or the second.
+    :ivar end: of the run, ns.
+    :ivar callback_of: by global vertex the number of its callback.
+    """
+
+    work: RecordedLoad | Load
+    how: How | Settings
+    tables: Tables
+    end: int
+    callback_of: list[int]
+
+    def with_number(self, of: str, number: int) -> Problem:
+        """Return the same problem for another number of ``workers`` or ``cpus``."""
+        how = self.how
+        return self._replace(
+            how=how._replace(**{of: number}) if isinstance(how, How)
+            else replace(how, **{of: number}))      # type: ignore[arg-type]
+
+    @property
+    def load(self) -> Load:
+        """Return the load."""
+        return self.work if isinstance(self.work, Load) else self.work.load
+
+    def decide(
+        self, load: Load, computed: list[int], end: int, stop: bool
+    ) -> list[Decision]:
+        """
+        Schedule a load up to a time, or its first miss; return what was decided.
+
+        :param computed: of a recorded load, the CPU times.
+        """
+        if isinstance(self.how, How):
+            assert isinstance(self.work, RecordedLoad)
+            return self.how.schedule(
+                self.work._replace(load=load, computed=computed), self.tables, end,
+                stop_at_first_miss=stop)
+        state, key = self.how.start(self.tables)
+        if engine.run(self.tables, state, key, load, end, stop,
+                      machine=self.how.machine(self.tables, state, load)) == end:
+            finish(self.tables, state, end)
+        return state.decisions
+
+
+class Found(NamedTuple):
+    """The greatest factor (None: nothing broke up to ``MOST``), and the sink that breaks next."""
+
+    factor: float | None
+    breaks: int
+
+
+class Fewer(NamedTuple):
+    """How many workers or CPUs there are, how few are enough, and the sink that one less breaks."""
+
+    given: int
+    least: int
+    breaks: int
+
+
+class Search:
+    """Looks for the greatest factors of a problem."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        load, tables = problem.load, problem.tables
+        self._costs = np.array(load.costs, dtype=np.int64)
+        self._dispatches = np.zeros_like(self._costs)
+        self._computed = np.empty(0, dtype=np.int64)
+        work = problem.work
+        if isinstance(work, RecordedLoad):
+            self._dispatches[:len(work.dispatches)] = work.dispatches
+            self._computed = np.array(work.computed, dtype=np.int64)
+        self._of = self._callback_of_cost(load, tables)
+        self._reach = WINDOW * max(
+            [tables.sink_deadline[sink] for sink in tables.sinks], default=0)
+        length = load.times[-1] - load.times[0] if load.times else 0
+        self._is_long = length > LONG * self._reach
+        self._stops = True
+        #: Windows in which something broke, the last one first.
+        self._windows: list[tuple[int, int]] = []
+        #: Sinks that miss without any factor.
+        self.left_out: list[int] = []
+        self._leave_out()
+
+    def _callback_of_cost(self, load: Load, tables: Tables) -> Any:
+        """Return by place of a cost whose it is; -1 of what no DAG declares."""
+        of = np.full(len(load.costs), -1, dtype=np.int64)
+        jobs = np.bincount(load.dags, minlength=tables.n_dags).tolist()
+        for dag in range(tables.n_dags):
+            first, after = tables.first_vertex[dag:dag + 2]
+            row = np.array(self._problem.callback_of[first:after])
+            base = load.cost_base[dag]
+            rows = jobs[dag] if load.cost_stride[dag] else 1
+            of[base:base + rows * len(row)] = np.tile(row, rows)
+        return of
+
+    def _leave_out(self) -> None:
+        """Leave out the sinks that miss anyway."""
+        problem = self._problem
+        with no_garbage():
+            missed = {miss.sink for miss in self._misses(self._scaled(ALL, 1), False)}
+        self.left_out = sorted(missed)
+        if missed:
+            deadlines = list(problem.tables.sink_deadline)
+            for sink in missed:
+                deadlines[sink] = _NO_DEADLINE
+            self._problem = problem._replace(
+                tables=problem.tables._replace(sink_deadline=deadlines))
+            # jobs may still expire, which is no reason to stop
+            self._stops = next(self._misses(self._scaled(ALL, 1), False, True), None) is None
+
+    def _misses(
+        self, scaled: tuple[Load, list[int], int], stop: bool, of_any: bool = False
+    ) -> Iterator[Miss]:
+        for kind, _, vertex, _, deadline, _ in self._problem.decide(*scaled, stop):
+            if kind not in (SINK_IN_TIME, JOB_END, DROP) and (
+                    of_any or vertex not in self.left_out):
+                yield Miss(vertex, deadline,
+                           deadline - self._problem.tables.sink_deadline[vertex])
+
+    def _scaled(self, callback: int, factor: float) -> tuple[Load, list[int], int]:
+        """Return load and CPU times in which a callback takes longer, and the end of the run."""
+        which = self._of == callback if callback != ALL else self._of >= 0
+        costs = self._costs.copy()
+        pure = costs[which] - self._dispatches[which]
+        costs[which] += np.minimum(pure * (factor - 1), NEVER >> 8).astype(np.int64)
+        computed = self._computed.copy()
+        if len(computed):
+            which &= computed >= 0
+            computed[which] = np.minimum(computed[which] * factor, NEVER >> 8).astype(np.int64)
+        return (self._problem.load._replace(costs=costs.tolist()), computed.tolist(),
+                self._problem.end)
+
+    def first_miss(
+        self, callback: int, factor: float, window: tuple[int, int] | None = None
+    ) -> Miss | None:
+        """Return a deadline that is missed with a factor, in a window or anywhere, if any is."""
+        load, computed, end = self._scaled(callback, factor)
+        if window is not None:
+            first, last = (bisect_left(load.times, each) for each in window)
+            end = min(end, window[1])
+            load = load._replace(
+                times=load.times[first:last], dags=load.dags[first:last],
+                jobs=load.jobs[first:last], releases=load.releases[first:last])
+        with no_garbage():
+            return min(self._misses((load, computed, end), self._stops), default=None,
+                       key=lambda miss: miss.deadline)
+
+    def factor(self, callback: int) -> Found:
+        """Return the greatest factor for a callback, or for ``ALL``."""
+        factor, breaks = MOST, NOTHING
+        for window in list(self._windows):
+            miss = self.first_miss(callback, factor, window)
+            if miss is not None:
+                factor, breaks = self._bisect(callback, factor, miss.sink, window)
+        while factor > 1.0:     # which is known to be met
+            miss = self.first_miss(callback, factor)
+            if miss is None:
+                break
+            window = miss.release - self._reach, miss.deadline + 1
+            if not self._is_long or self.first_miss(callback, factor, window) is None:
+                return Found(*self._bisect(callback, factor, miss.sink, None))
+            self._windows = [window, *self._windows][:_MOST_WINDOWS]
+            factor, breaks = self._bisect(callback, factor, miss.sink, window)
+        return Found(None if breaks == NOTHING else factor, breaks)
+
+    def fewer(self, of: str) -> Fewer | None:
+        """Return how few ``workers`` or ``cpus`` meet what is met now; None: it was not said."""
+        problem = self._problem
+        given = getattr(problem.how, of)
+        if given is None:
+            return None
+        least, breaks = given, NOTHING
+        while least > 1 and breaks == NOTHING:
+            self._problem = problem.with_number(of, least - 1)
+            miss = self.first_miss(ALL, 1.0)
+            if miss is None:
+                least -= 1
+            else:
+                breaks = miss.sink
+        self._problem = problem
+        return Fewer(given, least, breaks)
+
+    def _bisect(
+        self, callback: int, high: float, breaks: int, window: tuple[int, int] | None
+    ) -> tuple[float, int]:
+        """Return the greatest factor below one that is not met, and the sink that breaks next."""
+        low = 1.0
+        while high > low * EXACT:
+            middle = math.sqrt(low * high)
+            miss = self.first_miss(callback, middle, window)
+            if miss is None:
+                low = middle
+            else:
+                high, breaks = middle, miss.sink
+        return low, breaks
+
+
+def callbacks_of(task_set: TaskSet) -> list[int]:
+    """Return by global vertex the number of its callback."""
+    places = {callback.key: i for i, callback in enumerate(task_set.callbacks)}
+    return [places[vertex.callback.key] for vertex in task_set.vertices]
+
+
+class Slack(NamedTuple):
+    """
+    What was found.
+
+    :ivar factors: by callback, and of all together (``ALL``).
+    :ivar left_out: sinks that miss as things are.
+    :ivar fewer: of ``workers`` and ``cpus``; None: it was not said how many there are.
+    """
+
+    factors: dict[int, Found]
+    left_out: list[int]
+    fewer: dict[str, Fewer | None]
+
+
+def find_slack(
+    problem: Problem, progress: Callable[[int], None] = lambda done: None, jobs: int = 1
+) -> Slack:
+    """
+    Find the greatest factors of all callbacks, and of all together.
+
+    :param progress: told how many callbacks are done.
+    :param jobs: how many processes search, where it is not quick.
+    """
+    search = Search(problem)
+    rest = sorted(set(problem.callback_of))
+    found = {ALL: search.factor(ALL)}
+    begin, quick = time.monotonic(), True
+    while rest and (quick or jobs == 1):
+        callback = rest.pop(0)
+        found[callback] = search.factor(callback)
+        progress(len(found) - 1)
+        quick = (time.monotonic() - begin) * len(rest) < _FEW_S * (len(found) - 1)
+    if rest:
+        spawn = multiprocessing.get_context('spawn')
+        with ProcessPoolExecutor(min(len(rest), jobs), spawn, _start, (problem,)) as pool:
+            for callback, one in zip(rest, pool.map(_factor, rest)):
+                found[callback] = one
+                progress(len(found) - 1)
+    return Slack(found, search.left_out, {of: search.fewer(of) for of in ('workers', 'cpus')})
+
+
+def slack_result(
+    slack: Slack, task_set: TaskSet, dags: Mapping[str, Any]
+) -> dict[str, Any]:
+    """
+    Return the result format of ``slack --json``.
+
+    :param dags: of the result of the run as things are.
+    """
+    names = [vertex.name for vertex in task_set.vertices]
+
+    def shown(found: Found) -> dict[str, Any]:
+        return {'factor': None if found.factor is None else round(found.factor, 4),
+                'breaks': named(found.breaks)}
+
+    def named(sink: int) -> str | None:
+        return None if sink == NOTHING else names[sink]
+
+    return {
+        'most': MOST,
+        'callbacks': {callback.key: shown(slack.factors[i])
+                      for i, callback in enumerate(task_set.callbacks) if i in slack.factors},
+        'load': shown(slack.factors[ALL]),
+        **{of: None if fewer is None else {**fewer._asdict(), 'breaks': named(fewer.breaks)}
+           for of, fewer in slack.fewer.items()},
+        'left_out': [names[sink] for sink in slack.left_out],
+        'sinks': {name: {'relative_deadline_ns': sink['relative_deadline_ns'],
+                         'margin_ns': margin(sink)}
+                  for dag in dags.values() for name, sink in dag['sinks'].items()}}
+
+
+_search: Search | None = None   # of this process, if it is a worker
+
+
+def _start(problem: Problem) -> None:
+    global _search
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the first process's to handle
+    _search = Search(problem)
+
+
+def _factor(callback: int) -> Found:
+    assert _search is not None
+    return _search.factor(callback)

@@ -1,0 +1,112 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""How much longer callbacks may take: by hand, against plain bisection, and what users see."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.cli import main as program
+from mddag_executor.replay import reschedule
+from mddag_executor.replay import slack as module
+from mddag_executor.replay.slack import callbacks_of, find_slack, Problem, Search
+import pytest
+
+from .helpers import Chances, MS, small, VirtualRun
+
+BY_HAND = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /a
+    callbacks: [{name: first, timer: 10ms, publishes: [/x], execution_time: 1ms}]
+  - node: /b
+    callbacks: [{name: last, subscription: /x, deadline: 8ms, execution_time: 2ms}]
+  - node: /c
+    callbacks: [{name: alone, timer: 100ms, deadline: 100ms, execution_time: 100us}]
+"""
+
+
+def slack_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, Any]:
+    status = program.main(['slack', *arguments, '--json', '-'])
+    return status, json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize('recorded', [False, True])
+def test_by_hand(recorded: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    graph, trace = tmp_path / 'g.yaml', tmp_path / 't.mcap'
+    graph.write_text(BY_HAND)
+    assert program.main(['simulate', str(graph), '--trace', str(trace), '--duration', '1s']) == 0
+    capsys.readouterr()
+    status, result = slack_of(capsys, str(trace if recorded else graph), '--jobs', '1')
+    assert status == 0
+    factors = {name: one['factor'] for name, one in result['callbacks'].items()}
+    assert 5.94 <= factors['/a:first'] <= 6
+    assert 3.46 <= factors['/b:last'] <= 3.5
+    assert factors['/c:alone'] is None
+    assert result['callbacks']['/a:first']['breaks'] == '/b:last'
+    assert 2.64 <= result['load']['factor'] <= 8 / 3
+    assert result['workers'] == {'given': 2, 'least': 1, 'breaks': None}
+    assert result['sinks']['/b:last']['margin_ns'] == {
+        'min': 5 * MS, 'p1': 5 * MS, 'median': 5 * MS, 'max': 5 * MS}
+    assert result['left_out'] == []
+
+
+def test_what_misses_already_is_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph = tmp_path / 'g.yaml'
+    graph.write_text(BY_HAND.replace('deadline: 8ms', 'deadline: 2ms').replace(
+        'alone, timer: 100ms, deadline: 100ms', 'alone, timer: 100ms, deadline: 5ms'))
+    status, result = slack_of(capsys, str(graph), '--fail-under', '0.5')
+    assert status == 1
+    assert result['left_out'] == ['/b:last']
+    assert 49.5 <= result['callbacks']['/c:alone']['factor'] <= 50
+    assert result['callbacks']['/a:first']['factor'] > 10     # the other worker is free
+
+
+def test_what_people_see(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    graph, page = tmp_path / 'g.yaml', tmp_path / 's.html'
+    graph.write_text(BY_HAND)
+    assert program.main(['slack', str(graph), '--fail-under', '3', '--report', str(page)]) == 0
+    out = capsys.readouterr().out
+    assert 'b:last    3.49 times  b:last' in out
+    assert '1 callback may take 100 times as long and more' in out
+    assert '1 of 2 workers are enough' in out
+    assert 'b:last' in page.read_text()
+    assert program.main(['slack', str(graph), '--fail-under', '3.6']) == 1
+    for arguments, error in (
+            ([str(graph), str(graph)], 'there is a declaration already'),
+            ([str(graph), '--skip', '1s'], '--skip'),
+            ([str(tmp_path / 'none.mcap')], 'none.mcap')):
+        assert program.main(['slack', *arguments]) == 2
+        assert error in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('seed', [3, 4])
+def test_windows_find_what_plain_bisection_finds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    path = tmp_path / 'run.mcap'
+    VirtualRun(path, small(), seed, duration=500 * MS, longest=2 * MS,
+               chances=Chances(0, 0, 0, 0, 0, 0, 0))
+    run = reschedule(path)
+    problem = Problem(
+        run.work, run.how, run.tables, run.end_ns, callbacks_of(run.task_set))
+    found = []
+    for long in (10 ** 9, 1):
+        monkeypatch.setattr(module, 'LONG', long)
+        found.append(find_slack(problem).factors)
+    for plain, windows in zip(*(each.values() for each in found)):
+        if plain.factor is None:
+            assert windows.factor is None
+        else:
+            assert windows.factor is not None
+            # both hold on the whole; schedules have anomalies, so neither need be the greatest
+            assert windows.factor == pytest.approx(plain.factor, rel=0.25)
+    search = Search(problem)
+    for callback, one in found[1].items():
+        if one.factor is not None:
+            assert search.first_miss(callback, one.factor) is None
