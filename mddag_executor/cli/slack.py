@@ -77,7 +77,7 @@ def main(args: argparse.Namespace) -> int:
     problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
     callbacks = len(set(problem.callback_of))
     with Progress('looking for slack', callbacks) as line:
-        slack = find_slack(problem, line.update, args.jobs or common.processors())
+        slack = find_slack(problem, line.update, args.jobs or defaults.processors())
     result = slack_result(slack, task_set, dags)
     if args.report is not None:
         from mddag_executor.report.slack import page

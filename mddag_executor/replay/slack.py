@@ -86,7 +86,7 @@ class Problem(NamedTuple):
         """Return the same problem for another number of ``workers`` or ``cpus``."""
         how = self.how
         return self._replace(
-            how=how._replace(**{of: number}) if isinstance(how, How)
+            how=how._replace(**{of: number}) if isinstance(how, How)    # type: ignore[arg-type]
             else replace(how, **{of: number}))      # type: ignore[arg-type]
 
     @property
@@ -122,7 +122,7 @@ class Found(NamedTuple):
 
 
 class Fewer(NamedTuple):
-    """How many workers or CPUs there are, how few are enough, and the sink that one less breaks."""
+    """How many workers or CPUs there are, how few are enough, and what one less breaks."""
 
     given: int
     least: int
