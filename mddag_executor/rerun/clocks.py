@@ -30,7 +30,7 @@ import random
 import sys
 import threading
 import time
-from typing import Any
+from typing import Any, ClassVar
 import uuid
 import weakref
 
@@ -43,8 +43,30 @@ from rclpy.clock_type import ClockType
 from rclpy.time import Time
 from rclpy.timer import Timer
 
-_READ_NS = ('time_ns', 'monotonic_ns', 'perf_counter_ns')
-_READ_S = ('time', 'monotonic', 'perf_counter')
+_READS = ('time', 'time_ns', 'monotonic', 'monotonic_ns', 'perf_counter', 'perf_counter_ns')
+
+
+class _Asked:
+    """
+    Functions that stand in the place of those of ``time``, and whom they ask.
+
+    They are made once: a module that imports one keeps it for later runs.
+    """
+
+    run: ClassVar[VirtualTime | None] = None
+    functions: ClassVar[dict[str, Callable[..., Any]]] = {}
+
+
+def _asking(original: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what asks the run that is under way, in place of a function of ``time``."""
+    function = _Asked.functions.get(original.__name__)
+    if function is None:
+        def function(*args: Any) -> Any:
+            run = _Asked.run
+            return original(*args) if run is None else run.asked(original, args)
+
+        _Asked.functions[original.__name__] = function
+    return function
 
 
 class VirtualTime:
@@ -77,11 +99,13 @@ class VirtualTime:
         # The one in C waits without asking anybody; pools of threads are built on it.
         replace(queue, 'SimpleQueue', lambda original: vars(queue)['_PySimpleQueue'])
         replace(uuid, 'uuid4', self._uuid4)
-        for name in _READ_NS:
-            replace(time, name, lambda original: self._reads(original, 1))
-        for name in _READ_S:
-            replace(time, name, lambda original: self._reads(original, 1_000_000_000))
-        replace(time, 'sleep', self._time_sleep)
+        for name in (*_READS, 'sleep'):
+            replace(time, name, _asking)
+        _Asked.run = self
+
+    def uninstall(self) -> None:
+        """Have the functions of ``time`` tell real time again."""
+        _Asked.run = None
 
     # --- clocks ----------------------------------------------------------------------------------
 
@@ -96,9 +120,11 @@ class VirtualTime:
         def now(clock: Clock) -> Time:
             kind = clock.clock_type
             if kind is ros_time and not self._simulated or self._is_virtual(clock):
+                if loop.strands.mine() is not None:
+                    loop.looked()
                 return Time(nanoseconds=loop.now, clock_type=kind)
             if kind is not ros_time:
-                self._look(f'a clock of {kind.name}')
+                self._look(f'a clock of {kind.name}', 2)
             return original(clock)
 
         return now
@@ -121,37 +147,28 @@ class VirtualTime:
 
     # --- Python's time ---------------------------------------------------------------------------
 
-    def _reads(self, original: Callable[[], Any], divisor: int) -> Callable[[], Any]:
-        loop, name = self._loop, f'time.{original.__name__}()'
+    def asked(self, original: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+        """Do what a function of ``time`` does."""
+        loop, name = self._loop, original.__name__
+        if loop.strands.mine() is None:
+            return original(*args)
+        if not self._all:
+            self._look(f'time.{name}()', 3)
+            return original(*args)
+        if name in _READS:
+            loop.looked()
+            return loop.now if name.endswith('_ns') else loop.now / 1e9
+        seconds, = args
+        if seconds < 0:
+            raise ValueError('sleep length must be non-negative')
+        loop.wait(None, loop.now + round(seconds * 1e9), 'time.sleep')
+        return None
 
-        def read() -> Any:
-            if loop.strands.mine() is None:
-                return original()
-            if self._all:
-                return loop.now if divisor == 1 else loop.now / divisor
-            self._look(name)
-            return original()
-
-        return read
-
-    def _time_sleep(self, original: Callable[[float], None]) -> Callable[[float], None]:
-        def sleep(seconds: float) -> None:
-            loop = self._loop
-            if loop.strands.mine() is None or not self._all:
-                self._look('time.sleep()')
-                original(seconds)
-            elif seconds < 0:
-                raise ValueError('sleep length must be non-negative')
-            else:
-                loop.wait(None, loop.now + round(seconds * 1e9), 'time.sleep')
-
-        return sleep
-
-    def _look(self, what: str) -> None:
-        """Warn of something that code of a node asks for (who calls this was called by it)."""
+    def _look(self, what: str, depth: int) -> None:
+        """Warn of something that code of a node asks for, which is so many calls further up."""
         if self._loop.strands.mine() is None:
             return
-        caller = sys._getframe(2)
+        caller = sys._getframe(depth)
         if is_library(caller.f_globals.get('__name__', '')):
             return
         name = caller.f_code.co_filename

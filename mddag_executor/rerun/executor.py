@@ -13,7 +13,7 @@ from mddag_executor.live.entity import Entity, TASK
 from mddag_executor.live.hosting import Guest, Host
 from mddag_executor.live.tasks import make_task, Unclaimed
 from mddag_executor.live.work import QuickCallback, Work
-from mddag_executor.rerun.loop import Loop
+from mddag_executor.rerun.loop import Loop, POLL_NS
 from rclpy.node import Node
 from rclpy.task import Future, Task
 
@@ -105,8 +105,9 @@ class RerunHost(Host):
             loop.wait(lambda: event.is_set() or loop.strands.has_waiting(thread), None,
                       'for a program to start')
             return
-        deadline = None if timeout_s is None or timeout_s < 0 else loop.now + round(
-            timeout_s * 1e9)
+        deadline = None
+        if timeout_s is not None and timeout_s >= 0:  # callbacks are to run meanwhile
+            deadline = loop.now + max(POLL_NS, round(timeout_s * 1e9))
 
         def over() -> bool:
             return (guest is not None and guest.ended.is_set()

@@ -44,7 +44,9 @@ from mddag_executor.rerun.times import Times
 DRAIN_NS = 10_000_000_000
 """So long what has begun may go on after the end of the recording."""
 POLL_NS = 1_000_000
-"""How often a coroutine looks again that waits for something unknown."""
+"""How often who waits for something unknown looks again."""
+MOST_LOOKS = 1000
+"""Who looks so often at the time at one instant waits for it to pass."""
 MOST_AT_ONCE = 20_000
 """So many callbacks at one instant are a circle in which nothing takes any time."""
 
@@ -117,6 +119,7 @@ class Loop:
         self._resumed: set[int] = set()
         self._at_once = 0
         self._stopped = False
+        self._looked_at = self._looks = 0
 
     # --- what is to happen -----------------------------------------------------------------------
 
@@ -162,9 +165,7 @@ class Loop:
             return True
         while self._foreign:
             self._foreign.popleft()()
-        if self.changed:
-            self.changed = False
-            self._refresh()
+        self.refresh_now()
         if self._stopped:
             return False
         events, now = self._events, self.now
@@ -182,6 +183,12 @@ class Loop:
             self._execute(work)
             return True
         return self._advance(deadline)
+
+    def refresh_now(self) -> None:
+        """Bring up to date which entities there are, if any may have come or gone."""
+        if self.changed and self.strands.mine() is not None:
+            self.changed = False
+            self._refresh()
 
     def _advance(self, deadline: int | None) -> bool:
         """Let time go on to what comes next."""
@@ -308,6 +315,9 @@ class Loop:
         """
         if until is not None and until():
             return True
+        if deadline is not None and deadline <= self.now:
+            self.looked()
+            return until is not None and until()
         execution = self._current
         if execution is not None:
             held, execution.held = execution.held, []
@@ -325,6 +335,19 @@ class Loop:
             return self.strands.wait(until, deadline, place)
         finally:
             self._current, strand.execution = strand.execution, None
+
+    def looked(self) -> None:
+        """
+        Take in that the calling strand has looked at the time, or whether something has come.
+
+        Who does so all the time waits for time to pass, and so it does.
+        """
+        if self._looked_at != self.now:
+            self._looked_at, self._looks = self.now, 0
+        self._looks += 1
+        if self._looks >= MOST_LOOKS:
+            self._looks = 0
+            self.wait(None, self.now + POLL_NS, 'for time to pass')
 
     def blocked(self) -> list[str]:
         """Return which callbacks wait for something that has not come."""

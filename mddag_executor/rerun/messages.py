@@ -131,6 +131,7 @@ class Messages:
         self._known: dict[int, Inlet] = {}
         self._last: dict[str, tuple[int, bytes]] = {}
         self.offered: dict[str, Any] = {}
+        self._publishers: dict[str, int] = {}
         self._sequence = 0
 
     # --- who is there ----------------------------------------------------------------------------
@@ -149,13 +150,15 @@ class Messages:
             self._inlets.setdefault(inlet.topic, []).append(inlet)
         for outlet in self._outlets.values():
             outlet.inlets = None
-        self.offered = {}
+        self.offered, self._publishers = {}, {}
         for node in nodes:
             for publisher in node.publishers:
                 try:
-                    self.offered.setdefault(publisher.topic_name, publisher.msg_type)
+                    topic = publisher.topic_name
                 except InvalidHandle:
                     continue  # destroyed meanwhile
+                self.offered.setdefault(topic, publisher.msg_type)
+                self._publishers[topic] = self._publishers.get(topic, 0) + 1
         for inlet in new:
             if inlet.latched:
                 self._deliver_kept(inlet)
@@ -213,13 +216,18 @@ class Messages:
 
     def subscription_count(self, publisher: Publisher) -> int:
         """Return how many subscribe to a publisher's topic: nodes, and the rerun itself."""
+        self._loop.refresh_now()
         return 1 + len(self._inlets_of(self._outlet(publisher)))
 
     def publisher_count(self, subscription: Any) -> int:
         """Return how many publish to a subscription: nodes of the run, or the recording."""
+        self._loop.refresh_now()
         topic = subscription.topic_name
-        here = sum(outlet.topic == topic for outlet in self._outlets.values())
-        return here or int(topic in self.offered or topic in self._last)
+        return self.publishers(topic) or int(topic in self._last)
+
+    def publishers(self, topic: str) -> int:
+        """Return how many publishers nodes of the run have on a topic."""
+        return self._publishers.get(topic, 0)
 
     def record(self, sent: Sent, thread: int) -> None:
         """Record a publication."""

@@ -38,7 +38,7 @@ class Recording:
 
     :ivar start: when its first message came, ns; ``end``: the last.
     :ivar topics: every topic in it.
-    :ivar kinds: the type of each topic that has been loaded.
+    :ivar kinds: the type of each topic, as far as it has been loaded.
     :raises mddag_executor.replay.bags.BagError: where there is no bag.
     """
 

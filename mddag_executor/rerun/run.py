@@ -31,6 +31,7 @@ from mddag_executor.live.shutdown import is_over
 from mddag_executor.rerun.actions import Actions
 from mddag_executor.rerun.clocks import replace_timers, VirtualTime
 from mddag_executor.rerun.compare import Difference, differences
+from mddag_executor.rerun.discovery import Discovery
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.executor import NodeHolder, RerunHost
 from mddag_executor.rerun.loop import ENDED, Loop, RECORDED
@@ -49,12 +50,16 @@ import rclpy
 from rclpy.exceptions import ROSInterruptException
 from rclpy.executors import ExternalShutdownException
 from rclpy.publisher import Publisher
+from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rclpy.time import Time
 from rclpy.utilities import get_default_context, try_shutdown
+from rosgraph_msgs.msg import Clock
 
 CLOCK = '/clock'
 CLOCK_EVERY_NS = 10_000_000
+"""How often ``/clock`` tells the time to those who subscribe to it."""
 DEFAULT_DEADLINE = 100_000_000
 MAX_ACTIVE_JOBS = 64
 EXPIRE_AFTER = 1_000_000_000
@@ -144,6 +149,7 @@ class Rerun:
         self._failed: list[Guest] = []
         self._hosted: set[str] = set()
         self._begun = self._started_s = 0.0
+        self._clocked = False
 
     # --- parts -----------------------------------------------------------------------------------
 
@@ -172,6 +178,10 @@ class Rerun:
         self._services = Services(loop, self._holder, self._warn)
         self._actions = Actions(
             loop, self._holder, lambda: self._registry.by_id, self._warn)
+        recording = source.messages
+        self._discovery = Discovery(
+            loop, self._holder, self._messages, source.topics,
+            lambda: {} if recording is None else recording.kinds, self._warn)
         self._timers = Timers(loop, source.first_release)
         self._host = RerunHost(self._holder, loop.stop, loop)
         if self._recorder is not None:
@@ -209,24 +219,27 @@ class Rerun:
             except Stuck as stuck:
                 raise self._blocked(stuck) from None
             finally:
+                self._virtual.uninstall()
                 self._replacements.undo()
                 if self._recorder is not None:
                     self._recorder.close(loop.now)
         self._check_programs()
-        self._check_hosted()
+        if not self._hosted:
+            self._warn(self._none_hosted())
         self._outputs.finish()
         return self._result(time.monotonic() - self._begun)
 
     def _install(self) -> None:
         replace = self._replacements.replace
         messages = self._messages
-        virtual = VirtualTime(
+        virtual = self._virtual = VirtualTime(
             self._loop, self._settings.all_clocks, CLOCK in self._source.topics,
             self._settings.seed, self._warn)
         virtual.install(replace)
         replace_timers(self._replacements, self._timers)
         self._services.install(self._replacements)
         self._actions.install(self._replacements)
+        self._discovery.install(self._replacements)
         replace(Publisher, 'publish', instead(messages.publish))
         replace(Publisher, 'get_subscription_count', instead(messages.subscription_count))
         replace(Publisher, 'wait_for_all_acked', instead(lambda *args, **more: True))
@@ -248,15 +261,13 @@ class Rerun:
     def _started(self) -> None:
         """Begin to deliver, when each program has come to where it waits for something."""
         self._started_s = time.monotonic() - self._begun
-        if all(guest.settled.is_set() for guest in self._host.guests):
-            self._check_hosted()
+        if all(guest.settled.is_set() for guest in self._host.guests) and not self._hosted:
+            raise RerunError(self._none_hosted())
         self._check_topics()
         self._play_from(self._loop.start)
 
-    def _check_hosted(self) -> None:
-        if not self._hosted:
-            raise RerunError(
-                f'{self._task_set.file}: none of its callbacks is in the nodes that run: give the '
+    def _none_hosted(self) -> str:
+        return (f'{self._task_set.file}: none of its callbacks is in the nodes that run: give the '
                 'nodes that it declares')
 
     def _check_topics(self) -> None:
@@ -288,6 +299,10 @@ class Rerun:
         if self._recorder is not None:
             self._recorder.entities(nodes, added)
         new = self._messages.refresh(nodes, registry.subscriptions())
+        if not self._clocked and self._messages.inlets(CLOCK) and not (
+                {CLOCK} & {*self._source.topics, *self._messages.offered}):
+            self._clocked = True
+            self._tell_time()
         if new and self._messages_wanted() and now > self._loop.start:
             self._play_from(now)
 
@@ -327,6 +342,14 @@ class Rerun:
             return  # it begins anew, with more topics
         self._messages.recorded(message.topic, message.data, message.published)
         self._next(playing)
+
+    def _tell_time(self) -> None:
+        """Publish virtual time on ``/clock``, where somebody subscribes to it."""
+        now = self._loop.now
+        stamp = Time(nanoseconds=now).to_msg()
+        self._messages.recorded(CLOCK, serialize_message(Clock(clock=stamp)), now)
+        if now + CLOCK_EVERY_NS < self._loop.end:
+            self._loop.at(now + CLOCK_EVERY_NS, RECORDED, self._tell_time)
 
     # --- the end ---------------------------------------------------------------------------------
 

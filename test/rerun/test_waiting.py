@@ -13,6 +13,7 @@ import time
 from typing import Any
 
 from action_msgs.msg import GoalStatus
+from builtin_interfaces.msg import Time
 from mddag_executor.rerun import rerun, RerunError, Result
 import pytest
 from rcl_interfaces.srv import GetParameters
@@ -23,6 +24,7 @@ from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
@@ -387,6 +389,60 @@ def test_all_clocks(bag: str, graph: Path) -> None:
     assert not result.warnings
 
 
+def test_who_waits_by_looking_at_the_time_all_the_time(bag: str, graph: Path) -> None:
+    def take(node: Filter, number: int) -> None:
+        if number == 2:
+            begin = time.monotonic()
+            while time.monotonic() < begin + 0.02:
+                pass
+            node.note('time')
+            begin = node.get_clock().now()
+            while node.get_clock().now() - begin < Duration(seconds=0.01):
+                threading.Event().wait(0)
+            node.note('clock')
+
+    seen, _ = run_filter(bag, graph, take, all_clocks=True)
+    assert seen == [(220.0, 'time'), (230.0, 'clock')]
+
+
+def test_a_program_that_polls(bag: str, graph: Path) -> None:
+    seen: Seen = []
+
+    def main() -> None:
+        rclpy.init()
+        node = Filter(lambda node, number: node.note(number))
+        while len(node.seen) < 3:
+            rclpy.spin_once(node, timeout_sec=0)
+        seen.extend(node.seen)
+
+    rerun(bag, graph, [main])
+    assert seen == [(0.0, 0), (100.0, 1), (200.0, 2)]
+
+
+def test_functions_of_time_that_were_imported_by_name(
+    bag: str, graph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / 'sleepy_node.py').write_text('''
+from time import sleep, time
+import rclpy
+from std_msgs.msg import Header
+
+def main():
+    rclpy.init()
+    node = rclpy.create_node('filter')
+    node.create_subscription(Header, '/points', lambda message: None, 10)
+    publisher = node.create_publisher(Header, '/slept', 10)
+    while rclpy.ok():
+        publisher.publish(Header(frame_id=str(time())))
+        sleep(0.5)
+''')
+    monkeypatch.syspath_prepend(str(tmp_path))
+    results = [rerun(bag, graph, ['sleepy_node:main'], all_clocks=True) for _ in range(2)]
+    assert results[0].digest == results[1].digest
+    assert [(each.time - START) / MS for each in results[1].outputs
+            if each.topic == '/slept'] == [0, 500, 1000, 1500]
+
+
 def test_what_is_not_the_same_each_time_is_warned_of(bag: str, graph: Path) -> None:
     def take(node: Filter, number: int) -> None:
         time.time()
@@ -397,6 +453,60 @@ def test_what_is_not_the_same_each_time_is_warned_of(bag: str, graph: Path) -> N
         'time.time() is not the same in each run: give --all-clocks',
         'time.sleep() takes real time: give --all-clocks']
     assert all(warning.startswith(f'{__file__}:') for warning in result.warnings)
+
+
+def test_the_clock_is_told_where_somebody_subscribes_to_it(bag: str, graph: Path) -> None:
+    def fill(node: Filter) -> None:
+        node.create_subscription(
+            Clock, '/clock', lambda message: node.note(message.clock.nanosec // MS), 10)
+
+    seen, _ = run_filter(bag, graph, lambda node, number: None, fill=fill)
+    assert seen[:4] == [(0.0, 0), (10.0, 10), (20.0, 20), (30.0, 30)]
+    assert len(seen) == 190
+
+
+def test_simulated_time_is_that_of_the_recording(tmp_path: Path, graph: Path) -> None:
+    """The clock of the simulator went half as fast as real time."""
+    messages = sorted([
+        *((i * 100 * MS, '/points', Header(frame_id=str(i))) for i in range(10)),
+        *((i * 20 * MS, '/clock', Clock(clock=Time(sec=5, nanosec=i * 10 * MS)))
+          for i in range(48))], key=lambda each: each[0])
+    bag = write_bag(tmp_path / 'in.mcap', messages)
+    seen: list[float] = []
+
+    def make() -> Node:
+        def take(node: Filter, number: int) -> None:
+            seen.append(node.get_clock().now().nanoseconds / MS)
+            if number == 2:
+                node.get_clock().sleep_for(Duration(seconds=0.1))
+                seen.append(-node.get_clock().now().nanoseconds / MS)
+
+        return Filter(take, parameter_overrides=[Parameter('use_sim_time', value=True)])
+
+    rerun(bag, graph, [make])
+    # Until the first message of the clock there is no time.
+    assert seen[1:6] == [5050, 5100, 5150, -5200, 5200]
+
+
+def test_who_is_there_is_known_at_once(bag: str, graph: Path) -> None:
+    def fill(node: Filter) -> None:
+        node.create_publisher(String, '/names', 10)
+        node.note(node.count_publishers('/points'))
+
+    def take(node: Filter, number: int) -> None:
+        if number == 1:
+            node.note(dict(node.get_topic_names_and_types())['/names'])
+            node.note((node.count_publishers('names'), node.count_subscribers('/names'),
+                       node.get_node_names()))
+
+    def other() -> Node:
+        node = rclpy.create_node('other')
+        node.create_subscription(String, '/names', lambda message: None, 10)
+        return node
+
+    seen, _ = run_filter(bag, graph, take, other, fill=fill)
+    assert seen == [(0.0, 1), (100.0, ['std_msgs/msg/String']),
+                    (100.0, (1, 1, ['filter', 'other']))]
 
 
 # --- what blocks ---------------------------------------------------------------------------------
