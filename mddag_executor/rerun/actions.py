@@ -85,6 +85,11 @@ class Actions:
 
         return construct
 
+    def knows(self, waitable: Any) -> bool:
+        """Return whether a waitable is an action client or server."""
+        return any(each is waitable for known in (self._clients, self._servers)
+                   for _, each in known.values())
+
     # --- what clients send -----------------------------------------------------------------------
 
     def _server(self, name: str) -> Any:

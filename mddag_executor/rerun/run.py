@@ -22,12 +22,15 @@ from typing import Any, BinaryIO
 from mddag_executor import defaults
 from mddag_executor.live import hooks
 from mddag_executor.live.engine import Engine
+from mddag_executor.live.entity import WAITABLE
 from mddag_executor.live.hosting import Guest
+from mddag_executor.live.intake.entities import is_qos_event
 from mddag_executor.live.loading import describe, Program
 from mddag_executor.live.other_processes import OtherProcesses
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 from mddag_executor.live.shutdown import is_over
+from mddag_executor.live.work import Work
 from mddag_executor.rerun.actions import Actions
 from mddag_executor.rerun.clocks import replace_timers, VirtualTime
 from mddag_executor.rerun.compare import Difference, differences
@@ -49,6 +52,7 @@ from msg_graph import TaskSet
 import rclpy
 from rclpy.exceptions import ROSInterruptException
 from rclpy.executors import ExternalShutdownException
+from rclpy.guard_condition import GuardCondition
 from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
@@ -240,10 +244,21 @@ class Rerun:
         self._services.install(self._replacements)
         self._actions.install(self._replacements)
         self._discovery.install(self._replacements)
+        replace(GuardCondition, 'trigger', self._trigger)
         replace(Publisher, 'publish', instead(messages.publish))
         replace(Publisher, 'get_subscription_count', instead(messages.subscription_count))
         replace(Publisher, 'wait_for_all_acked', instead(lambda *args, **more: True))
         replace(Subscription, 'get_publisher_count', instead(messages.publisher_count))
+
+    def _trigger(self, original: Callable[[GuardCondition], None]) -> Callable[..., None]:
+        def trigger(guard: GuardCondition) -> None:
+            original(guard)
+            entity = self._registry.by_id.get(id(guard))
+            if entity is not None and guard.callback is not None:
+                work = Work(guard, guard.callback, entity=entity)
+                self._loop.soon(lambda: self._engine.ready(work, self._loop.now))
+
+        return trigger
 
     def _seed(self) -> None:
         random.seed(self._settings.seed)
@@ -292,6 +307,9 @@ class Rerun:
                 hosted, registry.subscriptions(), engine.record, now)
         for entity in added:
             entity.since = now
+            if entity.kind == WAITABLE and not self._actions.knows(entity.rclpy) and (
+                    not is_qos_event(entity.rclpy)):
+                self._warn(f'{entity.name}: a waitable of its own kind, which never gets ready')
         for entity in gone:
             engine.remove(entity, now)
         self._timers.refresh(registry.timers())

@@ -33,6 +33,21 @@ from .helpers import GRAPH, MS, START, write_bag
 
 Seen = list[tuple[float, Any]]
 
+SLEEPY = """\
+from time import sleep, time
+import rclpy
+from std_msgs.msg import Header
+
+def main():
+    rclpy.init()
+    node = rclpy.create_node('filter')
+    node.create_subscription(Header, '/points', lambda message: None, 10)
+    publisher = node.create_publisher(Header, '/slept', 10)
+    while rclpy.ok():
+        publisher.publish(Header(frame_id=str(time())))
+        sleep(0.5)
+"""
+
 
 @pytest.fixture
 def bag(tmp_path: Path) -> str:
@@ -201,6 +216,19 @@ def test_threads_of_nodes_are_in_virtual_time_too(bag: str, graph: Path) -> None
     assert seen == [(100.0 * i + 5, 2 * i) for i in range(5)] + [(405.0, 'pooled')]
     assert result.counts['/doubled'] == 5
     assert not result.warnings
+
+
+def test_guard_conditions(bag: str, graph: Path) -> None:
+    def fill(node: Filter) -> None:
+        node.guard = node.create_guard_condition(  # type: ignore[attr-defined]
+            lambda: node.note('triggered'))
+
+    def take(node: Filter, number: int) -> None:
+        if number == 2:
+            node.guard.trigger()  # type: ignore[attr-defined]
+
+    seen, _ = run_filter(bag, graph, take, fill=fill)
+    assert seen == [(200.0, 'triggered')]
 
 
 def test_joining_a_thread(bag: str, graph: Path) -> None:
@@ -422,20 +450,7 @@ def test_a_program_that_polls(bag: str, graph: Path) -> None:
 def test_functions_of_time_that_were_imported_by_name(
     bag: str, graph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / 'sleepy_node.py').write_text('''
-from time import sleep, time
-import rclpy
-from std_msgs.msg import Header
-
-def main():
-    rclpy.init()
-    node = rclpy.create_node('filter')
-    node.create_subscription(Header, '/points', lambda message: None, 10)
-    publisher = node.create_publisher(Header, '/slept', 10)
-    while rclpy.ok():
-        publisher.publish(Header(frame_id=str(time())))
-        sleep(0.5)
-''')
+    (tmp_path / 'sleepy_node.py').write_text(SLEEPY)
     monkeypatch.syspath_prepend(str(tmp_path))
     results = [rerun(bag, graph, ['sleepy_node:main'], all_clocks=True) for _ in range(2)]
     assert results[0].digest == results[1].digest

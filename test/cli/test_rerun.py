@@ -1,0 +1,155 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+EXAMPLE = Path(__file__).resolve().parents[2] / 'examples' / 'rerun'
+THIRD_PARTY = EXAMPLE.parent / 'third_party'
+NODES = ('--node', 'robot:Tracker', '--node', 'robot:Brake')
+
+
+@pytest.fixture(scope='module')
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the example, and a drive of 5 s."""
+    folder = tmp_path_factory.mktemp('rerun')
+    for name in ('graph.yaml', 'robot.py'):
+        shutil.copy(EXAMPLE / name, folder)
+    mddag(folder, 'simulate', 'graph.yaml', '--duration', '5s', '--trace', 'releases.mcap')
+    mddag(folder, 'rerun', 'releases.mcap', 'graph.yaml', '--node', 'robot:Lidar', '-o',
+          'drive.mcap')
+    return folder
+
+
+def mddag(
+    folder: Path, *args: str, status: int = 0, **more: str
+) -> subprocess.CompletedProcess[str]:
+    """Run mddag in a folder, as a user would."""
+    done = subprocess.run(
+        [sys.executable, '-m', 'mddag_executor', *args], cwd=folder, capture_output=True,
+        text=True, check=False, timeout=120, env={**os.environ, **more})
+    assert done.returncode == status, done.stderr
+    return done
+
+
+def digest(folder: Path, *args: str, **more: str) -> str:
+    done = mddag(folder, 'rerun', 'drive.mcap', *args, '--json', '-', **more)
+    found: str = json.loads(done.stdout)['digest']
+    return found
+
+
+def test_a_run_and_its_result(drive: Path) -> None:
+    done = mddag(
+        drive, 'rerun', 'drive.mcap', 'graph.yaml', *NODES, '-o', 'out.mcap', '--trace',
+        'run.mcap', '--json', 'result.json')
+    assert 'times as fast as real time' in done.stdout
+    result = json.loads((drive / 'result.json').read_text())
+    assert result['topics'] == {'/brake': 50, '/parameter_events': 4, '/track': 50}
+    assert result['messages'] == 104
+    assert (result['callbacks'], result['warnings'], result['recorded']) == (100, [], [])
+    assert result['dags']['brake']['sinks']['/brake:decide']['completed'] == 50
+    replayed = mddag(drive, 'replay', 'run.mcap', '--json', '-')
+    sinks = json.loads(replayed.stdout)['dags']['brake']['sinks']
+    assert sinks['/brake:decide']['response_ns']['max'] == 9_000_000
+    same = mddag(drive, 'rerun', 'drive.mcap', 'graph.yaml', *NODES, '--expect', 'out.mcap')
+    assert 'the same as out.mcap' in same.stdout
+
+
+@pytest.mark.slow
+def test_the_same_each_time_also_beside_busy_processes(drive: Path) -> None:
+    """Also where seven workers are too few, and with other hashes of strings."""
+    text = (drive / 'graph.yaml').read_text()
+    (drive / 'overload.yaml').write_text(
+        text.replace('execution_time: 8ms', 'execution_time: 130ms'))
+    busy = [subprocess.Popen([sys.executable, '-c', 'while True: pass']) for _ in range(4)]
+    try:
+        found = {
+            digest(drive, 'overload.yaml', *NODES, '--workers', '7', PYTHONHASHSEED=str(i))
+            for i in range(3)}
+    finally:
+        for each in busy:
+            each.kill()
+            each.wait()
+    found |= {digest(drive, 'overload.yaml', *NODES, '--workers', '7') for _ in range(3)}
+    assert len(found) == 1
+    assert found != {digest(drive, 'graph.yaml', *NODES)}
+
+
+def test_differences_end_with_status_1(drive: Path, tmp_path: Path) -> None:
+    for name in ('graph.yaml', 'robot.py', 'drive.mcap'):
+        shutil.copy(drive / name, tmp_path)
+    mddag(tmp_path, 'rerun', 'drive.mcap', 'graph.yaml', *NODES, '-o', 'before.mcap')
+    text = (tmp_path / 'robot.py').read_text()
+    (tmp_path / 'robot.py').write_text(text.replace('GAIN = 0.3', 'GAIN = 0.3001'))
+    expect = ('rerun', 'drive.mcap', 'graph.yaml', *NODES, '--expect', 'before.mcap')
+    done = mddag(tmp_path, *expect, status=1)
+    assert done.stdout.splitlines()[-1].startswith(
+        '/track: content, first in message 1 at 0.110000 s: data is ')
+    done = mddag(tmp_path, *expect, '--json', '-', status=1)
+    difference, = json.loads(done.stdout)['differences']
+    assert (difference['topic'], difference['field'], difference['number']) == (
+        '/track', 'data', 1)
+    mddag(tmp_path, *expect, '--tolerance', '1e-2')
+
+
+def test_unmodified_programs(drive: Path, tmp_path: Path) -> None:
+    """A talker, and a listener with an executor of its own, started as ros2 run does."""
+    graph = str(THIRD_PARTY / 'graph.yaml')
+    prefix = str(THIRD_PARTY / 'install')
+    args = ('rerun', str(drive / 'drive.mcap'), graph, '--node', 'their_robot/talker.py',
+            '--node', 'their_robot/listener.py')
+    first = mddag(tmp_path, *args, '-o', 'chatter.mcap', AMENT_PREFIX_PATH=prefix)
+    assert 'heard 49 messages' in first.stdout
+    again = mddag(tmp_path, *args, '--expect', 'chatter.mcap', AMENT_PREFIX_PATH=prefix)
+    assert 'the same as chatter.mcap' in again.stdout
+    # Of the listener alone: what the talker said is in the bag.
+    alone = mddag(tmp_path, 'rerun', 'chatter.mcap', graph, '--node', 'their_robot/listener.py',
+                  AMENT_PREFIX_PATH=prefix)
+    assert 'heard 49 messages' in alone.stdout
+
+
+@pytest.mark.parametrize(('args', 'message'), [
+    (('none.mcap', 'graph.yaml', *NODES), 'none.mcap: '),
+    (('drive.mcap', 'graph.yaml'), 'the following arguments are required: --node'),
+    (('drive.mcap', 'graph.yaml', '--node', 'robot:Breake'), "did you mean 'Brake'"),
+    (('drive.mcap', 'graph.yaml', *NODES, '--times', 'recorded'),
+     '--times recorded: drive.mcap is a bag'),
+    (('drive.mcap', 'graph.yaml', *NODES, '--times', 'none.json'), 'none.json: '),
+    (('drive.mcap', 'graph.yaml', *NODES, '--expect', 'none.mcap'), 'none.mcap: '),
+    (('drive.mcap', 'graph.yaml', *NODES, '-o', '/nowhere/out.mcap'), 'there is no directory'),
+    (('drive.mcap', 'graph.yaml', *NODES, '--policy', 'edf'), "policy 'edf': there is no such"),
+    (('drive.mcap', 'graph.yaml', '--node', 'robot:Brake'),
+     '/track, which /brake:decide needs, is not recorded'),
+    (('releases.mcap', 'graph.yaml', '--node', 'robot:Tracker'),
+     '/distance, which /tracker:track needs, is not recorded'),
+])
+def test_bad_input_is_one_line(drive: Path, args: tuple[str, ...], message: str) -> None:
+    before = sorted(path.name for path in drive.iterdir())
+    done = mddag(drive, 'rerun', *args, status=2)
+    errors = [line for line in done.stderr.splitlines() if line.startswith('error: ')]
+    assert len(errors) == 1 and message in errors[0], done.stderr
+    assert 'Traceback' not in done.stderr
+    assert sorted(path.name for path in drive.iterdir() if path.name != '__pycache__') == [
+        name for name in before if name != '__pycache__']
+
+
+def test_a_callback_that_raises_shows_its_traceback(drive: Path, tmp_path: Path) -> None:
+    for name in ('graph.yaml', 'drive.mcap'):
+        shutil.copy(drive / name, tmp_path)
+    text = (drive / 'robot.py').read_text()
+    (tmp_path / 'robot.py').write_text(text.replace(
+        '        if self.distance is None:', '        if message.data < 40:\n'
+        "            raise ValueError('too near')\n        if self.distance is None:"))
+    done = mddag(tmp_path, 'rerun', 'drive.mcap', 'graph.yaml', *NODES, '-o', 'out.mcap', status=2)
+    assert "raise ValueError('too near')" in done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith('error: /tracker:track: it raised ValueError: too near at ')
+    assert not (tmp_path / 'out.mcap').exists()
