@@ -27,11 +27,13 @@ from mddag_executor.errors import InputError, UsageError
 from mddag_executor.resources import find
 
 if TYPE_CHECKING:
+    from mddag_executor.replay.run import Recording
     from mddag_executor.report.html import Watch
     from mddag_executor.report.html_data import ReportData
     from msg_graph import TaskSet
 
 STDIN = '<stdin>'
+_MCAP = b'\x89MCAP'
 MOST_BYTES = 64 << 20
 """Of declarations, architecture files and tables of execution times; traces are not read so."""
 _read_already: object = None  # the stream that was standard input when it was read
@@ -107,6 +109,40 @@ def input_file(path: str) -> Iterator[Path]:
         with copy.open('wb') as target:
             shutil.copyfileobj(source, target, 1 << 20)
         yield copy
+
+
+def recording_and_graph(args: argparse.Namespace) -> None:
+    """
+    Tell TRACE… from GRAPH, which `options.add_recording` leaves together.
+
+    The last is a trace, too, if that is what it looks like.
+    """
+    traces = args.trace
+    if len(traces) > 1 and not _is_trace(traces[-1]):
+        *traces, args.graph = traces
+    args.trace = traces[0] if len(traces) == 1 else traces
+    if len(traces) > 1 and '-' in traces:
+        raise UsageError('-: of several traces none can be standard input: name them')
+
+
+def _is_trace(path: str) -> bool:
+    if path.endswith('.mcap'):
+        return True
+    try:
+        with open(path, 'rb') as file:
+            return file.read(len(_MCAP)) == _MCAP
+    except OSError:
+        return False
+
+
+@contextmanager
+def input_recording(given: str | list[str]) -> Iterator[tuple[Recording, str]]:
+    """Give what `input_trace` gives, or the paths of several traces of one run."""
+    if not isinstance(given, str):
+        yield given, ', '.join(given)
+        return
+    with input_trace(given) as found:
+        yield found
 
 
 @contextmanager

@@ -30,10 +30,7 @@ MOST_SHOWN = 20
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('trace', metavar='TRACE', help="a recorded run, an MCAP file ('-': standard input)")
-    add('graph', metavar='GRAPH', nargs='?',
-        help="the declaration that judges, a YAML file ('-': standard input; default: the one "
-        'that the trace was recorded with)')
+    options.add_recording(parser, "a recorded run, an MCAP file ('-': standard input)")
     add('--sink', metavar='S', help='only jobs of this sink, as /node:callback')
     add('--job', type=options.or_zero(options.positive_int), metavar='K',
         help='only the job of this number')
@@ -49,11 +46,12 @@ def main(args: argparse.Namespace) -> int:
     :raises msg_graph.GraphError: when the declaration is wrong
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
+    common.recording_and_graph(args)
     common.check_output(args.json)
     if args.trace == '-' and args.graph == '-':
         raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
     task_set = None if args.graph is None else common.load_graph(args.graph)
-    with common.input_trace(args.trace) as (path, name):
+    with common.input_recording(args.trace) as (path, name):
         if task_set is None or recorded.is_bag(path):
             recorded.check_declared(path, name)
         outcome = recorded.as_recorded(

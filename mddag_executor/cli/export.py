@@ -14,11 +14,12 @@ import argparse
 from pathlib import PurePath
 from typing import TYPE_CHECKING
 
-from mddag_executor.cli import common, recorded
+from mddag_executor.cli import common, options, recorded
 from mddag_executor.cli.text import printable, warn
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
+    from mddag_executor.replay.run import Recording
     from mddag_executor.report.export import Target
     from msg_graph import TaskSet
 
@@ -34,12 +35,9 @@ FORMS = ('pftrace', 'csv', 'parquet')
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('trace', metavar='TRACE',
-        help="a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
+    options.add_recording(
+        parser, "a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
         'ordinary bag, a folder or a file')
-    add('graph', metavar='GRAPH', nargs='?',
-        help="the declaration that judges, a YAML file ('-': standard input; default: the one "
-        'that the trace was recorded with)')
     add('-o', '--output', metavar='OUT.{pftrace,csv,parquet}', required=True,
         help='the file to write: for Perfetto (ui.perfetto.dev; needs mddag_executor[export]), '
         "as CSV ('-': CSV to standard output), or as Parquet (needs mddag_executor[export])")
@@ -60,11 +58,12 @@ def main(args: argparse.Namespace) -> int:
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     from mddag_executor.report.export import check_available, target
+    common.recording_and_graph(args)
     form = _form(args)
     common.check_output(args.output)
     check_available(form)
     task_set = None if args.graph is None else common.load_graph(args.graph)
-    with common.input_trace(args.trace) as (path, name), \
+    with common.input_recording(args.trace) as (path, name), \
             common.output_file(args.output) as file:
         warnings = _export(args, path, name, task_set, target(form, file, args.rows == 'jobs'))
     for warning in warnings:
@@ -75,7 +74,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _export(
-    args: argparse.Namespace, path: str, name: str, task_set: TaskSet | None, target: Target
+    args: argparse.Namespace, path: Recording, name: str, task_set: TaskSet | None, target: Target
 ) -> list[str]:
     """Write what a recording holds; return what is missing or doubtful of it."""
     from mddag_executor.report.export import Exporter

@@ -107,6 +107,21 @@ def add_graph(parser: argparse.ArgumentParser) -> None:
         'graph', metavar='GRAPH', help="the declaration, a YAML file ('-': standard input)")
 
 
+def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
+    """
+    Declare the arguments `TRACE… [GRAPH]`; see `common.recording_and_graph`.
+
+    :param what: the help of TRACE
+    """
+    parser.add_argument(
+        'trace', metavar='TRACE', nargs='+',
+        help=f'{what}; of one run in several processes the traces of all')
+    parser.add_argument(
+        'graph', metavar='GRAPH', nargs='?',
+        help="the declaration that judges, a YAML file ('-': standard input; default: the one "
+        'that the trace was recorded with)')
+
+
 def add_workload(parser: argparse.ArgumentParser) -> None:
     """Declare `--graph` of a benchmark; see `common.load_workload`."""
     parser.add_argument(

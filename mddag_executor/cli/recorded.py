@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mddag_executor.replay import Replay, Reschedule
     from mddag_executor.replay.bags_reschedule import BagReschedule
     from mddag_executor.replay.happenings import Observer
+    from mddag_executor.replay.run import Recording
     from msg_graph import TaskSet
 
 _ONLY_RESCHEDULED = (
@@ -78,13 +79,13 @@ def check(args: argparse.Namespace, *files: str | None) -> None:
                 '--reschedule')
 
 
-def is_bag(path: str) -> bool:
+def is_bag(path: Recording) -> bool:
     """Tell whether a recording is an ordinary bag, which can only be rescheduled."""
     from mddag_executor.replay.bags import is_ordinary
-    return is_ordinary(path)
+    return isinstance(path, str) and is_ordinary(path)
 
 
-def check_declared(path: str, name: str) -> None:
+def check_declared(path: Recording, name: str) -> None:
     """
     Find out whether a recording says which deadlines there are, where no graph is given.
 
@@ -97,7 +98,7 @@ def check_declared(path: str, name: str) -> None:
 
 
 def as_recorded(
-    path: str, name: str, task_set: TaskSet | None,
+    path: Recording, name: str, task_set: TaskSet | None,
     more: Callable[[Replay], Sequence[Observer]] | None = None, doing: str = 'replaying',
     skip: int = 0, jobs: bool = False,
 ) -> Replay:
@@ -116,14 +117,14 @@ def as_recorded(
 
 
 def rescheduled(
-    args: argparse.Namespace, path: str, name: str, task_set: TaskSet | None
+    args: argparse.Namespace, path: Recording, name: str, task_set: TaskSet | None
 ) -> Reschedule | BagReschedule:
     """
     Run the scheduler over a recording of any kind.
 
     :raises mddag_executor.errors.MddagError: where that cannot be
     """
-    if is_bag(path):
+    if isinstance(path, str) and is_bag(path):
         return bags.reschedule_bag(args, path, name, task_set)
     if args.execution_times is not None:
         raise UsageError('--execution-times: a trace has its own: leave the option out')

@@ -35,12 +35,9 @@ mddag replay run.mcap --fail-on-miss --tolerate-ratio 0.01 --tolerate-burst 2 --
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('trace', metavar='TRACE',
-        help="a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
+    options.add_recording(
+        parser, "a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
         'ordinary bag, a folder or a file')
-    add('graph', metavar='GRAPH', nargs='?',
-        help="the declaration that judges, a YAML file ('-': standard input; default: the one "
-        'that the trace was recorded with)')
     recorded.add_arguments(
         parser, 'run the scheduler over the recorded releases and execution times')
     recorded.add_skip(parser)
@@ -58,12 +55,13 @@ def main(args: argparse.Namespace) -> int:
     :raises msg_graph.GraphError: when the declaration is wrong
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
+    common.recording_and_graph(args)
     common.check_output(args.json)
     common.check_report(args.report)
     verdicts.check(args)
     _check_arguments(args)
     task_set = None if args.graph is None else common.load_graph(args.graph)
-    with common.input_trace(args.trace) as (path, name):
+    with common.input_recording(args.trace) as (path, name):
         watch = common.report_watch(args.report)
         drift: list[Drift] = []
         outcome: Replay | Reschedule | BagReschedule

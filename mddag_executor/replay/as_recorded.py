@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-import os
 from typing import Any
 
 from mddag_executor.memory import no_garbage
@@ -17,7 +16,7 @@ from mddag_executor.replay.imported_run import ImportedPaths, ImportedRun
 from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.own_paths import OwnPaths
 from mddag_executor.replay.path_results import path_results
-from mddag_executor.replay.run import open_run, Run
+from mddag_executor.replay.run import open_run, Recording, Run
 from mddag_executor.replay.usage import share, Usage
 from mddag_executor.replay.waits import GroupWaits
 from mddag_executor.text import counted
@@ -140,7 +139,7 @@ def recording_result(run: Run) -> dict[str, Any]:
 
 
 def replay(
-    path: str | os.PathLike[str],
+    path: Recording,
     task_set: TaskSet | None = None,
     *,
     name: str | None = None,

@@ -107,6 +107,12 @@ class OwnRun:
         self.shut_down = False
         #: The greatest time of an event, ns.
         self.last = 0
+        #: Called when it has been played.
+        self.when_played: Callable[[], object] = lambda: None
+        #: What is to be said of it beside: of the traces that it was joined from.
+        self.notes: list[str] = []
+        #: What its workers are called, where that is more than a number.
+        self.worker_names: list[str] = []
         self.jobs = 0
         self.lost = 0
         self.dropped: Counter[str] = Counter()
@@ -138,6 +144,7 @@ class OwnRun:
             if self.end == 0:
                 self.end = min(max(0, self.head.time), NEVER - 1)
             self._finish()
+        self.when_played()
 
     def _finish(self) -> None:
         batch = Batch((), {})
@@ -150,7 +157,7 @@ class OwnRun:
         """Return what is missing or wrong, one line each, once it has been played."""
         name, path = self.name, self._reader.path
         lines = [name + text[len(path):] if text.startswith(path) else text
-                 for text in self._reader.warnings] + self._mapping.warnings
+                 for text in self._reader.warnings] + self._mapping.warnings + self.notes
         if not self.shut_down:
             lines.append(
                 f'{name}: the end of the run is not recorded (the process was killed, or the '

@@ -10,7 +10,6 @@ took, and how long the executor took to notice, to dispatch and to carry message
 
 from __future__ import annotations
 
-import os
 from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER, POLICIES, Tables
@@ -24,7 +23,7 @@ from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.groups import with_groups
 from mddag_executor.replay.load import LoadBuilder, RecordedLoad
 from mddag_executor.replay.recording import Head, ReplayError
-from mddag_executor.replay.run import open_run
+from mddag_executor.replay.run import open_run, Recording
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import engine, LogEntry
@@ -178,7 +177,7 @@ class Reschedule:
 
 
 def reschedule(
-    path: str | os.PathLike[str],
+    path: Recording,
     task_set: TaskSet | None = None,
     *,
     policy: str | None = None,

@@ -4,9 +4,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import os
+import shutil
+import tempfile
+import weakref
 
 from mddag_executor.replay.imported_run import ImportedRun
+from mddag_executor.replay.joining import Joined
 from mddag_executor.replay.own import OwnRun
 from mddag_executor.replay.recording import named_errors, read_head, ReplayError
 from mddag_executor.trace import TraceReader
@@ -24,8 +29,12 @@ What all have: ``play``, and
 """
 
 
+Recording = str | os.PathLike[str] | Sequence[str]
+"""The path of a trace, or those of the traces of all processes of one run."""
+
+
 def open_run(
-    path: str | os.PathLike[str], task_set: TaskSet | None = None, name: str | None = None,
+    path: Recording, task_set: TaskSet | None = None, name: str | None = None,
     needs_declaration: bool = False,
 ) -> Run:
     """
@@ -38,6 +47,8 @@ def open_run(
     :raises ReplayError: when no run is recorded in it, or none of the declaration's callbacks.
     :raises msg_graph.GraphError: when the recorded declaration is wrong.
     """
+    if not isinstance(path, (str, os.PathLike)):
+        return _joined(path, task_set)
     path = os.fspath(path)
     with named_errors(path, name or path):
         reader = TraceReader(path)
@@ -49,6 +60,27 @@ def open_run(
         raise ReplayError(
             run.name, 'it was imported, so nothing in it says which callbacks have which '
             'deadlines', 'give the GRAPH')
+    return run
+
+
+def _joined(paths: Sequence[str], task_set: TaskSet | None) -> OwnRun:
+    """Return the run of several traces; it can be played once."""
+    joined = Joined([(path, path) for path in paths])
+    folder = tempfile.mkdtemp(prefix='mddag-')
+    path = os.path.join(folder, 'joined.mcap')
+    try:
+        joined.write(path)
+        with named_errors(path, joined.name):
+            reader = TraceReader(path)
+            head = read_head(reader)
+            assert head is not None
+            run = OwnRun(reader, joined.name, head, task_set)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    run.when_played = weakref.finalize(run, shutil.rmtree, folder, ignore_errors=True)
+    run.same = False  # each process judged its own part of the jobs
+    run.notes, run.worker_names = joined.warnings, joined.worker_names
     return run
 
 

@@ -103,7 +103,8 @@
       dag === null ? 'declared by no DAG' : `job ${c.job[i]} of ${dag}` +
         (isNaN(release) ? '' : `, released at ${instant(release)}`),
       `ready ${instant(c.start[i] - c.wait[i])}, started ${instant(c.start[i])}, ` +
-        (c.worker[i] < 0 ? 'on a spare thread' : `worker ${c.worker[i]}`),
+        (c.worker[i] < 0 ? 'on a spare thread' :
+          meta.worker_names[c.worker[i]] || `worker ${c.worker[i]}`),
       `waited ${time(c.wait[i])}, ran ${time(c.took[i])}`,
       least[i] < 0 ? (dag === null ? '' : 'no verdict known') : verdictText(least[i])];
   }

@@ -123,7 +123,7 @@ def of_replay(outcome: Replay, watch: Watch) -> ReportData:
                       outcome.duration_ns, outcome.warnings)
     return data._replace(
         paths=result.get('paths', {}), recorded=result.get('recorded_callbacks', {}),
-        misses=result['misses'])
+        misses=result['misses'], worker_names=getattr(outcome.run, 'worker_names', ()))
 
 
 def of_reschedule(outcome: Reschedule) -> ReportData:

@@ -22,7 +22,7 @@ in HTML or text on a canvas, never markup or code.
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import json
 from typing import Any, NamedTuple
 import zlib
@@ -60,6 +60,7 @@ class ReportData(NamedTuple):
     :ivar paths: end-to-end times of the declared paths, as in the result of a replay.
     :ivar recorded: the callbacks of an imported recording, as in the result of a replay.
     :ivar misses: why deadlines were missed, as in the result of a replay.
+    :ivar worker_names: what workers are called, where that is more than a number.
     """
 
     title: str
@@ -76,6 +77,7 @@ class ReportData(NamedTuple):
     paths: Mapping[str, Any] = {}
     recorded: Mapping[str, Any] = {}
     misses: Mapping[str, Any] | None = None
+    worker_names: Sequence[str] = ()
 
 
 class Line(NamedTuple):
@@ -152,7 +154,9 @@ def prepare(data: ReportData) -> Prepared:
                    for i, name in enumerate(undeclared))],
         'sinks': [{'row': v, 'dag': data.tables.dag_of[v], 'name': printable(short[names[v]]),
                    'deadline': data.tables.sink_deadline[v] // UNIT_NS} for v in sinks],
-        'worker_lines': _worker_lines(data), 'paths': paths, 'first_path': _tightest(paths),
+        'worker_lines': _worker_lines(data),
+        'worker_names': [printable(name) for name in data.worker_names],
+        'paths': paths, 'first_path': _tightest(paths),
         'misses': [miss[:2] for miss in misses], 'columns': packer.columns}
     return Prepared(meta, packer.blob(), lines, origin, misses)
 

@@ -53,7 +53,8 @@ def figures(data: ReportData, prepared: Prepared) -> Figures:
     duration = max(1, data.duration_ns) / 1e9
     time = Range1d(
         start=0, end=duration, bounds=(-0.2 * duration, 1.2 * duration), name='timeline_range')
-    workers = [Line('spare threads' if w == data.workers else f'worker {w}', y, False)
+    names = prepared.meta['worker_names'] or [f'worker {w}' for w in range(data.workers)]
+    workers = [Line('spare threads' if w == data.workers else names[w], y, False)
                for w, y in enumerate(prepared.meta['worker_lines']) if y]
     workers.append(Line('missed deadlines', 0, False))
     gaps = prepared.meta['gaps']

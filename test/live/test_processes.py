@@ -16,6 +16,7 @@ import time
 from typing import Any
 
 from mddag_executor.core.tally import counts
+from mddag_executor.replay import replay
 from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest
@@ -149,6 +150,12 @@ def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world: Path) ->
     assert result['dags']['chain']['sinks']['/last:sink']['completed'] > 0
     assert sum(e['_name'] == 'mddag:complete' for e in read_events('out.down.mcap')) >= 60
     assert f'trace: {world / "out.up.mcap"}' in out
+    replayed = replay(['out.up.mcap', 'out.down.mcap']).result()
+    assert any(warning.startswith('out.up.mcap: its end is not recorded (the process was killed')
+               and 'with it' in warning or warning.endswith('no job was open in it')
+               for warning in replayed['warnings']), replayed['warnings']
+    sink = replayed['dags']['chain']['sinks']['/last:sink']
+    assert sink['completed'] > 0 and set(replayed['callbacks']) >= {'/first:relay', '/last:sink'}
 
 
 def test_an_exception_in_one_ends_the_run_with_its_status(world: Path) -> None:

@@ -1,0 +1,286 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The traces of several processes as the trace of one run.
+
+Theory of operation
+-------------------
+The joined trace has the events of all in the order of time, and is replayed like any other.
+
+1. *Clocks.*  Each process counts its trace's time from the steady clock of the machine, by an
+   offset that is recorded (``caret_init``).  Where two offsets differ by less than ``SAME_CLOCK``
+   the machine is the same, and times are put on the first trace's clock exactly; else they are
+   taken as they are.
+2. *Who is who.*  Addresses, which are those of one process, get the number of the trace above
+   their 48 bits; workers are counted through.
+3. *Jobs* are numbered anew, in the order of their first release.  A release is that of a job that
+   another process has released already if it is the same, to ``SAME_RELEASE``; of a DAG whose jobs
+   header stamps join, also if it follows that within the DAG's period: the stamp is taken later
+   than a timer is due.  What fits nothing is a job of its own.
+4. Of a DAG that several run, those vertices are expected that are in any of the processes.  Jobs
+   are judged from the time on from which all processes have judged.
+5. A process whose end is not recorded was killed.  Its open jobs are said, and the run goes on.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+import heapq
+import os
+from typing import Any
+
+from mddag_executor.core import legs_of
+from mddag_executor.replay.recording import (
+    declared,
+    Head,
+    named_errors,
+    read_head,
+    ReplayError,
+    TASK_SET,
+)
+from mddag_executor.text import counted, listed
+from mddag_executor.trace import TraceFile, TraceReader
+from mddag_executor.trace.schema import EVENTS
+from msg_graph import Dag
+
+SAME_CLOCK = 500_000_000
+SAME_RELEASE = 100_000
+_KEPT = 1024
+_BITS = 48
+_INIT, _SHUTDOWN = 'ros2_caret:caret_init', 'mddag:shutdown'
+_JUDGE_FROM, _HOSTED, _RELEASE = 'mddag:judge_from', 'mddag:hosted', 'mddag:job_release'
+_COMPLETE, _DISPATCH = 'mddag:complete', 'mddag:dispatch'
+_ENDS = ('mddag:expire', 'mddag:abort')
+_OF_DAG = ('mddag:deadline', 'mddag:drop', 'mddag:fail', _DISPATCH, _COMPLETE, *_ENDS)
+_TIMES = {'release', 'ready', 'reference_deadline', 'completed', 'deadline', 'begin', 'end'}
+_NO_ADDRESSES = {'queue_depth', 'message_timestamp'}
+
+Event = tuple[Any, ...]
+
+
+class _Part:
+    """One of the traces: where its times, workers and addresses are in the whole."""
+
+    def __init__(self, place: int, path: str, name: str) -> None:
+        self.place, self.name = place, name
+        with named_errors(path, name):
+            self.reader = TraceReader(path)
+            head = read_head(self.reader)
+            if head is None:
+                raise ReplayError(
+                    name, 'it was not recorded by this executor', 'replay it by itself')
+            self.head: Head = head
+            self.clock = self.judges_from = 0
+            self.end: int | None = None
+            for event in self.reader.events({_INIT, _SHUTDOWN, _JUDGE_FROM}):
+                if None in event:
+                    continue
+                if event[0] == _INIT:
+                    self.clock = event[4]
+                elif event[0] == _SHUTDOWN:
+                    self.end = event[4]
+                else:
+                    self.judges_from = event[4]
+        self.shift = 0
+        self.first_worker = 0
+        self.first_spare = 0
+        self.last = 0
+        # by DAG the vertices that are here, where not all are; by job what is to complete here
+        self.hosted: dict[int, set[int]] = {}
+        self.open: dict[tuple[int, int], int] = {}
+        self.numbers: dict[tuple[int, int], int] = {}
+
+    def events(self) -> Iterator[tuple[_Part, Event]]:
+        """Yield itself with each event, by the clock and with the addresses of the whole."""
+        edits = {}
+        with named_errors(self.reader.path, self.name):
+            for event in self.reader.events(set(EVENTS), sorted=True):
+                if None in event:
+                    continue
+                if event[0] not in edits:
+                    edits[event[0]] = self._edits(event[0])
+                changed = list(event)
+                changed[1] += self.shift
+                for column, edit in edits[event[0]]:
+                    changed[column] = edit(changed[column])
+                self.last = changed[1]
+                yield self, tuple(changed)
+
+    def _edits(self, name: str) -> list[tuple[int, Callable[[int], int]]]:
+        """Return which columns of an event change, and how."""
+        found: list[tuple[int, Callable[[int], int]]] = []
+        for column, (field, kind) in enumerate(EVENTS[name].fields, 4):
+            if kind == 'uint64' and field not in _NO_ADDRESSES:
+                found.append((column, self._address))
+            elif kind == 'int64' and field in _TIMES and self.shift and name != _INIT:
+                found.append((column, lambda time: time + self.shift if time > 0 else time))
+            elif field == 'worker':
+                found.append((column, self._worker))
+        return found
+
+    def _address(self, address: int) -> int:
+        return address | self.place << _BITS if 0 < address < 1 << _BITS else address
+
+    def _worker(self, worker: int) -> int:
+        if 0 <= worker < self.head.workers:
+            return self.first_worker + worker
+        return self.first_spare + worker
+
+
+class Joined:
+    """
+    Joins traces of this executor.
+
+    :param files: path of each, and what messages call it.
+    :ivar warnings: what is to be said of them beside what the joined trace says, once written.
+    :raises mddag_executor.trace.TraceError: when one is no trace.
+    :raises ReplayError: when they are not of one run.
+    """
+
+    def __init__(self, files: Sequence[tuple[str, str]]) -> None:
+        self._parts = [_Part(i, path, name) for i, (path, name) in enumerate(files)]
+        first = self._parts[0]
+        self.head, self.name = first.head, ', '.join(part.name for part in self._parts)
+        self.task_set = declared(first.head, first.name)
+        self.warnings: list[str] = []
+        workers = spare = 0
+        for part in self._parts:
+            if part.head.yaml != self.head.yaml:
+                raise ReplayError(
+                    part.name, f'it was recorded with another declaration than {first.name}',
+                    'give the traces of one run')
+            part.first_worker = workers
+            workers += part.head.workers
+        for part in self._parts:
+            part.first_spare = workers + spare
+            spare += part.head.workers
+            if abs(part.clock - first.clock) < SAME_CLOCK:
+                part.shift = first.clock - part.clock
+        if any(abs(part.clock - first.clock) >= SAME_CLOCK for part in self._parts):
+            self.warnings.append(
+                f'{self.name}: they are of several machines, whose clocks are taken as '
+                'synchronised')
+        self._workers = workers
+        #: Which worker is of which process: by the last word of its trace's name.
+        self.worker_names = [
+            f'{os.path.basename(part.name).removesuffix(".mcap").rpartition(".")[2]} {worker}'
+            for part in self._parts for worker in range(part.head.workers)]
+        # of each DAG: releases with their numbers, and in which parts they have been seen
+        self._releases: list[deque[tuple[int, int, set[int]]]] = [
+            deque(maxlen=_KEPT) for _ in self.task_set.dags]
+        self._next = [0] * len(self.task_set.dags)
+        self._legs = [[max(1, len(legs_of(v, dag.vertices))) for v in dag.vertices]
+                      for dag in self.task_set.dags]
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """
+        Write the joined trace.
+
+        :raises mddag_executor.trace.TraceError: when that cannot be, or one cannot be read.
+        """
+        head = self.head
+        begin = min(part.head.time + part.shift for part in self._parts)
+        judges_from = max(part.judges_from + part.shift * (part.judges_from > 0)
+                          for part in self._parts)
+        end = 0
+        with TraceFile(path) as file:
+            file.add(TASK_SET, begin, 0, 0, head.yaml, head.file, head.policy, self._workers,
+                     head.default_deadline, head.max_active_jobs, head.preemptive, head.cpus)
+            file.add(_INIT, begin, 0, 0, self._parts[0].clock, 'jazzy')
+            if judges_from:
+                file.add(_JUDGE_FROM, begin, 0, 0, judges_from)
+            streams = [part.events() for part in self._parts]
+            for part, event in heapq.merge(*streams, key=lambda each: int(each[1][1])):
+                if event[0] == _SHUTDOWN:
+                    end = max(end, event[4])
+                elif event[0] not in (TASK_SET, _INIT, _JUDGE_FROM):
+                    told = self._told(part, event)
+                    if told is not None:
+                        end = max(end, event[1])
+                        file.add(*told)
+            if any(part.end is not None for part in self._parts):
+                file.add(_SHUTDOWN, end, 0, 0, end)
+        self._say(end)
+
+    def _told(self, part: _Part, event: Event) -> Event | None:
+        """Return an event as it is in the joined trace, None where it is not."""
+        name = event[0]
+        if name == _HOSTED:
+            return self._hosted(part, event)
+        if name == _RELEASE:
+            return self._released(part, event)
+        if name not in _OF_DAG:
+            return event
+        fields = [field for field, _ in EVENTS[name].fields]
+        at_dag, at_job = 4 + fields.index('dag'), 4 + fields.index('job')
+        number = part.numbers.get((event[at_dag], event[at_job]))
+        if number is None:
+            return event if event[at_dag] < 0 else None
+        job = event[at_dag], number
+        if name == _COMPLETE and job in part.open:
+            part.open[job] -= 1
+            if part.open[job] <= 0:
+                del part.open[job]
+        elif name in _ENDS:
+            part.open.pop(job, None)
+        return (*event[:at_job], number, *event[at_job + 1:])
+
+    def _hosted(self, part: _Part, event: Event) -> Event | None:
+        dag, text = event[4:6]
+        if not 0 <= dag < len(self.task_set.dags):
+            return event
+        part.hosted[dag] = {int(word) for word in text.split(',') if word.isdecimal()}
+        vertices = set().union(*(each.hosted.get(dag, ()) for each in self._parts))
+        return (*event[:5], ','.join(map(str, sorted(vertices))))
+
+    def _released(self, part: _Part, event: Event) -> Event | None:
+        dag, job, release = event[4:7]
+        if not 0 <= dag < len(self.task_set.dags):
+            return event
+        found = self._find(self.task_set.dags[dag], release, part.place)
+        told = None
+        if found is None:
+            number = self._next[dag]
+            self._next[dag] += 1
+            self._releases[dag].append((release, number, {part.place}))
+            told = (*event[:5], number, release)
+        else:
+            number = found[1]
+            found[2].add(part.place)
+        part.numbers[dag, job] = number
+        here = part.hosted.get(dag, range(len(self._legs[dag])))
+        part.open[dag, number] = sum(self._legs[dag][v] for v in here if v < len(self._legs[dag]))
+        return told
+
+    def _find(self, dag: Dag, release: int, place: int) -> tuple[int, int, set[int]] | None:
+        """Return the job of a release that another process has told of (rule 3)."""
+        stamped = dag.release_from == 'header_stamp'
+        best = None
+        for known in reversed(self._releases[dag.index]):
+            if place in known[2]:
+                continue
+            away = release - known[0]
+            if abs(away) <= SAME_RELEASE:
+                return known
+            if stamped and best is None and 0 < away < dag.period_ns:
+                best = known
+            if away > dag.period_ns:
+                break
+        return best
+
+    def _say(self, end: int) -> None:
+        """Say what is missing of each trace, and what ended with its process (rule 5)."""
+        for part in self._parts:
+            path = part.reader.path
+            self.warnings += [
+                part.name + text[len(path):] if text.startswith(path) else text
+                for text in part.reader.warnings]
+            if part.end is not None:
+                continue
+            jobs = [f'{self.task_set.dags[dag].name} {number}' for dag, number in part.open]
+            self.warnings.append(
+                f'{part.name}: its end is not recorded (the process was killed, or the trace is '
+                f'cut): it ends {max(0, end - part.last) / 1e9:.3f} s before the run; '
+                + (f'{counted(len(jobs), "job")} ended with it: {listed(jobs)}' if jobs
+                   else 'no job was open in it'))

@@ -1,0 +1,176 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""The traces of several processes as one run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.core.tally import counts
+from mddag_executor.replay import replay, ReplayError, reschedule
+from mddag_executor.trace import TraceFile
+import pytest
+
+MS = 1_000_000
+BASE = 10 ** 18
+GRAPH = """
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: tick, timer: 10ms, publishes: [/x], dag: chain}]}
+  - {node: /b, callbacks: [{name: take, subscription: /x, deadline: 8ms}]}
+processes: {up: [/a], down: [/b]}
+"""
+STAMPED = GRAPH.replace('dag: chain', 'dag: chain, release_from: header_stamp')
+ADDRESS = 0x7F00_0000_0010
+
+
+class Trace:
+    """The trace of a process that runs one vertex; its clock is late by some ns."""
+
+    def __init__(self, folder: Path, name: str, vertex: int, late: int = 0, graph: str = GRAPH,
+                 judges_from: int = 0) -> None:
+        self.path = str(folder / f'run.{name}.mcap')
+        self.file = TraceFile(self.path)
+        self.vertex, self.late, self.pid, self.job = vertex, late, 100 + vertex, 0
+        self.add('task_set', 0, graph, 'graph.yaml', 'rad', 2, 100 * MS, 64, False, 2)
+        self.add('caret_init', 0, BASE - late, 'jazzy')
+        self.add('rclcpp_callback_register', 0, ADDRESS, f'callback of {name}')
+        self.add('hosted', 0, 0, str(vertex))
+        self.add('judge_from', 0, BASE + judges_from - late)
+
+    def add(self, name: str, at: int, *fields: Any) -> None:
+        self.file.add(name, BASE + at - self.late, self.pid, 1, *fields)
+
+    def runs(self, release: int, start: int, took: int = MS, completes: bool = True) -> None:
+        """Run its vertex for the next job; times in ns since the base."""
+        t = BASE - self.late
+        self.add('job_release', start, 0, self.job, t + release)
+        self.add('dispatch', start, ADDRESS, 0, self.vertex, self.job, 0, t + start,
+                 t + release + 8 * MS)
+        self.add('callback_start', start, ADDRESS, False)
+        if completes:
+            end = start + took
+            self.add('callback_end', end, ADDRESS)
+            self.add('complete', end, ADDRESS, 0, self.vertex, self.job, True, t + end, 0, took,
+                     True)
+        self.job += 1
+
+    def end(self, at: int | None) -> str:
+        if at is not None:
+            self.add('shutdown', at, BASE + at - self.late)
+        self.file.finish()
+        return self.path
+
+
+def sink(result: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = result['dags']['chain']['sinks']['/b:take']
+    return found
+
+
+@pytest.mark.parametrize('late', [0, 7 * MS])
+def test_a_job_goes_on_in_the_other_trace(tmp_path: Path, late: int) -> None:
+    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1, late)
+    for i, takes in enumerate((2, 2, 7)):
+        release = i * 10 * MS
+        up.runs(release, release + MS)
+        down.job += i == 0  # its jobs have other numbers
+        down.runs(release + 5, release + 3 * MS, takes * MS)  # its clock was read anew
+    outcome = replay([up.end(100 * MS), down.end(90 * MS)])
+    result = outcome.result()
+    assert result['warnings'] == []
+    assert result['dags']['chain']['jobs'] == 3
+    verdicts = counts(sink(result))
+    assert (verdicts.due, verdicts.in_time, verdicts.late) == (3, 2, 1)
+    assert sink(result)['response_ns'] == {
+        'min': 5 * MS, 'median': 5 * MS, 'p99': 10 * MS, 'max': 10 * MS}
+    breakdown = sink(result)['breakdown']
+    assert breakdown['mean']['transport_ns'] == MS, breakdown
+    assert result['workers'] == 4 and set(result['callbacks']) == {'/a:tick', '/b:take'}
+    assert outcome.run.worker_names == ['up 0', 'up 1', 'down 0', 'down 1']
+    assert result['recording']['shut_down'] and result['recording']['end_ns'] == BASE + 100 * MS
+
+
+def test_a_stamp_is_taken_later_than_its_timer_was_due(tmp_path: Path) -> None:
+    up, down = (Trace(tmp_path, name, i, graph=STAMPED) for i, name in enumerate(('up', 'down')))
+    for i in range(3):
+        release = i * 10 * MS
+        up.runs(release, release + MS)
+        down.runs(release + MS + 1000, release + 3 * MS)
+    down.runs(55 * MS, 56 * MS)  # of a job that the other trace does not have
+    result = replay([up.end(100 * MS), down.end(100 * MS)]).result()
+    assert result['dags']['chain']['jobs'] == 4
+    assert sink(result)['response_ns']['max'] == 4 * MS
+    assert counts(sink(result)).in_time == 4
+
+
+def test_what_follows_without_a_stamp_is_another_job(tmp_path: Path) -> None:
+    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
+    up.runs(0, MS)
+    down.runs(2 * MS, 3 * MS)
+    result = replay([up.end(100 * MS), down.end(100 * MS)]).result()
+    assert result['dags']['chain']['jobs'] == 2
+    verdicts = counts(sink(result))
+    assert (verdicts.due, verdicts.in_time, verdicts.late) == (2, 1, 1)
+
+
+def test_a_process_that_was_killed_is_said_with_the_jobs_that_ended_with_it(
+        tmp_path: Path) -> None:
+    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
+    for i in range(4):
+        up.runs(i * 10 * MS, i * 10 * MS + MS)
+    down.runs(0, 3 * MS)
+    down.runs(10 * MS, 13 * MS, completes=False)
+    result = replay([up.end(100 * MS), down.end(None)]).result()
+    warning, = result['warnings']
+    assert warning.startswith(f'{tmp_path}/run.down.mcap: its end is not recorded')
+    assert warning.endswith('it ends 0.087 s before the run; 1 job ended with it: chain 1')
+    verdicts = counts(sink(result))
+    assert (verdicts.due, verdicts.in_time, verdicts.late) == (4, 1, 3)
+
+
+def test_jobs_are_judged_once_all_judge(tmp_path: Path) -> None:
+    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1, judges_from=5 * MS)
+    for i in range(3):
+        up.runs(i * 10 * MS, i * 10 * MS + MS)
+        down.runs(i * 10 * MS, i * 10 * MS + 3 * MS)
+    assert counts(sink(replay([up.end(90 * MS), down.end(90 * MS)]).result())).due == 2
+
+
+def test_a_joined_run_is_rescheduled(tmp_path: Path) -> None:
+    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
+    for i in range(3):
+        up.runs(i * 10 * MS, i * 10 * MS + MS)
+        down.runs(i * 10 * MS, i * 10 * MS + 3 * MS)
+    outcome = reschedule([up.end(90 * MS), down.end(90 * MS)], workers=1)
+    assert counts(sink(outcome.result())).in_time == 3
+
+
+def test_traces_of_different_runs_are_refused(tmp_path: Path) -> None:
+    up = Trace(tmp_path, 'up', 0).end(MS)
+    other = Trace(tmp_path, 'other', 0, graph=GRAPH.replace('8ms', '9ms')).end(MS)
+    with pytest.raises(ReplayError, match='another declaration than'):
+        replay([up, other])
+    empty = str(tmp_path / 'empty.mcap')
+    with TraceFile(empty) as file:
+        file.add('callback_start', 5, 1, 1, 7, False)
+    with pytest.raises(ReplayError, match='not recorded by this executor'):
+        replay([up, empty])
+
+
+def test_the_command_takes_several_traces(tmp_path: Path, mddag: Any) -> None:
+    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
+    up.runs(0, MS)
+    down.runs(0, 3 * MS)
+    paths = up.end(90 * MS), down.end(90 * MS)
+    graph = tmp_path / 'graph.yaml'
+    graph.write_text(GRAPH.replace('8ms', '3ms'))
+    assert '1 in time' in mddag('replay', *paths).stdout
+    assert '1 late' in mddag('replay', *paths, graph).stdout
+    assert 'misses' in mddag('explain', *paths, graph).stdout
+    out = tmp_path / 'out.csv'
+    assert mddag('export', *paths, '-o', out).returncode == 0
+    assert [line.split(',')[2:4] for line in out.read_text().splitlines()[1:]] == [
+        ['/a:tick', '0'], ['/b:take', '2']]
+    refused = mddag('replay', paths[0], '-', paths[1])
+    assert refused.returncode == 2 and 'standard input' in refused.stderr
