@@ -77,8 +77,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '(default: 0.3,0.6,0.8 for autoware, as declared for reference-system)')
     add('--graph', metavar='FILE', help='a declaration to take instead of the one that ships '
         "with the package ('-': standard input)")
-    add('--bodies', choices=('sleep', 'spin'),
-        help='how the synthetic callbacks execute (default: sleep)')
+    add('--bodies', choices=('sleep', 'spin', 'native', 'mixed'),
+        help='how the synthetic callbacks execute: they sleep, compute in Python, compute without '
+        'the interpreter lock, or, drawn for each, do one of the three (default: sleep)')
     add('--topics', type=options.positive_int, metavar='N',
         help='with --load topics: how many (default: both 20 at 50 Hz and 50 at 100 Hz)')
     add('--rate', type=options.positive_float, metavar='HZ',

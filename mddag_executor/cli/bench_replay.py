@@ -36,11 +36,17 @@ mddag bench replay
 mddag bench replay --events 10000000 --json replay.json
 mddag bench replay --trace run.mcap
 mddag bench replay --accuracy --utilisation 0.3,0.6,0.8 --seconds 10
-mddag bench replay --accuracy --utilisation 0.6 --workers 7,4"""
+mddag bench replay --accuracy --utilisation 0.6 --workers 7,4
+mddag bench replay --accuracy --bodies spin --seconds 20"""
 
 MEDIAN_LIMIT, P99_LIMIT = 0.05, 0.15
-_FEW = 30
-"""Sinks with fewer jobs are shown, but their quantiles say little."""
+_FEW = 100
+"""Sinks with fewer jobs are left out: their quantiles say little."""
+_UTILISATION = {'sleep': [0.3, 0.6, 0.8]}
+_COMPUTING = [0.05, 0.08]
+"""Callbacks that compute have one interpreter: 0.08 of seven workers is 0.56 of a core."""
+_WORKERS = {'sleep': [7]}
+_OTHERS = [7, 1, 2]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,14 +61,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser, 3, 'measure R times in turn: the best of speeds, the median of errors')
     add('--accuracy', action='store_true',
         help='record live runs, reschedule them, and compare the response times of each sink')
-    add('--utilisation', type=options.list_of(options.positive_float),
-        default=[0.3, 0.6, 0.8], metavar='U[,U…]',
-        help='with --accuracy: of the live runs (default: 0.3,0.6,0.8)')
+    add('--bodies', choices=('sleep', 'spin', 'native', 'mixed'), default='sleep',
+        help='with --accuracy: how the callbacks of the live runs execute (default: sleep)')
+    add('--utilisation', type=options.list_of(options.positive_float), metavar='U[,U…]',
+        help='with --accuracy: of the live runs (default: 0.3,0.6,0.8 for callbacks that sleep, '
+        'else 0.05,0.08)')
     add('--seconds', type=options.positive_float, default=30.0, metavar='S',
         help='with --accuracy: how long each live run is (default: 30)')
-    add('--workers', type=options.list_of(options.positive_int), default=[7], metavar='M[,M…]',
+    add('--workers', type=options.list_of(options.positive_int), metavar='M[,M…]',
         help='with --accuracy: of the live runs; the runs with further numbers are predicted '
-        'from the recording with the first (default: 7)')
+        'from the recording with the first (default: 7 for callbacks that sleep, else 7,1,2)')
     options.add_workload(parser)
     options.add_json(parser)
 
@@ -77,6 +85,8 @@ def main(args: argparse.Namespace) -> int:
     common.check_output(args.json)
     if args.accuracy and args.trace:
         raise UsageError('--accuracy: it records its own runs: leave --trace out')
+    args.utilisation = args.utilisation or _UTILISATION.get(args.bodies, _COMPUTING)
+    args.workers = args.workers or _WORKERS.get(args.bodies, _OTHERS)
     with tempfile.TemporaryDirectory(prefix='mddag-bench-') as folder:
         result = _accuracy(args, folder) if args.accuracy else _speed(args, folder)
     if common.write_result(args, result):
@@ -143,7 +153,7 @@ def _accuracy(args: argparse.Namespace, folder: str) -> dict[str, Any]:
                     _record(graph, args, utilisation, workers, path)
                     first = first or path
                     runs.append(_compared(first, path, utilisation, workers, args.workers[0]))
-    return {'seconds': args.seconds, 'repeat': args.repeat, 'runs': runs,
+    return {'bodies': args.bodies, 'seconds': args.seconds, 'repeat': args.repeat, 'runs': runs,
             'summary': _summaries(runs)}
 
 
@@ -154,7 +164,7 @@ def _record(
     # The load is what the first number of workers would be utilised by: it stays the same.
     share = utilisation * args.workers[0] / workers
     done = subprocess.run(
-        [sys.executable, '-m', 'mddag_executor', 'run', graph, '--synthetic', 'sleep',
+        [sys.executable, '-m', 'mddag_executor', 'run', graph, '--synthetic', args.bodies,
          '--utilisation', repr(share), '--workers', str(workers), '--duration',
          f'{args.seconds:g}s', '--trace', path],
         capture_output=True, text=True, check=False, timeout=args.seconds + 120)
@@ -193,6 +203,8 @@ def _summaries(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
             found.setdefault(key, []).append(row)
     rows = []
     for key, group in found.items():
+        if statistics.median(row['jobs'] for row in group) < _FEW:
+            continue
         median = {name: statistics.median(row[name] for row in group) for name in (
             'jobs', 'recorded_median', 'predicted_median', 'ideal_median', 'recorded_p99',
             'predicted_p99', 'median_error', 'p99_error')}
@@ -226,7 +238,7 @@ def _show_accuracy(result: dict[str, Any]) -> None:
               format_ns(round(row['ideal_median'])),
               *(format_ns(round(row[f'{side}_p99'])) for side in ('recorded', 'predicted')),
               f'{row["p99_error"]:+.1%}'.replace('%', ' %'),
-              '' if row['within'] else 'few jobs' if row['jobs'] < _FEW else 'worse')
+              '' if row['within'] else 'worse')
              for row in rows]))
         within = sum(row['within'] for row in rows)
         print(f'{within} of {len(rows)} sinks within {MEDIAN_LIMIT:.0%} of the median and '

@@ -69,9 +69,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'or module:NodeClass; arguments for it follow in the same word, as '
         "'pkg/exe --rate 2'; repeat it for more nodes")
     what.add_argument(
-        '--synthetic', choices=('sleep', 'spin'),
-        help='make the nodes from the declaration; their callbacks sleep, or take CPU, for the '
-        'declared execution times')
+        '--synthetic', choices=('sleep', 'spin', 'native', 'mixed'),
+        help='make the nodes from the declaration; for the declared execution times their '
+        'callbacks sleep, compute in Python, compute without the interpreter lock, or, drawn for '
+        'each callback, do one of the three')
     add('--utilisation', type=options.positive_float, metavar='U',
         help='with --synthetic: scale the execution times to this normalised utilisation, '
         'sum(C/T)/workers')

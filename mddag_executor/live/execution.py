@@ -14,13 +14,17 @@ experiment: whether its deadlines can be met at all depends on the draw
 ``sleep`` stands for work outside of Python (a GPU, a C++ library that releases the interpreter
 lock): it takes a worker but no CPU, so the CPU that the process does take is overhead.
 ``spin`` takes CPU and the interpreter lock: all bodies together have at most one core.
+``native`` takes CPU without the lock, as numpy or OpenCV.  ``mixed`` draws for each callback which
+of the three it does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+import hashlib
 import math
+import random
 import statistics
 import time
 from typing import Literal
@@ -28,10 +32,12 @@ from typing import Literal
 from mddag_executor.errors import MddagError
 from mddag_executor.simulate.workload import draw_execution_times
 from mddag_executor.simulate.workload import utilisation as normalised
-from msg_graph import Dag, TaskSet
+from msg_graph import Dag, TaskSet, Vertex
 from msg_graph.analysis import path_lengths
 
-Mode = Literal['sleep', 'spin']
+Body = Literal['sleep', 'spin', 'native']
+Mode = Literal[Body, 'mixed']
+BODIES: tuple[Body, ...] = ('sleep', 'spin', 'native')
 
 Emulate = Callable[[int], None]
 """
@@ -67,7 +73,7 @@ class ExecutionPlan:
     :param seed: the same seed gives the same draw, on every machine and Python version.
     :param utilisation: normalised utilisation to scale to; None takes the draw as it is.
     :param workers: the number of workers that the utilisation is normalised to.
-    :param mode: ``sleep`` or ``spin``.
+    :param mode: one of ``BODIES``, or ``mixed``.
     :raises PlanError: when a utilisation is asked for and no execution time is declared.
     """
 
@@ -106,6 +112,12 @@ class ExecutionPlan:
     def execution_ns(self, dag: int, vertex: int) -> int:
         """Return the execution time of a vertex, by DAG index and local index, ns."""
         return self._times[dag][vertex]
+
+    def body(self, vertex: Vertex) -> Body:
+        """Return what the execution of a vertex does."""
+        if self.mode == 'mixed':
+            return random.Random(f'{self.seed} {vertex.callback.key}').choice(BODIES)
+        return self.mode
 
     def critical_path_ns(self, dag: Dag) -> list[int]:
         """Return the longest path from the source to the end of each vertex, by index, ns."""
@@ -172,6 +184,29 @@ def spinner() -> Emulate:
     return emulate
 
 
-def emulator(mode: Mode) -> Emulate:
-    """Return what executes a body in this mode."""
-    return sleeper() if mode == 'sleep' else spinner()
+def native() -> Emulate:
+    """
+    Make a function that takes about that much CPU time in C, without the interpreter lock.
+
+    How much C does in a time is measured first (some milliseconds).
+    """
+    def compute(iterations: int) -> None:
+        hashlib.pbkdf2_hmac('sha256', b'password', b'salt', iterations)
+
+    def taken(iterations: int) -> int:
+        before = time.thread_time_ns()
+        compute(iterations)
+        return time.thread_time_ns() - before
+
+    few, many = (min(taken(n) for _ in range(5)) for n in (1, 2000))
+    each = max(1, many - few) / 1999
+
+    def emulate(execution_ns: int) -> None:
+        compute(max(1, round((execution_ns - few) / each)))
+
+    return emulate
+
+
+def emulator(body: Body) -> Emulate:
+    """Return what executes a body."""
+    return sleeper() if body == 'sleep' else spinner() if body == 'spin' else native()

@@ -201,8 +201,9 @@ def _throughput(
     cpu = end.cpu_ns - start.cpu_ns
     # CPU that the emulation itself takes is execution, not overhead.
     times = [plan.execution_ns(v.dag, v.index) for v in ledger.task_set.vertices]
-    cpu -= sum(n * t for n, t in zip(counts, times)
-               if plan.mode == 'spin' or t <= ledger.busy_below_ns)
+    bodies = [plan.body(v) for v in ledger.task_set.vertices]
+    cpu -= sum(n * t for v, (n, t) in enumerate(zip(counts, times))
+               if bodies[v] != 'sleep' or t <= ledger.busy_below_ns)
     seconds = (end.at_ns - start.at_ns) / 1e9
     return {
         'callbacks': callbacks,

@@ -132,8 +132,9 @@ class SyntheticWorkload:
         self._joins: dict[str, list[Join]] = {}
         self._current_job = current_job
         self._context = context
-        self._emulate = emulator(plan.mode)
-        self.ledger.busy_below_ns = getattr(self._emulate, 'busy_below_ns', 0)
+        self._emulate = {body: emulator(body) for body in sorted(
+            {plan.body(vertex) for vertex in task_set.vertices})}
+        self.ledger.busy_below_ns = getattr(self._emulate.get('sleep'), 'busy_below_ns', 0)
         # Timers on the steady clock: steps of the system's clock move no release.
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._nodes: dict[str, Node] = {}
@@ -269,7 +270,7 @@ class SyntheticWorkload:
             vertex=vertex, sender=f'{name}#{vertex.index}',
             senders=senders or [SENSOR + topic for topic in vertex.callback.topics],
             execution_ns=self.plan.execution_ns(vertex.dag, vertex.index),
-            publishers=publishers, emulate=self._emulate,
+            publishers=publishers, emulate=self._emulate[self.plan.body(vertex)],
             durations=self.ledger.durations[vertex.dag][vertex.index],
             completions=completions if vertex.deadline_ns is not None else None,
             clock_offset_ns=self.ledger.clock_offset_ns)

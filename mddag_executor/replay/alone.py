@@ -14,7 +14,7 @@ explains is its own.
   waiting was for the interpreter.
 * One that *waits* needs the interpreter when it goes on, and publishes.  If somebody held it all
   the time until then it had to wait for a switch interval, or since that one had begun.
-* One that *computes without the lock* shared the CPUs with all that computed, if they were more.
+* One that *computes without the lock* waited for a CPU if hardly any of them was idle meanwhile.
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ from typing import Any
 from mddag_executor.replay.happenings import Ints
 from mddag_executor.simulate.machine import BRIEF_NS, SWITCH_NS
 import numpy as np
+
+FULL = 0.9
+"""CPUs that are busy for so much of a time have nothing left."""
 
 
 def alone(start: Ints, took: Ints, cpu: Ints, held: Ints, cpus: int) -> Ints:
@@ -46,15 +49,15 @@ def alone(start: Ints, took: Ints, cpu: Ints, held: Ints, cpus: int) -> Ints:
         beside = others(end) - others(start)
         mine = np.minimum(waited, np.maximum(0, beside - cpu))
         result[holds] -= mine[holds]
-        _take_back_last_wait(result, known & ~holds, end, cpu, waited, start[holds], end[holds])
+        after = np.where(cpu >= waited, np.minimum(cpu, BRIEF_NS), cpu - cpu // 4)
+        last = np.minimum(held_for(end - after, start[holds], end[holds]), SWITCH_NS)
+        others_do = known & ~holds
+        result[others_do] -= np.minimum(last, waited)[others_do]
     native = known & ~holds & (2 * cpu >= took)
     if cpus > 0 and native.any():
         others = _computed(start[known], end[known], cpu[known])
-        computing = (others(end) - others(start)) / np.maximum(took, 1)
-        alone_share = np.minimum(1.0, cpus / np.maximum(computing, 1e-9))
-        shared = np.rint(took * (1 - alone_share)).astype(np.int64)
-        mine = np.minimum(result - cpu, np.maximum(0, shared))
-        result[native] -= np.maximum(0, mine)[native]
+        native &= others(end) - others(start) >= FULL * cpus * took
+        result[native] = cpu[native]
     return result
 
 
@@ -73,18 +76,17 @@ def _computed(start: Ints, end: Ints, cpu: Ints) -> Any:
     return until
 
 
-def _take_back_last_wait(
-    result: Ints, which: Any, end: Ints, cpu: Ints, waited: Ints, begins: Ints, ends: Ints
-) -> None:
-    """Take back from some executions what they waited for the interpreter before they went on."""
+def held_for(when: Ints, begins: Ints, ends: Ints) -> Ints:
+    """
+    Return for how long somebody had held the interpreter without a pause, 0 where nobody did.
+
+    :param begins: of the executions that hold it; ``ends``: of the same.
+    """
     order = np.argsort(begins, kind='stable')
     begins, ends = begins[order], np.maximum.accumulate(ends[order])
     first = np.r_[True, begins[1:] > ends[:-1]]     # of each time without a pause
     begins = begins[first]
     ends = ends[np.r_[np.flatnonzero(first)[1:] - 1, len(first) - 1]]
-    after = np.where(cpu >= waited, np.minimum(cpu, BRIEF_NS), cpu - cpu // 4)
-    goes_on = end - after
-    place = np.searchsorted(begins, goes_on, 'left') - 1
-    inside = which & (place >= 0) & (ends[place] >= goes_on)
-    since = np.where(inside, goes_on - begins[place], 0)
-    result -= np.minimum(np.minimum(since, SWITCH_NS), waited)
+    place = np.searchsorted(begins, when, 'left') - 1
+    inside = (place >= 0) & (ends[place] >= when)
+    return np.where(inside, when - begins[place], 0)

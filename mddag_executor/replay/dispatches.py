@@ -14,6 +14,10 @@ for one.  Where they are no more than the workers at the instant from which an e
 it could have started at once.  (It may still have waited: a worker that is about to end is left
 to take what it has started itself.)  Else it had to wait for the worker that took it, until that
 had ended what it did before.
+
+One that holds the interpreter also had to wait until the last one before it that did so had ended.
+One that starts while another holds it waits for a switch interval at most, with whatever a thread
+does before it runs a callback: that is the interpreter's time, not the executor's.
 """
 
 from __future__ import annotations
@@ -36,6 +40,7 @@ class Dispatches:
         # from when it was free, and from when its worker was, too
         self._free, self._worker = array('q'), array('q')
         self._start, self._end = array('q'), array('q')
+        self._holding: list[int] = []
 
     def add(self, worker: int, group: int | None, ready: int, start: int, end: int) -> int:
         """
@@ -58,6 +63,10 @@ class Dispatches:
         self._end.append(end)
         return len(self._start) - 1
 
+    def holds(self, number: int) -> None:
+        """Take in that an execution holds the interpreter."""
+        self._holding.append(number)
+
     def late(self) -> Any:
         """Return by number how late it was dispatched, ns, as an array."""
         import numpy as np
@@ -67,4 +76,13 @@ class Dispatches:
         n_free, n_ended = (
             np.searchsorted(np.sort(times), free, 'right') for times in (free, end))
         could = np.where(n_free - n_ended <= self._n_workers, free, worker)
+        if self._holding:
+            from mddag_executor.replay.alone import held_for
+            from mddag_executor.simulate.machine import SWITCH_NS
+            begins, ends = start[self._holding], end[self._holding]
+            before = np.sort(ends)
+            place = np.searchsorted(before, begins, 'right') - 1
+            last = np.where(place >= 0, before[place], could[self._holding])
+            could[self._holding] = np.maximum(could[self._holding], last)
+            could = could + np.minimum(held_for(start, begins, ends), SWITCH_NS)
         return np.maximum(0, start - could)

@@ -14,6 +14,8 @@ Theory of operation
 * The execution time of a vertex in a job is what its execution took, the pieces of a coroutine
   added up.  Where it did not complete (the job was dropped, expired, or open at the end) it is the
   median of the callback's executions in the recording, or else the declared mean.
+* A job that expired when it was released never ran: its timer was noticed later than its next
+  period.  That depends on the machine, not on the scheduler, so it is skipped again.
 * Of a sync vertex that is the leg that made it whole.  The legs before it, which only keep their
   message, load the workers as what no DAG declares does: each piece is a job of the undeclared
   DAG, ready when it was in the recording.  Callback groups of undeclared callbacks are not kept.
@@ -75,6 +77,7 @@ class RecordedLoad(NamedTuple):
     failed: frozenset[tuple[int, int]] = frozenset()
     computed: Sequence[int] = ()
     dispatches: Sequence[int] = ()
+    skipped: frozenset[tuple[int, int]] = frozenset()
 
 
 class _Jobs:
@@ -141,6 +144,7 @@ class LoadBuilder(Observer):
         self._untaken: tuple[int, int, int] | None = None
         self._dispatches = Dispatches(n_workers)
         self._failed: set[tuple[int, int]] = set()
+        self._skipped: set[tuple[int, int]] = set()
         #: By global vertex: the address of the callback that ran as it.
         self.callback_of: dict[int, int] = {}
 
@@ -205,6 +209,8 @@ class LoadBuilder(Observer):
         jobs.took[place] = busy
         jobs.cpu[place] = cpu
         jobs.held[place] = held
+        if held and jobs.dispatch[place] >= 0:
+            self._dispatches.holds(jobs.dispatch[place])
         jobs.start[place] = start
         jobs.end[place] = ended
         if several:
@@ -218,6 +224,13 @@ class LoadBuilder(Observer):
         for edge, end in zip(edges, ends):
             if end < max(ends):
                 jobs.arrived[row * jobs.n_edges + edge] = end
+
+    def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
+        """Keep what was skipped."""
+        jobs = self._jobs[dag]
+        row = jobs.row.get(job)
+        if not aborted and row is not None and jobs.noticed[row] == now:
+            self._skipped.add((dag, row))
 
     def failed(self, dag: int, vertex: int, job: int, now: int) -> None:
         """Keep what failed: it does so again."""
@@ -249,6 +262,7 @@ class LoadBuilder(Observer):
         for dag, jobs in zip(self._task_set.dags, self._jobs):
             bases.append(len(costs))
             took = np.array(jobs.took, dtype=np.int64).reshape(-1, jobs.size)
+            took[[row for of, row in self._skipped if of == dag.index]] = 0
             missing = took < 0
             estimated += int(missing.sum())
             for vertex in dag.vertices:
@@ -278,7 +292,7 @@ class LoadBuilder(Observer):
             [jobs.numbers for jobs in self._jobs], demand, executions, estimated, list(unknown),
             transports, usual if len(measured) else None, transport,
             frozenset(self._failed), computed if max(computed, default=-1) >= 0 else (),
-            dispatches)
+            dispatches, frozenset(self._skipped))
 
     def _take_back(self) -> None:
         """Make the execution times those that the executions would have taken alone."""

@@ -3,7 +3,7 @@
 """
 Replay rescheduled: what the core would have done with the recorded releases.
 
-The recorded load (see ``load``) goes through the core in virtual time (see ``timed``).  What
+The recorded load (see ``load``) goes through the core in virtual time.  What
 became of a job in the recording does not matter, only when it was released, how long its callbacks
 took, and how long the executor took to notice, to dispatch and to carry messages.
 """
@@ -58,7 +58,8 @@ class How(NamedTuple):
         state.scalars[JUDGE_FROM] = self.judge_from
         load = work.load
         stops = bool(load.holds) or self.cpus is not None
-        deliveries = Deliveries(tables, state, policy.key, work.transports, work.failed, stops)
+        deliveries = Deliveries(
+            tables, state, policy.key, work.transports, work.failed, stops, work.skipped)
         machine = Machine(tables, state, load, self.cpus, work.computed,
                           bool(work.computed and load.holds), deliveries)
         ended = engine.run(tables, state, policy.key, load, end, stop_at_first_miss, log,

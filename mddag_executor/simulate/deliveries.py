@@ -60,17 +60,20 @@ class Deliveries:
     :param state: of the core, empty, made with ``propagate=2``.
     :param failed: the vertices and jobs whose executions fail.
     :param stops: whether executions may stand still.
+    :param skipped: the DAGs and jobs whose sources do not run: they expire at once.
     """
 
     def __init__(
         self, tables: Tables, state: State, key: KeyFunction, transports: Transports,
         failed: Set[tuple[int, int]] = frozenset(), stops: bool = False,
+        skipped: Set[tuple[int, int]] = frozenset(),
     ) -> None:
         self._t = tables
         self._s = state
         self._key = key
         self._transports = transports
         self._failed = failed
+        self.skipped = skipped
         self._first_edge = [tables.first_successor[v] for v in tables.first_vertex]
         self._early = not state.scalars[PREEMPTIVE]
         # (time, order, slot, job, vertex that the message starts)

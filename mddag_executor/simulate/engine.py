@@ -10,9 +10,10 @@ one instant first the completions are told to the core, workers in ascending ord
 releases in DAG order, then the core dispatches until it has nothing left to do (design section 9).
 A completion at the horizon counts; nothing is released or dispatched there any more.
 
-Where messages take time or executions fail, ``deliveries`` ends the executions, and the messages
-of an instant arrive between its completions and its releases.  Where CPUs are few or executions
-hold the interpreter, ``machine`` tells after each instant when those that run finish.
+Where messages take time, executions fail or sources skip jobs, ``deliveries`` ends the executions,
+and the messages of an instant arrive between its completions and its releases.  Where CPUs are few
+or executions hold the interpreter, ``machine`` tells after each instant when those finish that
+run.
 
 A job's deadlines count from its release, which is the time at which its source becomes ready,
 unless ``releases`` says that it was earlier (a sensor's message that arrived later).
@@ -125,7 +126,7 @@ def run(
         if deliveries is not None:
             deliveries.arrive(now)
         while next_release < n_releases and load.times[next_release] == now:
-            release_load(t, s, key, load, next_release, now)
+            release_load(t, s, key, load, next_release, now, deliveries)
             next_release += 1
         _dispatch(t, s, key, now, finish_at, running, log, deliveries, machine)
         if machine is not None:
@@ -135,7 +136,8 @@ def run(
 
 
 def release_load(
-    t: Tables, s: State, key: KeyFunction, load: Load, i: int, now: int
+    t: Tables, s: State, key: KeyFunction, load: Load, i: int, now: int,
+    deliveries: Deliveries | None,
 ) -> None:
     """Release the i-th job of a load, with the execution times that the load gives it."""
     dag = load.dags[i]
@@ -145,6 +147,10 @@ def release_load(
     if slot < 0:
         add_slot(t, s, dag)
         slot = jobs.release_job(t, s, dag, job, release, now)
+    if deliveries is not None:
+        if (dag, job) in deliveries.skipped:
+            jobs.expire_job(t, s, slot, now)
+            return
     base = s.job_base[slot]
     cost = load.cost_base[dag] + job * load.cost_stride[dag]
     for place in range(t.n_region[dag]):

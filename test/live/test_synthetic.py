@@ -11,7 +11,14 @@ from typing import Any
 
 from mddag_executor.live import current_job
 from mddag_executor.live.bodies import Grid, Join, JOIN_LIMIT, Role
-from mddag_executor.live.execution import ExecutionPlan, PlanError, sleeper, spinner
+from mddag_executor.live.execution import (
+    BODIES,
+    ExecutionPlan,
+    native,
+    PlanError,
+    sleeper,
+    spinner,
+)
 from mddag_executor.live.executor import MultiDeadlineExecutor
 from mddag_executor.live.session import run_synthetic, Session
 from mddag_executor.live.synthetic import SyntheticWorkload
@@ -175,6 +182,25 @@ def test_spinning_takes_cpu_of_its_own_thread_only() -> None:
     for thread in threads:
         thread.join()
     assert len(taken) == 3 and min(taken) >= 30 * MS
+
+
+def test_what_bodies_do(autoware: TaskSet) -> None:
+    """Mixed ones are drawn: the same for the same seed, whatever else there is."""
+    drawn = [[ExecutionPlan(autoware, seed, mode='mixed').body(v) for v in autoware.vertices]
+             for seed in (1, 1, 2)]
+    assert set(drawn[0]) == set(BODIES) and drawn[0] == drawn[1] != drawn[2]
+    assert {ExecutionPlan(autoware, mode='native').body(v) for v in autoware.vertices} == {
+        'native'}
+
+
+def test_native_bodies_take_cpu_time() -> None:
+    emulate = native()
+    start = time.thread_time_ns()
+    emulate(0)
+    short = time.thread_time_ns() - start
+    start = time.thread_time_ns()
+    emulate(20 * MS)
+    assert time.thread_time_ns() - start > 2 * MS + short
 
 
 # --- joins and releases --------------------------------------------------------------------------

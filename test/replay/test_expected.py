@@ -1,6 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Results of version 1.0.0, to the last digit."""
+"""
+Results of version 1.0.0, to the last digit.
+
+But for what was mended since: rescheduled, a job whose timer skipped it is skipped again
+(``virtual_run_rescheduled``).
+"""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from mddag_executor.trace import TraceFile
 from msg_graph import loads, TaskSet
 import pytest
 
-from .helpers import declarations, MS, small, START_TIME, VirtualRun, VPID
+from .helpers import Chances, declarations, MS, small, START_TIME, VirtualRun, VPID
 from .simulated import executions, loose, write_simulated
 
 JOBS = 12
@@ -344,7 +344,7 @@ nodes:
 def test_a_run_with_losses_is_rescheduled_whole(tmp_path: Path, seed: int) -> None:
     """Messages that were lost and jobs that expired do not matter: only releases and times do."""
     path = tmp_path / 'a.mcap'
-    driven = VirtualRun(path, small(), seed, longest=2 * MS)
+    driven = VirtualRun(path, small(), seed, longest=2 * MS, chances=Chances(skipped=0))
     outcome = reschedule(path, workers=8)
     assert outcome.warnings == []
     released = sum(driven.tally.jobs)
@@ -420,3 +420,90 @@ nodes:
         result = reschedule(tmp_path / 'a.mcap', **how).result()
         assert result['deadline_missed'] == late
         assert result['preemptive'] != late
+
+
+def test_what_a_timer_skipped_is_skipped_again(tmp_path: Path) -> None:
+    """A job that expired at its release never ran, and would not have with other workers."""
+    path, text = tmp_path / 'a.mcap', 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, ' \
+        'timer: 10ms, deadline: 10ms, dag: a}]}]'
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
+        for job in range(3):
+            now = START_TIME + (0, 25 * MS, 25 * MS)[job]
+            file.add('job_release', now, 1, 1, 0, job, START_TIME + job * 10 * MS)
+            if job == 1:
+                file.add('expire', now, 1, 1, 0, job)
+                continue
+            file.add('dispatch', now, 1, 10, 9, 0, 0, job, 0, now, 0)
+            file.add('callback_start', now, 1, 10, 9, False)
+            file.add('callback_end', now + MS, 1, 10, 9)
+            file.add('complete', now + MS, 1, 10, 9, 0, 0, job, True, now + MS, 0)
+        file.add('shutdown', START_TIME + 60 * MS, 1, 1, START_TIME + 60 * MS)
+    result = reschedule(path, workers=4).result()
+    sink = result['dags']['a']['sinks']['/n:a']
+    assert (sink['completed'], sink['expired'], sink['late']) == (2, 1, 0)
+    assert (result['executions'], result['estimated_executions']) == (3, 0)
+
+
+def of_python(path: Path, jobs: list[tuple[int, int, int, int, bool]], cpus: int = 2) -> None:
+    """
+    Record jobs of DAGs of one timer callback each, as they ran on a worker each.
+
+    :param jobs: DAG, start, end and CPU time (ms), and whether it held the interpreter.
+    """
+    callbacks = ', '.join(
+        f'{{name: d{dag}, timer: 100ms, deadline: {deadline}ms, dag: d{dag}}}'
+        for dag, deadline in enumerate((20, 50, 90)))
+    text = f'mddag: 1\nnodes: [{{node: /n, callbacks: [{callbacks}]}}]'
+    ends = sorted((end, dag, start, cpu, held) for dag, start, end, cpu, held in jobs)
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 3, 100 * MS, 64, False, cpus)
+        for dag, start, *_ in jobs:
+            now = START_TIME + start * MS
+            file.add('job_release', now, 1, 1, dag, 0, now)
+        for end, dag, start, cpu, held in ends:
+            now, end = START_TIME + start * MS, START_TIME + end * MS
+            file.add('dispatch', now, 1, 10 + dag, 9 + dag, dag, 0, 0, dag, now, 0)
+            file.add('callback_start', now, 1, 10 + dag, 9 + dag, False)
+            file.add('callback_end', end, 1, 10 + dag, 9 + dag)
+            file.add('complete', end, 1, 10 + dag, 9 + dag, dag, 0, 0, True, end, 0, cpu * MS,
+                     held)
+        file.add('shutdown', START_TIME + 200 * MS, 1, 1, START_TIME + 200 * MS)
+
+
+def responses(path: Path, **how: Any) -> list[float]:
+    """Return the response times of the DAGs, rescheduled, ms."""
+    dags = reschedule(path, overheads=False, **how).result()['dags']
+    return [sink['response_ns']['max'] / MS for dag in dags.values()
+            for sink in dag['sinks'].values() if sink['response_ns'] is not None]
+
+
+def test_what_was_stretched_by_the_interpreter_is_taken_back(tmp_path: Path) -> None:
+    """Two computed 10 ms each, at the same time: alone it takes 10 ms, one after the other."""
+    path = tmp_path / 'a.mcap'
+    of_python(path, [(0, 0, 20, 10, True), (1, 0, 20, 10, True)])
+    assert responses(path, workers=1) == [10, 20]
+    assert responses(path, workers=3) == [10, 20]
+    # what waited for nobody else keeps its waiting
+    of_python(path, [(0, 0, 20, 10, True)])
+    assert responses(path, workers=1) == [20]
+
+
+def test_what_computes_without_the_interpreter_shares_the_cpus(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    of_python(path, [(0, 0, 12, 12, False), (1, 0, 12, 12, False)])
+    assert responses(path) == [12, 12]
+    assert sorted(responses(path, cpus=1)) == [21, 24]
+    assert responses(path, workers=1) == [12, 24]
+    # recorded with one CPU they took twice as long
+    of_python(path, [(0, 0, 24, 12, False), (1, 0, 24, 12, False)], cpus=1)
+    assert responses(path, cpus=2) == [12, 12]
+
+
+def test_what_is_declared_counts_more_than_what_was_recorded(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    of_python(path, [(0, 0, 10, 10, False), (1, 0, 10, 10, False)])
+    recorded = replay(path).task_set.text
+    declared = loads(recorded.replace('dag: d', 'holds_interpreter: true, dag: d'), 'g.yaml')
+    assert responses(path) == [10, 10]
+    assert responses(path, task_set=declared) == [10, 20]

@@ -52,7 +52,7 @@ class Spec:
     :ivar seed: of the execution times, or of the phases of the published topics.
     :ivar graph: path of the declaration, for declared loads.
     :ivar utilisation: what its execution times are scaled to; None takes them as drawn.
-    :ivar bodies: how these execute, ``sleep`` or ``spin``.
+    :ivar bodies: how these execute, as ``execution.Mode``.
     :ivar topics: how many topics are published, each with one subscription.
     :ivar rate_hz: how often each is.
     :ivar idle: how many subscriptions there are besides, whose topics nobody publishes.
