@@ -4,8 +4,10 @@
 The verb `export`: a trace as a file for other tools.
 
 The end of the file's name says which: `.pftrace` for Perfetto's viewer, `.csv` for spreadsheets,
-`.parquet` for data frames.  The run is judged as `replay` does it, and recordings are of the same
-kinds: traces of this executor, imported ones, and with `--reschedule` ordinary bags.
+`.parquet` for data frames, `.mcap` for Foxglove, Lichtblick and PlotJuggler.  The run is judged as
+`replay` does it, and recordings are of the same kinds: traces of this executor, imported ones, and
+with `--reschedule` ordinary bags.  A name that ends in `/` is a folder, for a session as LTTng
+records it, with the events of the trace as they are.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded
-from mddag_executor.cli.text import printable, warn
+from mddag_executor.cli.text import printable, Progress, warn
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -27,9 +29,12 @@ EXAMPLE = """\
 mddag export run.mcap -o run.pftrace
 mddag export run.mcap graph.yaml -o jobs.csv --rows jobs
 mddag export run.mcap -o executions.parquet
+mddag export run.mcap -o run.foxglove.mcap
+mddag export run.mcap -o session/
 mddag export drive/ graph.yaml --reschedule --workers 4 -o drive.pftrace"""
 
-FORMS = ('pftrace', 'csv', 'parquet')
+FORMS = ('pftrace', 'csv', 'parquet', 'mcap')
+_FOLDER = 'folder'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,9 +43,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_recording(
         parser, "a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
         'ordinary bag, a folder or a file')
-    add('-o', '--output', metavar='OUT.{pftrace,csv,parquet}', required=True,
-        help='the file to write: for Perfetto (ui.perfetto.dev; needs mddag_executor[export]), '
-        "as CSV ('-': CSV to standard output), or as Parquet (needs mddag_executor[export])")
+    add('-o', '--output', metavar='OUT', required=True,
+        help='the file to write: OUT.pftrace for Perfetto (ui.perfetto.dev; needs '
+        "mddag_executor[export]), OUT.csv ('-': CSV to standard output), OUT.parquet (needs "
+        'mddag_executor[export]), OUT.foxglove.mcap with a layout OUT.foxglove.json, or OUT/, a '
+        'new folder in the Common Trace Format (babeltrace2, Trace Compass, tracetools_analysis)')
+    add('--caret', action='store_true',
+        help="with OUT/: the events that CARET's analysis takes, with what its tracer sees filled "
+        'in, instead of those of the trace')
     add('--rows', choices=('executions', 'jobs'),
         help='for CSV and Parquet: one row for each execution of a callback (default), or for '
         'each job at each sink')
@@ -57,17 +67,22 @@ def main(args: argparse.Namespace) -> int:
     :raises msg_graph.GraphError: when the declaration is wrong
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
-    from mddag_executor.report.export import check_available, target
+    from mddag_executor.report.export import check_available, layout_of, target
     common.recording_and_graph(args)
     form = _form(args)
+    if form == _FOLDER:
+        return _export_session(args)
     common.check_output(args.output)
     check_available(form)
     task_set = None if args.graph is None else common.load_graph(args.graph)
     with common.input_recording(args.trace) as (path, name), \
             common.output_file(args.output) as file:
-        warnings = _export(args, path, name, task_set, target(form, file, args.rows == 'jobs'))
+        writes = target(form, file, args.rows == 'jobs')
+        warnings = _export(args, path, name, task_set, writes)
     for warning in warnings:
         warn(warning)
+    if form == 'mcap':
+        common.write_json(str(PurePath(args.output).with_suffix('.json')), layout_of(writes))
     if args.output != '-':
         print(f'exported: {printable(args.output)}')
     return 0
@@ -90,16 +105,41 @@ def _export(
     return outcome.warnings
 
 
+def _export_session(args: argparse.Namespace) -> int:
+    """Write a session in the Common Trace Format."""
+    from mddag_executor.replay import caret_events
+    from mddag_executor.trace.ctf_out import export_ctf, export_dicts
+    if args.graph is not None or args.reschedule or args.rows is not None:
+        raise UsageError(
+            f'-o {args.output}: a session has the events of the trace as they are: leave GRAPH, '
+            '--reschedule and --rows out')
+    if not isinstance(args.trace, str):
+        raise UsageError(f'-o {args.output}: a session has the events of one trace: name one')
+    with common.input_trace(args.trace) as (path, name), Progress('exporting') as line:
+        if args.caret:
+            export_dicts(caret_events(path), args.output, line.events)
+        else:
+            for warning in export_ctf(path, args.output, name=name, progress=line.events):
+                warn(warning)
+    print(f'exported: {printable(args.output)}')
+    return 0
+
+
 def _form(args: argparse.Namespace) -> str:
     """Return what is to be written."""
     if args.trace == '-' and args.graph == '-':
         raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
+    if args.output.endswith('/'):
+        return _FOLDER
+    if args.caret:
+        raise UsageError("--caret: it is for a folder: let the name of -o end in '/'")
     form = 'csv' if args.output == '-' else PurePath(args.output).suffix[1:].lower()
     if form not in FORMS:
         raise UsageError(
             f'-o {args.output}: it is not known what to write: let the name end in '
-            f'{", ".join("." + each for each in FORMS[:-1])} or .{FORMS[-1]}')
-    if form == 'pftrace' and args.rows is not None:
-        raise UsageError('--rows: Perfetto gets both, executions and jobs: leave it out')
+            f'{", ".join("." + each for each in FORMS)} or /')
+    if form in ('pftrace', 'mcap') and args.rows is not None:
+        raise UsageError(
+            f'--rows: a .{form} gets both, executions and jobs: leave the option out')
     recorded.check(args, args.trace, args.graph)
     return form

@@ -301,56 +301,63 @@ def by_start(row: ExecutionRow) -> int:
     return row.start_ns
 
 
-class _Rows:
-    """A target that takes rows of one kind, in batches."""
+class Rows:
+    """
+    A target that writes rows of one kind, in batches.
 
-    def __init__(self, jobs: bool) -> None:
-        self._jobs = jobs
+    :param kind: of the rows: executions, or jobs.
+    """
+
+    def __init__(
+        self, kind: type[ExecutionRow] | type[JobRow], writer: CsvWriter | ParquetWriter
+    ) -> None:
+        self._kind = kind
+        self._writer = writer
         self._batch: list[tuple[Any, ...]] = []
-        self.kind: type[ExecutionRow] | type[JobRow] = JobRow if jobs else ExecutionRow
 
     def begin(self, task_set: TaskSet, tables: Tables) -> None:
-        """Write what the run is of."""
+        """Write what the run is of: nothing."""
 
     def execution(self, ran: Ran) -> None:
         """Write an execution."""
-        if not self._jobs:
-            self._add(ran.row)
+        self._add(ran.row)
 
     def verdict(self, row: JobRow, vertex: int) -> None:
         """Write a verdict."""
-        if self._jobs:
-            self._add(row)
+        self._add(row)
 
     def _add(self, row: tuple[Any, ...]) -> None:
+        if not isinstance(row, self._kind):
+            return
         self._batch.append(row)
         if len(self._batch) >= BATCH:
             self._flush()
 
     def _flush(self) -> None:
-        raise NotImplementedError
+        if self._batch:
+            self._writer.write(self._batch)
+            self._batch.clear()
 
     def finish(self) -> None:
         """Write what is left."""
         self._flush()
+        self._writer.end()
 
 
-class CsvRows(_Rows):
+class CsvWriter:
     """Writes rows as CSV (RFC 4180, UTF-8) below a line of titles; no value is an empty cell."""
 
-    def __init__(self, file: BinaryIO, jobs: bool) -> None:
-        super().__init__(jobs)
+    def __init__(self, file: BinaryIO, kind: type[ExecutionRow] | type[JobRow]) -> None:
         self._text = io.TextIOWrapper(file, 'utf-8', 'backslashreplace', newline='')
         self._writer = csv.writer(self._text)
-        self._writer.writerow(self.kind._fields)
+        self._writer.writerow(kind._fields)
 
-    def _flush(self) -> None:
-        self._writer.writerows([[_cell(value) for value in row] for row in self._batch])
-        self._batch.clear()
+    def write(self, rows: Sequence[tuple[Any, ...]]) -> None:
+        """Write rows."""
+        self._writer.writerows([[_cell(value) for value in row] for row in rows])
 
-    def finish(self) -> None:
-        """Write what is left, and leave the file to its owner."""
-        super().finish()
+    def end(self) -> None:
+        """Leave the file to its owner."""
         self._text.flush()
         self._text.detach()
 
@@ -365,17 +372,16 @@ def _cell(value: Any) -> Any:
     return f'{value:.9f}' if isinstance(value, float) else value
 
 
-class ParquetRows(_Rows):
+class ParquetWriter:
     """Writes rows as Parquet, names as dictionaries."""
 
-    def __init__(self, file: BinaryIO, jobs: bool) -> None:
-        super().__init__(jobs)
+    def __init__(self, file: BinaryIO, kind: type[ExecutionRow] | type[JobRow]) -> None:
         import pyarrow
         import pyarrow.parquet
         types = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64(),
                  bool: pyarrow.bool_()}
         fields = []
-        for name, hint in get_type_hints(self.kind).items():
+        for name, hint in get_type_hints(kind).items():
             kinds = get_args(hint) or (hint,)       # `int | None`
             fields.append(pyarrow.field(name, types[kinds[0]], nullable=len(kinds) > 1))
         self._schema: Any = pyarrow.schema(fields)
@@ -383,17 +389,14 @@ class ParquetRows(_Rows):
         self._writer: Any = pyarrow.parquet.ParquetWriter(
             file, self._schema, compression='zstd')
 
-    def _flush(self) -> None:
-        if not self._batch:
-            return
+    def write(self, rows: Sequence[tuple[Any, ...]]) -> None:
+        """Write rows."""
         columns = [self._arrow.array(column, type=field.type)
-                   for column, field in zip(zip(*self._batch), self._schema)]
+                   for column, field in zip(zip(*rows), self._schema)]
         self._writer.write_table(self._arrow.table(columns, schema=self._schema))
-        self._batch.clear()
 
-    def finish(self) -> None:
-        """Write what is left, and the footer."""
-        super().finish()
+    def end(self) -> None:
+        """Write the footer."""
         self._writer.close()
 
 
@@ -418,11 +421,22 @@ def check_available(form: str) -> None:
             'install versions that fit together') from None
 
 
+def layout_of(target: Target) -> dict[str, Any]:
+    """Return the layout that shows what was written for Foxglove."""
+    from mddag_executor.report.foxglove import FoxgloveTarget
+    assert isinstance(target, FoxgloveTarget)
+    return target.layout
+
+
 def target(form: str, file: BinaryIO, jobs: bool) -> Target:
-    """Return what writes a format: ``csv``, ``parquet`` or ``pftrace``."""
+    """Return what writes a format: ``csv``, ``parquet``, ``pftrace`` or ``mcap``."""
+    kind = JobRow if jobs else ExecutionRow
     if form == 'csv':
-        return Ordered(CsvRows(file, jobs), by_release)
+        return Ordered(Rows(kind, CsvWriter(file, kind)), by_release)
     if form == 'parquet':
-        return Ordered(ParquetRows(file, jobs), by_release)
+        return Ordered(Rows(kind, ParquetWriter(file, kind)), by_release)
+    if form == 'mcap':
+        from mddag_executor.report.foxglove import FoxgloveTarget
+        return FoxgloveTarget(file)
     from mddag_executor.report.perfetto import PerfettoTarget
     return Ordered(PerfettoTarget(file), by_start)

@@ -28,9 +28,11 @@ class Pool:
     :ivar jobs: how many chunks it does at a time; it may change.
     :ivar chunk_s: about how long a chunk should take: short enough for Ctrl-C and progress, long
         enough to be worth handing over.
+    :ivar submit: lets someone do a number of runs from a place on.
     """
 
     jobs: int
+    submit: Callable[[int, int], Future[Chunk]]
     chunk_s = 0.25
 
     def __enter__(self) -> Pool:
@@ -42,10 +44,6 @@ class Pool:
 
     def start(self, compiling: Callable[[], None]) -> None:
         """Do what has to be done once; ``compiling`` is called now and then meanwhile."""
-
-    def submit(self, first: int, count: int) -> Future[Chunk]:
-        """Let someone do ``count`` runs from the place ``first`` on."""
-        raise NotImplementedError
 
     def failure(self, error: BaseException) -> MddagError | None:
         """Return the error that tells the user what an exception of a chunk means, if any."""
@@ -61,9 +59,16 @@ class Pool:
 
 class _LocalPool(Pool):
 
-    def __init__(self, executor: Executor, jobs: int) -> None:
+    def __init__(
+        self, executor: Executor, jobs: int, work: Callable[[int, int], Chunk]
+    ) -> None:
         self._executor = executor
+        self._work = work
         self.jobs = jobs
+
+    def submit(self, first: int, count: int) -> Future[Chunk]:
+        """Let a thread or process do runs."""
+        return self._executor.submit(self._work, first, count)
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
@@ -74,28 +79,21 @@ class ThreadPool(_LocalPool):
     """Threads of this process."""
 
     def __init__(self, evaluator: Evaluator, jobs: int) -> None:
-        super().__init__(ThreadPoolExecutor(jobs), jobs)
+        super().__init__(ThreadPoolExecutor(jobs), jobs, evaluator)
         self._evaluator = evaluator
 
     def start(self, compiling: Callable[[], None]) -> None:
         """Compile the core, if that is what the evaluator uses."""
         self._evaluator.prepare(compiling)
 
-    def submit(self, first: int, count: int) -> Future[Chunk]:
-        """Let a thread do runs."""
-        return self._executor.submit(self._evaluator, first, count)
-
 
 class ProcessPool(_LocalPool):
     """Processes of this machine, with the plain core."""
 
     def __init__(self, experiments: Sequence[Experiment], runs: int, jobs: int) -> None:
-        super().__init__(ProcessPoolExecutor(
-            jobs, multiprocessing.get_context('spawn'), _start_worker, (experiments, runs)), jobs)
-
-    def submit(self, first: int, count: int) -> Future[Chunk]:
-        """Let a process do runs."""
-        return self._executor.submit(_work, first, count)
+        executor = ProcessPoolExecutor(
+            jobs, multiprocessing.get_context('spawn'), _start_worker, (experiments, runs))
+        super().__init__(executor, jobs, _work)
 
     def failure(self, error: BaseException) -> MddagError | None:
         """Tell of a worker process that is gone."""

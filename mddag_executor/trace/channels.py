@@ -38,10 +38,11 @@ DEFINITIONS_LIMIT = 64 * 1024 * 1024        # bytes of all schemas and channels
 
 @dataclass(frozen=True)
 class Layout:
-    """An event's full name and the names of its fields without the preamble."""
+    """An event's full name, and the names and types of its fields without the preamble."""
 
     name: str
     fields: tuple[str, ...]
+    types: tuple[FieldType, ...] = ()
 
 
 class Channels:
@@ -136,7 +137,8 @@ class Channels:
         _check(fields, table)
         preamble = [field for field, _ in PREAMBLE]
         wanted = table if self._as_table and table else fields
-        layout = Layout(name, tuple(field for field in wanted if field not in preamble))
+        kept = tuple(field for field in wanted if field not in preamble)
+        layout = Layout(name, kept, tuple(fields[field] for field in kept if field in fields))
         self.fields.setdefault(name, layout.fields)
 
         head = (name if self._as_table else layout,)

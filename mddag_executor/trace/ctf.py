@@ -277,7 +277,7 @@ class _Importer:
         if vpid is None or vtid is None:
             self._nameless += 1
             vpid, vtid = vpid or 0, vtid or 0
-        if procname is not None and self._procnames.get((vpid, vtid)) != procname:
+        if procname and self._procnames.get((vpid, vtid)) != procname:
             self._procnames[vpid, vtid] = procname
             self._file.extend((('mddag:process', time, vtid, procname),), vpid)
         kind = self._kinds[number]

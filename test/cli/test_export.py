@@ -11,7 +11,11 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from mcap.reader import make_reader
 from mddag_executor.cli import main as program
+from mddag_executor.replay import caret_events
+from mddag_executor.replay.for_caret import CARET_EVENTS
+from mddag_executor.trace import read_events, TraceReader
 import pytest
 
 from .helpers import caller
@@ -83,7 +87,7 @@ def test_another_graph_judges(
 
 @pytest.mark.parametrize(('arguments', 'error'), [
     (['export', 'TRACE', '-o', 'out.xlsx'], 'it is not known what to write'),
-    (['export', 'TRACE', '-o', 'out'], 'let the name end in .pftrace, .csv or .parquet'),
+    (['export', 'TRACE', '-o', 'out'], 'let the name end in .pftrace, .csv, .parquet, .mcap or /'),
     (['export', 'TRACE', '-o', 'out.pftrace', '--rows', 'jobs'], '--rows: '),
     (['export', '-', '-', '-o', 'out.csv'], 'standard input can be only one'),
     (['export', 'GRAPH', '-o', 'out.csv'], 'error: '),
@@ -203,3 +207,79 @@ def test_diff(
         == 1
     assert call(capsys, 'diff', after, trace, wide, '--fail-on-worse', '--tolerance', '100%')[0] \
         == 0
+
+
+def test_a_file_for_foxglove_and_its_layout(
+    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / 'run.foxglove.mcap'
+    assert call(capsys, 'export', trace, '-o', out) == (0, f'exported: {out}\n', '')
+    topics: dict[str, list[Any]] = {}
+    times = []
+    with out.open('rb') as file:
+        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            assert schema is not None
+            assert (schema.encoding, channel.message_encoding) == ('jsonschema', 'json')
+            assert (schema.name == 'foxglove.Log') == (channel.topic == '/misses')
+            topics.setdefault(channel.topic, []).append(json.loads(message.data))
+            times.append(message.log_time)
+    assert times == sorted(times)
+    assert list(topics) == ['/workers/0', '/sinks/n/s', '/misses']
+    # each callback runs 10 times: it begins, and the worker is idle again
+    states = [message['state'] for message in topics['/workers/0']]
+    assert [states.count(state) for state in ('/n:t', '/n:s', 'idle')] == [10, 10, 20]
+    assert topics['/sinks/n/s'][0] == {
+        'job': 0, 'verdict': 'late', 'missed': 1, 'deadline_ms': 5.0, 'response_ms': 6.0,
+        'margin_ms': -1.0}
+    assert topics['/misses'][0] == {
+        'timestamp': {'sec': 0, 'nsec': 6_000_000}, 'level': 3,
+        'message': 'job 0 of /n late by 1 ms', 'name': '/n:s', 'file': '', 'line': 0}
+    layout = json.loads((tmp_path / 'run.foxglove.json').read_text())
+    shown = json.dumps(layout['layout'])
+    assert all(panel in shown for panel in layout['configById'])
+    paths = [path['value'] for panel in layout['configById'].values()
+             for path in panel.get('paths', ())]
+    assert all(path.rpartition('.')[0] in topics for path in paths)
+
+
+@pytest.mark.needs('babeltrace2')
+@pytest.mark.parametrize('recorded', [False, True])
+def test_a_session_that_is_imported_again_has_the_same_events(
+    recorded: bool, trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trace = DEMO if recorded else trace
+    out, back = tmp_path / 'session', tmp_path / 'back.mcap'
+    assert call(capsys, 'export', trace, '-o', f'{out}/') == (0, f'exported: {out}/\n', '')
+    assert call(capsys, 'import', 'ctf', out, '-o', back)[0] == 0
+    before, after = (list(TraceReader(path).events(sorted=True)) for path in (trace, back))
+    assert before == after
+    status, _, error = call(capsys, 'export', trace, '-o', f'{out}/')
+    assert (status, error) == (
+        2, f'error: {out}: is there already: name another folder\n')
+
+
+@pytest.mark.needs('babeltrace2')
+def test_a_session_for_caret_has_what_its_tracer_sees(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, back = tmp_path / 'session', tmp_path / 'back.mcap'
+    assert call(capsys, 'export', DEMO, '-o', f'{out}/', '--caret')[0] == 0
+    assert call(capsys, 'import', 'ctf', out, '-o', back)[0] == 0
+    wanted = {'ros2_caret:dds_write', 'ros2:dispatch_subscription_callback', 'ros2:callback_start'}
+    names = [event['_name'] for event in read_events(back)]
+    assert wanted <= set(names) <= CARET_EVENTS
+    expected = list(caret_events(DEMO))
+    assert len(names) == len(expected)
+    found = [event for event in read_events(back) if event['_name'] in wanted]
+    assert found == [event for event in expected if event['_name'] in wanted]
+
+
+@pytest.mark.parametrize(('arguments', 'error'), [
+    (('--caret', '-o', 'x.csv'), "--caret: it is for a folder: let the name of -o end in '/'"),
+    (('--rows', 'jobs', '-o', 'x/'), 'leave GRAPH, --reschedule and --rows out'),
+    (('--rows', 'jobs', '-o', 'x.mcap'), 'a .mcap gets both')])
+def test_options_of_sessions_and_foxglove(
+    arguments: tuple[str, ...], error: str, trace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, _, said = call(capsys, 'export', trace, *arguments)
+    assert status == 2 and error in said
