@@ -47,7 +47,6 @@ def main(args: argparse.Namespace) -> int:
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     common.recording_and_graph(args)
-    common.recording_and_graph(args)
     common.check_output(args.json)
     if args.trace == '-' and args.graph == '-':
         raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
