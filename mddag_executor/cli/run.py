@@ -85,6 +85,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='threads that run callbacks (default: what the declaration says, else 7)')
     add('--policy', default='rad', metavar='P',
         help=f'one of {", ".join(POLICIES)} (default: rad)')
+    add('--preempt', action='store_true',
+        help='callbacks that compute in Python pause for more urgent ones (Python 3.12 and newer)')
     add('--intake', choices=('auto', 'events', 'waitset'), default='auto',
         help='how the executor learns what is ready (default: auto)')
     add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
@@ -192,7 +194,7 @@ def run_here(
         from mddag_executor.live.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
-            intake=args.intake, freeze_gc=True,
+            intake=args.intake, freeze_gc=True, preempt=args.preempt,
             diagnostics_period=args.diagnostics, process=args.process)
         # With `--json -` what nodes print must not get into the JSON.
         output = sys.stdout if common.wants_tables(args) else sys.stderr

@@ -197,6 +197,8 @@ def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> lis
     command = [sys.executable, '-m', 'mddag_executor', 'run', args.graph, '--part', folder,
                '--policy', args.policy, '--intake', args.intake,
                '--diagnostics', f'{args.diagnostics}ns' if args.diagnostics else 'off']
+    if args.preempt:
+        command.append('--preempt')
     if args.synthetic is None:
         for spec in specs:
             command += ['--node', spec]

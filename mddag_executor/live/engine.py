@@ -56,6 +56,8 @@ MOST_MISSED = 1000
 
 OVERTAKE_NS = 8_000_000
 """Nothing overtakes who holds the interpreter for less than this: the two would share it."""
+PREEMPT_NS = 1_000_000
+"""The same where the one that is overtaken pauses."""
 
 
 class Engine:
@@ -99,6 +101,9 @@ class Engine:
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
         self._holders: list[Work] = []
+        # whether who holds the interpreter may have overtaken another
+        self.is_shared = False
+        self.overtake_ns = OVERTAKE_NS
         self._holds_since = 0
 
     # --- what became ready -----------------------------------------------------------------------
@@ -344,6 +349,7 @@ class Engine:
         if state.x_holds[x]:
             self._holders = [w for w in self._holders if self._holds(w)]
             self._holders.append(work)
+            self.is_shared = len(self._holders) > 1
             self._holds_since = now
             self.has_more = bool(state.ready or state.unpolled)  # what is held back stays there
         else:
@@ -360,21 +366,26 @@ class Engine:
         """Return whether who began last to hold the interpreter holds it for long."""
         held = now - self._holds_since
         work = self._holders[-1] if self._holders else None
-        if held >= OVERTAKE_NS or work is None or not self._holds(work):
+        if held >= self.overtake_ns or work is None or not self._holds(work):
             return True
         entity = work.entity
         usual = entity.habit.computed_ns or entity.busy_ns / max(1, entity.ran)
-        return usual >= held + OVERTAKE_NS
+        return usual >= held + self.overtake_ns
 
     def interpreter_holder(self) -> Work | None:
         """Return the most urgent execution that holds the interpreter."""
         if self._state.scalars[N_HOLDING] == 0:
             return None
-        last = self._holders[-1]
-        if self._state.scalars[N_HOLDING] == 1 and self._holds(last):
-            return last
+        if self._state.scalars[N_HOLDING] == 1 and self._holders and self._holds(
+                self._holders[-1]):
+            return self._holders[-1]
         holders = [work for work in self._holders if self._holds(work)]
         return min(holders, key=lambda work: self._state.x_key[work.x], default=None)
+
+    def overtaken(self) -> list[Work]:
+        """Return what a more urgent execution has overtaken that computes, too."""
+        first = self.interpreter_holder()
+        return [work for work in self._holders if work is not first and self._holds(work)]
 
     def stop_holding(self, work: Work) -> None:
         """Give the interpreter back for an execution that does not need it now."""
@@ -431,6 +442,8 @@ class Engine:
         :param failed: whether its callback has let an exception out.
         """
         x, work.x = work.x, -1
+        if work in self._holders:
+            self._holders.remove(work)
         entity = work.entity
         entity.ran += 1
         entity.failed += failed

@@ -69,6 +69,7 @@ from mddag_executor.live.verdicts import DeadlineMiss
 from mddag_executor.live.work import QuickCallback, Work
 from msg_graph import TaskSet
 from rclpy.executors import ExternalShutdownException, TimeoutObject
+from rclpy.logging import get_logger
 from rclpy.task import Future, Task
 
 if TYPE_CHECKING:
@@ -126,6 +127,8 @@ class MultiDeadlineExecutor(BareExecutor):
     :param thresholds: what makes a status of the diagnostics worse than OK.
     :param process: which of the declared ``processes`` this is; what runs in the others is not
         counted as missing.
+    :param preempt: whether callbacks that compute in Python pause for more urgent ones (Python
+        3.12 and newer; ``statistics()['preemption']`` says whether they do).
     :raises msg_graph.GraphError: when the declaration is not right.
     :raises mddag_executor.errors.MddagError: on an unknown policy, intake or thread setting, a
         value of the wrong kind, and when the trace cannot be written.
@@ -151,6 +154,7 @@ class MultiDeadlineExecutor(BareExecutor):
         diagnostics_period: int | str | None = None,
         thresholds: Thresholds | None = None,
         process: str | None = None,
+        preempt: bool = False,
     ) -> None:
         task_set, num_workers, deadline_ns = resolve(
             graph, num_workers, default_deadline, intake)
@@ -180,7 +184,11 @@ class MultiDeadlineExecutor(BareExecutor):
             record=self._recorder.record if self._recorder else None, on_miss=on_deadline_miss,
             fail=self._fail, process=process)
         self._pool = Pool(
-            self._engine, self._trace_clock, self._fail, self._context_ended, prepare)
+            self._engine, self._trace_clock, self._fail, self._context_ended, prepare,
+            bool(preempt))
+        if self._pool.preemption is not None and self._pool.preemption.reason:
+            get_logger('mddag_executor').warning(
+                f'preempt: it is off: {self._pool.preemption.reason}')
         self._pool.pump = self._pump
         self._pool.relieve_intake = self._relieve_intake
         self._stop_watch = StopWatch(

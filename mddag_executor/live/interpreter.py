@@ -36,8 +36,9 @@ import threading
 from time import monotonic_ns
 
 from mddag_executor.live.alarm import Alarm
-from mddag_executor.live.engine import Engine
+from mddag_executor.live.engine import Engine, PREEMPT_NS
 from mddag_executor.live.habits import COMPUTES, Habit, LOOK_NS
+from mddag_executor.live.preemption import Preemption
 from mddag_executor.live.seat import Seat
 from mddag_executor.live.thread_clock import ThreadClock
 from mddag_executor.live.work import Work
@@ -60,14 +61,18 @@ class Interpreter:
     :param lock: that of the engine.
     :param seats: the seat of each worker.
     :param hand_out: called, under the lock, when somebody has given the interpreter back.
+    :param preemption: has those pause that are overtaken; None: they do not.
     :ivar rings_at: when it is looked next; 0: never.
     """
 
     def __init__(
         self, engine: Engine, lock: threading.Lock, seats: list[Seat],
-        hand_out: Callable[[], None],
+        hand_out: Callable[[], None], preemption: Preemption | None = None,
     ) -> None:
         self._engine = engine
+        self._preemption = preemption
+        if preemption is not None and not preemption.reason:
+            engine.overtake_ns = PREEMPT_NS
         self._lock = lock
         self._seats = seats
         self._hand_out = hand_out
@@ -105,23 +110,28 @@ class Interpreter:
     # --- looking ---------------------------------------------------------------------------------
 
     def look_after(self) -> None:
-        """Look soon if anything is held back; the caller holds the lock."""
+        """Look soon if anything is held back or pauses; the caller holds the lock."""
         if self._closed:
             return  # the alarm rings for the end, and is not to be set anew
         engine = self._engine
-        holder = engine.interpreter_holder() if engine.held_back else None
+        pauses = self._preemption is not None and self._preemption.update([
+            (work, seat) for work in engine.overtaken()
+            if (seat := self._seat(work)) is not None])
+        holder = engine.interpreter_holder() if engine.held_back or pauses else None
         if holder is None:
             if self.rings_at:
                 self.rings_at = 0
+                self._seen = None, 0, 0
                 self._alarm.start(0)
         elif holder is not self._seen[0]:
             self._idle = 0
             self._note(holder)
-            self._watch(holder.entity.habit.patience_ns)
+            self._watch(LOOK_NS if pauses else holder.entity.habit.patience_ns)
         elif not self.rings_at:
             self._watch(LOOK_NS)
         elif monotonic_ns() - self._seen[1] >= LOOK_NS:  # seen on the way: nobody is woken for it
-            self._watch(holder.entity.habit.patience_ns if self._has_computed(holder) else SOON_NS)
+            patience_ns = LOOK_NS if pauses else holder.entity.habit.patience_ns
+            self._watch(patience_ns if self._has_computed(holder) else SOON_NS)
 
     def _watch(self, ns: int) -> None:
         """Set the alarm for the next look."""
@@ -166,8 +176,12 @@ class Interpreter:
 
     def _clock(self, work: Work) -> ThreadClock | None:
         """Return the CPU clock of the worker's thread in which an execution runs."""
+        seat = self._seat(work)
+        return None if seat is None else seat.cpu_clock
+
+    def _seat(self, work: Work) -> Seat | None:
         seat = self._seats[work.worker] if work.worker < len(self._seats) else None
-        return seat.cpu_clock if seat is not None and seat.work is work else None
+        return seat if seat is not None and seat.work is work else None
 
     def _note(self, work: Work) -> tuple[int, int]:
         """Return how long the last look was ago, and for how long it has computed since."""

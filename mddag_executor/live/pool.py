@@ -42,6 +42,7 @@ from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import BRIEF_NS
 from mddag_executor.live.gates import Refused
 from mddag_executor.live.interpreter import Interpreter
+from mddag_executor.live.preemption import Preemption
 from mddag_executor.live.seat import current, Seat
 from mddag_executor.live.thread_clock import ThreadClock
 from mddag_executor.live.work import Destroyed, QuickCallback, Work
@@ -61,11 +62,13 @@ class Pool:
     :param fail: gets every exception that a callback lets out.
     :param context_ended: whether the context has ended: callbacks fail then for that alone.
     :param prepare_thread: called first in each worker thread (priority, CPU set).
+    :param preempt: whether what computes in Python is to pause for what is more urgent.
     """
 
     def __init__(
         self, engine: Engine, clock: TraceClock, fail: Callable[[BaseException], None],
         context_ended: Callable[[], bool], prepare_thread: Callable[[], None] | None = None,
+        preempt: bool = False,
     ) -> None:
         self.engine = engine
         self.clock = clock
@@ -88,7 +91,9 @@ class Pool:
         self._intakes: list[Seat] = []
         self._polled: list[Work] = []
         self._refusals = 0
-        self._interpreter = Interpreter(engine, self.lock, self._seats, self._hand_out_now)
+        self.preemption = Preemption() if preempt else None
+        self._interpreter = Interpreter(
+            engine, self.lock, self._seats, self._hand_out_now, self.preemption)
 
     # --- telling the engine ----------------------------------------------------------------------
 
@@ -166,6 +171,8 @@ class Pool:
         """Start nothing more; what runs goes on."""
         with self.lock:
             self.running = False
+            if self.preemption is not None:
+                self.preemption.update(())
 
     def start_no_more(self) -> None:
         """Start nothing more, from now on; for those who must not wait for the lock."""
@@ -185,6 +192,8 @@ class Pool:
                     seat.ended = True
                     seat.wake.release()
             self._closed = True
+            if self.preemption is not None:
+                self.preemption.close()
             seats += self._intakes
         self._interpreter.close()
         deadline = None if timeout is None else monotonic_ns() + int(timeout * 1e9)
@@ -278,7 +287,7 @@ class Pool:
             seat = self._seats[work.worker]
             seat.work = work
             seat.wake.release()
-        if engine.held_back or self._interpreter.rings_at:
+        if engine.held_back or engine.is_shared or self._interpreter.rings_at:
             self._interpreter.look_after()
         return chosen
 
@@ -352,7 +361,7 @@ class Pool:
                 seat.work = engine.dispatch(now, seat.worker)
                 if engine.has_more:
                     self._hand_out(now)
-                elif engine.held_back or self._interpreter.rings_at:
+                elif engine.held_back or engine.is_shared or self._interpreter.rings_at:
                     self._interpreter.look_after()
         let_run = type(raised) is not Refused
         if waits_for is not None:

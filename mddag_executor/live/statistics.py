@@ -25,7 +25,8 @@ def statistics(
     ``unattributed`` counts messages of declared callbacks whose publication was not found; they
     ran as undeclared ones.  ``stops`` has how often and for how long no thread of the process ran
     while it spun, how many misses fell into these stops, and the times of the last ones (ns since
-    the epoch).
+    the epoch).  ``preemption`` (None unless asked for) has why it is off, or None, and how often a
+    callback was to pause.
     """
     engine = pool.engine
     with pool.lock:
@@ -48,6 +49,8 @@ def statistics(
         'policy': engine.scheduler.policy.name, 'workers': engine.n_workers,
         **result, 'stops': stops, 'callbacks': callbacks, 'undeclared': undeclared,
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
+        'preemption': None if pool.preemption is None else {
+            'reason_off': pool.preemption.reason or None, 'pauses': pool.preemption.count},
         'queue': waiting, 'idle_workers': idle, 'lent': pool.lent,
         'unattributed': {
             'unknown': engine.jobs.unknown,
