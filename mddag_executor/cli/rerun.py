@@ -58,6 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='how long callbacks take: recorded (the default for a trace), declared (the default '
         'for a bag), or a file: a trace, or JSON with execution times')
     options.add_workers(parser)
+    options.add_cpus(parser, 'as many as are needed')
     add('--policy', default='rad', metavar='P',
         help=f'one of {", ".join(POLICIES)} (default: rad)')
     options.add_seed(
@@ -124,7 +125,7 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
     from mddag_executor.rerun.sources import open_source
     task_set = common.load_graph(args.graph)
     settings = Settings(
-        defaults.workers(args.workers, task_set), args.policy, args.seed, args.all_clocks,
+        defaults.workers(args.workers, task_set), args.cpus, args.policy, args.seed, args.all_clocks,
         ros_args=tuple(args.ros_args))
     with ExitStack() as files:
         path, name = files.enter_context(common.input_trace(args.recording))

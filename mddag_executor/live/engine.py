@@ -400,6 +400,17 @@ class Engine:
         return all(state.x_state[x] == DONE
                    for x in range(first, first + self.tables.n_legs[vertex]) if x != work.x)
 
+    def takes(self, work: Work, ns: int) -> None:
+        """Set how long a running execution takes, for those that need to know how far it is."""
+        state, x = self._state, work.x
+        state.x_left[x] += ns - state.x_cost[x]
+        state.x_cost[x] = ns
+
+    def progress(self, x: int, now: int) -> int:
+        """Return how far a running execution is, ns; see ``simulate.machine``."""
+        state = self._state
+        return state.x_cost[x] - state.x_left[x] + now - state.x_started[x]
+
     def lend(self, work: Work) -> None:
         """Free the worker of an execution that goes on without one."""
         self.scheduler.lend(work.x)

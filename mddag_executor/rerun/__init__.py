@@ -44,6 +44,7 @@ def rerun(
     *,
     times: str | os.PathLike[str] | None = None,
     workers: int | None = None,
+    cpus: int | None = None,
     policy: str = 'rad',
     seed: int = 0,
     all_clocks: bool = False,
@@ -70,7 +71,7 @@ def rerun(
     task_set = graph if isinstance(graph, TaskSet) else load(os.fspath(graph))
     find_policy(policy)
     settings = Settings(
-        defaults.workers(workers, task_set), policy, seed, all_clocks, patience_s,
+        defaults.workers(workers, task_set), cpus, policy, seed, all_clocks, patience_s,
         tuple(ros_args))
     source = open_source(
         os.fspath(recording), task_set, None if times is None else os.fspath(times), seed)

@@ -32,11 +32,13 @@ from heapq import heappop, heappush
 import itertools
 from typing import Any, Protocol
 
+from mddag_executor.core import NEVER
 from mddag_executor.live.compat import UNKNOWN
-from mddag_executor.live.engine import Engine
+from mddag_executor.live.engine import Engine, OVERTAKE_NS
 from mddag_executor.live.gates import Refused
 from mddag_executor.live.jobs import Origin
 from mddag_executor.live.work import Destroyed, QuickCallback, Work
+from mddag_executor.rerun.computing import Computing
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.strands import Strands
 from mddag_executor.rerun.times import Times
@@ -96,6 +98,7 @@ class Loop:
         end, before the strands end that still wait.
     :ivar now: the virtual time.
     :ivar callbacks: how many callbacks have run.
+    :ivar computing: shares CPUs and the interpreter, where these are few.
     :ivar changed: whether there may be new entities, or some are gone.
     """
 
@@ -108,6 +111,7 @@ class Loop:
         self.end = end
         self.callbacks = 0
         self.changed = True
+        self.computing: Computing | None = None
         self.strands = Strands(self._step, over)
         self._times = times
         self._refresh = refresh
@@ -119,7 +123,7 @@ class Loop:
         self._resumed: set[int] = set()
         self._at_once = 0
         self._stopped = False
-        self._looked_at = self._looks = 0
+        self._looked_at = self._looks = self._ask_at = 0
 
     # --- what is to happen -----------------------------------------------------------------------
 
@@ -168,6 +172,8 @@ class Loop:
         self.refresh_now()
         if self._stopped:
             return False
+        if self.computing is not None and self.computing.go_on(self.now):
+            return True
         events, now = self._events, self.now
         if events and events[0][0] <= now:
             _, _, _, function, args = heappop(events)
@@ -182,6 +188,13 @@ class Loop:
         if work is not None:
             self._execute(work)
             return True
+        if self.computing is not None:
+            self.computing.share(now)
+            if self.computing.go_on(now):
+                return True
+        if engine.held_back and now >= self._ask_at:
+            self._ask_at = now + OVERTAKE_NS
+            self.at(self._ask_at, TIMER, _nothing)  # it may overtake by then
         return self._advance(deadline)
 
     def refresh_now(self) -> None:
@@ -196,10 +209,16 @@ class Loop:
         if deadline is not None and deadline <= self.end and (
                 next_at is None or deadline < next_at):
             next_at = deadline
+        if self.computing is not None:
+            ends = max(self.now + 1, self.computing.next_time())
+            if ends < NEVER and (next_at is None or ends < next_at):
+                next_at = ends
         if next_at is None or next_at > self.end + DRAIN_NS:
             return False
         self.now = next_at
         self._at_once = 0
+        if self.computing is not None:
+            self.computing.settle(next_at)
         return True
 
     # --- callbacks -------------------------------------------------------------------------------
@@ -217,6 +236,8 @@ class Loop:
         release = 0 if origin is None else self.engine.release_of(work)
         execution = self._current = Execution(work, self.now, release)
         takes = self._execution_time(work, origin, release)
+        if self.computing is not None:
+            self.computing.waits(work)
         try:
             execution.waits_for = work.step() if entity.gate is None else entity.gate.step(work)
         except Destroyed:
@@ -234,11 +255,37 @@ class Loop:
         finally:
             self._current = None
         self.callbacks += 1
+        if self.computing is not None and execution.worker >= 0 and self.now == execution.start:
+            self._compute(execution, takes)
+            return
         end = max(self.now, execution.start + takes)
         if end > self.now:
             self._let_leave_early(execution, end)
         order = (work.worker << _WORKER_BITS) + next(self._order)
-        heappush(self._events, (end, ENDED, order, self._ended, (execution, end)))
+        heappush(self._events, (end, ENDED, order, self.ended, (execution, end)))
+
+    def _compute(self, execution: Execution, takes: int) -> None:
+        """Have an execution end when CPUs and interpreter let it."""
+        work, origin = execution.work, execution.origin
+        assert self.computing is not None
+        computes = takes
+        leaving: list[tuple[int, Callable[[], None]]] = []
+        if origin is not None and takes:
+            computes = self._times.computed(origin.dag, origin.vertex, execution.release)
+            kept = []
+            for held in execution.held:
+                early = held.early(origin, execution.release)
+                if early < 0:
+                    leaving.append((max(0, takes + early), partial(
+                        self._leave, held, execution)))
+                else:
+                    kept.append(held)
+            execution.held = kept
+        self.computing.begin(execution, work, takes, computes, leaving)
+
+    def _leave(self, held: Held, execution: Execution) -> None:
+        held.record(execution.thread)
+        held.leave(execution.origin, execution.release, self.now)
 
     def _execution_time(self, work: Work, origin: Origin | None, release: int) -> int:
         """Return how long a callback takes: its first piece all of it, a sync its last leg."""
@@ -267,7 +314,7 @@ class Loop:
                 kept.append(held)
         execution.held = kept
 
-    def _ended(self, execution: Execution, now: int) -> None:
+    def ended(self, execution: Execution, now: int) -> None:
         """End an execution in virtual time, or suspend it."""
         work, engine, worker = execution.work, self.engine, execution.worker
         start, waits_for = execution.start, execution.waits_for
@@ -355,3 +402,7 @@ class Loop:
             f'{strand.execution.work.entity.name}: it still waits ({strand.place})'
             for strand in self.strands.waiting
             if strand.execution is not None and strand.deadline is None]
+
+
+def _nothing() -> None:
+    pass

@@ -34,6 +34,7 @@ from mddag_executor.live.work import Work
 from mddag_executor.rerun.actions import Actions
 from mddag_executor.rerun.clocks import replace_timers, VirtualTime
 from mddag_executor.rerun.compare import Difference, differences
+from mddag_executor.rerun.computing import Computing
 from mddag_executor.rerun.discovery import Discovery
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.executor import NodeHolder, RerunHost
@@ -46,6 +47,7 @@ from mddag_executor.rerun.services import Services
 from mddag_executor.rerun.sources import Source
 from mddag_executor.rerun.strands import Stuck
 from mddag_executor.rerun.timers import Timers
+from mddag_executor.rerun.times import AsRecorded
 from mddag_executor.rerun.trace import VirtualTraceWriter
 from mddag_executor.rerun.types import type_name
 from msg_graph import TaskSet
@@ -78,12 +80,14 @@ class Settings:
     """
     How nodes are run again.
 
+    :ivar cpus: that callbacks which compute share; None: as many as are needed.
     :ivar seed: of Python's ``random``, of numpy's legacy generator and of what is drawn.
     :ivar all_clocks: whether steady and system clocks and Python's ``time`` are virtual, too.
     :ivar patience_s: a callback that uses no CPU for so long is blocked for ever.
     """
 
     workers: int = defaults.WORKERS
+    cpus: int | None = None
     policy: str = 'rad'
     seed: int = 0
     all_clocks: bool = False
@@ -176,6 +180,11 @@ class Rerun:
             self._engine, source.times, source.start, source.end, self._refresh, self._begin,
             self._over)
         clock.loop = self._holder.loop = loop
+        self._holders = self._held()
+        if settings.cpus is not None or self._holders:
+            python = isinstance(source.times, AsRecorded) and source.times.python
+            loop.computing = Computing(
+                self._engine, settings.cpus, python, loop.start, loop.ended)
         self._registry = Registry(task_set, self._engine, self._engine.leave_group)
         self._messages = Messages(
             loop, source.times, self._outputs, task_set, self._recorder, self._warn)
@@ -190,6 +199,15 @@ class Rerun:
         self._host = RerunHost(self._holder, loop.stop, loop)
         if self._recorder is not None:
             self._recorder.entities((), [self._holder.task_entity])
+
+    def _held(self) -> set[str]:
+        """Return the callbacks that hold the interpreter, declared or else recorded."""
+        held, vertices = set(), self._task_set.vertices
+        for place, vertex in enumerate(vertices):
+            declared = vertex.callback.holds_interpreter
+            if self._source.times.holds(place) if declared is None else declared:
+                held.add(vertex.callback.key)
+        return held
 
     def _warn(self, text: str) -> None:
         if text not in self.warnings:
@@ -307,6 +325,8 @@ class Rerun:
                 hosted, registry.subscriptions(), engine.record, now)
         for entity in added:
             entity.since = now
+            if entity.callback is not None and entity.callback.key in self._holders:
+                entity.habit.holds = 1
             if entity.kind == WAITABLE and not self._actions.knows(entity.rclpy) and (
                     not is_qos_event(entity.rclpy)):
                 self._warn(f'{entity.name}: a waitable of its own kind, which never gets ready')

@@ -113,9 +113,10 @@ class _Recorded:
     def __init__(self, path: str, task_set: TaskSet, name: str) -> None:
         run = open_run(path, task_set, name)
         tables = Tables.build(task_set, max_active_jobs=NEVER)
-        builder = LoadBuilder(task_set, tables, run.who, run.head.workers)
+        head = run.head
+        builder = LoadBuilder(task_set, tables, run.who, head.workers, max(0, head.cpus))
         Replay(run, more=lambda replay: [builder], paths=False)
         self.times = AsRecorded(tables, builder.build())
         start = run.end if run.start is None else run.start
-        self.start = min(start, run.head.time or start)
+        self.start = min(start, head.time or start)
         self.end = run.end

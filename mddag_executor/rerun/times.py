@@ -41,6 +41,12 @@ class Times(Protocol):
     def transport(self, dag: int, before: int, after: int, release: int) -> int:
         """Return how long after the end of a vertex its message to another one arrives."""
 
+    def computed(self, dag: int, vertex: int, release: int) -> int:
+        """Return how much of its execution a vertex computes; -1: it only waits."""
+
+    def holds(self, vertex: int) -> bool:
+        """Return whether a vertex holds the interpreter, where that is recorded."""
+
 
 class SameInEachJob:
     """
@@ -62,6 +68,14 @@ class SameInEachJob:
         """Return that messages take no time."""
         return 0
 
+    def computed(self, dag: int, vertex: int, release: int) -> int:
+        """Return that all of it is computing."""
+        return self._times[vertex]
+
+    def holds(self, vertex: int) -> bool:
+        """Return that nothing is recorded."""
+        return False
+
 
 class AsRecorded:
     """The times of the job of a recording that was released at about the same time."""
@@ -70,7 +84,7 @@ class AsRecorded:
 
     def __init__(self, tables: Tables, work: RecordedLoad) -> None:
         self._tables = tables
-        self._load, self._transports = work.load, work.transports
+        self._load, self._transports, self._computed = work.load, work.transports, work.computed
         load = work.load
         self._releases: list[list[tuple[int, int]]] = [[] for _ in range(tables.n_dags)]
         for dag, job, release in zip(load.dags, load.jobs, load.releases or load.times):
@@ -101,6 +115,27 @@ class AsRecorded:
         t = self._transports
         return self._value(
             t.delays, t.base[dag] + edge, t.stride[dag], dag, release, (before, after))
+
+    def computed(self, dag: int, vertex: int, release: int) -> int:
+        """Return the CPU time that a vertex of the job with that release took."""
+        if not self._computed:
+            return self.execution(dag, vertex, release)
+        load, local = self._load, vertex - self._tables.first_vertex[dag]
+        first, stride = load.cost_base[dag] + local, load.cost_stride[dag]
+        return self._value(self._computed, first, stride, dag, release, (vertex, -2))
+
+    def holds(self, vertex: int) -> bool:
+        """Return whether a vertex held the interpreter in most jobs."""
+        load, dag = self._load, self._tables.dag_of[vertex]
+        first = load.cost_base[dag] + vertex - self._tables.first_vertex[dag]
+        held = [load.holds[first + job * load.cost_stride[dag]]
+                for _, job in self._releases[dag]] if load.holds else []
+        return 2 * sum(held) > len(held)
+
+    @property
+    def python(self) -> bool:
+        """Return whether it is known what needs the interpreter."""
+        return bool(self._computed and self._load.holds)
 
     def _value(
         self, values: Sequence[int], first: int, stride: int, dag: int, release: int,

@@ -28,14 +28,11 @@ preempted executions back, knows of none.  All is in whole nanoseconds.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core.state import State
 from mddag_executor.simulate.engine import Load
-
-if TYPE_CHECKING:
-    from mddag_executor.simulate.deliveries import Deliveries
 
 SWITCH_NS = 1_000_000
 """Python's switch interval while an executor spins."""
@@ -47,6 +44,13 @@ HARDLY = 8
 """One that holds the interpreter and waits for less than this part of it keeps it meanwhile."""
 
 _LOCK, _CPU, _NOTHING = range(3)
+
+
+class Places(Protocol):
+    """Knows how far executions are when something of them has to be told."""
+
+    def next_place(self, x: int) -> int:
+        """Return how far a running execution is then."""
 
 
 class Machine:
@@ -64,7 +68,7 @@ class Machine:
 
     def __init__(
         self, tables: Tables, state: State, load: Load, cpus: int | None = None,
-        computed: Sequence[int] = (), python: bool = False, deliveries: Deliveries | None = None,
+        computed: Sequence[int] = (), python: bool = False, deliveries: Places | None = None,
     ) -> None:
         self._t = tables
         self._s = state
@@ -98,8 +102,11 @@ class Machine:
         place = (load.cost_base[dag] + s.job_index[slot] * load.cost_stride[dag]
                  + x - s.job_base[slot])
         cost = s.x_cost[x]
-        cpu = self._computed[place] if self._computed else cost
-        self._parts[x] = self._ends(cost, min(cpu, cost), s.x_holds[x] != 0)
+        self.begins(x, cost, self._computed[place] if self._computed else cost)
+
+    def begins(self, x: int, cost: int, cpu: int) -> None:
+        """Take in what an execution that has been dispatched takes, and what it computes of it."""
+        self._parts[x] = self._ends(cost, min(cpu, cost), self._s.x_holds[x] != 0)
 
     def _ends(self, cost: int, cpu: int, holds: bool) -> tuple[int, int, int]:
         """Return where the first three parts of an execution end."""

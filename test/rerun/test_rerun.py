@@ -145,6 +145,46 @@ def test_an_overload_shows_in_the_outputs(bag: str, graph: Path) -> None:
     assert rerun(bag, graph, [Filter, Sink]).digest == result.digest
 
 
+TWO = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /driver
+    callbacks:
+      - {name: drive, timer: 100ms, publishes: [/points], dag: main}
+  - node: /filter
+    callbacks:
+      - {name: take, subscription: /points, publishes: [/filtered], execution_time: 10ms,
+         deadline: 50ms}
+  - node: /other
+    callbacks:
+      - {name: take, subscription: /points, execution_time: 10ms, publishes: [/out],
+         deadline: 60ms}
+"""
+
+
+class Other(Node):
+
+    def __init__(self) -> None:
+        super().__init__('other')
+        self.publisher = self.create_publisher(Header, '/out', 10)
+        self.create_subscription(Header, '/points', self.publisher.publish, 10)
+
+
+def test_callbacks_share_cpus(bag: str, graph: Path) -> None:
+    graph.write_text(TWO)
+    # Two that compute take turns by slices of 3 ms.
+    for cpus, expected in ((2, [510, 510]), (1, [519, 520])):
+        result = rerun(bag, graph, [Filter, Other], cpus=cpus)
+        assert [published(result, topic)[5][0] for topic in ('/filtered', '/out')] == expected
+
+
+def test_callbacks_that_hold_the_interpreter(bag: str, graph: Path) -> None:
+    graph.write_text(TWO.replace('10ms', '10ms, holds_interpreter: true'))
+    result = rerun(bag, graph, [Filter, Other])
+    assert [published(result, topic)[5][0] for topic in ('/filtered', '/out')] == [510, 520]
+
+
 # --- timers, seeds, what is kept -----------------------------------------------------------------
 
 def node_with(function: Callable[[Node], None], name: str = 'filter') -> Callable[[], Node]:
