@@ -125,8 +125,8 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
     from mddag_executor.rerun.sources import open_source
     task_set = common.load_graph(args.graph)
     settings = Settings(
-        defaults.workers(args.workers, task_set), args.cpus, args.policy, args.seed, args.all_clocks,
-        ros_args=tuple(args.ros_args))
+        defaults.workers(args.workers, task_set), args.cpus, args.policy, args.seed,
+        args.all_clocks, ros_args=tuple(args.ros_args))
     with ExitStack() as files:
         path, name = files.enter_context(common.input_trace(args.recording))
         source = open_source(path, task_set, args.times, args.seed, name)

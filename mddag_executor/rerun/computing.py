@@ -3,8 +3,8 @@
 """
 When executions end that share CPUs and the interpreter.
 
-The machine is the simulator's (``simulate.machine``): it tells who stands still.  What an execution
-has sent before its end leaves when it is as far as it was then in the recording.
+The machine is the simulator's (``simulate.machine``): it tells who stands still.  What an
+execution has sent before its end leaves when it is as far as it was then in the recording.
 """
 
 from __future__ import annotations
