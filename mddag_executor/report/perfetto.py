@@ -5,13 +5,15 @@ A run for Perfetto's viewer (https://ui.perfetto.dev), in its own format.
 
 Theory of operation
 -------------------
-Tracks stand in four groups:
+Tracks stand in groups:
 
 * *workers*: one for each worker, with what it ran; arrows (flows) go from the execution that
   published to the one that its message started (of several pieces, to and from the last);
 * *callbacks*: in a group for each DAG one for each callback, with its executions by job;
-* *jobs*: one for each sink, with each job from its release to its completion there;
-* *missed deadlines*: an instant for each.
+* *jobs*: one for each sink, with each job from its release to its completion there, and one with
+  an instant at each deadline;
+* *missed deadlines*: an instant for each;
+* *ready callbacks*: a counter of those that wait for a worker or their group.
 
 Executions of one track may overlap (a reentrant group, jobs that overlap): then it has several
 tracks of one name, as Perfetto demands that slices of a track nest.  An execution goes to the
@@ -24,17 +26,19 @@ are the trace's, in nanoseconds.
 
 from __future__ import annotations
 
+from array import array
 from typing import Any, BinaryIO
 
 from mddag_executor.core import legs_of, Tables
 from mddag_executor.report.export import JobRow, Ran
 from mddag_executor.report.text import format_ns, printable
 from msg_graph import TaskSet
+import numpy as np
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import TracePacket, TrackEvent
 
 _SEQUENCE = 1
 _CLEARED, _NEEDED = 1, 2        # SEQ_INCREMENTAL_STATE_CLEARED, SEQ_NEEDS_INCREMENTAL_STATE
-_WORKERS, _CALLBACKS, _JOBS, _MISSED = 1, 2, 3, 4
+_WORKERS, _CALLBACKS, _JOBS, _MISSED, _READY = range(1, 6)
 _MASK = 2 ** 64 - 1
 
 
@@ -47,13 +51,15 @@ class PerfettoTarget:
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self._uuid = _MISSED
+        self._uuid = _READY
         # by kind and number: the end of the last slice and the uuid of each of its tracks
         self._lanes: dict[tuple[Any, ...], list[list[int]]] = {}
         self._dag_groups: dict[int, int] = {}
         self._names: dict[str, int] = {}
         self._keys: dict[str, int] = {}
         self._first = True
+        # by execution: when it became ready, and when it started
+        self._ready, self._started = array('q'), array('q')
 
     def begin(self, task_set: TaskSet, tables: Tables) -> None:
         """Write what there is whatever the run was."""
@@ -76,10 +82,14 @@ class PerfettoTarget:
         for uuid, name in ((_WORKERS, 'workers'), (_CALLBACKS, 'callbacks'),
                            (_JOBS, 'jobs by sink'), (_MISSED, 'missed deadlines')):
             self._describe(uuid, name, None, uuid)
+        self._describe(_READY, 'ready callbacks', None, _READY, counts=True)
 
     def execution(self, ran: Ran) -> None:
         """Write an execution on the track of its worker and on that of its callback."""
         row, piece = ran.row, ran.piece
+        if row.waiting_ns:
+            self._ready.append(row.ready_ns)
+            self._started.append(row.start_ns)
         name = f'worker {row.worker}' if row.worker >= 0 else 'spare threads'
         rank = row.worker if row.worker >= 0 else 1 << 20
         track = self._lane(('worker', row.worker), name, _WORKERS, rank, piece.start, piece.end)
@@ -125,6 +135,9 @@ class PerfettoTarget:
             self._note(event, 'slack_ns', row.slack_ns or 0)
             self._put(row.release_ns, event)
             self._end(track, row.completed_ns)
+        track = self._lane(('deadline', vertex), f'{row.sink} deadline', _JOBS, vertex, 0, 0)
+        event = self._event(TrackEvent.TYPE_INSTANT, track, f'job {row.job}')
+        self._put(row.deadline_ns, event)
         if row.verdict == 'in_time':
             return
         event = self._event(TrackEvent.TYPE_INSTANT, _MISSED, f'{row.sink} missed')
@@ -137,7 +150,16 @@ class PerfettoTarget:
         self._put(row.deadline_ns if row.completed_ns is None else row.completed_ns, event)
 
     def finish(self) -> None:
-        """Write what is left: nothing."""
+        """Write how many callbacks were ready over time, which is known only now."""
+        times = np.concatenate([self._ready, self._started])
+        step = np.repeat([1, -1], len(self._ready))
+        when, place = np.unique(times, return_inverse=True)
+        change = np.zeros(len(when), dtype=np.int64)
+        np.add.at(change, place, step)
+        for time, count in zip(when.tolist(), np.cumsum(change).tolist()):
+            event = self._event(TrackEvent.TYPE_COUNTER, _READY, None)
+            event.counter_value = count
+            self._put(time, event)
 
     # --- tracks ----------------------------------------------------------------------------------
 
@@ -169,7 +191,9 @@ class PerfettoTarget:
         self._describe(self._uuid, name, parent, rank)
         return self._uuid
 
-    def _describe(self, uuid: int, name: str, parent: int | None, rank: int) -> None:
+    def _describe(
+        self, uuid: int, name: str, parent: int | None, rank: int, counts: bool = False
+    ) -> None:
         packet = TracePacket()
         packet.trusted_packet_sequence_id = _SEQUENCE
         track = packet.track_descriptor
@@ -178,6 +202,8 @@ class PerfettoTarget:
         if parent is not None:
             track.parent_uuid = parent
         track.sibling_order_rank = rank
+        if counts:
+            track.counter.SetInParent()
         track.child_ordering = type(track).EXPLICIT
         self._write(packet)
 

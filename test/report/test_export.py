@@ -194,6 +194,7 @@ class Parsed:
         event_type = pb2.TrackEvent
         order = {event_type.TYPE_SLICE_END: 0, event_type.TYPE_INSTANT: 1,
                  event_type.TYPE_SLICE_BEGIN: 2}
+        self.counts: list[tuple[str, int, int]] = []
         self.begins: list[tuple[str, int]] = []     # as they stand in the file: group, start
         for place, packet in enumerate(trace.packet):
             names.update((e.iid, e.name) for e in packet.interned_data.event_names)
@@ -205,6 +206,10 @@ class Parsed:
                      for n in event.debug_annotations}
             if event.type == event_type.TYPE_SLICE_BEGIN:
                 self.begins.append((self.path(event.track_uuid).split(' > ')[0], packet.timestamp))
+            if event.type == event_type.TYPE_COUNTER:
+                self.counts.append((self.path(event.track_uuid), packet.timestamp,
+                                    event.counter_value))
+                continue
             name = event.name or (names[event.name_iid] if event.name_iid else '')
             events.setdefault(event.track_uuid, []).append(
                 (packet.timestamp, order[event.type], place, event, name, notes))
@@ -213,6 +218,7 @@ class Parsed:
                                              for p in trace.packet} == {1}
         self.slices: list[tuple[str, str, int, int, dict[str, Any], Any]] = []
         self.instants: list[tuple[str, int, str, dict[str, Any]]] = []
+        self.deadlines: list[tuple[str, int, str, dict[str, Any]]] = []
         for uuid, found in events.items():
             self._pair(uuid, sorted(found, key=lambda e: e[2]))
 
@@ -222,7 +228,8 @@ class Parsed:
         for time, kind, _, event, name, notes in found:
             track = self.path(uuid)
             if kind == 1:
-                self.instants.append((track, time, name, notes))
+                (self.deadlines if track.endswith(' deadline') else self.instants).append(
+                    (track, time, name, notes))
                 continue
             assert time >= last, 'slices of a track are in order and do not overlap'
             last = time
@@ -257,6 +264,12 @@ def test_perfetto_by_hand(tmp_path: Path) -> None:
     assert parsed.instants[0][3] == {
         'DAG': '/driver', 'job': 2, 'verdict': 'late', 'deadline_ns': runs.START + 38 * MS,
         'late_by_ns': 2 * MS}
+    assert [(track, (time - runs.START) / MS, name) for track, time, name, _ in parsed.deadlines
+            ] == [('jobs by sink > /filter:run deadline', at, f'job {job}')
+                  for job, at in enumerate((18, 28, 38))]
+    # only the second callback waits, for 1 ms each time
+    assert [(track, (time - runs.START) / MS, count) for track, time, count in parsed.counts] == [
+        ('ready callbacks', ready + late, 1 - late) for ready in (11, 22, 36) for late in (0, 1)]
     notes = next(s[4] for s in parsed.slices if s[:2] == ('workers > worker 1', '/filter:run'))
     assert notes == {'DAG': '/driver', 'job': 0, 'waiting_ns': MS, 'since_release_ns': 2 * MS,
                      'reference_slack_ns': 3 * MS}
