@@ -214,3 +214,42 @@ def test_a_process_that_was_killed_loses_the_last_second_at_most(tmp_path: Path)
     with pytest.warns(UserWarning, match='without a finish record'):
         first, *_, last = [event['_timestamp'] for event in read_events(path)]
     assert last - first > 1.2e9
+
+
+COMPUTING = """\
+mddag: 1
+nodes:
+  - node: /slow
+    callbacks:
+      - {name: a, timer: 100ms, deadline: 100ms, dag: slow, execution_time: 20ms}
+  - node: /fast
+    callbacks:
+      - {name: b, timer: 20ms, publishes: [/x], dag: fast, execution_time: 1ms}
+      - {name: c, subscription: /x, deadline: 20ms, execution_time: 2ms}
+  - node: /middle
+    callbacks:
+      - {name: d, timer: 50ms, deadline: 40ms, dag: middle, execution_time: 6ms}
+"""
+
+
+def test_callbacks_that_compute_are_predicted_for_other_workers(tmp_path: Path) -> None:
+    """
+    They have one interpreter whatever the workers are, so their medians stay where they are.
+
+    Version 1.0.0 predicted medians a hundred times as long, or no waiting at all.
+    """
+    graph, path = tmp_path / 'g.yaml', tmp_path / 'a.mcap'
+    graph.write_text(COMPUTING)
+    subprocess.run(
+        [sys.executable, '-m', 'mddag_executor', 'run', str(graph), '--synthetic', 'spin',
+         '--workers', '3', '--duration', '3s', '--trace', str(path)],
+        check=True, capture_output=True, timeout=100)
+    use = replay(path).result()['callbacks']
+    assert all(each['cpu_ns'] > 0 for each in use.values() if each['executions'])
+    assert use['/slow:a']['held_interpreter'] > 0
+    recorded = replay(path).result()['dags']
+    for workers in (1, 3, 7):
+        for name, dag in reschedule(path, workers=workers).result()['dags'].items():
+            for sink_name, sink in dag['sinks'].items():
+                median = recorded[name]['sinks'][sink_name]['response_ns']['median']
+                assert median / 6 < sink['response_ns']['median'] < median * 6, (workers, name)
