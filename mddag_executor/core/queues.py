@@ -33,6 +33,7 @@ from mddag_executor.core.state import (
     N_STALE,
     OVERTAKING,
     QueueEntry,
+    SEVERAL_INTERPRETERS,
     State,
     WAITING,
 )
@@ -99,7 +100,25 @@ def next_queue(s: State) -> list[QueueEntry]:
         _drop_stale(s, s.held_back)
     if len(s.held_back) == 0 or (len(s.ready) > 0 and s.ready[0] < s.held_back[0]):
         return s.ready
-    return s.held_back if interpreter_is_free(s, s.held_back[0]) else s.ready
+    if interpreter_is_free(s, s.held_back[0]):
+        return s.held_back
+    if s.scalars[SEVERAL_INTERPRETERS] != 0:
+        _bring_forward(s)
+    return s.ready
+
+
+def _bring_forward(s: State) -> None:
+    """Put what was held back into the ready queue where its interpreter is free now."""
+    kept = 0
+    for i in range(len(s.held_back)):
+        entry = s.held_back[i]
+        if not is_stale(s, entry) and interpreter_is_free(s, entry):
+            heappush(s.ready, entry)
+        else:
+            s.held_back[kept] = entry
+            kept += 1
+    del s.held_back[kept:]
+    heapify(s.held_back)
 
 
 def _drop_stale(s: State, queue: list[QueueEntry]) -> None:
@@ -109,13 +128,15 @@ def _drop_stale(s: State, queue: list[QueueEntry]) -> None:
 
 
 def interpreter_is_free(s: State, entry: QueueEntry) -> bool:
-    """Tell whether nothing that is as urgent or more holds the interpreter (rule 11)."""
+    """Tell whether nothing that is as urgent or more holds its interpreter (rule 11)."""
     if s.scalars[N_HOLDING] > 0:
         if s.scalars[OVERTAKING] == 0:
             return False
+        interpreter = s.x_holds[entry[4]]
         for worker in range(len(s.worker_x)):
             x = s.worker_x[worker]
-            if x >= 0 and s.x_holds[x] != 0 and s.x_key[x][0] <= entry[0]:
+            if (x >= 0 and s.x_holds[x] != 0 and s.x_holds[x] == interpreter
+                    and s.x_key[x][0] <= entry[0]):
                 return False
     return True
 

@@ -26,7 +26,7 @@ ELSEWHERE, HERE, ENDS_HERE = range(3)
 
 # Columns of ``scalars``.
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
- JUDGE_FROM, SKIP, N_HOLDING, OVERTAKING, N_SCALARS) = range(13)
+ JUDGE_FROM, SKIP, N_HOLDING, OVERTAKING, SEVERAL_INTERPRETERS, N_SCALARS) = range(14)
 
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  Each sink of a job is in time,
 # or late: it completed; or missed: it had not completed when the run ended past its deadline; or
@@ -84,7 +84,7 @@ class State(NamedTuple):
     x_state: list[int]
     x_pending: list[int]
     x_group: list[int]
-    # whether it holds the interpreter while it runs
+    # which interpreter it holds while it runs, from 1; 0: none
     x_holds: list[int]
     x_worker: list[int]
     x_key: list[QueueEntry]

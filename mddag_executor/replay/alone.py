@@ -29,13 +29,15 @@ FULL = 0.9
 """CPUs that are busy for so much of a time have nothing left."""
 
 
-def alone(start: Ints, took: Ints, cpu: Ints, held: Ints, cpus: int) -> Ints:
+def alone(
+    start: Ints, took: Ints, cpu: Ints, held: Ints, interpreter: Ints, cpus: int
+) -> Ints:
     """
     Return what executions would have taken alone, ns.
 
     :param took: how long they took, all in all.
     :param cpu: their CPU time, -1 where it is not known: they took what they would have.
-    :param held: whether they held the interpreter.
+    :param held: whether they held the interpreter, and ``interpreter``: which one.
     :param cpus: of the machine; 0: not known.
     """
     known = cpu >= 0
@@ -44,15 +46,17 @@ def alone(start: Ints, took: Ints, cpu: Ints, held: Ints, cpus: int) -> Ints:
     holds = known & (held != 0)
     result = took.copy()
     end = start + took
-    if holds.any():
-        others = _computed(start[holds], end[holds], cpu[holds])
+    after = np.where(cpu >= waited, np.minimum(cpu, BRIEF_NS), cpu - cpu // 4)
+    for number in np.unique(interpreter[holds]).tolist():
+        here = interpreter == number
+        mine = holds & here
+        others = _computed(start[mine], end[mine], cpu[mine])
         beside = others(end) - others(start)
-        mine = np.minimum(waited, np.maximum(0, beside - cpu))
-        result[holds] -= mine[holds]
-        after = np.where(cpu >= waited, np.minimum(cpu, BRIEF_NS), cpu - cpu // 4)
-        last = np.minimum(held_for(end - after, start[holds], end[holds]), SWITCH_NS)
-        others_do = known & ~holds
-        result[others_do] -= np.minimum(last, waited)[others_do]
+        for_it = np.minimum(waited, np.maximum(0, beside - cpu))
+        last = np.minimum(held_for(end - after, start[mine], end[mine]), SWITCH_NS)
+        result[mine] -= for_it[mine]
+        waits = known & ~holds & here
+        result[waits] -= np.minimum(last, waited)[waits]
     native = known & ~holds & (2 * cpu >= took)
     if cpus > 0 and native.any():
         others = _computed(start[known], end[known], cpu[known])

@@ -40,14 +40,18 @@ class Dispatches:
         # from when it was free, and from when its worker was, too
         self._free, self._worker = array('q'), array('q')
         self._start, self._end = array('q'), array('q')
-        self._holding: list[int] = []
+        self._interpreter, self._holding = array('q'), array('q')
 
-    def add(self, worker: int, group: int | None, ready: int, start: int, end: int) -> int:
+    def add(
+        self, worker: int, group: int | None, ready: int, start: int, end: int,
+        interpreter: int = 1,
+    ) -> int:
         """
         Take in an execution; times in ns.
 
         :param worker: which one ran it, -1 where that is not known.
         :param group: what identifies its mutually exclusive callback group, or None.
+        :param interpreter: that of its process.
         :return: its number.
         """
         could = ready
@@ -61,6 +65,7 @@ class Dispatches:
         self._worker.append(could)
         self._start.append(start)
         self._end.append(end)
+        self._interpreter.append(interpreter)
         return len(self._start) - 1
 
     def holds(self, number: int) -> None:
@@ -77,12 +82,22 @@ class Dispatches:
             np.searchsorted(np.sort(times), free, 'right') for times in (free, end))
         could = np.where(n_free - n_ended <= self._n_workers, free, worker)
         if self._holding:
-            from mddag_executor.replay.alone import held_for
-            from mddag_executor.simulate.machine import SWITCH_NS
-            begins, ends = start[self._holding], end[self._holding]
-            before = np.sort(ends)
-            place = np.searchsorted(before, begins, 'right') - 1
-            last = np.where(place >= 0, before[place], could[self._holding])
-            could[self._holding] = np.maximum(could[self._holding], last)
-            could = could + np.minimum(held_for(start, begins, ends), SWITCH_NS)
+            self._for_interpreter(start, end, could)
         return np.maximum(0, start - could)
+
+    def _for_interpreter(self, start: Any, end: Any, could: Any) -> None:
+        """Let executions start later that had to wait for an interpreter."""
+        from mddag_executor.replay.alone import held_for
+        from mddag_executor.simulate.machine import SWITCH_NS
+        import numpy as np
+        interpreter = np.array(self._interpreter, dtype=np.int64)
+        holding = np.array(self._holding, dtype=np.int64)
+        for number in np.unique(interpreter[holding]).tolist():
+            mine = holding[interpreter[holding] == number]
+            before = np.sort(end[mine])
+            place = np.searchsorted(before, start[mine], 'right') - 1
+            could[mine] = np.maximum(
+                could[mine], np.where(place >= 0, before[place], could[mine]))
+            here = interpreter == number
+            could[here] += np.minimum(
+                held_for(start[here], start[mine], end[mine]), SWITCH_NS)

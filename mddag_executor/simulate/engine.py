@@ -53,7 +53,7 @@ class Load(NamedTuple):
 
     Times in ns; the cost columns as in the theory of operation.  ``releases`` is empty where each
     job's source becomes ready (``times``) at its release.  ``holds`` tells, as ``costs``, which
-    executions hold the interpreter (1, else 0); it is empty where none does.
+    interpreter executions hold (from 1; 0: none); it is empty where none does.
     """
 
     times: list[int]

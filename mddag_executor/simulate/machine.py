@@ -31,7 +31,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from mddag_executor.core import NEVER, Tables
-from mddag_executor.core.state import State
+from mddag_executor.core.state import SEVERAL_INTERPRETERS, State
 from mddag_executor.simulate.engine import Load
 
 SWITCH_NS = 1_000_000
@@ -53,6 +53,29 @@ class Places(Protocol):
         """Return how far a running execution is then."""
 
 
+class _Lock:
+    """The lock of an interpreter: those that want it, first who has it."""
+
+    def __init__(self) -> None:
+        self._queue: list[int] = []
+        self.switch_at = NEVER
+
+    def take_turns(self, now: int, wanted: list[int]) -> list[int]:
+        """Return who has it now, if anybody."""
+        before = self._queue
+        queue = [x for x in before if x in wanted]
+        queue += [x for x in wanted if x not in queue]
+        if len(queue) < 2:
+            self.switch_at = NEVER
+        elif len(before) < 2 or queue[0] != before[0]:
+            self.switch_at = now + SWITCH_NS
+        elif now >= self.switch_at:
+            queue.append(queue.pop(0))
+            self.switch_at = now + SWITCH_NS
+        self._queue = queue
+        return queue[:1]
+
+
 class Machine:
     """
     Who computes, among those that run.
@@ -63,12 +86,14 @@ class Machine:
     :param computed: CPU time of the executions, as ``load.costs``; -1: it waits, as far as is
         known.  Empty: all of them compute all the time.
     :param python: whether executions that do not hold the interpreter need it at their end.
+    :param interpreters: by vertex that of its process, from 1; empty: there is one.
     :ivar next_time: when somebody needs something else, or must wait.
     """
 
     def __init__(
         self, tables: Tables, state: State, load: Load, cpus: int | None = None,
         computed: Sequence[int] = (), python: bool = False, deliveries: Places | None = None,
+        interpreters: Sequence[int] = (),
     ) -> None:
         self._t = tables
         self._s = state
@@ -77,13 +102,14 @@ class Machine:
         self._computed = computed
         self._python = python
         self._deliveries = deliveries
+        self._interpreters = interpreters
+        state.scalars[SEVERAL_INTERPRETERS] = int(max(load.holds, default=0) > 1)
         # by execution that was started: up to where it needs what
         self._parts: dict[int, tuple[int, int, int]] = {}
         self._still: list[int] = []
         self._settled = 0
-        # those that want the lock, first who has it, and those that compute, first who have a CPU
-        self._lock: list[int] = []
-        self._switch_at = NEVER
+        self._locks = [_Lock() for _ in range(max((1, *interpreters, *load.holds)))]
+        # those that compute, first who have a CPU
         self._cpu: list[int] = []
         self._slice_at = NEVER
         self.next_time = NEVER
@@ -128,21 +154,23 @@ class Machine:
     def share(self, now: int, finish_at: list[int]) -> None:
         """Find out who goes on, and set when they finish."""
         s = self._s
-        lock, free, steps = [], [], {}
+        free, steps = [], {}
+        waiting: list[list[int]] = [[] for _ in self._locks]
         for x in s.worker_x:
             if x >= 0:
                 at = s.x_cost[x] - s.x_left[x] + now - s.x_started[x]
                 need, until = self._need(x, at)
                 if need == _LOCK:
-                    lock.append(x)
+                    waiting[self._interpreter(x) - 1].append(x)
                 elif need == _CPU:
                     free.append(x)
                 steps[x] = at, until, need
-        self._take_turns_with_lock(now, lock)
-        self._take_turns_with_cpus(now, free + self._lock[:1])
+        for lock, wanted in zip(self._locks, waiting):
+            free += lock.take_turns(now, wanted)
+        self._take_turns_with_cpus(now, free)
         computes = set(self._cpu[:self._cpus])
         self._still = []
-        self.next_time = min(self._switch_at, self._slice_at)
+        self.next_time = min(self._slice_at, *(lock.switch_at for lock in self._locks))
         for worker, x in enumerate(s.worker_x):
             if x < 0:
                 continue
@@ -169,18 +197,11 @@ class Machine:
         cost = self._s.x_cost[x]
         return (_LOCK if third < cost else _NOTHING), cost
 
-    def _take_turns_with_lock(self, now: int, wanted: list[int]) -> None:
-        before = self._lock
-        queue = [x for x in before if x in wanted]
-        queue += [x for x in wanted if x not in queue]
-        if len(queue) < 2:
-            self._switch_at = NEVER
-        elif len(before) < 2 or queue[0] != before[0]:
-            self._switch_at = now + SWITCH_NS
-        elif now >= self._switch_at:
-            queue.append(queue.pop(0))
-            self._switch_at = now + SWITCH_NS
-        self._lock = queue
+    def _interpreter(self, x: int) -> int:
+        """Return which interpreter an execution computes with."""
+        s = self._s
+        return s.x_holds[x] or (
+            self._interpreters[s.x_vertex[x]] if self._interpreters else 1)
 
     def _take_turns_with_cpus(self, now: int, wanted: list[int]) -> None:
         queue = [x for x in self._cpu if x in wanted]

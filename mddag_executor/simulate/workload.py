@@ -147,7 +147,15 @@ def periodic_load(task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns
 
 
 def declared_holds(task_set: TaskSet) -> list[list[int]]:
-    """Return by DAG which vertices are declared to hold the interpreter; empty where none is."""
-    holds = [[int(vertex.callback.holds_interpreter or False) for vertex in dag.vertices]
-             for dag in task_set.dags]
+    """Return by DAG which interpreter vertices are declared to hold, 0: none; empty: no vertex."""
+    number = iter(interpreters_of(task_set))
+    holds = [[next(number) * int(vertex.callback.holds_interpreter or False)
+              for vertex in dag.vertices] for dag in task_set.dags]
     return holds if any(map(any, holds)) else []
+
+
+def interpreters_of(task_set: TaskSet) -> list[int]:
+    """Return by vertex the number of its process, from 1; at last that of undeclared callbacks."""
+    place = {node: number for number, process in enumerate(task_set.processes, 1)
+             for node in process.nodes}
+    return [*(place.get(vertex.callback.node, 1) for vertex in task_set.vertices), 1]

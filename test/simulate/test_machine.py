@@ -45,6 +45,7 @@ class Job:
     cost: int
     holds: bool = False
     cpu: int | None = None
+    interpreter: int = 1
     left: int = 0
     start: int = -1
     end: int = -1
@@ -61,12 +62,13 @@ def times(
     order = sorted(range(len(jobs)), key=lambda n: (jobs[n].release, n))
     n = len(jobs)
     load = Load([jobs[i].release for i in order], order, [0] * n, [job.cost for job in jobs],
-                list(range(n)), [0] * n, holds=[int(job.holds) for job in jobs])
+                list(range(n)), [0] * n, holds=[job.interpreter * job.holds for job in jobs])
     state = new_state(tables, workers, preemptive=preemptive)
     computed = [job.cost if job.cpu is None else job.cpu for job in jobs]
     log: list[LogEntry] = []
     run(tables, state, find_policy('rad').key, load, 10 ** 12, False, log,
-        machine=Machine(tables, state, load, cpus, computed, python))
+        machine=Machine(tables, state, load, cpus, computed, python, None,
+                        [*(job.interpreter for job in jobs), 1]))
     found = [(-1, -1)] * n
     for now, kind, _, dag, _, _ in log:
         if kind == START and found[dag][0] < 0:
@@ -99,6 +101,15 @@ def test_one_that_is_more_urgent_overtakes_and_they_take_turns() -> None:
     # with one worker it waits; where it takes the worker, the other one does
     assert in_ms(times(jobs, 1)) == [(0, 10), (10, 13)]
     assert in_ms(times(jobs, 1, preemptive=True)) == [(0, 13), (2, 5)]
+
+
+def test_each_process_has_its_interpreter() -> None:
+    """The second of each waits for the first of its own; what goes first of all is held back."""
+    jobs = of_ms(Job(0, 50, 4, True), Job(0, 60, 6, True, interpreter=2),
+                 Job(1, 70, 3, True), Job(1, 80, 2, True, interpreter=2))
+    assert in_ms(times(jobs, 4)) == [(0, 4), (0, 6), (4, 7), (6, 8)]
+    jobs[0].cost = 9 * MS
+    assert in_ms(times(jobs, 4)) == [(0, 9), (0, 6), (9, 12), (6, 8)]
 
 
 def test_cpus_are_shared_by_slices() -> None:
@@ -171,6 +182,25 @@ SWITCH, SLICE, BRIEF = 3, 5, 2
 
 
 @dataclass(eq=False)
+class Lock:
+    """An interpreter's; ``left`` is for how many ticks who has it keeps it."""
+
+    queue: list[Job] = field(default_factory=list)
+    left: int = 0
+
+    def pass_on(self, wanted: list[Job]) -> None:
+        had, several = self.queue[:1], len(self.queue) > 1
+        self.queue = [job for job in self.queue if job in wanted]
+        self.queue += [job for job in wanted if job not in self.queue]
+        if not several or self.queue[:1] != had:
+            self.left = SWITCH
+        elif self.left == 0:
+            self.queue = self.queue[1:] + self.queue[:1]
+            self.left = SWITCH
+        self.left -= 1
+
+
+@dataclass(eq=False)
 class Ticks:
     """The machine, tick by tick; written from its theory of operation."""
 
@@ -180,10 +210,8 @@ class Ticks:
     python: bool
     on: list[Job | None] = field(default_factory=list)
     waiting: list[Job] = field(default_factory=list)
-    lock: list[Job] = field(default_factory=list)
+    locks: dict[int, Lock] = field(default_factory=dict)
     computing: list[Job] = field(default_factory=list)
-    # ticks until who has the lock, or a CPU, gives it up
-    turn: int | None = None
     slice_left: int | None = None
 
     def times(self) -> list[tuple[int, int]]:
@@ -204,17 +232,21 @@ class Ticks:
         wanted: dict[str, list[Job]] = {LOCK: [], CPU: [], NOTHING: []}
         for job in filter(None, self.on):
             wanted[self._needs(job)].append(job)
-        self._pass_lock(wanted[LOCK])
-        self._pass_cpus(wanted[CPU] + self.lock[:1])
+        having = []
+        for number in (1, 2):
+            lock = self.locks.setdefault(number, Lock())
+            lock.pass_on([job for job in wanted[LOCK] if job.interpreter == number])
+            having += lock.queue[:1]
+        self._pass_cpus(wanted[CPU] + having)
         for job in wanted[NOTHING] + self.computing[:self.cpus]:
             job.left -= 1
-        self.turn = None if self.turn is None else self.turn - 1
         self.slice_left = None if self.slice_left is None else self.slice_left - 1
 
     def _start(self, job: Job, now: int) -> None:
         urgency = job.release + job.deadline
         if None not in self.on or (job.holds and any(
-                other is not None and other.holds and other.release + other.deadline <= urgency
+                other is not None and other.holds and other.interpreter == job.interpreter
+                and other.release + other.deadline <= urgency
                 for other in self.on)):
             return
         self.waiting.remove(job)
@@ -237,18 +269,6 @@ class Ticks:
             parts = [LOCK] * (cpu // 4) + [NOTHING] * waits + [LOCK] * (cpu - cpu // 4)
         return parts[job.cost - job.left]
 
-    def _pass_lock(self, wanted: list[Job]) -> None:
-        had, several = self.lock[:1], len(self.lock) > 1
-        self.lock = [job for job in self.lock if job in wanted]
-        self.lock += [job for job in wanted if job not in self.lock]
-        if len(self.lock) < 2:
-            self.turn = None
-        elif not several or self.lock[:1] != had:
-            self.turn = SWITCH
-        elif self.turn == 0:
-            self.lock = self.lock[1:] + self.lock[:1]
-            self.turn = SWITCH
-
     def _pass_cpus(self, wanted: list[Job]) -> None:
         had = self.computing[:self.cpus]
         old = [job for job in self.computing if job in wanted]
@@ -270,7 +290,8 @@ def some_jobs(draw: st.DrawFn) -> list[Job]:
     for urgency in urgencies:
         release, cost = draw(st.integers(0, 20)), draw(st.integers(1, 25))
         jobs.append(Job(release, urgency - release, cost, draw(st.booleans()),
-                        draw(st.one_of(st.none(), st.integers(0, cost)))))
+                        draw(st.one_of(st.none(), st.integers(0, cost))),
+                        draw(st.integers(1, 2))))
     return jobs
 
 
