@@ -42,9 +42,9 @@ test: env
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 # The tests that run ROS, in an environment with ROS 2 Kilted instead of Jazzy.
-LIVE_TESTS := test/live test/examples test/hardening/test_misuse.py \
+LIVE_TESTS := test/live test/rerun test/examples test/hardening/test_misuse.py \
 	test/replay/test_live_replay.py \
-	$(addprefix test/cli/test_,$(addsuffix .py,demo graph_systems run top))
+	$(addprefix test/cli/test_,$(addsuffix .py,demo graph_systems rerun run top))
 
 test-kilted:
 	@PYTHON='$(PYTHON)' sh .ci/environment $(KILTED) ros-kilted,test-kilted

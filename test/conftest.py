@@ -130,7 +130,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 # What runs ROS, or looks at how time passes. Side by side (`make test`) they are one group, which
 # one process runs one after the other while the other process runs the rest.
-ALONE = ('live', 'rerun', 'integration', 'bench', 'launch', 'examples', 'hardening')
+ALONE = ('live', 'integration', 'bench', 'launch', 'examples', 'hardening')
 ALONE_FILES = (
     'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_bench_replay.py',
     'cli/test_graph_systems.py', 'replay/test_live_replay.py', 'test_docs.py', 'test_readme.py')

@@ -9,6 +9,7 @@ that of its type, and its bytes.
 
 from __future__ import annotations
 
+from collections.abc import Container
 import hashlib
 import struct
 from typing import Any, BinaryIO, NamedTuple
@@ -33,12 +34,12 @@ class Outputs:
     Collects what is published.
 
     :param file: gets it as a bag, where one is wanted.
-    :param keep: whether to keep the messages.
+    :param keep: which topics' messages to keep; None: those of all.
     :ivar messages: what was kept.
     :ivar counts: how many messages were published, by topic.
     """
 
-    def __init__(self, file: BinaryIO | None, keep: bool) -> None:
+    def __init__(self, file: BinaryIO | None, keep: Container[str] | None = None) -> None:
         self.messages: list[Output] = []
         self.counts: dict[str, int] = {}
         self._keep = keep
@@ -49,7 +50,7 @@ class Outputs:
     def add(self, time: int, topic: str, kind: Any, data: bytes, publisher: Any) -> None:
         """Add a message."""
         self.counts[topic] = self.counts.get(topic, 0) + 1
-        if self._keep:
+        if self._keep is None or topic in self._keep:
             self.messages.append(Output(time, topic, kind, data))
         head = self._heads.get((topic, kind))
         if head is None:

@@ -152,7 +152,7 @@ class Rerun:
         self._trace = trace
         self._replacements = Replacements()
         self.warnings: list[str] = []
-        self._outputs = Outputs(output, keep or bool(source.topics))
+        self._outputs = Outputs(output, None if keep else source.topics)
         self._programs: Callable[[], Sequence[Program]] = tuple
         self._failed: list[Guest] = []
         self._hosted: set[str] = set()

@@ -25,6 +25,7 @@ import rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
+from rosbags.typesys import get_typestore, Stores
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Header, String
 
@@ -105,6 +106,19 @@ def test_outputs_are_a_bag_that_others_read(bag: str, graph: Path, tmp_path: Pat
     assert found == [(each.time, 2.0 * i) for i, each in enumerate(
         each for each in result.outputs if each.topic == '/out')]
     assert_same(result, out)
+
+
+def test_a_bag_of_sqlite(bag: str, graph: Path, tmp_path: Path) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    folder = tmp_path / 'sqlite'
+    with Writer(folder, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection(
+            '/points', 'std_msgs/msg/Header', typestore=get_typestore(Stores.ROS2_JAZZY))
+        for i in range(20):
+            writer.write(connection, START + i * 100 * MS, serialize_message(
+                Header(frame_id=str(i))))
+    result = rerun(folder, graph, [Filter, Sink])
+    assert result.digest == rerun(bag, graph, [Filter, Sink]).digest
 
 
 def test_the_trace_replays(bag: str, graph: Path, tmp_path: Path) -> None:
