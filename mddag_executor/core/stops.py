@@ -27,23 +27,35 @@ class Stops:
         self._total_ns = 0
         self._misses = 0
         self._latest: deque[tuple[int, int]] = deque(maxlen=KEEP_STOPS)
-        self._elsewhere: deque[tuple[int, int]] = deque(maxlen=KEEP_MISSES)
+        self._elsewhere: deque[tuple[int, int, Any]] = deque(maxlen=KEEP_MISSES)
 
-    def stopped(self, begin: int, end: int) -> None:
-        """Take in a stop; each begins after the one before has ended."""
+    def stopped(self, begin: int, end: int) -> list[Any]:
+        """
+        Take in a stop; each begins after the one before has ended.
+
+        Return what `missed` was told of the misses that turn out to fall into it.
+        """
         self._count += 1
         self._total_ns += end - begin
         self._latest.append((begin, end))
         others = [miss for miss in self._elsewhere if miss[1] < begin or miss[0] > end]
-        self._misses += len(self._elsewhere) - len(others)
+        found = [what for release, deadline, what in self._elsewhere
+                 if deadline >= begin and release <= end]
+        self._misses += len(found)
         self._elsewhere = deque(others, KEEP_MISSES)
+        return found
 
-    def missed(self, release: int, deadline: int) -> None:
-        """Take in a miss of a job that was to run between these times."""
+    def missed(self, release: int, deadline: int, what: Any = None) -> bool:
+        """
+        Take in a miss of a job that was to run between these times.
+
+        Return whether it falls into a stop that is known.
+        """
         if any(begin <= deadline and release <= end for begin, end in self._latest):
             self._misses += 1
-        else:
-            self._elsewhere.append((release, deadline))
+            return True
+        self._elsewhere.append((release, deadline, what))
+        return False
 
     def result(self) -> dict[str, Any]:
         """Return how many stops there were, how long, the misses in them, and the last stops."""

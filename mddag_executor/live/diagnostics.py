@@ -22,7 +22,8 @@ the host's name and the process, and values are texts whose units stand in their
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 import os
 import socket
@@ -74,17 +75,22 @@ class DagWatch:
     :param dag: its index.
     :param period_ns: the period of its source.
     :param every_ns: the period of the diagnostics.
+    :param causes: how many misses of which cause there have been.
     """
 
     def __init__(
         self, tally: Tally, dag: int, name: str, period_ns: int, sinks: list[SinkTally],
-        thresholds: Thresholds, every_ns: int,
+        names: list[str], thresholds: Thresholds, every_ns: int, causes: Mapping[str, int],
     ) -> None:
+        self._causes = causes
+        self._caused: deque[Counter[str]] = deque(maxlen=thresholds.window)
+        self._last_causes = Counter(causes)
         self._tally = tally
         self._dag = dag
         self._name = name
         self._period_ns = period_ns
         self._sinks = sinks
+        self._names = names
         self._thresholds = thresholds
         self._stale_after = max(thresholds.stale_periods * period_ns, every_ns)
         self._last = self._read()
@@ -106,7 +112,8 @@ class DagWatch:
             self._released_at = now
         self._last, self._jobs = results, jobs
         window = Counts.total(self._window)
-        level, message = self._level(step, window, now)
+        causes = self._why()
+        level, message = self._level(step, window, now, causes)
         ratio = window.missed / window.due if window.due else 0.0
         values = {
             'period_ms': _ms(self._period_ns), 'jobs': str(jobs),
@@ -114,10 +121,25 @@ class DagWatch:
             'late': str(results.late), 'expired': str(results.expired),
             'aborted': str(results.aborted), 'failed': str(results.failed),
             'window_results': str(window.due), 'window_missed': str(window.missed),
-            'window_missed_ratio': f'{ratio:.4f}', **self._response_times()}
+            'window_missed_ratio': f'{ratio:.4f}', 'window_causes': causes,
+            **self._response_times()}
         return Status(f'{self._thresholds.name}: {self._name}', level, message, values)
 
-    def _level(self, step: Counts, window: Counts, now: int) -> tuple[int, str]:
+    def _why(self) -> str:
+        """Return the causes of the window's misses, the most frequent first."""
+        causes = Counter(self._causes)
+        step = Counter(causes)
+        step.subtract(self._last_causes)    # what turns out to be the machine's counts less before
+        self._caused.append(step)
+        self._last_causes = causes
+        total: Counter[str] = Counter()
+        for each in self._caused:
+            total.update(each)
+        return ', '.join(f'{n} {cause}' for cause, n in total.most_common() if n > 0)
+
+    def _level(
+        self, step: Counts, window: Counts, now: int, causes: str
+    ) -> tuple[int, str]:
         limits = self._thresholds
         if self._released_at is None:
             return STALE, 'nothing has been released yet'
@@ -127,8 +149,8 @@ class DagWatch:
         if not window.missed:
             return OK, f'{counted(window.due, "result")} in time'
         message = f'{window.missed} of {window.due} results missed their deadlines'
-        if window.failed:
-            message += f', {window.failed} because a callback raised'
+        if causes:
+            message += f': {causes}'
         if window.missed >= max(
                 limits.warn_burst, limits.error_ratio * window.due):
             return ERROR, message
@@ -140,12 +162,14 @@ class DagWatch:
         """Return the response times of the last period, in parts of their deadlines and in ms."""
         times: list[int] = []
         used: list[float] = []
+        margins: dict[str, int] = {}
         for i, sink in enumerate(self._sinks):
             completed = sink.completed
             found = last_responses(sink, completed - self._completed[i])
             self._completed[i] = completed
             times += found
             if found:
+                margins[self._names[i]] = sink.relative_deadline_ns - max(found)
                 used.append(max(found) / sink.relative_deadline_ns)
         if not times:
             return {}
@@ -153,7 +177,8 @@ class DagWatch:
         return {
             'response_p50_ms': _ms(quantile(times, 0.5)),
             'response_p99_ms': _ms(quantile(times, 0.99)), 'response_max_ms': _ms(times[-1]),
-            'deadline_used_max': f'{max(used):.2f}'}
+            'deadline_used_max': f'{max(used):.2f}', 'margin_min_ms': _ms(min(margins.values())),
+            **{f'margin_ms {name}': _ms(margin) for name, margin in margins.items()}}
 
 
 def _ms(nanoseconds: int) -> str:
@@ -235,7 +260,9 @@ class Diagnostics:
             self._dags.append((
                 {vertex.callback.key for vertex in dag.vertices},
                 DagWatch(tally, dag.index, dag.name, dag.period_ns,
-                         [tally.sinks[v] for v in sinks], thresholds, period_ns)))
+                         [tally.sinks[v] for v in sinks],
+                         [tally.vertex_name(v) for v in sinks], thresholds, period_ns,
+                         pool.engine.verdicts.causes[dag.index])))
         self._pool = PoolWatch(pool, registry, recorder, thresholds)
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None

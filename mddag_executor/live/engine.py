@@ -545,7 +545,7 @@ class Engine:
         decisions = self.scheduler.decisions()
         if self._finished:  # it was judged already, and the trace is closed
             return
-        for x in self.verdicts.add(decisions, now):
+        for x in self.verdicts.add(decisions, now, self._state):
             work = self._work.pop(x, None)
             if work is not None:  # the core dropped it: what is left of an aborted job
                 work.entity.waiting.pop(x, None)

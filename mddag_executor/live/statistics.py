@@ -10,6 +10,7 @@ from mddag_executor.core.tally import counts, never_due
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
+from mddag_executor.live.why import CAUSES
 
 
 def statistics(
@@ -25,13 +26,15 @@ def statistics(
     ``unattributed`` counts messages of declared callbacks whose publication was not found; they
     ran as undeclared ones.  ``stops`` has how often and for how long no thread of the process ran
     while it spun, how many misses fell into these stops, and the times of the last ones (ns since
-    the epoch).  ``preemption`` (None unless asked for) has why it is off, or None, and how often a
-    callback was to pause.
+    the epoch).  ``causes`` has how many misses of which cause there are, as far as the executor
+    knows it at once.  ``preemption`` (None unless asked for) has why it is off, or None, and how
+    often a callback was to pause.
     """
     engine = pool.engine
     with pool.lock:
         result = engine.verdicts.tally.result()
         stops = engine.verdicts.stops.result()
+        causes = {cause: sum(of[cause] for of in engine.verdicts.causes) for cause in CAUSES}
         waiting = engine.scheduler.queue_length
         idle = engine.scheduler.idle_workers
         undeclared = engine.undeclared
@@ -47,7 +50,8 @@ def statistics(
     result['never_due'] = never_due(result['dags'])
     return {
         'policy': engine.scheduler.policy.name, 'workers': engine.n_workers,
-        **result, 'stops': stops, 'callbacks': callbacks, 'undeclared': undeclared,
+        **result, 'stops': stops, 'causes': causes, 'callbacks': callbacks,
+        'undeclared': undeclared,
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
         'preemption': None if pool.preemption is None else {
             'reason_off': pool.preemption.reason or None, 'pauses': pool.preemption.count},

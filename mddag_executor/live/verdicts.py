@@ -20,11 +20,13 @@ from mddag_executor.core.state import (
     SINK_FAILED,
     SINK_IN_TIME,
     SINK_LATE,
+    State,
 )
 from mddag_executor.core.stops import Stops
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.live.entity import Entity
 from mddag_executor.live.jobs import Origin
+from mddag_executor.live.why import CAUSES, MACHINE, Why
 from msg_graph import TaskSet
 
 KEEP_RESPONSES = 2_000
@@ -73,6 +75,9 @@ class Verdicts:
     ) -> None:
         self.tally = Tally(task_set, tables, KEEP_RESPONSES)
         self.stops = Stops()
+        self._why = Why(task_set, tables)
+        #: By DAG: how many misses of each cause, as far as is known at once.
+        self.causes = [dict.fromkeys(CAUSES, 0) for _ in range(tables.n_dags)]
         self.record = record
         self._dags = task_set.dags if task_set is not None else ()
         self._tables = tables
@@ -83,8 +88,8 @@ class Verdicts:
         self.misses: deque[DeadlineMiss] = deque()
         self._aborted: dict[tuple[int, int], None] = {}
 
-    def add(self, decisions: list[Decision], now: int) -> list[int]:
-        """Take in decisions; return the executions that the core dropped."""
+    def add(self, decisions: list[Decision], now: int, state: State) -> list[int]:
+        """Take in decisions of a core; return the executions that it dropped."""
         self.tally.add(decisions)
         dropped = []
         for kind, dag, vertex, job, deadline, time in decisions:
@@ -93,7 +98,7 @@ class Verdicts:
             elif kind == JOB_END:
                 self._ended(dag, job, deadline, now)
             elif kind != SINK_IN_TIME:
-                self._missed(kind, dag, vertex, job, deadline, time, now)
+                self._missed(kind, dag, vertex, job, deadline, time, now, state)
         return dropped
 
     def _ended(self, dag: int, job: int, end: int, now: int) -> None:
@@ -110,15 +115,20 @@ class Verdicts:
         return (dag, job) in self._aborted
 
     def _missed(
-        self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int, now: int
+        self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int, now: int,
+        state: State,
     ) -> None:
         if self.record is not None:
             self.record(
                 'deadline', now, threading.get_native_id(), dag,
                 self._tables.index_in_dag[vertex], job, deadline, time)
         release = deadline - self._tables.sink_deadline[vertex]
-        if kind != SINK_FAILED:  # that one is its callback's doing
-            self.stops.missed(release, deadline)
+        cause = self._why.cause(
+            state, kind, dag, vertex, job, deadline, time if kind == SINK_LATE else now)
+        # what failed is its callback's doing
+        if kind != SINK_FAILED and self.stops.missed(release, deadline, (dag, cause)):
+            cause = MACHINE
+        self.causes[dag][cause] += 1
         if self._on_miss is not None:
             self.misses.append(DeadlineMiss(
                 self._dags[dag].name, self.tally.vertex_name(vertex), job, release, deadline,
@@ -145,7 +155,9 @@ class Verdicts:
 
     def stopped(self, begin: int, end: int) -> None:
         """Take in that no thread of the process ran for a while, which has just ended."""
-        self.stops.stopped(begin, end)
+        for dag, cause in self.stops.stopped(begin, end):
+            self.causes[dag][cause] -= 1
+            self.causes[dag][MACHINE] += 1
         if self.record is not None:
             self.record('stop', end, threading.get_native_id(), begin, end)
 

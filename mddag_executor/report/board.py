@@ -23,9 +23,9 @@ MOST_STATUSES = 1000
 _STYLES = {'OK': 'green', 'WARN': 'yellow', 'ERROR': 'bold red', 'STALE': 'magenta', GONE: 'dim'}
 
 _DAG_TITLES = ('process', 'DAG', 'state', 'period ms', 'jobs', 'lately', 'missed', 'p50 ms',
-               'p99 ms', 'max ms', 'of deadline', 'message')
+               'p99 ms', 'max ms', 'of deadline', 'least margin ms', 'message')
 _DAG_KEYS = ('period_ms', 'jobs', 'window_results', 'window_missed', 'response_p50_ms',
-             'response_p99_ms', 'response_max_ms', 'deadline_used_max')
+             'response_p99_ms', 'response_max_ms', 'deadline_used_max', 'margin_min_ms')
 _POOL_TITLES = ('process', 'workers of', 'state', 'idle', 'queue', 'per s', 'busy', 'CPU',
                 'us each', 'compute', 'dropped', 'skipped', 'no job', 'message')
 _POOL_KEYS = ('idle_workers', 'queue', 'callbacks_per_s', 'busy_ratio', 'cpu_ratio',
