@@ -17,6 +17,7 @@ One process computes Python on one core, so what a process can take is bounded b
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
 
@@ -90,6 +91,10 @@ class Placing:
                             self._between[a][b] = (
                                 self._between[a].get(b, 0.0) + TRANSPORT_NS / dag.period_ns)
 
+    def block_of(self, node: str) -> int:
+        """Return the block that a node is in."""
+        return self._block[node]
+
     def loads(self, place: dict[int, int]) -> list[float]:
         """Return the load of each process; of blocks that are placed."""
         loads = [0.0] * self._n
@@ -105,21 +110,33 @@ class Placing:
 
         :raises UsageError: when too many nodes are to run apart.
         """
-        place: dict[int, int] = {}
-        # Where no load is declared blocks still spread out: the least of all counts for something.
-        for block in sorted(self._blocks, key=lambda b: (-self._own[b], b)):
-            allowed = [p for p in range(self._n) if self._fits(place, block, p)]
-            if not allowed:
-                raise UsageError(f'--apart: {counted(self._n, "process", "processes")} cannot '
-                                 'keep all these nodes apart: give more processes')
+        torn = Counter(block for block, _ in self._apart)
+        order = sorted(self._blocks, key=lambda b: (-torn[b], -self._own[b], b))
+        place = self._kept_apart({}, order[:len(torn)])
+        if place is None:
+            raise UsageError(f'--apart: {counted(self._n, "process", "processes")} cannot '
+                             'keep all these nodes apart: give more processes')
+        for block in order[len(torn):]:
             left = len(self._blocks) - len(place)
-            empty = [p for p in allowed if p not in place.values()]
-            choice = empty if left <= self._n - len(set(place.values())) else allowed
-            place[block] = min(choice or allowed, key=lambda p: (
-                self._cost({**place, block: p}), sum(q == p for q in place.values()), p))
+            empty = [p for p in range(self._n) if p not in place.values()]
+            place[block] = self._best(place, block, empty if left <= len(empty) else range(
+                self._n))[0]
         while better := next(self._better(place), None):
             place = better
         return place
+
+    def _best(self, place: dict[int, int], block: int, choice: Iterable[int]) -> list[int]:
+        """Return processes for a block, the best first; of equal ones that with fewer blocks."""
+        return sorted(choice, key=lambda p: (
+            self._cost({**place, block: p}), sum(q == p for q in place.values()), p))
+
+    def _kept_apart(self, place: dict[int, int], blocks: list[int]) -> dict[int, int] | None:
+        """Return a placement with more blocks, None where they cannot be kept apart."""
+        if not blocks:
+            return place
+        allowed = [p for p in range(self._n) if self._fits(place, blocks[0], p)]
+        return next((found for p in self._best(place, blocks[0], allowed) if (
+            found := self._kept_apart({**place, blocks[0]: p}, blocks[1:])) is not None), None)
 
     def _fits(self, place: dict[int, int], block: int, process: int) -> bool:
         return all((block, other) not in self._apart

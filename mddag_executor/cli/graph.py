@@ -20,7 +20,7 @@ mddag graph check --help
 """
 
 VERBS = ('check', 'draw', 'schema', 'fmt', 'from-caret', 'from-trace', 'from-ros', 'analyse',
-         'assign-deadlines')
+         'assign-deadlines', 'place')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

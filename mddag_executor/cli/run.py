@@ -56,6 +56,8 @@ mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20
 # SIGINTs within this time are one: who ends a process group sends it to all processes of it, and
 # `ros2 launch`, where it reads from no terminal, then once more to those that it started.
 _SAME_INTERRUPT_S = 1.0
+# A part whose run was killed must not stay for ever, whatever its nodes do.
+_PART_ENDS_S = 60
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -150,9 +152,9 @@ def main(args: argparse.Namespace) -> int:
 def part(args: argparse.Namespace) -> int:
     """Run one process of several, and leave what came of it in the folder of the run."""
     from mddag_executor.live.parts import Part
-    from mddag_executor.live.supervisor import end_with_parent
+    from mddag_executor.live.supervisor import belong_to_parent
     the_part = Part.read(args.part)
-    end_with_parent(the_part.parent)
+    belong_to_parent(the_part.parent)
     task_set = loads(the_part.text, name=args.graph)
     if args.process is None:
         from mddag_executor.live.hosting import nodes_of
@@ -190,7 +192,8 @@ def run_here(
     else:
         from mddag_executor.live.loading import resolve
         programs = [resolve(spec, _ros_arguments(args)) for spec in args.node]
-    with told_when_stuck() as ends, Signals() as signals, _rclpy(args.ros_args or []):
+    with told_when_stuck() as ends, Signals(
+            _PART_ENDS_S if args.part else 0) as signals, _rclpy(args.ros_args or []):
         from mddag_executor.live.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
@@ -370,9 +373,12 @@ class Signals:
     Let SIGINT and SIGTERM end the run, and its report be written; a context manager.
 
     A SIGINT that comes a while after the first interrupts the program itself.
+
+    :param limit_s: where that is not 0, the system ends the process so much later.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, limit_s: int = 0) -> None:
+        self._limit_s = limit_s
         self._session: Session | Supervisor | None = None
         self._first: float | None = None
         self._before: dict[int, Any] = {}
@@ -398,6 +404,8 @@ class Signals:
         now = time.monotonic()
         if self._first is None:
             self._first = now
+            if self._limit_s:
+                signal.alarm(self._limit_s)
         elif number == signal.SIGINT and now - self._first > _SAME_INTERRUPT_S:
             signal.default_int_handler(number, frame)
         if self._session is not None:

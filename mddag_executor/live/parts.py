@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from mddag_executor.core.tally import of_processes
+from mddag_executor.live.entity import COUNTS
 from mddag_executor.live.execution import ExecutionPlan
 from mddag_executor.live.measure import Books
 from mddag_executor.live.session import measured
@@ -116,12 +117,15 @@ def _callbacks(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     callbacks: dict[str, Any] = {}
     for part in parts:
         for name, counts in part['callbacks'].items():
-            mine = callbacks.setdefault(name, dict.fromkeys(counts, 0))
-            for key, value in counts.items():
-                if isinstance(value, bool):
-                    mine[key] = bool(mine[key]) or value
-                else:
-                    mine[key] = value if isinstance(value, str) else mine[key] + value
+            mine = callbacks.get(name)
+            if mine is None:
+                callbacks[name] = dict(counts)
+                continue
+            for key in (*COUNTS, 'waiting'):
+                mine[key] += counts[key]
+            mine['holds_interpreter'] |= counts['holds_interpreter']
+            mine['interpreter_share'] = max(
+                mine['interpreter_share'], counts['interpreter_share'], key=lambda s: s or 0.0)
     return callbacks
 
 

@@ -5,8 +5,9 @@ Starts, watches and ends the processes of one run.
 
 Theory of operation
 -------------------
-The processes are in sessions of their own, so that Ctrl-C reaches the supervisor only, which
-passes it on; and they end when the supervisor does, even if that was killed (``end_with_parent``).
+The processes put themselves into groups of their own, so that Ctrl-C reaches the supervisor only,
+which passes it on, and they end when the supervisor does, even if that was killed
+(``belong_to_parent``).  They stay in its session, which has its share of the CPUs.
 
 What they print is passed on line by line, each line with the name of its process before it.  An
 error line of one that then ends with status 2 is the supervisor's error.
@@ -42,8 +43,9 @@ class ProcessError(MddagError):
     """What a process of the run found wrong with its input."""
 
 
-def end_with_parent(parent: int) -> None:
-    """Have this process get SIGTERM when the one that started it ends (on Linux)."""
+def belong_to_parent(parent: int) -> None:
+    """Leave Ctrl-C to the process that started this one, and end when it ends (on Linux)."""
+    os.setpgrp()
     try:
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     except (AttributeError, OSError):
@@ -75,7 +77,8 @@ class Run:
     @property
     def died(self) -> bool:
         """Tell whether it ended by an exception, a signal or an error."""
-        as_asked = self.asked and self.status == -signal.SIGTERM  # ahead of its own handler
+        # asked to end while it started: ahead of its own handler, or its nodes cannot start then
+        as_asked = self.asked and self.status in (-signal.SIGTERM, _BAD_INPUT)
         return self.status not in (None, 0) and not as_asked
 
     @property
@@ -154,8 +157,7 @@ class Supervisor:
         nth = 1 + sum(run.name == name for run in self.runs)
         process = subprocess.Popen(
             self._command(name, nth), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, start_new_session=True,
-            env={**os.environ, 'PYTHONUNBUFFERED': '1'})
+            stderr=subprocess.PIPE, env={**os.environ, 'PYTHONUNBUFFERED': '1'})
         run = Run(name, nth, process)
         self.runs.append(run)
         for source, target in ((process.stdout, self._out), (process.stderr, self._err)):
@@ -195,7 +197,7 @@ class Supervisor:
 
     def _ended(self, run: Run, now: float, is_over: bool) -> None:
         self._reap(run)
-        if run.status == _BAD_INPUT:
+        if run.status == _BAD_INPUT and not run.asked:
             raise ProcessError(f'process {run.name}: {run.said.removeprefix("error: ")}')
         if run.died:
             self._tell(run)

@@ -80,6 +80,7 @@ class Running:
     def end(self) -> tuple[dict[str, Any], str, str]:
         """Wait for its end; return the result, and what it printed."""
         out, err = self.process.communicate(timeout=60)
+        assert Path('result.json').exists(), err
         return json.loads(Path('result.json').read_text()), out, err
 
 

@@ -1,0 +1,156 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+A placement in virtual time: what the scheduler's rules make of it.
+
+Theory of operation
+-------------------
+1. Each process computes Python in one callback at a time, the most urgent of its own first.  So in
+   the core the vertices of a process that hold the interpreter are one mutually exclusive group.
+2. All processes share the CPUs (``simulate.machine``), and each has its workers.
+3. What the executor and the middleware take is added to execution times: ``CALLBACK_NS`` for each
+   callback, ``TRANSPORT_NS`` at either end for each message between processes, which also arrives
+   ``DELAY_NS`` later.
+4. One placement is better than another where fewer deadlines are missed, then where the response
+   that uses most of its deadline uses less of it.  Placements that differ in one block of nodes or
+   two are tried, those of the least load first, until none is better or ``MOST_TRIES`` were tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
+
+from mddag_executor.assign.placement import Placing, TRANSPORT_NS
+from mddag_executor.core import NEVER, Tables, Tally
+from mddag_executor.core import policy as find_policy
+from mddag_executor.core.jobs import finish
+from mddag_executor.core.state import new_state
+from mddag_executor.core.tally import total
+from mddag_executor.simulate import engine
+from mddag_executor.simulate.deliveries import Deliveries, edges_of, Transports
+from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.workload import periodic_load
+from msg_graph import Process, TaskSet
+
+CALLBACK_NS = 100_000
+DELAY_NS = 300_000
+MOST_TRIES = 150
+_AHEAD = 40
+
+Cost = tuple[int, float]
+
+
+class Predictor:
+    """
+    Simulates placements.
+
+    :param workers: of each process.
+    :param cpus: that all processes share; None: enough for all.
+    :param duration_ns: virtual time of a run.
+    """
+
+    def __init__(
+        self, task_set: TaskSet, workers: int, cpus: int | None, policy: str, duration_ns: int,
+    ) -> None:
+        self._task_set = task_set
+        self._workers = workers
+        self._cpus = cpus
+        self._policy = find_policy(policy)
+        self._duration = duration_ns
+
+    def predict(
+        self, processes: Sequence[Process], execution_ns: Sequence[Sequence[int]]
+    ) -> Tally:
+        """Return the verdicts about a placement, with these execution times in each job."""
+        task_set = self._task_set
+        place = {node: i for i, process in enumerate(processes) for node in process.nodes}
+        tables = Tables.build(task_set, max_active_jobs=NEVER)
+        own = len(processes)
+        groups = [place[v.callback.node] if v.callback.holds_interpreter is not False
+                  else (group + own if group >= 0 else -1)
+                  for v, group in zip(task_set.vertices, tables.group)]
+        tables = tables._replace(
+            group=groups + tables.group[len(groups):], n_groups=own + tables.n_groups)
+        times, transports = self._with_transport(tables, place, execution_ns)
+        load = periodic_load(task_set, times, self._duration)
+        state = new_state(
+            tables, self._workers * own, preemptive=self._policy.mode(False), propagate=2,
+            polling=self._policy.polling)
+        deliveries = Deliveries(
+            tables, state, self._policy.key, transports, stops=self._cpus is not None)
+        machine = None if self._cpus is None else Machine(
+            tables, state, load, self._cpus, deliveries=deliveries)
+        ended = engine.run(tables, state, self._policy.key, load, self._duration, False,
+                           deliveries=deliveries, machine=machine)
+        finish(tables, state, ended)
+        tally = Tally(task_set, tables)
+        for dag in load.dags:
+            tally.released(dag)
+        tally.add(state.decisions)
+        return tally
+
+    def _with_transport(
+        self, tables: Tables, place: dict[str, int], execution_ns: Sequence[Sequence[int]],
+    ) -> tuple[list[list[int]], Transports]:
+        """Return execution times and messages with what they take more (rule 3)."""
+        times = [[ns + CALLBACK_NS for ns in row] for row in execution_ns]
+        delays: list[int] = []
+        base = []
+        for dag, row in zip(self._task_set.dags, times):
+            base.append(len(delays))
+            for vertex in dag.vertices:
+                here = place[vertex.callback.node]
+                away = [place[dag.vertices[v].callback.node] != here for v in vertex.successors]
+                for after, leaves in zip(vertex.successors, away):
+                    row[after] += TRANSPORT_NS * leaves
+                    delays.append(DELAY_NS * leaves)
+                row[vertex.index] += TRANSPORT_NS * any(away)
+            assert len(delays) - base[-1] == edges_of(tables)[dag.index]
+        return times, Transports(delays, base, [0] * len(base))
+
+
+def cost_of(tally: Tally) -> Cost:
+    """Return what is compared of two placements (rule 4)."""
+    dags = tally.result()['dags']
+    worst = max((sink['response_ns']['max'] / sink['relative_deadline_ns']
+                 for dag in dags.values() for sink in dag['sinks'].values()
+                 if sink['response_ns'] is not None), default=0.0)
+    return total(dags).missed, round(worst, 2)
+
+
+def improve(
+    placing: Placing, place: dict[int, int], cost: Callable[[tuple[Process, ...]], Cost],
+    tell: Callable[[int], None] = lambda tried: None, most: int = MOST_TRIES,
+) -> tuple[dict[int, int], int]:
+    """
+    Return a placement at least as good, and how many were simulated.
+
+    :param cost: simulates one.
+    :param tell: told now and then how many have been.
+    """
+    best, tried = cost(placing.processes(place)), 1
+    seen = {tuple(sorted(place.items()))}
+    while tried < most:
+        for other in _next(placing, place, seen):
+            seen.add(tuple(sorted(other.items())))
+            tried += 1
+            tell(tried)
+            found = cost(placing.processes(other))
+            if found < best:
+                place, best = other, found
+                break
+            if tried >= most:
+                break
+        else:
+            break
+    return place, tried
+
+
+def _next(
+    placing: Placing, place: dict[int, int], seen: set[tuple[tuple[int, int], ...]]
+) -> Iterable[dict[int, int]]:
+    """Return the placements to try next, those of the least load first."""
+    candidates = [each for each in placing.neighbours(place)
+                  if tuple(sorted(each.items())) not in seen]
+    return islice(sorted(candidates, key=lambda each: max(placing.loads(each))), _AHEAD)

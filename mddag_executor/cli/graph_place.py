@@ -1,0 +1,235 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""The verb `graph place`: which node runs in which process, so that the deadlines hold."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+import sys
+from typing import Any, TYPE_CHECKING
+
+from mddag_executor import defaults
+from mddag_executor.cli import common, options
+from mddag_executor.cli.text import Cell, one_line, printable, Progress, table
+from mddag_executor.core import POLICIES
+from mddag_executor.core import policy as find_policy
+from mddag_executor.errors import UsageError
+from mddag_executor.text import counted
+
+if TYPE_CHECKING:
+    from mddag_executor.assign.placed import Predictor
+    from mddag_executor.assign.placement import Placing
+    from msg_graph import Process, TaskSet
+
+HELP = 'say which node is to run in which process, so that the deadlines hold'
+EXAMPLE = """\
+mddag graph place config/autoware.yaml --processes 2 --cpus 2 --utilisation 0.2 -o placed.yaml
+mddag graph place graph.yaml --processes 3 --trace run.mcap --apart /lidar,/camera -o placed.yaml
+mddag run placed.yaml --node my_robot/lidar --node my_robot/camera --node my_robot/control"""
+DESCRIPTION = """\
+Pack the nodes of a declaration into processes by the time that they need the interpreter of
+Python, and improve that by simulation with the rules of the scheduler: each process computes in
+one callback at a time, and all share the CPUs. The result is the declaration with `processes:`,
+which `mddag run` goes by."""
+
+_DRAWS = 10
+_MOST_FACTOR = 4.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    options.add_graph(parser)
+    add('--processes', type=options.positive_int, required=True, metavar='N',
+        help='how many processes')
+    add('-o', '--output', metavar='PLACED.yaml', required=True,
+        help="the declaration to write ('-': to standard output)")
+    options.add_cpus(parser, 'those of this machine')
+    add('--workers', type=options.positive_int, metavar='M',
+        help=f"threads of each process (default: the declaration's, else {defaults.WORKERS})")
+    add('--policy', default='rad', metavar='P',
+        help=f'one of {", ".join(POLICIES)} (default: rad)')
+    add('--trace', metavar='TRACE', action='append', default=[],
+        help='take execution times, and who computes in Python, from a recorded run (default: '
+        'those that are declared); repeat it for the traces of several processes')
+    add('--utilisation', type=options.positive_float, metavar='U',
+        help='scale declared execution times to this normalised utilisation, sum(C/T)/workers')
+    options.add_seed(parser, 'draw declared execution times with this', int)
+    add('--together', metavar='NODE,NODE…', action='append', default=[],
+        help='nodes that run in one process; repeat it for more groups')
+    add('--apart', metavar='NODE,NODE…', action='append', default=[],
+        help='nodes of which no two run in one process; repeat it for more groups')
+    options.add_virtual_time(parser)
+    options.add_json(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """
+    Place nodes.
+
+    :raises msg_graph.GraphError: when the declaration is wrong
+    :raises mddag_executor.errors.MddagError: when they cannot be placed as asked
+    """
+    from mddag_executor.assign.placed import cost_of, improve, Predictor
+    from mddag_executor.assign.placement import Placing
+    from msg_graph.processes import with_processes
+    if args.json == '-' and args.output == '-':
+        raise UsageError('-: standard output can take only one of -o and --json: name a file')
+    if args.trace and args.utilisation is not None:
+        raise UsageError('--utilisation: recorded execution times are not scaled: leave it out')
+    find_policy(args.policy)
+    for path in (args.output, args.json):
+        common.check_output(path)
+    task_set = common.load_graph(args.graph)
+    workers = defaults.workers(args.workers, task_set)
+    times, judged = _times(args, task_set, workers)
+    placing = Placing(judged, args.processes, times, _groups(args.together), _groups(args.apart))
+    cpus = args.cpus or defaults.processors()
+    predictor = Predictor(judged, workers, cpus, args.policy, args.duration)
+    with Progress('placing') as line:
+        place, tried = improve(
+            placing, placing.place(),
+            lambda processes: cost_of(predictor.predict(processes, times)),
+            lambda tried: line.update(tried, 'placements simulated'))
+        processes = placing.processes(place)
+        result: dict[str, Any] = {
+            'processes': [{'name': p.name, 'nodes': p.nodes} for p in processes],
+            'loads': _loads(placing, place, processes), 'cpus': cpus, 'workers': workers,
+            'policy': args.policy, 'tried': tried,
+            'predicted': predictor.predict(processes, times).result()['dags'],
+            'one_process': predictor.predict(_one(placing.nodes), times).result()['dags'],
+            'factor': _factor(predictor, processes, times),
+            'draws': _draws(args, task_set, workers, predictor, processes)}
+    common.write_text(args.output, with_processes(task_set, processes).text)
+    if args.json is not None:
+        common.write_json(args.json, result)
+    if common.wants_tables(args):
+        stream = sys.stderr if args.output == '-' else sys.stdout
+        for text in _told(result):
+            print(text, file=stream)
+    return 0
+
+
+def _groups(given: Sequence[str]) -> list[list[str]]:
+    return [[node.strip() for node in group.split(',')] for group in given]
+
+
+def _one(nodes: Sequence[str]) -> tuple[Process, ...]:
+    from msg_graph import Process
+    return (Process('all', tuple(nodes)),)
+
+
+def _times(
+    args: argparse.Namespace, task_set: TaskSet, workers: int
+) -> tuple[list[list[int]], TaskSet]:
+    """Return the execution time of each vertex, and the task set with who computes in Python."""
+    if args.trace:
+        return _recorded(args.trace, task_set)
+    return _drawn(args, task_set, workers, args.seed), task_set
+
+
+def _drawn(
+    args: argparse.Namespace, task_set: TaskSet, workers: int, seed: int
+) -> list[list[int]]:
+    from mddag_executor.simulate import draw_execution_times, scale_execution_times
+    times = draw_execution_times(task_set, seed)
+    if args.utilisation is None:
+        return times
+    return scale_execution_times(task_set, times, workers, args.utilisation)
+
+
+def _recorded(traces: list[str], task_set: TaskSet) -> tuple[list[list[int]], TaskSet]:
+    """Return mean CPU times as recorded, of callbacks that wait what they took."""
+    from mddag_executor.cli import recorded
+    path = traces[0] if len(traces) == 1 else traces
+    used = recorded.as_recorded(path, ', '.join(traces), task_set).usage.callbacks()
+    times = {}
+    holds = {}
+    for callback in task_set.callbacks:
+        use = used[callback.key]
+        count, busy = use['executions'], use['busy_ns']
+        if use.get('measured'):
+            holds[callback.key] = 2 * use['held_interpreter'] >= use['measured']
+            if holds[callback.key]:
+                count, busy = use['measured'], use['cpu_ns']
+        if not count and callback.execution_time is not None:
+            count, busy = 1, callback.execution_time.mean_ns
+        times[callback.key] = busy // count if count else 0
+    callbacks = {c.key: c if c.holds_interpreter is not None else replace(
+        c, holds_interpreter=holds.get(c.key)) for c in task_set.callbacks}
+    judged = replace(task_set, callbacks=tuple(callbacks.values()), dags=tuple(
+        replace(dag, vertices=tuple(
+            replace(vertex, callback=callbacks[vertex.callback.key]) for vertex in dag.vertices))
+        for dag in task_set.dags))
+    return [[times[v.callback.key] for v in dag.vertices] for dag in task_set.dags], judged
+
+
+def _loads(placing: Placing, place: dict[int, int], processes: Sequence[Process]) -> list[float]:
+    """Return the load of each process, in their order."""
+    loads = placing.loads(place)
+    return [loads[place[placing.block_of(process.nodes[0])]] for process in processes]
+
+
+def _factor(
+    predictor: Predictor, processes: Sequence[Process], times: list[list[int]]
+) -> float | None:
+    """Return by how much all execution times may grow; None: deadlines are missed already."""
+    def holds(factor: float) -> bool:
+        return not predictor.predict(
+            processes, [[round(ns * factor) for ns in row] for row in times]).missed
+
+    low, high = 1.0, _MOST_FACTOR
+    if not holds(low):
+        return None
+    if holds(high):
+        return high
+    while high - low > 0.02:
+        middle = (low + high) / 2
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return round(low, 2)
+
+
+def _draws(
+    args: argparse.Namespace, task_set: TaskSet, workers: int, predictor: Predictor,
+    processes: Sequence[Process],
+) -> list[float]:
+    """Return the share in time of other draws of execution times; none of a recorded run."""
+    from mddag_executor.core.tally import total
+    found = []
+    for seed in range(args.seed + 1, args.seed + 1 + _DRAWS) if not args.trace else ():
+        times = _drawn(args, task_set, workers, seed)
+        verdicts = total(predictor.predict(processes, times).result()['dags'])
+        found.append(verdicts.in_time / verdicts.due if verdicts.due else 1.0)
+    return found
+
+
+def _told(result: dict[str, Any]) -> Iterator[str]:
+    """Yield what is told of a placement."""
+    from mddag_executor.report.tables import sink_table, verdicts_line
+    rows: list[list[Cell]] = [
+        [process['name'], len(process['nodes']), f'{load:.2f}',
+         one_line(', '.join(process['nodes'][:3]))
+         + (f', … ({len(process["nodes"]) - 3} more)' if len(process['nodes']) > 3 else '')]
+        for process, load in zip(result['processes'], result['loads'])]
+    yield table(['process', 'nodes', 'of a core', 'which'], rows)
+    yield sink_table(result['predicted'])
+    yield (f'predicted with {counted(result["cpus"], "CPU")}: '
+           f'{verdicts_line(result["predicted"])}')
+    yield f'in one process: {verdicts_line(result["one_process"])}'
+    factor = result['factor']
+    if factor is None:
+        yield ('The deadlines do not hold: '
+               f'{counted(result["tried"], "placement")} were simulated, and this is the best.')
+    else:
+        more = 'at least ' if factor >= _MOST_FACTOR else ''
+        yield f'They hold until all execution times are {more}{factor:g} times as long.'
+    draws = result['draws']
+    if draws:
+        yield printable(
+            f'With {len(draws)} other draws of the execution times '
+            f'{100 * min(draws):.1f} to {100 * max(draws):.1f} % are in time, and in '
+            f'{sum(share == 1.0 for share in draws)} of them all.')
+    yield ('This counts what callbacks and messages take, not other programs on the CPUs, nor '
+           'waiting of nodes for each other.')

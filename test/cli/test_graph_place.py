@@ -1,0 +1,93 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""The verb `graph place`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import json
+from pathlib import Path
+import subprocess
+
+from msg_graph import load
+import pytest
+
+Mddag = Callable[..., subprocess.CompletedProcess[str]]
+GRAPH = """\
+mddag: 1  # the robot
+nodes:
+  - node: /a
+    callbacks: [{name: t, timer: 100ms, deadline: 40ms, execution_time: 30ms}]
+  - node: /b
+    callbacks: [{name: t, timer: 100ms, deadline: 40ms, execution_time: 30ms}]
+  - node: /c
+    callbacks: [{name: t, timer: 100ms, deadline: 100ms, execution_time: 10ms}]
+"""
+
+
+@pytest.fixture
+def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'graph.yaml').write_text(GRAPH)
+    return tmp_path
+
+
+def test_a_placement_is_written_and_predicted(graph: Path, mddag: Mddag) -> None:
+    run = mddag('graph', 'place', 'graph.yaml', '--processes', '2', '--cpus', '2',
+                '-o', 'placed.yaml', '--json', 'out.json')
+    assert run.returncode == 0, run.stderr
+    placed = load('placed.yaml')
+    assert Path('placed.yaml').read_text().startswith(GRAPH)
+    assert len(placed.processes) == 2 and placed.process_of('/a') != placed.process_of('/b')
+    for text in ('predicted with 2 CPUs: 90 sink jobs due, 90 in time', 'in one process: 90 sink',
+                 'They hold until all execution times are 1.', 'other draws'):
+        assert text in run.stdout, run.stdout
+    result = json.loads(Path('out.json').read_text())
+    assert [p['name'] for p in result['processes']] == ['p1', 'p2']
+    assert sorted(result['loads'], reverse=True)[0] == pytest.approx(0.4, abs=0.02)
+    assert 1.2 < result['factor'] < 1.34 and result['draws'] == [1.0] * 10
+    again = mddag('graph', 'place', 'placed.yaml', '--processes', '1', '-o', '-')
+    assert again.stdout == GRAPH + 'processes:\n  p1: [/a, /b, /c]\n'
+    assert 'The deadlines do not hold' in again.stderr
+
+
+def test_rules_of_the_user(graph: Path, mddag: Mddag) -> None:
+    place = ['graph', 'place', 'graph.yaml', '--processes', '2', '-o', 'placed.yaml']
+    assert mddag(*place, '--together', '/a, /b').returncode == 0
+    assert load('placed.yaml').process_of('/a') == load('placed.yaml').process_of('/b')
+    assert mddag(*place, '--apart', '/a,/c', '--apart', '/b,/c').returncode == 0
+    assert [p.nodes for p in load('placed.yaml').processes] == [('/a', '/b'), ('/c',)]
+
+
+def test_times_of_a_recorded_run(graph: Path, mddag: Mddag) -> None:
+    Path('times.json').write_text(json.dumps(
+        {f'/{n}': {f'/{n}:t': us} for n, us in (('a', 45_000), ('b', 5_000), ('c', 40_000))}))
+    recorded = mddag('simulate', 'graph.yaml', '--execution-times', 'times.json', '--trace',
+                     'run.mcap', '--duration', '1s')
+    assert recorded.returncode == 0, recorded.stderr
+    run = mddag('graph', 'place', 'graph.yaml', '--processes', '2', '--trace', 'run.mcap',
+                '-o', 'placed.yaml', '--json', 'out.json')
+    assert run.returncode == 0, run.stderr
+    result = json.loads(Path('out.json').read_text())
+    assert sorted(result['loads']) == pytest.approx([0.45, 0.45], abs=0.01)
+    assert result['draws'] == [] and 'other draws' not in run.stdout
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (['graph.yaml', '--processes', '4'], 'there are only 3 nodes to place'),
+    (['graph.yaml', '--processes', '2', '--together', '/x'], "node '/x'"),
+    (['graph.yaml', '--processes', '2', '--apart', '/a,/b,/c'], '--apart'),
+    (['graph.yaml', '--processes', '2', '--trace', 'no.mcap'], 'no.mcap'),
+    (['graph.yaml', '--processes', '2', '--trace', 'no.mcap', '--utilisation', '0.2'],
+     '--utilisation'),
+    (['none.yaml', '--processes', '2'], 'none.yaml'),
+    (['bare.yaml', '--processes', '1'], 'declares no execution_time'),
+])
+def test_bad_input_is_one_line(
+        graph: Path, mddag: Mddag, arguments: list[str], message: str) -> None:
+    Path('bare.yaml').write_text(
+        'mddag: 1\nnodes:\n  - node: /a\n    callbacks: [{name: a, timer: 1ms, deadline: 1ms}]\n')
+    run = mddag('graph', 'place', *arguments, '-o', 'placed.yaml')
+    assert (run.returncode, run.stdout) == (2, '')
+    assert message in run.stderr and run.stderr.count('\n') == 1
+    assert not Path('placed.yaml').exists()
