@@ -97,6 +97,10 @@ class Reschedule:
         self.judge_from = judge_from
         self.skip = skip
         self.warnings = recorded.warnings
+        if cpus is not None and recorded.run.declared and not work.computed:
+            self.warnings.append(
+                f'{recorded.run.name}: CPU times are not recorded in it, so with --cpus each '
+                'execution computes all the time')
         self.log: list[LogEntry]
         self.decisions: list[Decision]
         self.tally = MissTally(self.task_set, tables)

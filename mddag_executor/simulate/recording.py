@@ -8,7 +8,8 @@ Theory of operation
 Virtual time is the trace's clock: it starts at 0.  A worker is a thread; the address of a callback
 is its place in the declaration, from 1.  An execution that was preempted is recorded in pieces, as
 a coroutine that was suspended.  A sync callback, which the simulator runs once, completes with all
-its legs at its end, and all of its time is the last one's.
+its legs at its end, and all of its time is the last one's.  Where executions shared CPUs or held
+the interpreter, their CPU time is recorded, which is their execution time, and whether they did.
 
 A replayer feeds the events to a core again, so they must be in the order in which the core saw
 them: at one instant each completion with what it decided, then each release with the expiry that
@@ -90,7 +91,8 @@ class _Merger:
         """Yield the events in the order of the core."""
         settings = self._run.settings
         yield ('task_set', 0, 0, self._task_set.text, self._task_set.file, settings.policy,
-               settings.workers, _DEFAULT_DEADLINE, _MOST, self._run.preemptive)
+               settings.workers, _DEFAULT_DEADLINE, _MOST, self._run.preemptive,
+               settings.cpus or 0)
         for place, callback in enumerate(self._task_set.callbacks, 1):
             yield ('rclcpp_callback_register', 0, 0, place, callback.key)
         for entry in self._run.log:
@@ -120,11 +122,20 @@ class _Merger:
                 yield ('complete', now, thread, address, dag, vertex.index, job, False, now, leg)
         yield ('callback_end', now, thread, address)
         if kind == END:
-            yield ('complete', now, thread, address, dag, vertex.index, job, True, now, last)
+            yield ('complete', now, thread, address, dag, vertex.index, job, True, now, last,
+                   *self._computed(dag, vertex.index, job))
             del self._ready[dag, v, job]
             yield from self._verdict(dag, v, job, now)
             for after in vertex.successors:
                 self._ready[dag, self._first[dag] + after, job] = now
+
+    def _computed(self, dag: int, vertex: int, job: int) -> tuple[int, bool] | tuple[()]:
+        """Return the CPU time of an execution and whether it held the interpreter."""
+        load = self._load
+        if self._run.settings.cpus is None and not load.holds:
+            return ()
+        place = load.cost_base[dag] + job * load.cost_stride[dag] + vertex
+        return load.costs[place], bool(load.holds and load.holds[place])
 
     def _verdict(self, dag: int, v: int, job: int, now: int) -> Iterator[Event]:
         """Yield what the completion of a vertex decided."""

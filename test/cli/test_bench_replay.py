@@ -103,6 +103,7 @@ def test_accuracy_on_the_command_line(
     assert program.main(arguments) == 0
     shown = capsys.readouterr().out
     result = json.loads(out.read_text())
+    assert result['bodies'] == 'sleep'
     assert [(run['utilisation'], run['workers']) for run in result['runs']] == [
         (0.1, 2), (0.1, 3)] * 2
     same, other = result['summary']
@@ -123,7 +124,8 @@ def test_a_live_run_is_predicted(tmp_path: Path, graph: Path) -> None:
     assert program.main([
         'bench', 'replay', '--accuracy', '--graph', str(graph), '--repeat', '1', '--seconds', '2',
         '--utilisation', '0.02', '--workers', '3', '--json', str(out)]) == 0
-    sink, = json.loads(out.read_text())['summary']
+    run, = json.loads(out.read_text())['runs']
+    sink, = run['sinks']
     assert sink['jobs'] > 20
     assert abs(sink['median_error']) < 1  # a few percent where the machine is not busy
     assert sink['ideal_median'] < sink['recorded_median']

@@ -25,7 +25,7 @@ from mddag_executor.simulate import (
 )
 from mddag_executor.simulate.recording import write_trace
 from mddag_executor.trace import read_events
-from msg_graph import load
+from msg_graph import load, loads
 import pytest
 
 from ..core.task_sets import Case, cases, declaration, examples
@@ -152,3 +152,29 @@ def test_autoware(tmp_path: Path, preemptive: bool) -> None:
         for sink, values in dag['sinks'].items():
             found = replayed.result()['dags'][name]['sinks'][sink]
             assert {key: found[key] for key in values} == values
+
+
+@pytest.mark.parametrize(('holds', 'cpus'), [('true', None), ('true', 2), ('false', 1)])
+def test_what_shared_cpus_or_the_interpreter_does_so_again(
+    trace: Path, holds: str, cpus: int | None
+) -> None:
+    """The long one is overtaken; what it waited for the other one is taken back."""
+    task_set = loads(f"""\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {{name: a, timer: 40ms, deadline: 40ms, dag: a, execution_time: 22ms,
+          holds_interpreter: {holds}}}
+      - {{name: b, timer: 10ms, deadline: 10ms, dag: b, execution_time: 3ms,
+          holds_interpreter: {holds}}}
+""", 'g.yaml')
+    horizon = 160_000_000
+    load_ = periodic_load(task_set, draw_execution_times(task_set, 0), horizon)
+    run = simulate(task_set, load_, Settings(workers=2, duration_ns=horizon, cpus=cpus), log=True)
+    write_trace(trace, task_set, load_, run)
+    result = reschedule(trace).result()
+    assert result['dags'] == run.result()['dags']
+    assert result.get('cpus') == cpus
+    response = result['dags']['a']['sinks']['/n:a']['response_ns']['median']
+    assert response > 22_000_000     # it was not alone
