@@ -24,12 +24,16 @@ EXAMPLE = """\
 mddag bench rerun
 mddag bench rerun --duration 20s --repeat 5 --json rerun.json"""
 
+_DURATION_NS = 30_000_000_000
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     options.add_workload(parser)
     options.add_workers(parser)
-    options.add_virtual_time(parser)
+    parser.add_argument(
+        '--duration', type=options.duration, default=_DURATION_NS, metavar='TIME',
+        help=f'virtual time of each run (default: {_DURATION_NS // 10 ** 9}s)')
     options.add_seed(parser, 'of the execution times')
     options.add_repeat(parser, 3)
     options.add_json(parser)

@@ -157,7 +157,10 @@ def _show(args: argparse.Namespace, result: Result, values: dict[str, Any]) -> N
     print(f'{counted(result.callbacks, "callback")}, {result.virtual_ns / 1e9:.3f} s in '
           f'{result.elapsed_s:.3f} s ({speed:.1f} times as fast as real time)')
     print(f'{counted(sum(result.counts.values()), "message")} published, {result.digest}')
+    if result.recorded_topics:
+        same = len(result.recorded_topics) - len(result.recorded)
+        print(f'{counted(len(result.recorded_topics), "topic")} recorded, too, {same} the same')
     for difference in result.recorded:
-        print(f'recorded, too: {printable(difference.line())}')
+        print(f'not as recorded: {printable(difference.line())}')
     if args.expect is not None and not values['differences']:
         print(f'the same as {printable(args.expect)}')

@@ -51,12 +51,14 @@ class Recorder:
     for the entity (``Entity``).
 
     :param writer: writes the file; None: one that keeps nobody waiting.
+    :param cpus: that there are, 0: nobody knows; None: the machine's.
     :raises mddag_executor.trace.TraceError: when the file cannot be written.
     """
 
     def __init__(
         self, path: str, task_set: TaskSet | None, policy: str, workers: int,
         default_deadline: int, max_active_jobs: int, clock: Clock, writer: Writer | None = None,
+        cpus: int | None = None,
     ) -> None:
         if writer is None:
             from mddag_executor.trace.writer import TraceWriter  # late: it loads the compression
@@ -69,7 +71,8 @@ class Recorder:
         self._known: weakref.WeakSet[Any] = weakref.WeakSet()
         self._say(
             'task_set', task_set.text if task_set else '', task_set.file if task_set else '',
-            policy, workers, default_deadline, max_active_jobs, False, defaults.processors())
+            policy, workers, default_deadline, max_active_jobs, False,
+            defaults.processors() if cpus is None else cpus)
         self._say('caret_init', clock.offset_ns, 'jazzy')
         self._say('rmw_implementation', get_rmw_implementation_identifier())
         self._say('construct_executor', id(self), 'multi_deadline_executor')

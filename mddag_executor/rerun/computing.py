@@ -50,17 +50,17 @@ class Computing:
         self._machine.begins(work.x, 0, -1)
 
     def begin(
-        self, what: Any, work: Work, takes: int, computes: int,
+        self, what: Any, work: Work, takes: int,
         leaving: list[tuple[int, Callable[[], None]]],
     ) -> None:
         """
         Have an execution run on its worker.
 
-        :param takes: how long, if nothing keeps it; ``computes``: its CPU time, -1: it waits.
+        :param takes: how long, if nothing keeps it; of that it computes ``work.cpu_ns``.
         :param leaving: what is to be done before its end, and how far it is then.
         """
         self._engine.takes(work, takes)
-        self._machine.begins(work.x, takes, computes)
+        self._machine.begins(work.x, takes, work.cpu_ns)
         self._running[work.worker] = what
         if leaving:
             self._places[work.x] = sorted(leaving, key=lambda each: each[0], reverse=True)

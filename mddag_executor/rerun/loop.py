@@ -255,6 +255,8 @@ class Loop:
         finally:
             self._current = None
         self.callbacks += 1
+        if origin is not None and takes:
+            work.cpu_ns = max(0, self._times.computed(origin.dag, origin.vertex, release))
         if self.computing is not None and execution.worker >= 0 and self.now == execution.start:
             self._compute(execution, takes)
             return
@@ -268,10 +270,8 @@ class Loop:
         """Have an execution end when CPUs and interpreter let it."""
         work, origin = execution.work, execution.origin
         assert self.computing is not None
-        computes = takes
         leaving: list[tuple[int, Callable[[], None]]] = []
         if origin is not None and takes:
-            computes = self._times.computed(origin.dag, origin.vertex, execution.release)
             kept = []
             for held in execution.held:
                 early = held.early(origin, execution.release)
@@ -281,7 +281,7 @@ class Loop:
                 else:
                     kept.append(held)
             execution.held = kept
-        self.computing.begin(execution, work, takes, computes, leaving)
+        self.computing.begin(execution, work, takes, leaving)
 
     def _leave(self, held: Held, execution: Execution) -> None:
         held.record(execution.thread)

@@ -283,15 +283,17 @@ class Messages:
             return
         message = self._message(inlet, data)
         inlet.received += 1
-        info = {
-            'source_timestamp': source_stamp, 'received_timestamp': now,
-            'publication_sequence_number': number, 'reception_sequence_number': inlet.received}
         if entity.at_once:
             entity.rclpy.callback(message)
             engine.ran_at_once(entity)
             return
-        args = (message, info) if inlet.with_info else (message,)
-        work = Work(entity.rclpy, entity.rclpy.callback, args, None, info, entity=entity)
+        args: tuple[Any, ...] = (message,)
+        if inlet.with_info:
+            args = message, {
+                'source_timestamp': source_stamp, 'received_timestamp': now,
+                'publication_sequence_number': number,
+                'reception_sequence_number': inlet.received}
+        work = Work(entity.rclpy, entity.rclpy.callback, args, entity=entity)
         release = stamp = -1
         if entity.source >= 0:
             release, stamp = self._release(entity, message, source_stamp)

@@ -14,8 +14,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+import gc
 import os
 import random
+import sys
 import time
 from typing import Any, BinaryIO
 
@@ -106,7 +108,7 @@ class Result:
     :ivar started_s: how long it took, really, until all programs had started; ``elapsed_s``: with
         that, until the end.
     :ivar start_ns: the virtual time at which it began.
-    :ivar recorded: how topics differ that are in the recording, too.
+    :ivar recorded_topics: those that are in the recording, too; ``recorded``: how these differ.
     :ivar warnings: what is not the same in each run, or doubtful, one line each.
     """
 
@@ -119,6 +121,7 @@ class Result:
     virtual_ns: int
     elapsed_s: float
     verdicts: dict[str, Any]
+    recorded_topics: list[str] = field(default_factory=list)
     recorded: list[Difference] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -129,6 +132,7 @@ class Result:
             'callbacks': self.callbacks, 'virtual_s': self.virtual_ns / 1e9,
             'elapsed_s': self.elapsed_s, 'started_s': self.started_s,
             'topics': dict(sorted(self.counts.items())), **self.verdicts,
+            'recorded_topics': self.recorded_topics,
             'recorded': [each._asdict() for each in self.recorded],
             'warnings': self.warnings}
 
@@ -168,7 +172,7 @@ class Rerun:
         clock = _TraceTime(source.start)
         self._recorder = None if writer is None else Recorder(
             writer.path, task_set, settings.policy, settings.workers, DEFAULT_DEADLINE,
-            MAX_ACTIVE_JOBS, clock, writer)
+            MAX_ACTIVE_JOBS, clock, writer, settings.cpus or 0)
         self._engine = Engine(
             task_set, settings.workers, settings.policy, default_deadline=DEFAULT_DEADLINE,
             max_active_jobs=MAX_ACTIVE_JOBS, expire_after=EXPIRE_AFTER,
@@ -226,6 +230,7 @@ class Rerun:
         :raises RerunError: on whatever keeps it from going on.
         """
         self._begun = time.monotonic()
+        arguments = sys.argv  # each program has its own
         self._programs = programs
         with _context(self._settings.ros_args) as context:
             hooks.install()
@@ -243,6 +248,8 @@ class Rerun:
             finally:
                 self._virtual.uninstall()
                 self._replacements.undo()
+                gc.unfreeze()
+                sys.argv = arguments
                 if self._recorder is not None:
                     self._recorder.close(loop.now)
         self._check_programs()
@@ -294,6 +301,7 @@ class Rerun:
     def _started(self) -> None:
         """Begin to deliver, when each program has come to where it waits for something."""
         self._started_s = time.monotonic() - self._begun
+        gc.freeze()  # else each full collection looks at all that the nodes are made of
         if all(guest.settled.is_set() for guest in self._host.guests) and not self._hosted:
             raise RerunError(self._none_hosted())
         self._check_topics()
@@ -421,8 +429,9 @@ class Rerun:
     def _result(self, elapsed_s: float) -> Result:
         loop, recording = self._loop, self._source.messages
         recorded: list[Difference] = []
+        both: set[str] = set()
         if recording is not None:
-            both = recording.topics & self._outputs.counts.keys() - _OF_ALL_NODES
+            both = set(recording.topics & self._outputs.counts.keys() - _OF_ALL_NODES)
             recorded = differences(
                 [each for each in self._outputs.messages if each.topic in both],
                 (each for each in recording.messages() if each.topic in both), loop.start)
@@ -434,8 +443,8 @@ class Rerun:
             **self._engine.verdicts.tally.result()}
         return Result(
             self._outputs.digest, self._outputs.messages, self._outputs.counts, loop.callbacks,
-            self._started_s, loop.start, loop.now - loop.start, elapsed_s, verdicts, recorded,
-            self.warnings)
+            self._started_s, loop.start, loop.now - loop.start, elapsed_s, verdicts, sorted(both),
+            recorded, self.warnings)
 
 
 class _TraceTime:

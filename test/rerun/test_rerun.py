@@ -128,6 +128,7 @@ def test_the_trace_replays(bag: str, graph: Path, tmp_path: Path) -> None:
     assert not again.warnings
     mine, theirs = result.result()['dags']['main'], again.result()['dags']['main']
     assert theirs['jobs'] == mine['jobs'] == 20
+    assert again.result()['callbacks']['/sink:take']['cpu_ns'] == 20 * 5 * MS
     sink = theirs['sinks']['/sink:take']
     assert sink['response_ns'] == mine['sinks']['/sink:take']['response_ns']
 
@@ -243,6 +244,26 @@ def test_random_numbers_are_those_of_the_seed(bag: str, graph: Path) -> None:
     for seed in (1, 1, 2):
         rerun(bag, graph, [node_with(fill)], seed=seed)
     assert seen[:20] == seen[20:40] != seen[40:]
+
+
+def test_raw_messages_and_what_is_told_of_messages(bag: str, graph: Path) -> None:
+    seen: list[Any] = []
+
+    def fill(node: Node) -> None:
+        node.create_subscription(
+            Header, '/points', lambda message, info: seen.append((message.frame_id, info)), 10)
+        node.create_subscription(Header, '/points', seen.append, 10, raw=True)
+        publisher = node.create_publisher(Header, '/again', 10)
+        node.create_subscription(Header, '/points', publisher.publish, 10, raw=True)
+
+    result = rerun(bag, graph, [node_with(fill)])
+    told = [each for each in seen if isinstance(each, tuple)]
+    assert told[2] == ('2', {
+        'source_timestamp': START + 200 * MS, 'received_timestamp': START + 200 * MS,
+        'publication_sequence_number': 0, 'reception_sequence_number': 3})
+    raw = [each for each in seen if isinstance(each, bytes)]
+    assert deserialize_message(raw[2], Header).frame_id == '2'
+    assert published(result, '/again')[2][1].frame_id == '2'
 
 
 def test_a_message_is_as_it_was_published(bag: str, graph: Path) -> None:
