@@ -54,10 +54,11 @@ if TYPE_CHECKING:
 MOST_MISSED = 1000
 """After a long stop (a suspended machine) at most so many releases are judged one by one."""
 
-OVERTAKE_NS = 8_000_000
-"""Nothing overtakes who holds the interpreter for less than this: the two would share it."""
-PREEMPT_NS = 1_000_000
-"""The same where the one that is overtaken pauses."""
+TURN_NS = 1_000_000
+"""Nothing overtakes who holds the interpreter for less than this: Python takes turns no sooner."""
+LONGER, LONG_NS = 3, 5_000_000
+PATIENCE = 2
+"""Who waits for the interpreter overtakes if so many times the wait is past its time (RAD)."""
 
 
 class Engine:
@@ -103,7 +104,8 @@ class Engine:
         self._holders: list[Work] = []
         # whether who holds the interpreter may have overtaken another
         self.is_shared = False
-        self.overtake_ns = OVERTAKE_NS
+        # whether who is overtaken pauses
+        self.preempts = False
         self._holds_since = 0
 
     # --- what became ready -----------------------------------------------------------------------
@@ -363,14 +365,25 @@ class Engine:
         return x >= 0 and state.x_worker[x] >= 0 and state.x_holds[x] != 0
 
     def _may_be_overtaken(self, now: int) -> bool:
-        """Return whether who began last to hold the interpreter holds it for long."""
-        held = now - self._holds_since
+        """
+        Return whether what comes first may overtake who began last to hold the interpreter.
+
+        The two would share the interpreter, and lose by that.  So it waits where that is short
+        beside the time that it has.  (Not beside what is left of that: when all are late, all
+        would overtake.)
+        """
         work = self._holders[-1] if self._holders else None
-        if held >= self.overtake_ns or work is None or not self._holds(work):
+        if work is None or not self._holds(work):
             return True
-        entity = work.entity
-        usual = entity.habit.computed_ns or entity.busy_ns / max(1, entity.ran)
-        return usual >= held + self.overtake_ns
+        held, habit = now - self._holds_since, work.entity.habit
+        usual = habit.computed_ns or work.entity.busy_ns / max(1, work.entity.ran)
+        # Of one that takes much longer than usual nothing is known; it may take twice as long.
+        left = usual - held if held < LONGER * usual + LONG_NS else held
+        if left < TURN_NS or self.preempts:
+            return left >= TURN_NS
+        state = self._state
+        first = min(queue[0] for queue in (state.ready, state.held_back) if queue)[4]
+        return PATIENCE * left >= self.tables.rad_offset[state.x_vertex[first]]
 
     def interpreter_holder(self) -> Work | None:
         """Return the most urgent execution that holds the interpreter."""
@@ -514,6 +527,7 @@ class Engine:
     def destroyed(self, work: Work, now: int) -> None:
         """End a dispatched execution that must not run: its job cannot complete any more."""
         x, work.x = work.x, -1
+        self._holders = [each for each in self._holders if each is not work]
         if work.origin is not None:
             self.scheduler.expire_open(work.origin.slot, now)
         self.scheduler.complete(x, now)

@@ -27,7 +27,6 @@ LOOK_NS = 2_000_000
 """How often it is looked at who keeps others from the interpreter (see ``interpreter``)."""
 PROVEN = 32
 """Who has waited is trusted again after so many executions; who has not, after ``LATELY``."""
-MOST_PATIENCE_NS = 20_000_000
 
 COMPUTES = 0.8
 WAITS = 0.5
@@ -81,21 +80,21 @@ class Habit:
     def is_to_be_measured(self) -> bool:
         """Return whether to measure the execution that begins now."""
         self._runs += 1
-        self._sampled = self._runs % SAMPLE == 0
+        is_sample = self._runs % SAMPLE == 0
+        self._sampled = is_sample and (
+            self._tries < FIRST or self._runs % (SAMPLE * FIRST) == 0)
         if self._declared:
             return False
         if self._close > 0:
             self._close -= 1
             return True
-        return self._sampled
+        return is_sample
 
     @property
-    def patience_ns(self) -> int:
-        """Return after what time to look, while others wait, whether it still computes."""
-        if (self._runs < self._trusted_from or self._sampled
-                or self._released > MIXED):
-            return LOOK_NS
-        return min(MOST_PATIENCE_NS, LOOK_NS + 2 * int(self.computed_ns) // LOOK_NS * LOOK_NS)
+    def is_trusted(self) -> bool:
+        """Return whether it is expected to compute all the time, as it has always done lately."""
+        return (self._runs >= self._trusted_from and not self._sampled
+                and self._released <= MIXED)
 
     def has_waited(self) -> None:
         """Learn that it waited though it was thought to compute."""

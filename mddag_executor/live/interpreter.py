@@ -11,12 +11,12 @@ do is declared or learnt (``habits``).  Here
 
 1.  executions are measured for that;
 2.  while something is held back, a thread looks every ``LOOK_NS`` at the most urgent callback that
-    holds the interpreter (at one that has never waited yet, only when it takes longer than usual:
-    a look costs who computes a tenth of a millisecond), and so does on the way who takes in
-    something that arrives.  If its CPU clock stands still though no other process has its CPU, it
-    waits: for a lock, an event, a service.  It gives the interpreter back at once, so that nobody
-    is held back for one that waits for him; where others computed meanwhile it may have waited for
-    the lock, and is looked at once more.  If it computes while the looking thread has the lock, it
+    holds the interpreter (every ``PATIENCE_NS`` at one that has never waited yet: a look costs who
+    computes a tenth of a millisecond), and so does on the way who takes in something that arrives.
+    If its CPU clock stands still though no other process has its CPU, it waits: for a lock, an
+    event, a service.  It gives the interpreter back at once, so that nobody is held back for one
+    that waits for him; where the lock was not free meanwhile it may have waited for that, and is
+    looked at once more.  If it computes while the looking thread has the lock, it
     computes with the lock released (numpy, hashlib): it gives the interpreter back, too, and that
     is remembered.
 3.  while nothing is held back nobody looks, and nobody is woken: an alarm is set when something is
@@ -36,13 +36,15 @@ import threading
 from time import monotonic_ns
 
 from mddag_executor.live.alarm import Alarm
-from mddag_executor.live.engine import Engine, PREEMPT_NS
+from mddag_executor.live.engine import Engine
 from mddag_executor.live.habits import COMPUTES, Habit, LOOK_NS
 from mddag_executor.live.preemption import Preemption
 from mddag_executor.live.seat import Seat
 from mddag_executor.live.thread_clock import ThreadClock
 from mddag_executor.live.work import Work
 
+PATIENCE_NS = 10_000_000
+"""So often it is looked at one that has never waited yet."""
 SOON_NS = 100_000
 IDLE_LOOKS = 2
 LITTLE = 0.05
@@ -72,7 +74,7 @@ class Interpreter:
         self._engine = engine
         self._preemption = preemption
         if preemption is not None and not preemption.reason:
-            engine.overtake_ns = PREEMPT_NS
+            engine.preempts = True
         self._lock = lock
         self._seats = seats
         self._hand_out = hand_out
@@ -119,19 +121,23 @@ class Interpreter:
             if (seat := self._seat(work)) is not None])
         holder = engine.interpreter_holder() if engine.held_back or pauses else None
         if holder is None:
+            self._seen = None, 0, 0
             if self.rings_at:
                 self.rings_at = 0
-                self._seen = None, 0, 0
                 self._alarm.start(0)
-        elif holder is not self._seen[0]:
+            return
+        is_trusted = holder.entity.habit.is_trusted and not pauses
+        if holder is self._seen[0]:
+            if not self.rings_at:
+                self._watch(PATIENCE_NS if is_trusted else LOOK_NS)
+            elif monotonic_ns() - self._seen[1] >= LOOK_NS and not self._has_computed(holder):
+                self._watch(SOON_NS)  # it was seen on the way
+        elif not is_trusted:
             self._idle = 0
             self._note(holder)
-            self._watch(LOOK_NS if pauses else holder.entity.habit.patience_ns)
-        elif not self.rings_at:
             self._watch(LOOK_NS)
-        elif monotonic_ns() - self._seen[1] >= LOOK_NS:  # seen on the way: nobody is woken for it
-            patience_ns = LOOK_NS if pauses else holder.entity.habit.patience_ns
-            self._watch(patience_ns if self._has_computed(holder) else SOON_NS)
+        elif not self.rings_at:
+            self._watch(PATIENCE_NS)
 
     def _watch(self, ns: int) -> None:
         """Set the alarm for the next look."""
@@ -171,7 +177,12 @@ class Interpreter:
         :param free: whether the lock was free.
         """
         holder = self._engine.interpreter_holder()
-        if holder is not None and holder is self._seen[0] and not self._needs_it(holder, free):
+        if holder is None:
+            return
+        if holder is not self._seen[0]:
+            self._idle = 0
+            self._note(holder)
+        elif not self._needs_it(holder, free):
             self._engine.stop_holding(holder)
 
     def _clock(self, work: Work) -> ThreadClock | None:
