@@ -10,7 +10,8 @@ One process computes Python on one core, so what a process can take is bounded b
 1. The *load* of a node is the share of time that its callbacks hold the interpreter: execution
    time over period, of all vertices that do not say ``holds_interpreter: false``.
 2. A message that leaves its process costs ``TRANSPORT_NS`` more at either end.
-3. Nodes that stay together are one *block*.  Blocks are placed, the largest first, where the
+3. Nodes that stay together are one *block*; those that publish one topic do, since else nobody
+   could tell which of them a message is of.  Blocks are placed, the largest first, where the
    largest load of a process is least; then single blocks are moved, and pairs exchanged, as long
    as that lowers the largest load, or the sum of all loads at an equal largest one.
 """
@@ -47,7 +48,7 @@ class Placing:
         self._n = n_processes
         self.nodes = list(dict.fromkeys(callback.node for callback in task_set.callbacks))
         self._block = {node: i for i, node in enumerate(self.nodes)}
-        for group in together:
+        for group in (*together, *self._publishers()):
             self._check(group)
             joined = {self._block[node] for node in group}
             for node, block in self._block.items():
@@ -70,6 +71,14 @@ class Placing:
         self._own = dict.fromkeys(self._blocks, 0.0)
         self._between: dict[int, dict[int, float]] = {block: {} for block in self._blocks}
         self._measure(execution_ns)
+
+    def _publishers(self) -> list[list[str]]:
+        """Return the nodes that publish one topic, topic by topic (rule 3)."""
+        by_topic: dict[str, list[str]] = {}
+        for callback in self._task_set.callbacks:
+            for topic in callback.publishes:
+                by_topic.setdefault(topic, []).append(callback.node)
+        return list(by_topic.values())
 
     def _check(self, group: Iterable[str]) -> None:
         for node in group:

@@ -69,6 +69,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         task_set, specs = _placed(args, task_set, plan, folder)
         Part.make(folder, task_set.text)
         names = [process.name for process in task_set.processes]
+        _warn_of_contested(task_set)
         traces = _Traces(args.trace)
         for name in names:
             common.check_output(traces.of(name, 1))
@@ -107,6 +108,15 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
             if process['died']:
                 print(ended_line(process))
     return EXIT_DIED if any(run.died for run in supervisor.runs) else 0
+
+
+def _warn_of_contested(task_set: TaskSet) -> None:
+    from mddag_executor.live.other_processes import contested, divided
+    dags = divided(task_set)
+    topics = {t for v in task_set.vertices if v.dag in dags for t in v.callback.publishes}
+    for topic in sorted(contested(task_set) & topics):
+        warn(f'{topic}: nodes of several processes publish it, so nobody can tell which job a '
+             'message belongs to: put them into one process')
 
 
 def _placed(

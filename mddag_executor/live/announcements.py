@@ -15,6 +15,9 @@ sequence number, and the job, on a topic of its own.  Both have the same system 
     no job, so that nobody waits for it.
 2.  A job is called by the executor that released it first and its number there, wherever it goes,
     and has one release, by the steady clock that all processes of a machine share.
+    Those of a topic that overlap in time are announced together, when the last of them has
+    returned: a message may lie in the windows of all.  Between processes nobody could say when
+    that is so; so what several processes publish on one topic is a doubt (``contested``).
 3.  A message that may come from another process and belongs to no publication that is known waits
     for its announcement, which is under way: for ``WAIT_S`` at the least.  Then it runs as
     undeclared, and is counted.  Publications of one publisher are announced in their order, so its
@@ -38,6 +41,7 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.clocks import TraceClock
 from mddag_executor.live.jobs import Announced, NO_ORIGIN, Origin, Publication, RemotePublisher
+from mddag_executor.live.other_processes import contested
 from mddag_executor.live.work import Work
 from msg_graph import TaskSet
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -69,14 +73,17 @@ class Announcements:
 
     def __init__(
         self, task_set: TaskSet, process: str, context: Context, engine: Engine,
-        clock: TraceClock, give: Callable[[Work, Origin | Announced | None], None],
+        engine_lock: threading.Lock, clock: TraceClock,
+        give: Callable[[Work, Origin | Announced | None], None],
     ) -> None:
         self._jobs = engine.jobs
         self._engine = engine
+        self._engine_lock = engine_lock
         self._clock = clock
         self._give = give
         self._topics = sorted({t for c in task_set.callbacks for t in c.publishes})
         self._number = {topic: i for i, topic in enumerate(self._topics)}
+        self._contested = contested(task_set)
         self._token = int.from_bytes(os.urandom(8), 'little')
         self._publishers: dict[tuple[int, int], RemotePublisher] = {}
         self._waiting: list[tuple[float, Work]] = []
@@ -117,51 +124,65 @@ class Announcements:
         self.node.destroy_node()
 
     def _announce(
-        self, send: Callable[[Any, Any], None], topic: str, publication: Publication
+        self, send: Callable[[Any, Any], None], topic: str, several: list[Publication]
     ) -> None:
-        """Tell the others of a publication (rules 1 and 2)."""
-        origin = publication.origin
-        home, number, release = self._token, 0, 0
-        dag = -1
-        if origin is not NO_ORIGIN and origin.dag >= 0:
-            dag = origin.dag
-            assert self._engine.other_processes is not None and isinstance(origin, Origin)
-            name = self._engine.other_processes.name_of(origin)
-            if name is None:  # it was released here, and may come back
-                name = (self._token, origin.job)
-                self._engine.other_processes.name(name, origin)
-            home, number = name
-            release = (self._engine.scheduler.state.job_release[origin.slot]
-                       - self._clock.offset_ns)
-        entry = _ENTRY.pack(
-            self._token, id(publication.publisher), publication.sequence, publication.begin,
-            publication.end, home, number, release, dag, origin.vertex, self._number[topic])
+        """Tell the others of publications (rules 1 and 2)."""
+        entries = b''.join(self._entry(topic, publication) for publication in several)
         publisher = self._publisher
         if publisher is not None:
-            send(publisher, UInt8MultiArray(data=entry))
+            send(publisher, UInt8MultiArray(data=entries))
+
+    def _entry(self, topic: str, publication: Publication) -> bytes:
+        origin = publication.origin
+        assert isinstance(origin, Origin)
+        job = self._job(origin)
+        dag = -1 if job is None else origin.dag
+        (home, number), release = job or ((0, 0), 0)
+        return _ENTRY.pack(
+            self._token, id(publication.publisher), publication.sequence, publication.begin,
+            publication.end, home, number, release, dag, origin.vertex, self._number[topic])
+
+    def _job(self, origin: Origin) -> tuple[tuple[int, int], int] | None:
+        """Return name and release of a job; None for none, and one that has ended meanwhile."""
+        others = self._engine.other_processes
+        if origin is NO_ORIGIN or others is None:
+            return None
+        with self._engine_lock:
+            release = self._engine.open_release(origin)
+            if release is None:
+                return None
+            name = others.name_of(origin)
+            if name is None:  # it was released here, and may come back
+                name = (self._token, origin.job)
+                others.name(name, origin)
+        return name, release - self._clock.offset_ns
 
     def _hear(self, message: UInt8MultiArray) -> None:
         """Take in what another process announces, and give on what has waited for it."""
-        if len(message.data) != _ENTRY.size:
+        if len(message.data) % _ENTRY.size:
             return
-        whose, of, sequence, begin, end, home, number, release, dag, vertex, topic = (
-            _ENTRY.unpack(message.data))
-        if topic >= len(self._topics) or dag >= len(self._engine.dag_names):
-            return  # of somebody else
         with self._lock:
-            publisher = self._publishers.setdefault((whose, of), RemotePublisher())
-            self._jobs.take_in(self._topics[topic], Publication(
-                begin, publisher, Announced((home, number), dag, vertex, release), sequence, end))
-            found = self._found(self._topics[topic])
+            for entry in _ENTRY.iter_unpack(message.data):
+                self._take_in(*entry)
+            found = self._found()
         for work, origin in found:
             self._give(work, origin)
 
-    def _found(self, topic: str) -> list[tuple[Work, Origin | Announced]]:
+    def _take_in(
+        self, whose: int, of: int, sequence: int, begin: int, end: int, home: int, number: int,
+        release: int, dag: int, vertex: int, topic: int,
+    ) -> None:
+        if topic < len(self._topics) and dag < len(self._engine.dag_names):  # else of a stranger
+            publisher = self._publishers.setdefault((whose, of), RemotePublisher())
+            self._jobs.take_in(self._topics[topic], Publication(
+                begin, publisher, Announced((home, number), dag, vertex, release), sequence, end))
+
+    def _found(self) -> list[tuple[Work, Origin | Announced]]:
         """Return the messages that wait no longer, and whose they are."""
         found = []
         for entry in list(self._waiting):
             work = entry[1]
-            if work.entity.topic == topic and (origin := self._find(work)) is not None:
+            if (origin := self._find(work)) is not None:
                 self._waiting.remove(entry)
                 found.append((work, origin))
         return found
@@ -174,6 +195,10 @@ class Announcements:
 
     def take(self, work: Work) -> None:
         """Take a message that may come from another process; give it on when it is known."""
+        if work.entity.topic in self._contested:
+            self._jobs.doubtful += 1
+            self._give(work, None)
+            return
         with self._lock:
             origin = self._find(work)
             if origin is None:

@@ -215,6 +215,13 @@ class Engine:
             self.other_processes.name(announced.name, job)
         return job._replace(vertex=announced.vertex)
 
+    def open_release(self, origin: Origin) -> int | None:
+        """Return the release of a job that is open, None of one that has ended."""
+        state, slot = self._state, origin.slot
+        is_open = (state.job_dag[slot] == origin.dag and state.job_index[slot] == origin.job
+                   and state.job_state[slot] == OPEN)
+        return state.job_release[slot] if is_open else None
+
     def _is_idle(self, job: Origin, vertex: int, leg: int) -> bool:
         return self._state.x_state[self.scheduler.execution(job.slot, vertex, leg)] == IDLE
 

@@ -217,8 +217,8 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._engine.other_processes is not None
                 and self._engine.other_processes.announces):
             self._announcements = Announcements(
-                task_set, process, self.context, self._engine, self._trace_clock,
-                self._receiver.give)
+                task_set, process, self.context, self._engine, self._pool.lock,
+                self._trace_clock, self._receiver.give)
             self._receiver.announcements = self._announcements
             self._registry.own = {*self._announcements.subscriptions}
         self._intake_kind = intake

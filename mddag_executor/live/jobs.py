@@ -132,6 +132,9 @@ class Publication:
         self.origin = origin
 
 
+Announce = Callable[[Callable[[Any, Any], None], str, list[Publication]], None]
+
+
 class _Topic:
     """The publications of one topic: all of the last ones, and those that have not returned."""
 
@@ -140,6 +143,9 @@ class _Topic:
         self.open: list[Publication] = []
         self.announced: deque[Publication] = deque(maxlen=KEEP)
         self.is_announced = False
+        # what is announced once no publication of the topic is open
+        self.to_announce: list[Publication] = []
+        self.lock = threading.Lock()
         # The longest window of those kept; a maximum of two generations, so that it is forgotten.
         self.longest = 0
         self._longest_lately = 0
@@ -177,8 +183,8 @@ class Jobs:
         self._release_from = [d.release_from for d in task_set.dags] if task_set else []
         self.unknown = 0
         self.doubtful = 0
-        # tells other processes of a publication, once it has returned
-        self.announce: Callable[[Callable[[Any, Any], None], str, Publication], None] | None = None
+        # tells other processes of publications that have returned
+        self.announce: Announce | None = None
 
     def publish(
         self, send: Callable[[Any, Any], None], publisher: Any, msg: Any,
@@ -200,7 +206,12 @@ class Jobs:
         finally:
             topic.ended(publication, time_ns())
         if topic.is_announced and self.announce is not None:
-            self.announce(send, state.topic, publication)
+            with topic.lock:
+                topic.to_announce.append(publication)
+                if topic.open:
+                    return  # their stamps may lie in this window, so they are told together
+                several, topic.to_announce = topic.to_announce, []
+            self.announce(send, state.topic, several)
 
     def announce_on(self, topics: set[str]) -> None:
         """Have the publications on these topics announced."""

@@ -194,6 +194,15 @@ class OtherProcesses:
         return self._names.get((origin.dag, origin.job))
 
 
+def contested(task_set: TaskSet) -> set[str]:
+    """Return the topics that callbacks of several declared processes publish."""
+    processes: dict[str, set[str | None]] = {}
+    for callback in task_set.callbacks:
+        for topic in callback.publishes:
+            processes.setdefault(topic, set()).add(task_set.process_of(callback.node))
+    return {topic for topic, several in processes.items() if len(several) > 1}
+
+
 def divided(task_set: TaskSet) -> set[int]:
     """Return the DAGs that the declared processes divide, and no header stamp joins."""
     return {dag.index for dag in task_set.dags if dag.release_from != 'header_stamp' and len(

@@ -78,3 +78,15 @@ def test_together_and_apart() -> None:
 def test_no_process_is_without_a_node_where_nothing_is_declared_to_take_time() -> None:
     times = (0, 0, 0, 0)
     assert sorted(len(nodes) for nodes in placed(workload(*times), 3, *times)) == [1, 1, 2]
+
+
+def test_nodes_that_publish_one_topic_stay_together() -> None:
+    tasks = loads("""
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: t, timer: 10ms, publishes: [/x]}]}
+  - {node: /b, callbacks: [{name: t, timer: 10ms, publishes: [/x]}]}
+  - {node: /c, callbacks: [{name: s, subscription: /x, deadline: 10ms}]}
+""")
+    placing = Placing(tasks, 2, [[4 * MS, MS], [4 * MS, MS]])
+    assert [p.nodes for p in placing.processes(placing.place())] == [('/a', '/b'), ('/c',)]

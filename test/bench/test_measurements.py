@@ -220,6 +220,22 @@ def test_a_measurement_that_cannot_be_made_ends_all() -> None:
         measure(Spec('autoware', 'single', graph='/none.yaml'))
 
 
+@pytest.mark.parametrize('executor', ['rad-events', 'events'])
+def test_declared_processes_are_measured_as_one_run(tmp_path: Path, executor: str) -> None:
+    graph = tmp_path / 'graph.yaml'
+    graph.write_text("""
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: t, timer: 20ms, publishes: [/x], execution_time: 1ms}]}
+  - {node: /b, callbacks: [{name: s, subscription: /x, deadline: 500ms, execution_time: 1ms}]}
+processes: {one: [/a], two: [/b]}
+""")
+    result = measure(Spec('autoware', executor, graph=str(graph), seconds=1.0, warm_up_s=0.2))
+    assert 0 < result['on_time'] <= result['sink_jobs_due']
+    assert result['attribution'] == {'wrong': 0, 'none': 0}
+    assert result['dispatch_latency_us'] is not None and result['callbacks'] > 0
+
+
 def test_what_native_code_prints_is_no_result() -> None:
     # rclpy's EventsExecutor prints a warning about a clock with many timers.
     graph = str(find('config/autoware.yaml'))

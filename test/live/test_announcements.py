@@ -160,6 +160,24 @@ def test_what_nobody_announces_waits_for_a_while_and_is_counted(
     assert statistics['unattributed']['unknown'] == 1
 
 
+def test_what_several_processes_publish_on_one_topic_is_a_doubt(
+        make_executor: Any, make_node: Any) -> None:
+    text = GRAPH.replace('publishes: [/join_right]', 'publishes: [/join_left]').replace(
+        '      - {name: take_too, subscription: /join_right, publishes: [/end]}\n', '')
+    text += 'processes: {p1: [/one, /two], p2: [/three, /four, /five]}'
+    nodes = Nodes(make_node)
+    executor = make_executor(loads(text), process='p2')
+    for name in ('three', 'four', 'five'):
+        executor.add_node(nodes.nodes[name])
+    publisher = make_node('p').create_publisher(Int64, '/join_left', 10)
+    with Spinning(executor):
+        assert wait_for(lambda: publisher.get_subscription_count() == 1)
+        publisher.publish(Int64(data=1))
+        assert wait_for(lambda: len(nodes.ran.get('four /join_left', ())) == 1)
+    assert nodes.ran['four /join_left'] == [(1, None)]
+    assert executor.statistics()['unattributed'] == {'unknown': 0, 'doubtful': 1}
+
+
 def test_a_message_that_comes_first_waits_for_its_announcement(
         make_executor: Any, make_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     if not EventsIntake.available():
@@ -169,7 +187,8 @@ def test_a_message_that_comes_first_waits_for_its_announcement(
     monkeypatch.setattr('mddag_executor.live.announcements.WAIT_S', 60.0)
     monkeypatch.setattr(
         Announcements, '_announce',
-        lambda self, send, topic, p: held.append((self, send, topic, p)))
+        lambda self, send, topic, several: announce(
+            self, lambda *message: held.append((send, message)), topic, several))
     text = GRAPH + 'processes: {p1: [/one], p2: [/two, /three, /four, /five]}'
     nodes = Nodes(make_node)
     up, down = (make_executor(loads(text), process=name) for name in ('p1', 'p2'))
@@ -184,8 +203,8 @@ def test_a_message_that_comes_first_waits_for_its_announcement(
         assert wait_for(lambda: len(held) >= 2 * JOBS)
         assert wait_for(lambda: len(down._announcements._waiting) == 2 * JOBS)
         assert set(nodes.ran) == {'one'}
-        for each in held:
-            announce(*each)
+        for send, message in held:
+            send(*message)
         assert wait_for(lambda: len(nodes.ran.get('five /end', ())) == 2 * JOBS)
         nodes.timer.cancel()
     assert sorted(number for number, _ in nodes.ran['two /left']) == list(range(1, JOBS + 1))

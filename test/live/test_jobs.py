@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from hypothesis import given
@@ -206,3 +207,21 @@ def test_a_publication_here_and_one_elsewhere_at_once_are_a_doubt_unless_it_is_k
     assert bench.jobs.find(TOPIC, 7, 1) is None and bench.jobs.doubtful == 1
     other.offset = 0
     assert bench.job(7, 1) == 5 and number(bench, 7, 9) == 1
+
+
+def test_publications_that_overlap_are_announced_together_when_all_have_returned():
+    bench = Bench()
+    told: list[list[int]] = []
+    bench.jobs.announce = lambda send, topic, several: told.append(
+        [each.origin.job for each in several])  # type: ignore[union-attr]
+    bench.jobs.announce_on({TOPIC})
+
+    def publish(job: int, publisher: int, send: Callable[[], None] = lambda: None) -> None:
+        bench.jobs.publish(lambda *_: send(), None, None, bench.publishers[publisher],
+                           Origin(0, 0, job, publisher))
+
+    publish(1, 0)
+    publish(2, 0, lambda: publish(3, 1))
+    bench.jobs.announce_on(set())
+    publish(4, 0)
+    assert told == [[1], [3, 2]]

@@ -13,6 +13,8 @@ A process that does not end in time is killed: rclpy's EventsExecutor holds off 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 import json
 import os
 import statistics
@@ -23,6 +25,7 @@ import time
 from typing import Any
 
 from mddag_executor.live.bench.spec import BenchError, DECLARED, ROBOT, Spec
+from msg_graph import GraphError, load
 
 PATIENCE_S = 90.0
 """What a process may take besides its window and warm-up: discovery and the end."""
@@ -42,9 +45,19 @@ def measure(
     """
     Make one measurement in a new process; return its figures.
 
+    Of a declaration with ``processes:`` each is one, all at a time.
+
     :raises CrashError: when the process crashed, did not end and was killed, or gave no result.
     :raises BenchError: when the measurement cannot be made.
     """
+    names = _processes(spec)
+    if len(names) > 1:
+        from mddag_executor.live.bench.declared import of_processes
+        with ThreadPoolExecutor(len(names)) as threads:
+            parts = threads.map(lambda name: measure(
+                replace(spec, process=name), tick if name == names[0] else None, patience_s),
+                names)
+            return of_processes(spec, list(parts))
     # Of this machine only: it must not find another one's nodes, nor be found by them.
     environment = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ}
     command = [sys.executable, '-m', 'mddag_executor.live.bench', spec.to_json()]
@@ -74,6 +87,16 @@ def measure(
             raise CrashError(
                 f'{spec.name}: it ended well but gave no result: {text[:60]!r}') from None
         return result
+
+
+def _processes(spec: Spec) -> list[str]:
+    """Return the declared processes that a measurement is made of."""
+    if spec.load not in DECLARED or spec.process is not None or spec.graph is None:
+        return []
+    try:
+        return [process.name for process in load(spec.graph).processes]
+    except GraphError as error:
+        raise BenchError(str(error)) from None
 
 
 def _wait(process: subprocess.Popen[bytes], limit: float, tick: Tick | None) -> None:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import gc
 from typing import Any, cast
 
@@ -14,7 +15,8 @@ from mddag_executor.live.bench.latency import Starts
 from mddag_executor.live.bench.spec import BenchError, OURS, Spec
 from mddag_executor.live.bodies import no_job
 from mddag_executor.live.execution import ExecutionPlan, Mode
-from mddag_executor.live.session import run_synthetic
+from mddag_executor.live.measure import Books, measure
+from mddag_executor.live.session import run_and_note
 from mddag_executor.live.synthetic import SyntheticWorkload
 from msg_graph import load, TaskSet
 
@@ -24,9 +26,9 @@ HOT_PATH = 'hot_path'
 
 def run_declared(spec: Spec) -> dict[str, Any]:
     """
-    Run the nodes of a declaration under an executor.
+    Run the nodes of a declaration under an executor, or those of one of its processes.
 
-    :return: the figures of ``measure``, ``dispatch_latency_us`` and ``hot_path_us``.
+    :return: the figures of ``result_of``; of one process what that takes.
     :raises BenchError: when the run was over before anything was measured.
     :raises mddag_executor.errors.MddagError: when declaration and execution times do not fit.
     :raises msg_graph.GraphError: when the declaration is wrong.
@@ -38,7 +40,8 @@ def run_declared(spec: Spec) -> dict[str, Any]:
         task_set, spec.seed, spec.utilisation, spec.workers, cast(Mode, spec.bodies))
     executor = make_executor(spec, task_set)
     job_of_thread = current_job if spec.executor in OURS else no_job
-    workload = SyntheticWorkload(task_set, plan, current_job=job_of_thread)
+    workload = SyntheticWorkload(
+        task_set, plan, current_job=job_of_thread, process=spec.process)
     starts = Starts()
     # before an executor learns of them
     starts.watch(workload.nodes,
@@ -50,19 +53,38 @@ def run_declared(spec: Spec) -> dict[str, Any]:
     gc.collect()
     gc.freeze()
     with session:
-        result = run_synthetic(session, workload, spec.seconds, warm_up_s=spec.warm_up_s)
+        books = run_and_note(session, workload, spec.seconds, warm_up_s=spec.warm_up_s)
     if session.error is not None:
         raise session.error
-    if result is None:
+    if books is None:
         raise BenchError('the run was ended before anything was measured: run it again')
-    begin = result['window_start_ns']
     # rclpy's EventsExecutor moves a timer on before it queues the call, so that calls in a backlog
     # do not tell for which due time they stand: only messages are counted there.
     latencies = starts.within(
-        begin, begin + result['window_ns'], timers=spec.executor != 'events')
+        books.start.at_ns, books.end.at_ns, timers=spec.executor != 'events')
+    if spec.process is not None:
+        return {'books': books.plain(), 'latencies': latencies}
+    return result_of(task_set, plan, books, latencies)
+
+
+def result_of(
+    task_set: TaskSet, plan: ExecutionPlan, books: Books, latencies: list[int]
+) -> dict[str, Any]:
+    """Return the figures of ``measure``, ``dispatch_latency_us`` and ``hot_path_us``."""
+    result = measure(books.ledger, plan, books.start, books.end)
     return {
         **result, 'infeasible_sinks': len(plan.infeasible()),
         'dispatch_latency_us': quantiles_us(latencies), 'hot_path_us': hot_path(task_set, result)}
+
+
+def of_processes(spec: Spec, parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the figures of a run from what its processes returned."""
+    task_set = load(spec.graph or '')
+    plan = ExecutionPlan(
+        task_set, spec.seed, spec.utilisation, spec.workers, cast(Mode, spec.bodies))
+    return result_of(
+        task_set, plan, Books.of_processes(task_set, [part['books'] for part in parts]),
+        [latency for part in parts for latency in part['latencies']])
 
 
 def hot_path(task_set: TaskSet, result: dict[str, Any]) -> dict[str, Any] | None:

@@ -32,7 +32,8 @@ def make_executor(spec: Spec, task_set: TaskSet | None) -> Executor:
         # Here: the others are measured without a trace of this executor in the process.
         from mddag_executor.live.executor import MultiDeadlineExecutor
         return MultiDeadlineExecutor(
-            task_set, num_workers=spec.workers, policy=spec.policy, intake=OURS[spec.executor])
+            task_set, num_workers=spec.workers, policy=spec.policy, intake=OURS[spec.executor],
+            process=spec.process)
     if spec.executor == NONE:
         return NoExecutor()
     if spec.executor == 'multi':

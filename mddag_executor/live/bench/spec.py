@@ -59,6 +59,7 @@ class Spec:
     :ivar groups: the callback groups of the subscriptions, one of ``GROUPS``.
     :ivar phases: when the topics are published, one of ``PHASES``.
     :ivar scale: of how much the robot's nodes compute.
+    :ivar process: which of the declared processes it is of; None: of all that there are.
     """
 
     load: str
@@ -77,6 +78,7 @@ class Spec:
     groups: str = 'shared'
     phases: str = 'drawn'
     scale: float = 1.0
+    process: str | None = None
 
     @property
     def name(self) -> str:
