@@ -6,12 +6,13 @@ What recorded executions would have taken alone, without others that compute bes
 Theory of operation
 -------------------
 An execution that computed for ``cpu`` of its ``took`` waited for the rest: for something of its
-own, for the interpreter, or for a CPU.  What it waited for others is taken back; what nobody else
+own, for the interpreter, or for a CPU.  What it waited for others is taken back; what none of them
 explains is its own.
 
 * One that *holds the interpreter* cannot compute while others do.  What they computed meanwhile is
   known, if not when: an execution is taken to have computed evenly.  At most so much of its
-  waiting was for the interpreter.
+  waiting was for the interpreter.  The rest is its own (or the machine had no CPU for it); where
+  several held the interpreter at a time, all of them waited then, and each is left its part.
 * One that *waits* needs the interpreter when it goes on, and publishes.  If somebody held it all
   the time until then it had to wait for a switch interval, or since that one had begun.
 * One that *computes without the lock* waited for a CPU if hardly any of them was idle meanwhile.
@@ -54,7 +55,10 @@ def alone(
         beside = others(end) - others(start)
         for_it = np.minimum(waited, np.maximum(0, beside - cpu))
         last = np.minimum(held_for(end - after, start[mine], end[mine]), SWITCH_NS)
-        result[mine] -= for_it[mine]
+        together = _computed(start[mine], end[mine], took[mine])
+        several = np.maximum(1.0, (together(end) - together(start)) / np.maximum(took, 1))
+        own = np.rint((waited - for_it) / several).astype(np.int64)
+        result[mine] = (cpu + own)[mine]
         waits = known & ~holds & here
         result[waits] -= np.minimum(last, waited)[waits]
     native = known & ~holds & (2 * cpu >= took)
