@@ -25,7 +25,7 @@ from mddag_executor.live.thread_clock import Reading
 
 LOOK_NS = 2_000_000
 """How often it is looked at who keeps others from the interpreter (see ``interpreter``)."""
-PROVEN = 32
+PROVEN = 16
 """Who has waited is trusted again after so many executions; who has not, after ``LATELY``."""
 
 COMPUTES = 0.8
@@ -81,7 +81,7 @@ class Habit:
         """Return whether to measure the execution that begins now."""
         self._runs += 1
         is_sample = self._runs % SAMPLE == 0
-        self._sampled = is_sample and (
+        self._sampled = is_sample and self.computed_ns >= LOOK_NS and (
             self._tries < FIRST or self._runs % (SAMPLE * FIRST) == 0)
         if self._declared:
             return False

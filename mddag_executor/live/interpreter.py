@@ -43,7 +43,7 @@ from mddag_executor.live.seat import Seat
 from mddag_executor.live.thread_clock import ThreadClock
 from mddag_executor.live.work import Work
 
-PATIENCE_NS = 10_000_000
+PATIENCE_NS = 20_000_000
 """So often it is looked at one that has never waited yet."""
 SOON_NS = 100_000
 IDLE_LOOKS = 2
