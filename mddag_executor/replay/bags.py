@@ -275,10 +275,11 @@ def _stray_stamps(arrivals: Sequence[int], stamps: Sequence[int]) -> list[int]:
     known = [place for place, stamp in enumerate(stamps) if stamp > 0]
     if not known:
         return []
-    lags = [NEVER // 2 + stamps[place] - arrivals[place] for place in known]
+    lags = [stamps[place] - arrivals[place] for place in known]
     usual = sorted(lags)[len(lags) // 2]
     # a usual one at both ends: what is odd there is between others, too
-    return [known[odd - 1] for odd in Times().impossible([usual, *lags, usual])]
+    around = [NEVER // 2 + lag - usual for lag in (usual, *lags, usual)]
+    return [known[odd - 1] for odd in Times().impossible(around) if 0 < odd <= len(known)]
 
 
 def is_ordinary(path: str) -> bool:

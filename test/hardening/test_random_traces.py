@@ -77,7 +77,7 @@ def rows_of(path: Path, most: int) -> list[Row]:
         kind = EVENTS[event['_name']]
         at_work += kind.name in ('dispatch', 'job_release', 'complete', 'rclcpp_publish')
         found.append((event['_name'], event['_timestamp'], event['_vpid'], event['_vtid'],
-                      [event[name] for name, _ in kind.fields]))
+                      [event.get(name, 0) for name, _ in kind.fields]))
         if at_work > most:
             break
     return found

@@ -32,6 +32,7 @@ nodes:
       - {name: s, service: /s, period: 1s, deadline: 1s, dag: service}
 paths:
   - {name: p, callbacks: ['/n:t', '/n:x']}
+processes: {all: [/n]}
 """
 
 

@@ -29,6 +29,7 @@ from ..trace.helpers import records_of
 
 MS = 1_000_000
 BEGIN = 1_732_166_766_000_000_000
+YEAR = 365 * 24 * 3600 * 1000 * MS
 STORE = get_typestore(Stores.ROS2_JAZZY)
 GRAPH = """\
 mddag: 1
@@ -147,6 +148,16 @@ def test_stamps_that_can_not_be_are_said(tmp_path: Path) -> None:
     outcome = reschedule_bag(path, loads(published, 'g.yaml'))
     assert '10 of 10 messages' in outcome.warnings[0]
     assert 'without a publication time' in outcome.warnings[0]
+
+
+def test_messages_that_come_decades_after_their_stamps(tmp_path: Path) -> None:
+    writer = Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP)
+    with writer:
+        points = writer.add_connection('/points', 'std_msgs/msg/Header', typestore=STORE)
+        for i in range(10):
+            writer.write(points, BEGIN + 80 * YEAR + i * 100 * MS, header(BEGIN + i * 100 * MS))
+    stamps = Bag(tmp_path / 'bag', {'/points'}).stamps['/points']
+    assert list(stamps.header) == [BEGIN + i * 100 * MS for i in range(10)]
 
 
 def test_what_is_not_in_the_bag_is_said(tmp_path: Path) -> None:
