@@ -295,7 +295,8 @@ class Rerun:
 
     def _begin(self) -> None:
         """Start the programs, one after the other; each runs until it waits for something."""
-        self._host.start(self._programs(), self._settings.ros_args)
+        ros_args = self._settings.ros_args
+        self._host.start(self._programs(), ['--ros-args', *ros_args] if ros_args else [])
         self._loop.at(self._loop.start, ENDED, self._started)
 
     def _started(self) -> None:

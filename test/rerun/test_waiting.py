@@ -149,6 +149,23 @@ def test_a_service_that_nobody_offers(bag: str, graph: Path) -> None:
         '/filter:take: it still waits (for service /nobody)']
 
 
+def test_ros_arguments(bag: str, graph: Path) -> None:
+    seen: list[Any] = []
+
+    def main() -> None:
+        rclpy.init()
+        node = rclpy.create_node('filtre')
+        node.declare_parameter('gain', 0)
+        seen.append((node.get_name(), node.get_parameter('gain').value))
+        node.create_subscription(Header, '/cloud', lambda message: seen.append(message), 10)
+        rclpy.spin(node)
+
+    rerun(bag, graph, [main], ros_args=[
+        '-r', '__node:=filter', '-r', '/cloud:=/points', '-p', 'gain:=3'])
+    assert seen[0] == ('filter', 3)
+    assert len(seen) == 21
+
+
 def test_parameters_of_another_node(bag: str, graph: Path) -> None:
     def take(node: Filter, number: int) -> None:
         if number == 1:
