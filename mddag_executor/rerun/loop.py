@@ -14,7 +14,7 @@ done before time goes on.
 A callback runs, for real and at once, when the core dispatches it.  In virtual time it takes as
 long as ``times`` says, or as long as it has waited, if that is more.  What it sends is *held*
 until its virtual end, or until it begins to wait, for others may have to answer it.  A message
-whose recorded transport time is negative left before the end, and does so here.
+whose recorded transport time is negative left before the end, and does so here, too.
 
 What threads of others send has no virtual time: it is taken as of when it comes, and a warning
 says so.
@@ -120,7 +120,7 @@ class Loop:
         self._order = itertools.count()
         self._foreign: deque[Callable[[], None]] = deque()
         self._current: Execution | None = None
-        self._resumed: set[int] = set()
+        self._resumed: set[Work] = set()
         self._at_once = 0
         self._stopped = False
         self._looked_at = self._looks = self._ask_at = 0
@@ -141,11 +141,6 @@ class Loop:
     def stop(self) -> None:
         """End the run at this instant, from any thread."""
         self._stopped = True
-
-    @property
-    def stopped(self) -> bool:
-        """Tell whether the run is over, or about to be."""
-        return self._stopped or self.strands.over
 
     @property
     def current(self) -> Execution | None:
@@ -225,27 +220,48 @@ class Loop:
 
     def _execute(self, work: Work) -> None:
         """Run a callback that the core has dispatched, as far as it goes without waiting."""
-        entity = work.entity
         self._at_once += 1
         if self._at_once > MOST_AT_ONCE:
             raise RerunError(
-                f'{entity.name}: virtual time stands still at '
+                f'{work.entity.name}: virtual time stands still at '
                 f'{(self.now - self.start) / 1e9:.6f} s: callbacks start one another and take no '
                 'time: declare their execution_time')
         origin = work.origin
         release = 0 if origin is None else self.engine.release_of(work)
-        execution = self._current = Execution(work, self.now, release)
+        execution = Execution(work, self.now, release)
         takes = self._execution_time(work, origin, release)
         if self.computing is not None:
             self.computing.waits(work)
+        if not self._call(execution):
+            return
+        self.callbacks += 1
+        if origin is not None and takes:
+            work.cpu_ns = max(0, self._times.computed(origin.dag, origin.vertex, release))
+        waited = self.now > execution.start
+        if self.computing is not None and execution.worker >= 0 and not waited:
+            self.computing.begin(execution, work, takes, [
+                (max(0, takes + early), partial(self._leave, held, execution, early))
+                for early, held in self._take_early(execution, takes)])
+            return
+        end = max(self.now, execution.start + takes)
+        for early, held in self._take_early(execution, takes):
+            self.at(max(self.now, end + early), ARRIVED, self._leave, held, execution, early)
+        order = (work.worker << _WORKER_BITS) + next(self._order)
+        heappush(self._events, (end, ENDED, order, self.ended, (execution, end)))
+
+    def _call(self, execution: Execution) -> bool:
+        """Call what an execution calls; return whether it ran."""
+        work = execution.work
+        entity = work.entity
+        self._current = execution
         try:
             execution.waits_for = work.step() if entity.gate is None else entity.gate.step(work)
         except Destroyed:
             self.engine.destroyed(work, self.now)
-            return
+            return False
         except Refused:
             self.engine.refused(work, self.now)
-            return
+            return False
         except SystemExit as error:
             if error.code not in (None, 0):
                 raise CallbackFailed(entity.name, error, self.now - self.start) from error
@@ -254,65 +270,38 @@ class Loop:
             raise CallbackFailed(entity.name, error, self.now - self.start) from error
         finally:
             self._current = None
-        self.callbacks += 1
-        if origin is not None and takes:
-            work.cpu_ns = max(0, self._times.computed(origin.dag, origin.vertex, release))
-        if self.computing is not None and execution.worker >= 0 and self.now == execution.start:
-            self._compute(execution, takes)
-            return
-        end = max(self.now, execution.start + takes)
-        if end > self.now:
-            self._let_leave_early(execution, end)
-        order = (work.worker << _WORKER_BITS) + next(self._order)
-        heappush(self._events, (end, ENDED, order, self.ended, (execution, end)))
+        return True
 
-    def _compute(self, execution: Execution, takes: int) -> None:
-        """Have an execution end when CPUs and interpreter let it."""
-        work, origin = execution.work, execution.origin
-        assert self.computing is not None
-        leaving: list[tuple[int, Callable[[], None]]] = []
-        if origin is not None and takes:
-            kept = []
-            for held in execution.held:
-                early = held.early(origin, execution.release)
-                if early < 0:
-                    leaving.append((max(0, takes + early), partial(
-                        self._leave, held, execution)))
-                else:
-                    kept.append(held)
-            execution.held = kept
-        self.computing.begin(execution, work, takes, leaving)
+    def _take_early(self, execution: Execution, takes: int) -> list[tuple[int, Held]]:
+        """Take from what an execution has sent what left before its end in the recording."""
+        origin = execution.origin
+        if origin is None or not takes:
+            return []
+        found, kept = [], []
+        for held in execution.held:
+            early = held.early(origin, execution.release)
+            if early < 0:
+                found.append((early, held))
+            else:
+                kept.append(held)
+        execution.held = kept
+        return found
 
-    def _leave(self, held: Held, execution: Execution) -> None:
+    def _leave(self, held: Held, execution: Execution, early: int) -> None:
+        """Let something leave before its execution ends."""
         held.record(execution.thread)
-        held.leave(execution.origin, execution.release, self.now)
+        held.leave(execution.origin, execution.release, self.now - early)
 
     def _execution_time(self, work: Work, origin: Origin | None, release: int) -> int:
         """Return how long a callback takes: its first piece all of it, a sync its last leg."""
         if origin is None:
             return 0
-        if work.x in self._resumed:
-            self._resumed.discard(work.x)
+        if work in self._resumed:
+            self._resumed.discard(work)
             return 0
         if not self.engine.makes_whole(work):
             return 0
         return self._times.execution(origin.dag, origin.vertex, release)
-
-    def _let_leave_early(self, execution: Execution, end: int) -> None:
-        """Have messages leave before the end that did so in the recording."""
-        origin = execution.origin
-        if origin is None:
-            return
-        kept = []
-        for held in execution.held:
-            early = held.early(origin, execution.release)
-            if early < 0:
-                held.record(execution.thread)
-                self.at(max(self.now, end + early), ARRIVED, held.leave, origin,
-                        execution.release, end)
-            else:
-                kept.append(held)
-        execution.held = kept
 
     def ended(self, execution: Execution, now: int) -> None:
         """End an execution in virtual time, or suspend it."""
@@ -326,7 +315,7 @@ class Loop:
             engine.finished(work, start, now, now, execution.thread, worker)
         else:
             engine.suspended(work, start, now, execution.thread, worker)
-            self._resumed.add(work.x)
+            self._resumed.add(work)
             self._resume_when_done(work, waits_for)
         for each in held:
             each.leave(execution.origin, execution.release, now)

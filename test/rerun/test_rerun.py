@@ -15,11 +15,16 @@ from mddag_executor.rerun import (
     assert_same,
     CallbackFailed,
     compare,
+    programs,
     rerun,
     RerunError,
     Result,
 )
+from mddag_executor.rerun.recording import Recording
+from mddag_executor.rerun.run import Rerun, Settings
+from mddag_executor.rerun.sources import Source
 from mddag_executor.rerun.types import canonical
+from msg_graph import load
 import pytest
 import rclpy
 from rclpy.node import Node
@@ -140,6 +145,36 @@ def test_recorded_times_come_from_a_trace(bag: str, graph: Path, tmp_path: Path)
     result = rerun(bag, graph, [Filter, Sink], times=trace)
     assert [time for time, _ in published(result, '/filtered')] == [
         100.0 * i + 10 for i in range(20)]
+
+
+class Early:
+    """Each callback takes 10 ms and publishes 4 ms before its end."""
+
+    at_once = False
+
+    def execution(self, dag: int, vertex: int, release: int) -> int:
+        return 10 * MS
+
+    def transport(self, dag: int, before: int, after: int, release: int) -> int:
+        return -4 * MS
+
+    def computed(self, dag: int, vertex: int, release: int) -> int:
+        return 10 * MS
+
+    def holds(self, vertex: int) -> bool:
+        return False
+
+
+@pytest.mark.parametrize('cpus', [None, 2])
+def test_what_was_published_early_leaves_early(bag: str, graph: Path, cpus: int | None) -> None:
+    recording = Recording(bag)
+    assert recording.start is not None and recording.end is not None
+    source = Source('bag', recording.start, recording.end, recording, Early())
+    result = Rerun(source, load(str(graph)), Settings(workers=2, cpus=cpus)).run(
+        lambda: programs([Filter, Sink]))
+    assert [time for time, _ in published(result, '/filtered')][:2] == [6, 106]
+    # Nobody takes it in this DAG: it leaves at the end.
+    assert [time for time, _ in published(result, '/out')][:2] == [16, 116]
 
 
 def test_times_from_a_file(bag: str, graph: Path, tmp_path: Path) -> None:
