@@ -34,7 +34,7 @@ from typing import Any, Protocol
 
 from mddag_executor.core import NEVER
 from mddag_executor.live.compat import UNKNOWN
-from mddag_executor.live.engine import Engine, OVERTAKE_NS
+from mddag_executor.live.engine import Engine
 from mddag_executor.live.gates import Refused
 from mddag_executor.live.jobs import Origin
 from mddag_executor.live.work import Destroyed, QuickCallback, Work
@@ -46,7 +46,7 @@ from mddag_executor.rerun.times import Times
 DRAIN_NS = 10_000_000_000
 """So long what has begun may go on after the end of the recording."""
 POLL_NS = 1_000_000
-"""How often who waits for something unknown looks again."""
+"""How often who waits for something unknown looks again, or for the interpreter asks again."""
 MOST_LOOKS = 1000
 """Who looks so often at the time at one instant waits for it to pass."""
 MOST_AT_ONCE = 20_000
@@ -188,7 +188,7 @@ class Loop:
             if self.computing.go_on(now):
                 return True
         if engine.held_back and now >= self._ask_at:
-            self._ask_at = now + OVERTAKE_NS
+            self._ask_at = now + POLL_NS
             self.at(self._ask_at, TIMER, _nothing)  # it may overtake by then
         return self._advance(deadline)
 

@@ -136,8 +136,8 @@ class Messages:
 
     # --- who is there ----------------------------------------------------------------------------
 
-    def refresh(self, nodes: Iterable[Any], subscriptions: Iterable[Entity]) -> list[Inlet]:
-        """Take in which subscriptions and publishers there are; return new subscriptions."""
+    def refresh(self, nodes: Iterable[Any], subscriptions: Iterable[Entity]) -> None:
+        """Take in which subscriptions and publishers there are."""
         known, self._known = self._known, {}
         new = []
         self._inlets = {}
@@ -162,7 +162,6 @@ class Messages:
         for inlet in new:
             if inlet.latched:
                 self._deliver_kept(inlet)
-        return new
 
     def _deliver_kept(self, inlet: Inlet) -> None:
         """Give a subscription what was published before it was there, as far as that is kept."""

@@ -23,13 +23,18 @@ _IN_MEMORY = 256 << 20
 
 
 class Recorded(NamedTuple):
-    """A recorded message: when it came, when it was published, its topic with its type."""
+    """
+    A recorded message: when it came, when it was published, its topic with its type.
+
+    :ivar place: tells it from the others.
+    """
 
     time: int
     published: int
     topic: str
     kind: str
     data: bytes
+    place: int
 
 
 class Recording:
@@ -97,4 +102,4 @@ class Recording:
         topic = self._topics[i]
         return Recorded(
             self._times[i], self._published[i], topic.name, topic.message_type,
-            self._file.read(self._sizes[i]))
+            self._file.read(self._sizes[i]), i)

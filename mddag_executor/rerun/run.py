@@ -40,10 +40,10 @@ from mddag_executor.rerun.computing import Computing
 from mddag_executor.rerun.discovery import Discovery
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.executor import NodeHolder, RerunHost
-from mddag_executor.rerun.loop import ENDED, Loop, RECORDED
+from mddag_executor.rerun.loop import ENDED, Loop
 from mddag_executor.rerun.messages import Messages
 from mddag_executor.rerun.outputs import Output, Outputs
-from mddag_executor.rerun.recording import Recorded
+from mddag_executor.rerun.playing import CLOCK, Playing
 from mddag_executor.rerun.replacing import instead, Replacements
 from mddag_executor.rerun.services import Services
 from mddag_executor.rerun.sources import Source
@@ -51,23 +51,16 @@ from mddag_executor.rerun.strands import Stuck
 from mddag_executor.rerun.timers import Timers
 from mddag_executor.rerun.times import AsRecorded
 from mddag_executor.rerun.trace import VirtualTraceWriter
-from mddag_executor.rerun.types import type_name
 from msg_graph import TaskSet
 import rclpy
 from rclpy.exceptions import ROSInterruptException
 from rclpy.executors import ExternalShutdownException
 from rclpy.guard_condition import GuardCondition
 from rclpy.publisher import Publisher
-from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
-from rclpy.time import Time
 from rclpy.utilities import get_default_context, try_shutdown
-from rosgraph_msgs.msg import Clock
 
-CLOCK = '/clock'
-CLOCK_EVERY_NS = 10_000_000
-"""How often ``/clock`` tells the time to those who subscribe to it."""
 DEFAULT_DEADLINE = 100_000_000
 MAX_ACTIVE_JOBS = 64
 EXPIRE_AFTER = 1_000_000_000
@@ -161,7 +154,6 @@ class Rerun:
         self._failed: list[Guest] = []
         self._hosted: set[str] = set()
         self._begun = self._started_s = 0.0
-        self._clocked = False
 
     # --- parts -----------------------------------------------------------------------------------
 
@@ -192,6 +184,7 @@ class Rerun:
         self._registry = Registry(task_set, self._engine, self._engine.leave_group)
         self._messages = Messages(
             loop, source.times, self._outputs, task_set, self._recorder, self._warn)
+        self._playing = Playing(loop, self._messages, source.messages)
         self._services = Services(loop, self._holder, self._warn)
         self._actions = Actions(
             loop, self._holder, lambda: self._registry.by_id, self._warn)
@@ -306,7 +299,7 @@ class Rerun:
         if all(guest.settled.is_set() for guest in self._host.guests) and not self._hosted:
             raise RerunError(self._none_hosted())
         self._check_topics()
-        self._play_from(self._loop.start)
+        self._playing.begin()
 
     def _none_hosted(self) -> str:
         return (f'{self._task_set.file}: none of its callbacks is in the nodes that run: give the '
@@ -345,58 +338,8 @@ class Rerun:
         self._services.refresh(registry.by_id.values())
         if self._recorder is not None:
             self._recorder.entities(nodes, added)
-        new = self._messages.refresh(nodes, registry.subscriptions())
-        if not self._clocked and self._messages.inlets(CLOCK) and not (
-                {CLOCK} & {*self._source.topics, *self._messages.offered}):
-            self._clocked = True
-            self._tell_time()
-        if new and self._messages_wanted() and now > self._loop.start:
-            self._play_from(now)
-
-    # --- what is recorded ------------------------------------------------------------------------
-
-    def _messages_wanted(self) -> bool:
-        """Load what the nodes need of the recording; return whether that is more than before."""
-        recording = self._source.messages
-        if recording is None:
-            return False
-        topics = self._messages.topics()
-        more = recording.load({*topics, *self._messages.offered})
-        for topic, kind in topics.items():
-            recorded = recording.kinds.get(topic)
-            if recorded is not None and topic not in self._messages.offered and (
-                    recorded != type_name(kind)):
-                raise RerunError(
-                    f'{recording.name}: {topic} was recorded as {recorded}, and the node '
-                    f'subscribes to it as {type_name(kind)}: record it anew, or correct the node')
-        return more
-
-    def _play_from(self, since: int) -> None:
-        """Deliver the recorded messages from a time on."""
-        self._messages_wanted()
-        recording = self._source.messages
-        if recording is not None:
-            self._playing = recording.messages(since)
-            self._next(self._playing)
-
-    def _next(self, playing: Iterator[Recorded]) -> None:
-        message = next(playing, None)
-        if message is not None:
-            self._loop.at(message.time, RECORDED, self._deliver, playing, message)
-
-    def _deliver(self, playing: Iterator[Recorded], message: Recorded) -> None:
-        if playing is not self._playing:
-            return  # it begins anew, with more topics
-        self._messages.recorded(message.topic, message.data, message.published)
-        self._next(playing)
-
-    def _tell_time(self) -> None:
-        """Publish virtual time on ``/clock``, where somebody subscribes to it."""
-        now = self._loop.now
-        stamp = Time(nanoseconds=now).to_msg()
-        self._messages.recorded(CLOCK, serialize_message(Clock(clock=stamp)), now)
-        if now + CLOCK_EVERY_NS < self._loop.end:
-            self._loop.at(now + CLOCK_EVERY_NS, RECORDED, self._tell_time)
+        self._messages.refresh(nodes, registry.subscriptions())
+        self._playing.refresh()
 
     # --- the end ---------------------------------------------------------------------------------
 

@@ -346,6 +346,25 @@ def test_late_subscriptions_get_what_is_latched(bag: str, graph: Path) -> None:
     assert seen == ['a map']
 
 
+def test_a_subscription_that_comes_later(tmp_path: Path, graph: Path) -> None:
+    bag = write_bag(tmp_path / 'in.mcap', [
+        message for i in range(6) for message in (
+            (i * 100 * MS, '/points', Header(frame_id=str(i))),
+            (i * 100 * MS, '/names', String(data=f'name {i}')))])
+    seen: list[str] = []
+
+    def fill(node: Node) -> None:
+        def take(message: Header) -> None:
+            seen.append(message.frame_id)
+            if message.frame_id == '2':
+                node.create_subscription(String, '/names', lambda m: seen.append(m.data), 10)
+
+        node.create_subscription(Header, '/points', take, 10)
+
+    rerun(bag, graph, [node_with(fill)])
+    assert seen == ['0', '1', '2', 'name 2', '3', 'name 3', '4', 'name 4', '5', 'name 5']
+
+
 def test_padding_is_no_difference() -> None:
     data = serialize_message(JointState(name=['a', 'bcd'], position=[1.0]))
     whole = canonical(data, JointState)

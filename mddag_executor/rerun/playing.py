@@ -1,0 +1,108 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The recorded messages arrive at their recorded times.
+
+Of a recording is loaded what nodes subscribe to, and what they publish, to be compared.  Where a
+node subscribes to a further topic later, that is loaded then, and its messages come from then on.
+
+Where somebody subscribes to ``/clock``, and it is neither recorded nor published by a node, it
+tells virtual time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+
+from mddag_executor.rerun.errors import RerunError
+from mddag_executor.rerun.loop import Loop, RECORDED
+from mddag_executor.rerun.messages import Messages
+from mddag_executor.rerun.recording import Recorded, Recording
+from mddag_executor.rerun.types import type_name
+from rclpy.serialization import serialize_message
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+
+CLOCK = '/clock'
+CLOCK_EVERY_NS = 10_000_000
+"""How often ``/clock`` tells the time."""
+
+
+class Playing:
+    """
+    Delivers what is recorded.
+
+    :param recording: None: there are no messages.
+    """
+
+    def __init__(self, loop: Loop, messages: Messages, recording: Recording | None) -> None:
+        self._loop = loop
+        self._messages = messages
+        self._recording = recording
+        self._playing: Iterator[Recorded] | None = None
+        # which messages of this instant have been delivered
+        self._instant = -1
+        self._delivered: set[int] = set()
+        self._clocked = False
+
+    @property
+    def _topics(self) -> Collection[str]:
+        return () if self._recording is None else self._recording.topics
+
+    def begin(self) -> None:
+        """Deliver from now on."""
+        self._load()
+        self._play()
+
+    def refresh(self) -> None:
+        """Take in which topics nodes subscribe to now."""
+        if not self._clocked and self._messages.inlets(CLOCK) and (
+                CLOCK not in self._topics and CLOCK not in self._messages.offered):
+            self._clocked = True
+            self._tell_time()
+        if self._playing is not None and self._load():
+            self._play()
+
+    def _load(self) -> bool:
+        """Load what nodes need; return whether that is more than before."""
+        recording = self._recording
+        if recording is None:
+            return False
+        topics = self._messages.topics()
+        more = recording.load({*topics, *self._messages.offered})
+        for topic, kind in topics.items():
+            recorded = recording.kinds.get(topic)
+            if recorded is not None and topic not in self._messages.offered and (
+                    recorded != type_name(kind)):
+                raise RerunError(
+                    f'{recording.name}: {topic} was recorded as {recorded}, and the node '
+                    f'subscribes to it as {type_name(kind)}: record it anew, or correct the node')
+        return more
+
+    def _play(self) -> None:
+        if self._recording is not None:
+            self._playing = self._recording.messages(self._loop.now)
+            self._next(self._playing)
+
+    def _next(self, playing: Iterator[Recorded]) -> None:
+        message = next(playing, None)
+        if message is not None:
+            self._loop.at(message.time, RECORDED, self._deliver, playing, message)
+
+    def _deliver(self, playing: Iterator[Recorded], message: Recorded) -> None:
+        if playing is not self._playing:
+            return  # it has begun anew, with more topics
+        if self._instant != message.time:
+            self._instant = message.time
+            self._delivered.clear()
+        if message.place not in self._delivered:
+            self._delivered.add(message.place)
+            self._messages.recorded(message.topic, message.data, message.published)
+        self._next(playing)
+
+    def _tell_time(self) -> None:
+        now = self._loop.now
+        stamp = Time(nanoseconds=now).to_msg()
+        self._messages.recorded(CLOCK, serialize_message(Clock(clock=stamp)), now)
+        if now + CLOCK_EVERY_NS < self._loop.end:
+            self._loop.at(now + CLOCK_EVERY_NS, RECORDED, self._tell_time)
