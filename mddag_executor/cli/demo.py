@@ -40,9 +40,12 @@ from mddag_executor.report.tables import (
 from mddag_executor.resources import find
 from mddag_executor.text import counted
 
-EXAMPLE = 'mddag demo --seconds 20 --utilisation 0.6'
+EXAMPLE = """\
+mddag demo --seconds 20 --utilisation 0.6
+mddag demo --processes 2"""
 
 WORKERS = defaults.WORKERS
+UTILISATION = 0.6
 DEFAULT_SEED = 0
 """The first seed; at utilisation 0.6 its draw is feasible (`ExecutionPlan.infeasible`)."""
 
@@ -58,8 +61,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='how long to measure this executor (default: 20)')
     add('--baseline-seconds', type=options.positive_float, default=10.0, metavar='S',
         help="how long to measure rclpy's MultiThreadedExecutor (default: 10)")
-    add('--utilisation', type=options.positive_float, default=0.6, metavar='U',
-        help='normalised utilisation that the execution times are scaled to (default: 0.6)')
+    add('--utilisation', type=options.positive_float, metavar='U',
+        help='normalised utilisation that the execution times are scaled to (default: 0.6, with '
+        '--processes 0.1 for each)')
+    add('--processes', type=options.positive_int, metavar='N',
+        help='let callbacks compute in Python, place the nodes in N processes, run them, and '
+        'replay their recordings as one run')
     options.add_seed(parser, 'what the execution times are drawn with', int, DEFAULT_SEED)
     add('--output', default='build/demo', metavar='DIR',
         help='where trace and results are written (default: build/demo)')
@@ -77,6 +84,13 @@ def main(args: argparse.Namespace) -> int:
     output.mkdir(parents=True, exist_ok=True)
     graph = find('config/autoware.yaml')
     say = _say if common.wants_tables(args) else _say_nothing
+    if args.processes is not None:
+        from mddag_executor.cli.demo_processes import run_demo
+        result = run_demo(args, graph, output, say)
+        if args.json is not None:
+            common.write_json(args.json, result)
+        return 0
+    args.utilisation = args.utilisation or UTILISATION
     for line in _introduction(args, graph):
         say(line)
     live = run_live(args, graph, output)
@@ -137,7 +151,7 @@ def run_live(args: argparse.Namespace, graph: Path, output: Path) -> dict[str, A
         'run', str(graph), '--synthetic', 'sleep', '--utilisation', str(args.utilisation),
         '--seed', str(args.seed), '--workers', str(WORKERS), '--duration', f'{seconds:.3f}s',
         '--trace', str(output / 'demo.mcap'), '--json', '-']
-    result = _json_of(_mddag(*command), 'running', seconds + 3)
+    result = json_of(mddag(*command), 'running', seconds + 3)
     if result['measured'] is None:
         raise DemoError('mddag run: it ended before it measured anything: run the demo again')
     return result
@@ -146,9 +160,9 @@ def run_live(args: argparse.Namespace, graph: Path, output: Path) -> dict[str, A
 def run_replays(graph: Path, output: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Replay the recording as it was, and rescheduled by the core."""
     trace = str(output / 'demo.mcap')
-    recorded = _json_of(_mddag('replay', trace, '--json', '-'), 'replaying')
-    rescheduled = _json_of(
-        _mddag('replay', trace, str(graph), '--reschedule', '--workers', str(WORKERS),
+    recorded = json_of(mddag('replay', trace, '--json', '-'), 'replaying')
+    rescheduled = json_of(
+        mddag('replay', trace, str(graph), '--reschedule', '--workers', str(WORKERS),
                '--json', '-'), 'rescheduling')
     return recorded, rescheduled
 
@@ -163,11 +177,12 @@ def run_baseline(args: argparse.Namespace, graph: Path) -> dict[str, Any]:
         return measure(spec, progress.update)
 
 
-def _mddag(*arguments: str) -> list[str]:
+def mddag(*arguments: str) -> list[str]:
+    """Return the command line of a verb."""
     return [sys.executable, '-m', 'mddag_executor', *arguments]
 
 
-def _json_of(command: list[str], what: str, seconds: float | None = None) -> dict[str, Any]:
+def json_of(command: list[str], what: str, seconds: float | None = None) -> dict[str, Any]:
     """Run a program that prints JSON, with progress on a terminal meanwhile."""
     # Of this machine only: the demo must not find another one's nodes, nor be found by them.
     environment = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ}

@@ -243,22 +243,27 @@ class Diagnostics:
     Publishes the state of an executor, from a thread of its own.
 
     :param period_ns: how often.
+    :param process: which of the declared processes this is.
     """
 
     def __init__(
         self, context: Context, task_set: TaskSet | None, pool: Pool, registry: Registry,
         recorder: Recorder | None, period_ns: int, thresholds: Thresholds,
+        process: str | None = None,
     ) -> None:
         self._context = context
         self._registry = registry
         self._period_ns = period_ns
-        self._hardware_id = f'{socket.gethostname()}/{os.getpid()}'
+        self._hardware_id = f'{socket.gethostname()}/{process or os.getpid()}'
         tally, tables = pool.engine.verdicts.tally, pool.engine.tables
         self._dags = []
         for dag in task_set.dags if task_set is not None else ():
             sinks = tables.sinks[tables.first_sink[dag.index]:tables.first_sink[dag.index + 1]]
+            # one that several processes share is told of where its source and its sinks are
+            told_by = dag.vertices if process is None else [
+                dag.vertices[i] for i in (dag.source, *dag.sinks)]
             self._dags.append((
-                {vertex.callback.key for vertex in dag.vertices},
+                {vertex.callback.key for vertex in told_by},
                 DagWatch(tally, dag.index, dag.name, dag.period_ns,
                          [tally.sinks[v] for v in sinks],
                          [tally.vertex_name(v) for v in sinks], thresholds, period_ns,
@@ -268,7 +273,7 @@ class Diagnostics:
         self._thread: threading.Thread | None = None
 
     def statuses(self) -> list[Status]:
-        """Return a status for each DAG that has a callback here, and the pool's."""
+        """Return a status for each DAG that is here, and the pool's."""
         now = time.monotonic_ns()
         hosted = self._registry.hosted()
         found = [watch.status(now) for keys, watch in self._dags if not keys.isdisjoint(hosted)]

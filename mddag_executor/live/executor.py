@@ -212,7 +212,7 @@ class MultiDeadlineExecutor(BareExecutor):
         if every_ns is not None:
             self._diagnostics = Diagnostics(
                 self.context, task_set, self._pool, self._registry, self._recorder, every_ns,
-                thresholds)
+                thresholds, process)
         if process is not None and task_set is not None and (
                 self._engine.other_processes is not None
                 and self._engine.other_processes.announces):

@@ -95,8 +95,9 @@ class Board:
 
 
 def dag_rows(statuses: list[Status]) -> list[list[str]]:
-    """Return the rows of the table of DAGs."""
-    return [_row(s, _DAG_KEYS) for s in statuses if not s.is_pool]
+    """Return the rows of the table of DAGs: one list for all processes, DAG by DAG."""
+    return [_row(s, _DAG_KEYS) for s in sorted(statuses, key=lambda s: (s.name, s.process))
+            if not s.is_pool]
 
 
 def pool_rows(statuses: list[Status]) -> list[list[str]]:

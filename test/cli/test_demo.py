@@ -10,6 +10,7 @@ import subprocess
 from typing import Any
 
 from mddag_executor.cli.demo import agreement, replay_table, side_by_side
+from msg_graph import load
 import pytest
 
 
@@ -87,3 +88,24 @@ def test_a_step_that_fails_is_one_line(
     assert process.returncode == 2
     assert process.stderr == (
         f'error: mddag run: {tmp_path}/demo.mcap: this is a directory: name a file\n')
+
+
+@pytest.mark.slow
+def test_the_main_job_in_two_processes(
+    tmp_path: Path, mddag: Callable[..., subprocess.CompletedProcess[str]]
+) -> None:
+    process = mddag(
+        'demo', '--processes', '2', '--seconds', '2', '--baseline-seconds', '1', '--utilisation',
+        '0.05', '--output', tmp_path / 'made', '--json', tmp_path / 'result.json', timeout=180.0)
+    assert process.returncode == 0, process.stderr
+    result = json.loads((tmp_path / 'result.json').read_text())
+    assert [p['name'] for p in result['live']['processes']] == ['p1', 'p2']
+    assert result['live']['measured']['attribution']['wrong'] == 0
+    sinks = [{name for dag in result[of]['dags'].values() for name in dag['sinks']}
+             for of in ('live', 'recorded')]
+    assert sinks[0] == sinks[1] and len(sinks[0]) == 18
+    assert len(load(tmp_path / 'made' / 'placed.yaml').processes) == 2
+    assert [(run['what'], run['executor']) for run in result['measured']] == [
+        (what, executor) for what in ('2 processes', 'one process')
+        for executor in ('rad-events', 'events')]
+    assert 'predicted in time' in process.stdout and 'demo.p2.mcap' in process.stdout

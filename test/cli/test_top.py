@@ -17,7 +17,7 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-from mddag_executor.report.board import Board, GONE_AFTER_S, picture, plain
+from mddag_executor.report.board import Board, dag_rows, GONE_AFTER_S, picture, plain
 import pytest
 
 from .test_run import GRAPH
@@ -165,3 +165,11 @@ def test_run_takes_no_strange_period(mddag: Mddag, tmp_path: Path):
         done = mddag('run', str(tmp_path / 'graph.yaml'), '--synthetic', 'sleep',
                      '--diagnostics', value)
         assert done.returncode == 2 and message in done.stderr
+
+
+def test_processes_share_one_list_of_dags():
+    board = Board()
+    board.take(array(('h/up', 'mddag: x', 0, DAG), ('h/up', 'mddag: z', 0, DAG),
+                     ('h/down', 'mddag: y', 0, DAG), ('h/down', 'mddag: x', 1, DAG)))
+    assert [(row[1], row[0]) for row in dag_rows(board.statuses())] == [
+        ('mddag: x', 'h/down'), ('mddag: x', 'h/up'), ('mddag: y', 'h/down'), ('mddag: z', 'h/up')]
