@@ -74,6 +74,7 @@ def main(args: argparse.Namespace) -> int:
     """
     Run the nodes, and say what came of it.
 
+    :raises OSError: when a file cannot be read
     :raises msg_graph.GraphError: when the declaration is wrong
     :raises mddag_executor.errors.MddagError: when anything else cannot be used, or a node fails
     """
@@ -103,6 +104,8 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError('--trace -: a trace is not written to standard output: name a file')
     if args.output == args.json == '-':
         raise UsageError('-: standard output can be only one of -o and --json: name a file')
+    if args.expect is not None:
+        os.stat(args.expect)  # else it would be missed after the run
     if args.recording == args.graph == '-':
         raise UsageError('-: standard input can be only one of BAG and GRAPH: name the other')
 

@@ -552,7 +552,7 @@ def test_a_node_that_blocks_for_ever_is_named(bag: str, graph: Path) -> None:
             lock.acquire(timeout=60.0)
 
     with pytest.raises(RerunError) as caught:
-        run_filter(bag, graph, take, patience_s=0.5)
+        run_filter(bag, graph, take, patience_s=3.0)
     assert str(caught.value).startswith(
         f'/filter:take: it has been blocking at {__file__}:')
     assert 'at 0.300000 s of the run' in str(caught.value)
