@@ -39,6 +39,11 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tables import Tables
 
+TURN_NS = 1_000_000
+"""Nothing overtakes who holds the interpreter for less than this: Python takes turns no sooner."""
+LONGER, LONG_NS = 3, 5_000_000
+PATIENCE = 2
+"""Who waits for the interpreter overtakes if so many times the wait is past its time (RAD)."""
 SWEEP_AT = 64
 """So many stale entries may stand in the queues anyway."""
 
@@ -130,15 +135,33 @@ def _drop_stale(s: State, queue: list[QueueEntry]) -> None:
 def interpreter_is_free(s: State, entry: QueueEntry) -> bool:
     """Tell whether nothing that is as urgent or more holds its interpreter (rule 11)."""
     if s.scalars[N_HOLDING] > 0:
-        if s.scalars[OVERTAKING] == 0:
-            return False
         interpreter = s.x_holds[entry[4]]
         for worker in range(len(s.worker_x)):
             x = s.worker_x[worker]
             if (x >= 0 and s.x_holds[x] != 0 and s.x_holds[x] == interpreter
-                    and s.x_key[x][0] <= entry[0]):
+                    and (s.scalars[OVERTAKING] == 0 or s.x_key[x][0] <= entry[0])):
                 return False
     return True
+
+
+def overtaking_pays(t: Tables, s: State, held: int, usual: int, preempts: bool) -> bool:
+    """
+    Tell whether what waits first may overtake one that holds the interpreter (rule 11).
+
+    The two would share the interpreter, and lose by that.  So it waits where that is short
+    beside the time that it has.  (Not beside what is left of that: when all are late, all
+    would overtake.)
+
+    :param held: for how long that one has held it; ``usual``: for how long it does, ns.
+    :param preempts: whether it would be paused instead.
+    """
+    # Of one that takes much longer than usual nothing is known; it may take twice as long.
+    left = usual - held if held < LONGER * usual + LONG_NS else held
+    if left < TURN_NS or preempts:
+        return left >= TURN_NS
+    ready = len(s.held_back) == 0 or (len(s.ready) > 0 and s.ready[0] < s.held_back[0])
+    first = s.ready[0][4] if ready else s.held_back[0][4]
+    return PATIENCE * left >= t.rad_offset[s.x_vertex[first]]
 
 
 def wait_for_poll(t: Tables, s: State, entry: QueueEntry) -> None:

@@ -63,8 +63,8 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
     the interpreter (the driver says so, ``State.x_holds``) starts only if none on a worker whose
     priority is the same or smaller holds it; until then it is held back, and others go past it.
     One that is more urgent than all that hold it overtakes them, unless the driver says that
-    nothing does for the moment (``OVERTAKING``: live, who computes keeps the lock for a switch
-    interval anyway).  An execution that lends its worker, is suspended or turns out to wait
+    nothing does for the moment (``OVERTAKING``, by ``queues.overtaking_pays``: where the wait is
+    short).  An execution that lends its worker, is suspended or turns out to wait
     (``stop_holding``) holds it no more.  In virtual time there may be one interpreter for each
     process (``SEVERAL_INTERPRETERS``); each has this rule for itself.
 """

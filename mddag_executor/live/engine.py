@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.jobs import is_judged, judge_from
+from mddag_executor.core.queues import overtaking_pays
 from mddag_executor.core.state import (
     DONE,
     IDLE,
@@ -53,12 +54,6 @@ if TYPE_CHECKING:
 
 MOST_MISSED = 1000
 """After a long stop (a suspended machine) at most so many releases are judged one by one."""
-
-TURN_NS = 1_000_000
-"""Nothing overtakes who holds the interpreter for less than this: Python takes turns no sooner."""
-LONGER, LONG_NS = 3, 5_000_000
-PATIENCE = 2
-"""Who waits for the interpreter overtakes if so many times the wait is past its time (RAD)."""
 
 
 class Engine:
@@ -372,25 +367,14 @@ class Engine:
         return x >= 0 and state.x_worker[x] >= 0 and state.x_holds[x] != 0
 
     def _may_be_overtaken(self, now: int) -> bool:
-        """
-        Return whether what comes first may overtake who began last to hold the interpreter.
-
-        The two would share the interpreter, and lose by that.  So it waits where that is short
-        beside the time that it has.  (Not beside what is left of that: when all are late, all
-        would overtake.)
-        """
+        """Return whether what comes first may overtake who began last to hold the interpreter."""
         work = self._holders[-1] if self._holders else None
         if work is None or not self._holds(work):
             return True
-        held, habit = now - self._holds_since, work.entity.habit
+        habit = work.entity.habit
         usual = habit.computed_ns or work.entity.busy_ns / max(1, work.entity.ran)
-        # Of one that takes much longer than usual nothing is known; it may take twice as long.
-        left = usual - held if held < LONGER * usual + LONG_NS else held
-        if left < TURN_NS or self.preempts:
-            return left >= TURN_NS
-        state = self._state
-        first = min(queue[0] for queue in (state.ready, state.held_back) if queue)[4]
-        return PATIENCE * left >= self.tables.rad_offset[state.x_vertex[first]]
+        return overtaking_pays(
+            self.tables, self._state, now - self._holds_since, int(usual), self.preempts)
 
     def interpreter_holder(self) -> Work | None:
         """Return the most urgent execution that holds the interpreter."""

@@ -166,6 +166,8 @@ def _dispatch(
     log: list[LogEntry] | None, deliveries: Deliveries | None, machine: Machine | None,
 ) -> None:
     """Dispatch what is to run now; ``running`` is kept for the log, which wants the preempted."""
+    if machine is not None:
+        machine.decide(now)
     x = rules.schedule(t, s, key, now)
     while x >= 0:
         worker = s.x_worker[x]
@@ -179,6 +181,7 @@ def _dispatch(
             deliveries.started(x, now)
         if machine is not None:
             machine.started(x)
+            machine.decide(now)
         x = rules.schedule(t, s, key, now)
 
 

@@ -31,7 +31,14 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from mddag_executor.core import NEVER, Tables
-from mddag_executor.core.state import SEVERAL_INTERPRETERS, State
+from mddag_executor.core.queues import overtaking_pays
+from mddag_executor.core.state import (
+    N_HOLDING,
+    OVERTAKING,
+    PREEMPTIVE,
+    SEVERAL_INTERPRETERS,
+    State,
+)
 from mddag_executor.simulate.engine import Load
 
 SWITCH_NS = 1_000_000
@@ -119,6 +126,19 @@ class Machine:
         for x in self._still:
             self._s.x_left[x] += now - self._settled
         self._settled = now
+
+    def decide(self, now: int) -> None:
+        """Decide whether what waits first may overtake who began last to hold its interpreter."""
+        s = self._s
+        if s.scalars[N_HOLDING] == 0 or not (s.ready or s.held_back):
+            return
+        first = min(queue[0] for queue in (s.ready, s.held_back) if queue)[4]
+        holders = [x for x in s.worker_x if x >= 0 and 0 != s.x_holds[x] == s.x_holds[first]]
+        s.scalars[OVERTAKING] = 1
+        if holders:
+            last = max(holders, key=lambda x: (s.x_started[x], s.x_worker[x]))
+            s.scalars[OVERTAKING] = int(overtaking_pays(
+                self._t, s, now - s.x_started[last], s.x_cost[last], s.scalars[PREEMPTIVE] != 0))
 
     def started(self, x: int) -> None:
         """Take in that an execution has been dispatched."""

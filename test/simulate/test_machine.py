@@ -11,7 +11,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import policy as find_policy
-from mddag_executor.core import Tables
+from mddag_executor.core import queues, Tables
 from mddag_executor.core.state import new_state
 from mddag_executor.simulate import (
     END,
@@ -96,11 +96,14 @@ def test_one_after_the_other_where_none_is_more_urgent() -> None:
 
 def test_one_that_is_more_urgent_overtakes_and_they_take_turns() -> None:
     """It starts at 2, has the lock from 3 to 4, 5 to 6 and 7 to 8; the other one meanwhile."""
-    jobs = of_ms(Job(0, 100, 10, True), Job(2, 20, 3, True))
+    jobs = of_ms(Job(0, 100, 10, True), Job(2, 16, 3, True))
     assert in_ms(times(jobs, 2)) == [(0, 13), (2, 8)]
     # with one worker it waits; where it takes the worker, the other one does
     assert in_ms(times(jobs, 1)) == [(0, 10), (10, 13)]
     assert in_ms(times(jobs, 1, preemptive=True)) == [(0, 13), (2, 5)]
+    # where it has time enough for that, it waits for the 8 ms
+    jobs[1].deadline = 17 * MS
+    assert in_ms(times(jobs, 2)) == [(0, 10), (10, 13)]
 
 
 def test_each_process_has_its_interpreter() -> None:
@@ -178,7 +181,7 @@ nodes:
 
 # --- a model that goes by ticks ------------------------------------------------------------------
 
-SWITCH, SLICE, BRIEF = 3, 5, 2
+SWITCH, SLICE, BRIEF, TURN, LONG = 3, 5, 2, 2, 10
 
 
 @dataclass(eq=False)
@@ -227,8 +230,8 @@ class Ticks:
             if job is not None and job.left == 0:
                 job.end, self.on[worker] = now, None
         self.waiting += [job for job in self.jobs if job.release == now]
-        for job in sorted(self.waiting, key=lambda j: (j.release + j.deadline)):
-            self._start(job, now)
+        while self._start_one(now):
+            pass
         wanted: dict[str, list[Job]] = {LOCK: [], CPU: [], NOTHING: []}
         for job in filter(None, self.on):
             wanted[self._needs(job)].append(job)
@@ -242,16 +245,34 @@ class Ticks:
             job.left -= 1
         self.slice_left = None if self.slice_left is None else self.slice_left - 1
 
-    def _start(self, job: Job, now: int) -> None:
-        urgency = job.release + job.deadline
-        if None not in self.on or (job.holds and any(
-                other is not None and other.holds and other.interpreter == job.interpreter
-                and other.release + other.deadline <= urgency
-                for other in self.on)):
-            return
-        self.waiting.remove(job)
-        self.on[self.on.index(None)] = job
-        job.start, job.left = now, job.cost
+    def _start_one(self, now: int) -> bool:
+        waiting = sorted(self.waiting, key=lambda j: j.release + j.deadline)
+        if None not in self.on or not waiting:
+            return False
+        pays = self._overtaking_pays(waiting[0], now)
+        for job in waiting:
+            holders = self._holders(job) if job.holds else []
+            if all(pays and other.release + other.deadline > job.release + job.deadline
+                   for other in holders):
+                self.waiting.remove(job)
+                self.on[self.on.index(None)] = job
+                job.start, job.left = now, job.cost
+                return True
+        return False
+
+    def _holders(self, job: Job) -> list[Job]:
+        return [other for other in self.on if other is not None and other.holds
+                and other.interpreter == job.interpreter]
+
+    def _overtaking_pays(self, first: Job, now: int) -> bool:
+        """Tell whether twice the wait for who began last is longer than the deadline."""
+        holders = self._holders(first) if first.holds else []
+        if not holders:
+            return True
+        last = max(holders, key=lambda job: (job.start, self.on.index(job)))
+        held = now - last.start
+        left = last.cost - held if held < 3 * last.cost + LONG else held
+        return left >= TURN and 2 * left >= first.deadline
 
     def _needs(self, job: Job) -> str:
         cpu = job.cost if job.cpu is None else job.cpu
@@ -303,5 +324,7 @@ def test_as_the_model_that_goes_by_ticks(
     with pytest.MonkeyPatch.context() as patch:
         for name, ticks in (('SWITCH_NS', SWITCH), ('SLICE_NS', SLICE), ('BRIEF_NS', BRIEF)):
             patch.setattr(machine, name, ticks)
+        for name, ticks in (('TURN_NS', TURN), ('LONG_NS', LONG)):
+            patch.setattr(queues, name, ticks)
         found: Any = times(jobs, workers, cpus, python)
     assert found == Ticks(jobs, workers, cpus, python).times()
