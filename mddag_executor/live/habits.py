@@ -109,8 +109,8 @@ class Habit:
 
     @property
     def computes_at_all(self) -> bool:
-        """Return whether it may be one that holds the interpreter."""
-        return self.computed_ns >= max(SHORT_NS / 2, self._own_ns / 8)
+        """Return whether it may be one that holds the interpreter, for all that is known."""
+        return self._own_ns == 0.0 or self.computed_ns >= max(SHORT_NS / 2, self._own_ns / 32)
 
     def ran(self, duration: int, before: Reading, after: Reading, beside: int) -> None:
         """
