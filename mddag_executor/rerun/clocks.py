@@ -48,7 +48,7 @@ _READS = ('time', 'time_ns', 'monotonic', 'monotonic_ns', 'perf_counter', 'perf_
 
 class _Asked:
     """
-    Functions that stand in the place of those of ``time``, and whom they ask.
+    Functions that stand in the place of those of ``time`` and of ``uuid4``, and whom they ask.
 
     They are made once: a module that imports one keeps it for later runs.
     """
@@ -58,7 +58,7 @@ class _Asked:
 
 
 def _asking(original: Callable[..., Any]) -> Callable[..., Any]:
-    """Return what asks the run that is under way, in place of a function of ``time``."""
+    """Return what asks the run that is under way, in place of a function."""
     function = _Asked.functions.get(original.__name__)
     if function is None:
         def function(*args: Any) -> Any:
@@ -98,7 +98,7 @@ class VirtualTime:
         replace(threading.Thread, 'join', self._thread_join)
         # The one in C waits without asking anybody; pools of threads are built on it.
         replace(queue, 'SimpleQueue', lambda original: vars(queue)['_PySimpleQueue'])
-        replace(uuid, 'uuid4', self._uuid4)
+        replace(uuid, 'uuid4', _asking)
         for name in (*_READS, 'sleep'):
             replace(time, name, _asking)
         _Asked.run = self
@@ -148,10 +148,12 @@ class VirtualTime:
     # --- Python's time ---------------------------------------------------------------------------
 
     def asked(self, original: Callable[..., Any], args: tuple[Any, ...]) -> Any:
-        """Do what a function of ``time`` does."""
+        """Do what a function of ``time`` does, or ``uuid4``."""
         loop, name = self._loop, original.__name__
         if loop.strands.mine() is None:
             return original(*args)
+        if name == 'uuid4':
+            return uuid.UUID(int=self._random.getrandbits(128), version=4)
         if not self._all:
             self._look(f'time.{name}()', 3)
             return original(*args)
@@ -214,14 +216,6 @@ class VirtualTime:
             loop.wait(lambda: strand.ended, deadline, f'for thread {thread.name}')
 
         return join
-
-    def _uuid4(self, original: Callable[[], uuid.UUID]) -> Callable[[], uuid.UUID]:
-        def uuid4() -> uuid.UUID:
-            if self._loop.strands.mine() is None:
-                return original()
-            return uuid.UUID(int=self._random.getrandbits(128), version=4)
-
-        return uuid4
 
 
 def _wait_for_notify(condition: Any, wait: Callable[[Callable[[], bool]], bool]) -> bool:

@@ -35,6 +35,7 @@ Seen = list[tuple[float, Any]]
 
 SLEEPY = """\
 from time import sleep, time
+from uuid import uuid4
 import rclpy
 from std_msgs.msg import Header
 
@@ -44,7 +45,7 @@ def main():
     node.create_subscription(Header, '/points', lambda message: None, 10)
     publisher = node.create_publisher(Header, '/slept', 10)
     while rclpy.ok():
-        publisher.publish(Header(frame_id=str(time())))
+        publisher.publish(Header(frame_id=f'{time()} {uuid4()}'))
         sleep(0.5)
 """
 
