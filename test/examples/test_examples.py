@@ -142,8 +142,8 @@ def test_robot() -> None:
     assert set(found) == {
         'brake:check', 'fusion:keep', 'planner:locate', 'controller:locate', 'controller:follow',
         'controller:control', 'operator:adjust'}
-    assert min(found.values()) >= 2
-    assert '/planner:plan' in computing
+    assert min(found.values()) >= 1
+    assert computing.startswith('computing in Python: /')
 
 
 def test_third_party(tmp_path: Path) -> None:
