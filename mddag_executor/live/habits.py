@@ -58,14 +58,14 @@ class Habit:
     """
 
     __slots__ = (
-        'holds', '_declared', 'computed_ns', '_own_ns', '_released', '_passed', '_runs', '_close',
+        'holds', '_declared', 'computed_ns', '_part', '_released', '_passed', '_runs', '_close',
         '_unclear', '_looks', '_tries', '_trusted_from', '_sampled', '_overlaps')
 
     def __init__(self, declared: bool | None = None) -> None:
         self.holds = int(declared or False)
         self._declared = declared is not None
         self.computed_ns = 0.0
-        self._own_ns = 0.0
+        self._part: float | None = None
         self._released = 0.0
         self._passed = 0
         self._runs = 0
@@ -103,14 +103,15 @@ class Habit:
     @property
     def share(self) -> float | None:
         """Return for which part of its time it needs the interpreter; None: not known yet."""
-        if self._own_ns == 0.0:
+        if self._part is None:
             return float(self.holds) if self._declared else None
-        return self.computed_ns / self._own_ns * (1 - self._released)
+        return self._part * (1 - self._released)
 
     @property
     def computes_at_all(self) -> bool:
         """Return whether it may be one that holds the interpreter, for all that is known."""
-        return self._own_ns == 0.0 or self.computed_ns >= max(SHORT_NS / 2, self._own_ns / 32)
+        return self._part is None or (
+            self._part >= 1 / 32 and self.computed_ns >= SHORT_NS / 2)
 
     def ran(self, duration: int, before: Reading, after: Reading, beside: int) -> None:
         """
@@ -127,7 +128,7 @@ class Habit:
             most = least = computed
         if WAITS * least <= computed < COMPUTES * most:
             self._unclear += 1
-            if self._own_ns == 0.0 or self._unclear >= LATELY:
+            if self._part is None or self._unclear >= LATELY:
                 self._unclear = 0
                 self.holds = 1
         else:
@@ -137,15 +138,18 @@ class Habit:
             self.holds &= self._passed % TRY_EVERY == 0
 
     def _learn(self, computed: int, own: int) -> None:
-        if self._own_ns == 0.0:
-            self.computed_ns, self._own_ns = computed, own
+        # The part counts, not the time: where the machine stood still for long, once, that is not
+        # to count for more.
+        part = computed / max(1, own)
+        if self._part is None:
+            self._part, self.computed_ns = part, computed
         else:
+            self._part += (part - self._part) / LATELY
             self.computed_ns += (computed - self.computed_ns) / LATELY
-            self._own_ns += (own - self._own_ns) / LATELY
-        share, shortest = (WAITS, SHORT_NS / 2) if self.holds else (COMPUTES, SHORT_NS)
-        if (computed >= max(share * own, shortest)) != self.holds and not self._overlaps:
+        least, shortest = (WAITS, SHORT_NS / 2) if self.holds else (COMPUTES, SHORT_NS)
+        if (part >= least and computed >= shortest) != self.holds and not self._overlaps:
             self._close = LATELY  # it may have changed
-        self.holds = int(self.computed_ns >= max(share * self._own_ns, shortest))
+        self.holds = int(self._part >= least and self.computed_ns >= shortest)
 
     def is_to_be_tried(self) -> bool:
         """Return whether to find out, at a look, whether it computes with the lock released."""
