@@ -19,6 +19,8 @@ import tempfile
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options
+from mddag_executor.cli.slack_check import check_slack
+from mddag_executor.cli.slack_check import show as show_slack
 from mddag_executor.cli.text import format_ns, one_line, printable, Progress, table
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.resources import find
@@ -30,14 +32,16 @@ if TYPE_CHECKING:
 HELP = 'measure the replayer'
 DESCRIPTION = """\
 Measure the replayer: the speed and memory of reading and linking, beside other readers; with
---accuracy how well reschedule predicts a live run."""
+--accuracy how well reschedule predicts a live run; with --slack whether the slack that is told
+holds in live runs."""
 EXAMPLE = """\
 mddag bench replay
 mddag bench replay --events 10000000 --json replay.json
 mddag bench replay --trace run.mcap
 mddag bench replay --accuracy --utilisation 0.3,0.6,0.8 --seconds 10
 mddag bench replay --accuracy --utilisation 0.6 --workers 7,4
-mddag bench replay --accuracy --bodies spin --seconds 20"""
+mddag bench replay --accuracy --bodies spin --seconds 20
+mddag bench replay --slack --utilisation 0.3 --seconds 10"""
 
 MEDIAN_LIMIT, P99_LIMIT = 0.05, 0.15
 _FEW = 100
@@ -61,6 +65,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser, 3, 'measure R times in turn: the best of speeds, the median of errors')
     add('--accuracy', action='store_true',
         help='record live runs, reschedule them, and compare the response times of each sink')
+    add('--slack', action='store_true',
+        help='record a live run, find its slack, and look in further live runs whether a callback '
+        'that takes 0.9 times its factor longer breaks nothing, and one of 1.1 times something')
+    add('--callbacks', type=options.positive_int, default=10, metavar='N',
+        help='with --slack: how many callbacks to try (default: %(default)s)')
     add('--bodies', choices=('sleep', 'spin', 'native', 'mixed'), default='sleep',
         help='with --accuracy: how the callbacks of the live runs execute (default: sleep)')
     add('--utilisation', type=options.list_of(options.positive_float), metavar='U[,U…]',
@@ -83,18 +92,31 @@ def main(args: argparse.Namespace) -> int:
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     common.check_output(args.json)
-    if args.accuracy and args.trace:
-        raise UsageError('--accuracy: it records its own runs: leave --trace out')
+    if args.accuracy and args.slack:
+        raise UsageError('--slack: it is another measurement: leave it or --accuracy out')
+    if (args.accuracy or args.slack) and args.trace:
+        raise UsageError(f'--{"accuracy" if args.accuracy else "slack"}: it records its own runs: '
+                         'leave --trace out')
     args.utilisation = args.utilisation or _UTILISATION.get(args.bodies, _COMPUTING)
     args.workers = args.workers or _WORKERS.get(args.bodies, _OTHERS)
     with tempfile.TemporaryDirectory(prefix='mddag-bench-') as folder:
-        result = _accuracy(args, folder) if args.accuracy else _speed(args, folder)
+        result = _accuracy(args, folder) if args.accuracy else \
+            _slack(args, folder) if args.slack else _speed(args, folder)
     if common.write_result(args, result):
         if args.accuracy:
             _show_accuracy(result)
+        elif args.slack:
+            show_slack(result)
         else:
             _show_speed(result)
     return 0
+
+
+def _slack(args: argparse.Namespace, folder: str) -> dict[str, Any]:
+    def record(graph: str, path: str) -> None:
+        _record(graph, args, None, args.workers[0], path)
+
+    return check_slack(args, common.load_workload(args.graph), folder, record)
 
 
 # --- speed ---------------------------------------------------------------------------------------
@@ -158,15 +180,15 @@ def _accuracy(args: argparse.Namespace, folder: str) -> dict[str, Any]:
 
 
 def _record(
-    graph: str, args: argparse.Namespace, utilisation: float, workers: int, path: str
+    graph: str, args: argparse.Namespace, utilisation: float | None, workers: int, path: str
 ) -> None:
-    """Record a live run, in a process of its own."""
+    """Record a live run, in a process of its own; without utilisation of the declared times."""
     # The load is what the first number of workers would be utilised by: it stays the same.
-    share = utilisation * args.workers[0] / workers
+    scaled = [] if utilisation is None else [
+        '--utilisation', repr(utilisation * args.workers[0] / workers)]
     done = subprocess.run(
         [sys.executable, '-m', 'mddag_executor', 'run', graph, '--synthetic', args.bodies,
-         '--utilisation', repr(share), '--workers', str(workers), '--duration',
-         f'{args.seconds:g}s', '--trace', path],
+         *scaled, '--workers', str(workers), '--duration', f'{args.seconds:g}s', '--trace', path],
         capture_output=True, text=True, check=False, timeout=args.seconds + 120)
     if done.returncode != 0 or not os.path.exists(path):
         lines = done.stderr.strip().splitlines()

@@ -144,3 +144,26 @@ def test_wrong_options(
     assert program.main(['bench', 'replay', *options]) == 2
     output = capsys.readouterr()
     assert output.out == '' and says in output.err and output.err.count('\n') == 1
+
+
+def test_slack_holds_where_runs_are_simulated(
+    graph: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In virtual time instead of live: what is told must happen."""
+    def simulated(graph: str, args: Any, utilisation: Any, workers: int, path: str) -> None:
+        assert utilisation is None
+        assert program.main(['simulate', graph, '--workers', str(workers), '--duration', '3s',
+                             '--trace', path]) == 0
+
+    monkeypatch.setattr(bench_replay, '_record', simulated)
+    assert program.main([
+        'bench', 'replay', '--slack', '--graph', str(graph), '--utilisation', '0.12',
+        '--workers', '2', '--callbacks', '3']) == 0
+    out = capsys.readouterr().out
+    assert out.endswith('3 of 3 callbacks behave as told\n')
+    assert '/c:c      10.37 times' in out     # (90 - 9 - 8) / 7
+    for arguments, error in (
+            (['--slack', '--accuracy'], 'leave it or --accuracy out'),
+            (['--slack', '--trace', 'x.mcap'], '--slack: it records its own runs')):
+        assert program.main(['bench', 'replay', *arguments]) == 2
+        assert error in capsys.readouterr().err

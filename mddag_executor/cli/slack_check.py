@@ -1,0 +1,121 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What `bench replay --slack` does: whether slack that was told holds in live runs.
+
+Theory of operation
+-------------------
+The slack of a declaration with fixed execution times is found as `mddag slack GRAPH` does it.
+Then, for some callbacks, two live runs follow: with a little less than the factor (``HOLDS``) no
+deadline may be missed, with a little more (``BREAKS``) some deadline must be.  Misses in stops of
+the machine say nothing, so they do not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+import os
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.cli.text import Progress, table
+from mddag_executor.core import Tables
+from mddag_executor.defaults import processors
+from mddag_executor.errors import MddagError
+from msg_graph import TaskSet
+
+HOLDS, BREAKS = 0.9, 1.1
+LEAST, MOST = 1.2, 30.0
+"""Factors that are tried: less is within what live runs differ by, more takes too long."""
+WARM_UP_NS = 1_000_000_000
+
+Record = Callable[[str, str], None]
+"""Records a live run of a declaration to a trace."""
+
+
+def check_slack(
+    args: argparse.Namespace, task_set: TaskSet, folder: str, record: Record
+) -> dict[str, Any]:
+    """
+    Return the result of `bench replay --slack`.
+
+    :raises mddag_executor.errors.MddagError: when a live run fails, or nothing can be tried
+    """
+    from mddag_executor.replay.slack import callbacks_of, find_slack, NOTHING, Problem
+    from mddag_executor.simulate import draw_execution_times, periodic_load, Settings
+    from msg_graph import loads
+    times = _times(task_set, args.utilisation[0], args.workers[0])
+    fixed = loads(with_times(task_set, times), task_set.file)
+    settings = Settings(workers=args.workers[0])
+    load = periodic_load(fixed, draw_execution_times(fixed, 0), settings.duration_ns)
+    with Progress('recording', 2 * args.callbacks) as line:
+        slack = find_slack(Problem(
+            load, settings, Tables.build(fixed), settings.duration_ns, callbacks_of(fixed)),
+            jobs=processors())
+        found = sorted((one.factor, task_set.callbacks[i].key, one.breaks)
+                       for i, one in slack.factors.items()
+                       if i >= 0 and one.factor is not None and LEAST <= one.factor <= MOST)
+        if not found:
+            raise MddagError(
+                'bench replay --slack: no callback has a factor that can be tried: give another '
+                '--utilisation')
+        step = max(1, len(found) // args.callbacks)
+        rows: list[dict[str, Any]] = []
+        for factor, key, breaks in found[::step][:args.callbacks]:
+            assert breaks != NOTHING
+            missed: list[int] = []
+            for share in (HOLDS, BREAKS):
+                line.update(2 * len(rows) + len(missed), key)
+                longer = {**times, key: round(times[key] * factor * share)}
+                missed.append(_misses(_run(task_set, longer, folder, record)))
+            rows.append({
+                'callback': key, 'factor': factor, 'breaks': task_set.vertices[breaks].name,
+                'missed_below': missed[0], 'missed_above': missed[1],
+                'as_told': missed[0] == 0 and missed[1] > 0})
+    return {'seconds': args.seconds, 'utilisation': args.utilisation[0], 'callbacks': rows,
+            'as_told': sum(row['as_told'] for row in rows)}
+
+
+def _times(task_set: TaskSet, utilisation: float, workers: int) -> dict[str, int]:
+    """Return by callback the execution time that a synthetic run would draw, ns."""
+    from mddag_executor.simulate import draw_execution_times, scale_execution_times
+    drawn = scale_execution_times(
+        task_set, draw_execution_times(task_set, 0), workers, utilisation)
+    return {vertex.callback.key: drawn[vertex.dag][vertex.index] for vertex in task_set.vertices}
+
+
+def _run(task_set: TaskSet, times: dict[str, int], folder: str, record: Record) -> str:
+    """Run a declaration with fixed execution times; return its trace."""
+    graph, trace = (os.path.join(folder, f'slack.{form}') for form in ('yaml', 'mcap'))
+    Path(graph).write_text(with_times(task_set, times), encoding='utf-8')
+    record(graph, trace)
+    return trace
+
+
+def with_times(task_set: TaskSet, times: dict[str, int]) -> str:
+    """Return a declaration with fixed execution times, ns, by callback."""
+    import yaml
+    declared = yaml.safe_load(task_set.text)
+    for node in declared['nodes']:
+        for callback in node['callbacks']:
+            key = f'{node["node"]}:{callback["name"]}'
+            if key in times:
+                callback['execution_time'] = f'{times[key]}ns'
+    return str(yaml.safe_dump(declared, sort_keys=False))
+
+
+def _misses(trace: str) -> int:
+    """Return how many deadlines were missed, but for stops of the machine."""
+    from mddag_executor.replay import replay
+    misses = replay(trace, skip=WARM_UP_NS).result()['misses']
+    return int(misses['missed'] - misses['causes']['machine'])
+
+
+def show(result: dict[str, Any]) -> None:
+    """Print the result."""
+    print(table(('callback', 'may take', f'missed at {HOLDS:g} of it', f'at {BREAKS:g}',
+                 'as told'), [
+        [row['callback'], f'{row["factor"]:.2f} times', row['missed_below'], row['missed_above'],
+         'yes' if row['as_told'] else 'no'] for row in result['callbacks']]))
+    print(f'{result["as_told"]} of {len(result["callbacks"])} callbacks behave as told')
