@@ -163,7 +163,7 @@ def run_replays(graph: Path, output: Path) -> tuple[dict[str, Any], dict[str, An
     recorded = json_of(mddag('replay', trace, '--json', '-'), 'replaying')
     rescheduled = json_of(
         mddag('replay', trace, str(graph), '--reschedule', '--workers', str(WORKERS),
-               '--json', '-'), 'rescheduling')
+              '--json', '-'), 'rescheduling')
     return recorded, rescheduled
 
 

@@ -87,6 +87,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='threads that run callbacks (default: what the declaration says, else 7)')
     add('--policy', default='rad', metavar='P',
         help=f'one of {", ".join(POLICIES)} (default: rad)')
+    add('--cpu-order', action='store_true',
+        help='give workers the CPUs by the urgency of what they run, as nice levels: for more '
+        'processes than CPUs, where the user may')
     add('--preempt', action='store_true',
         help='callbacks that compute in Python pause for more urgent ones (Python 3.12 and newer)')
     add('--intake', choices=('auto', 'events', 'waitset'), default='auto',
@@ -197,7 +200,7 @@ def run_here(
         from mddag_executor.live.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
-            intake=args.intake, freeze_gc=True, preempt=args.preempt,
+            intake=args.intake, freeze_gc=True, preempt=args.preempt, cpu_order=args.cpu_order,
             diagnostics_period=args.diagnostics, process=args.process)
         # With `--json -` what nodes print must not get into the JSON.
         output = sys.stdout if common.wants_tables(args) else sys.stderr

@@ -207,8 +207,8 @@ def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> lis
     command = [sys.executable, '-m', 'mddag_executor', 'run', args.graph, '--part', folder,
                '--policy', args.policy, '--intake', args.intake,
                '--diagnostics', f'{args.diagnostics}ns' if args.diagnostics else 'off']
-    if args.preempt:
-        command.append('--preempt')
+    command += [option for option, asked in (
+        ('--preempt', args.preempt), ('--cpu-order', args.cpu_order)) if asked]
     if args.synthetic is None:
         for spec in specs:
             command += ['--node', spec]

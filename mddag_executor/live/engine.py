@@ -210,6 +210,13 @@ class Engine:
             self.other_processes.name(announced.name, job)
         return job._replace(vertex=announced.vertex)
 
+    def reference_deadline(self, work: Work) -> int | None:
+        """Return when an execution of an open job is to be done; None for any other."""
+        release = None if work.origin is None else self.open_release(work.origin)
+        if release is None or work.origin is None:
+            return None
+        return release + self.tables.rad_offset[work.origin.vertex]
+
     def open_release(self, origin: Origin) -> int | None:
         """Return the release of a job that is open, None of one that has ended."""
         state, slot = self._state, origin.slot

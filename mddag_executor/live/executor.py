@@ -35,6 +35,7 @@ from mddag_executor.live.compat import (
     RCL_ERRORS,
     TASKS_NEWEST_FIRST,
 )
+from mddag_executor.live.cpu_order import CpuOrder, why_not
 from mddag_executor.live.diagnostics import Diagnostics
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import Entity, TASK
@@ -127,6 +128,8 @@ class MultiDeadlineExecutor(BareExecutor):
     :param thresholds: what makes a status of the diagnostics worse than OK.
     :param process: which of the declared ``processes`` this is; what runs in the others is not
         counted as missing.
+    :param cpu_order: whether workers are less nice the more urgent what they run is (see
+        ``live.cpu_order``); off, and said in the log, where the user may not.
     :param preempt: whether callbacks that compute in Python pause for more urgent ones (Python
         3.12 and newer; ``statistics()['preemption']`` says whether they do).
     :raises msg_graph.GraphError: when the declaration is not right.
@@ -155,6 +158,7 @@ class MultiDeadlineExecutor(BareExecutor):
         thresholds: Thresholds | None = None,
         process: str | None = None,
         preempt: bool = False,
+        cpu_order: bool = False,
     ) -> None:
         task_set, num_workers, deadline_ns = resolve(
             graph, num_workers, default_deadline, intake)
@@ -186,6 +190,12 @@ class MultiDeadlineExecutor(BareExecutor):
         self._pool = Pool(
             self._engine, self._trace_clock, self._fail, self._context_ended, prepare,
             bool(preempt))
+        if cpu_order:
+            reason = why_not()
+            if reason is None:
+                self._pool.cpu_order = CpuOrder(self._engine)
+            else:
+                get_logger('mddag_executor').warning(f'cpu_order: it is off: {reason}')
         if self._pool.preemption is not None and self._pool.preemption.reason:
             get_logger('mddag_executor').warning(
                 f'preempt: it is off: {self._pool.preemption.reason}')

@@ -111,7 +111,8 @@ class Books:
         """
         Return the books of a run from those of its processes (``plain``), of one at least.
 
-        The window is that in which all of them measured.
+        The window is that in which all of them measured; what each counted in its own, which is
+        hardly another one, counts for its part of that.
         """
         ledger = Ledger(task_set)
         for part in parts:
@@ -127,12 +128,19 @@ class Books:
             for dag, first in enumerate(part['first_release']):
                 if first is not None:
                     ledger.first_release[dag] = first
-        readings = [[Reading(**part[name]) for part in parts] for name in ('start', 'end')]
-        start, end = (Reading(
-            latest(r.at_ns for r in several), sum(r.cpu_ns for r in several),
-            tuple(map(sum, zip(*(r.bodies for r in several)))))
-            for latest, several in zip((max, min), readings))
-        return cls(ledger, start, end, sum(part['evicted_joins'] for part in parts))
+        begin = max(part['start']['at_ns'] for part in parts)
+        until = max(begin, min(part['end']['at_ns'] for part in parts))
+        cpu = 0
+        bodies = [0] * len(task_set.vertices)
+        for part in parts:
+            first, last = Reading(**part['start']), Reading(**part['end'])
+            share = (until - begin) / max(1, last.at_ns - first.at_ns)
+            cpu += round((last.cpu_ns - first.cpu_ns) * share)
+            for i, (before, after) in enumerate(zip(first.bodies, last.bodies)):
+                bodies[i] += round((after - before) * share)
+        return cls(ledger, Reading(begin, 0, (0,) * len(bodies)),
+                   Reading(until, cpu, tuple(bodies)),
+                   sum(part['evicted_joins'] for part in parts))
 
 
 def measure(

@@ -38,6 +38,7 @@ from typing import Any
 
 from mddag_executor.clocks import TraceClock
 from mddag_executor.live.compat import UNKNOWN
+from mddag_executor.live.cpu_order import CpuOrder
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import BRIEF_NS
 from mddag_executor.live.gates import Refused
@@ -91,6 +92,7 @@ class Pool:
         self._intakes: list[Seat] = []
         self._polled: list[Work] = []
         self._refusals = 0
+        self.cpu_order: CpuOrder | None = None
         self.preemption = Preemption() if preempt else None
         self._interpreter = Interpreter(
             engine, self.lock, self._seats, self._hand_out_now, self.preemption)
@@ -321,6 +323,8 @@ class Pool:
         waits_for: Any = None
         raised: BaseException | None = None
         start = monotonic_ns() + self.clock.offset_ns
+        if self.cpu_order is not None and seat.thread is not None:
+            self.cpu_order.starts(seat, start)
         seat.began_ns = start
         seat.reading = None
         if seat.cpu_clock is not None and entity.habit.is_to_be_measured():

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import json
+
 from mddag_executor.live.execution import ExecutionPlan
-from mddag_executor.live.measure import Ledger, measure, Reading
+from mddag_executor.live.measure import Books, Ledger, measure, Reading
 from msg_graph import loads
 
 MS = 1_000_000
@@ -72,3 +74,32 @@ def test_nothing_due_is_no_division_by_zero() -> None:
     result = measure(Ledger(task_set), ExecutionPlan(task_set), reading(0), reading(0))
     assert result['on_time_ratio'] is None
     assert result['cpu_us_per_callback'] is None
+
+
+def test_the_books_of_several_processes_are_those_of_one_run():
+    task_set = loads("""
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: t, timer: 10ms, publishes: [/x], execution_time: 1ms}]}
+  - {node: /b, callbacks: [{name: s, subscription: /x, deadline: 5ms, execution_time: 1ms}]}
+""")
+    ms = 1_000_000
+    parts = []
+    for vertex, (begin, end) in enumerate(((100, 300), (150, 350))):
+        ledger = Ledger(task_set)
+        if vertex == 0:
+            ledger.first_release[0] = 0
+        for job in range(40):
+            ledger.durations[0][vertex].append(ms)
+            if vertex == 1:
+                ledger.completions[0][1].append((job * 10 * ms, (job * 10 + job % 8) * ms))
+        bodies = [0, 0]
+        bodies[vertex] = 20
+        parts.append(json.loads(json.dumps(Books(
+            ledger, Reading(begin * ms, 0, (0, 0)), Reading(end * ms, 8 * ms, tuple(bodies)),
+        ).plain())))
+    books = Books.of_processes(task_set, parts)
+    assert (books.start.at_ns, books.end.at_ns) == (150 * ms, 300 * ms)
+    result = measure(books.ledger, ExecutionPlan(task_set, mode='spin'), books.start, books.end)
+    assert (result['sink_jobs_due'], result['on_time'], result['missing']) == (15, 12, 0)
+    assert (result['callbacks'], result['callbacks_per_s']) == (30, 200.0)
