@@ -111,8 +111,9 @@ class Explainer(Observer):
         self._who = run.who
         self._keeps = jobs
         policy = POLICIES.get(run.head.policy)
-        self._workers = run.head.workers if isinstance(run, OwnRun) and not (
-            policy is not None and policy.polling) else 0
+        # of several processes it is not known whose workers were busy
+        self._workers = run.head.workers if isinstance(run, OwnRun) and run.processes == 1 \
+            and not (policy is not None and policy.polling) else 0
         vertices = task_set.vertices
         places = {callback.key: i for i, callback in enumerate(task_set.callbacks)}
         self._place = np.array([*(places[v.callback.key] for v in vertices), 0], dtype=np.int64)

@@ -105,6 +105,8 @@ class OwnRun:
         #: The run's end, ns: as recorded, or the last thing that the executor's core saw.
         self.end = 0
         self.shut_down = False
+        #: How many processes' traces are in it; each has workers of its own.
+        self.processes = 1
         #: The greatest time of an event, ns.
         self.last = 0
         #: Called when it has been played.

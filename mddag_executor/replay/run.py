@@ -75,6 +75,7 @@ def _joined(paths: Sequence[str], task_set: TaskSet | None) -> OwnRun:
             head = read_head(reader)
             assert head is not None
             run = OwnRun(reader, joined.name, head, task_set)
+            run.processes = len(paths)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
