@@ -117,7 +117,7 @@ def test_a_long_callback_does_not_hold_up_a_more_urgent_one(make_executor, make_
 
     def capture() -> None:
         before, end = len(ticks), time.monotonic() + 20.0
-        while len(ticks) < before + 3 and time.monotonic() < end:  # computes
+        while len(ticks) < before + 3 and len(seen) < 3 and time.monotonic() < end:  # computes
             pass
         seen.append(len(ticks) - before)
 
@@ -131,7 +131,7 @@ def test_a_long_callback_does_not_hold_up_a_more_urgent_one(make_executor, make_
     executor.add_node(node)
     with Spinning(executor):
         assert wait_for(lambda: len(seen) >= 3, 60.0)
-    assert min(seen) >= 3
+    assert min(seen[:3]) >= 3
 
 
 def test_one_that_waits_for_another_gives_the_interpreter_back(make_executor, make_node):
