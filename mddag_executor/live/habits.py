@@ -157,6 +157,11 @@ class Habit:
         return not self._declared and (
             self._looks <= FIRST or self._released > MIXED or self._looks % SAMPLE == 0)
 
+    @property
+    def is_to_be_learnt(self) -> bool:
+        """Return whether it is not known yet whether it computes with the lock released."""
+        return self._tries < FIRST and not self._declared
+
     def was_released(self, released: bool) -> bool:
         """Learn whether it computed with the lock released, and return that."""
         self._tries += 1

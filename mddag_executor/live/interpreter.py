@@ -18,7 +18,7 @@ do is declared or learnt (``habits``).  Here
     that waits for him; where the lock was not free meanwhile it may have waited for that, and is
     looked at once more.  If it computes while the looking thread has the lock, it
     computes with the lock released (numpy, hashlib): it gives the interpreter back, too, and that
-    is remembered.
+    is remembered.  At first that is tried, too, whenever anything arrives.
 3.  while nothing is held back nobody looks, and nobody is woken: an alarm is set when something is
     held back for the first time, and called off when nothing is any more.
 
@@ -126,7 +126,13 @@ class Interpreter:
                 self.rings_at = 0
                 self._alarm.start(0)
             return
-        is_trusted = holder.entity.habit.is_trusted and not pauses
+        habit = holder.entity.habit
+        if self._may_overlap and habit.is_to_be_learnt:
+            seat = self._seat(holder)
+            if (seat is not None and seat.cpu_clock is not None
+                    and seat.thread is not threading.current_thread()):
+                habit.was_released(self._computes_now(seat.cpu_clock))
+        is_trusted = habit.is_trusted and not pauses
         if holder is self._seen[0]:
             if not self.rings_at:
                 self._watch(PATIENCE_NS if is_trusted else LOOK_NS)
