@@ -242,7 +242,8 @@ def test_the_wheel_holds_what_runs_and_nothing_else(built: Path) -> None:
     share = {n.removeprefix(data) for n in names if n.startswith(data)}
     expected = {f'{SHARE}/{path.relative_to(TOP).as_posix()}'
                 for folder, pattern in (('launch', '*.launch.py'), ('config', '*.yaml'),
-                                        ('bags', '*.mcap'), ('bags', '*.md'))
+                                        ('bags', '*.mcap'), ('bags', '*.md'),
+                                        ('examples/robot', '*.yaml'), ('examples/robot', '*.py'))
                 for path in (TOP / folder).glob(pattern)}
     expected |= {f'{SHARE}/package.xml', f'share/ament_index/resource_index/packages/{NAME}'}
     assert len(expected) > 5
