@@ -133,7 +133,7 @@ class DagWatch:
         self._caused.append(step)
         self._last_causes = causes
         total: Counter[str] = Counter()
-        for each in self._caused:
+        for each in tuple(self._caused):
             total.update(each)
         return ', '.join(f'{n} {cause}' for cause, n in total.most_common() if n > 0)
 
