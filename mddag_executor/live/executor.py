@@ -383,6 +383,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._start_intake()
             self._submit_tasks()
             self._pool.start()
+            self._stop_watch.start()
             while not self.is_ending():
                 self._raise_error()
                 if done():

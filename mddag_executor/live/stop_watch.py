@@ -10,8 +10,10 @@ late, either other threads of the process kept the interpreter's lock, or nothin
 ran.  The CPU time of the process tells which: in a stop it does not grow.
 
 * A stop is as long as the lateness, less the CPU time that the process took since the slice
-  began.  Its end is known, so its begin is taken that much before it.  CPU time before and after
+  before.  Its end is known, so its begin is taken that much before it.  CPU time before and after
   the stop counts, too, and that of threads beside each other, so it was longer, if anything.
+* What the spinning thread does between two waits belongs to the slice after it: it may be stopped
+  there as well.
 * What is shorter than ``LEAST_NS`` is not noted.
 
 Nothing is added to the way of a message or a timer.  If a callback waits while it keeps the
@@ -50,17 +52,24 @@ class StopWatch:
         self._look = look
         self._clock = clock
         self._cpu = cpu
+        self.start()
+
+    def start(self) -> None:
+        """Begin to watch now."""
+        self._last, self._used = self._clock(), self._cpu()
 
     def wait(self, seconds: float) -> None:
         """Wait until the event is set, or the time is over."""
-        now, used = self._clock(), self._cpu()
+        now = self._clock()
         end = now + int(seconds * 1e9)
         is_set = False
         while not is_set and now < end:
-            due = min(end, now + SLICE_NS)
-            is_set = self._event.wait((due - now) / 1e9)
-            now, before, used = self._clock(), used, self._cpu()
-            begin = due + used - before
-            if now - begin >= LEAST_NS:
-                self._stopped(begin, now)
+            slice_ns = min(end - now, SLICE_NS)
+            is_set = self._event.wait(slice_ns / 1e9)
+            last, used = self._last, self._used
+            self.start()
+            now = self._last
+            stop = now - last - slice_ns - (self._used - used)
+            if stop >= LEAST_NS:
+                self._stopped(now - stop, now)
             self._look()

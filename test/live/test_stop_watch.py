@@ -56,6 +56,20 @@ def test_a_stop_beyond_the_end_is_one_stop() -> None:
     assert machine.waits == [SLICE_NS]
 
 
+def test_a_stop_between_two_waits_is_one() -> None:
+    found: list[tuple[int, int]] = []
+    machine = Machine()
+    event: Any = machine
+    watch = StopWatch(event, lambda *stop: found.append(stop), lambda: machine.now,
+                      lambda: machine.cpu)
+    machine.now += 500 * MS
+    watch.start()  # what was before does not count
+    machine.now += 300 * MS
+    machine.cpu += 10 * MS
+    watch.wait(0.05)
+    assert found == [(1520 * MS + 10 * MS, 1820 * MS)]
+
+
 def test_it_waits_no_longer_than_until_the_event() -> None:
     machine = Machine(set_after=2)
     machine.stops(0.1)
