@@ -4,10 +4,18 @@
 
 from mddag_executor.core.policies import POLICIES, Policy, policy, PolicyError
 from mddag_executor.core.scheduler import Scheduler
-from mddag_executor.core.tables import legs_of, NEVER, rad_offsets, Tables
+from mddag_executor.core.tables import (
+    DEFAULT_DEADLINE_NS,
+    EXPIRE_AFTER_NS,
+    legs_of,
+    MAX_ACTIVE_JOBS,
+    NEVER,
+    rad_offsets,
+    Tables,
+)
 from mddag_executor.core.tally import quantile, Tally
 
 __all__ = [
-    'NEVER', 'POLICIES', 'Policy', 'PolicyError', 'Scheduler', 'Tables', 'Tally', 'legs_of',
-    'policy', 'quantile', 'rad_offsets',
+    'DEFAULT_DEADLINE_NS', 'EXPIRE_AFTER_NS', 'MAX_ACTIVE_JOBS', 'NEVER', 'POLICIES', 'Policy',
+    'PolicyError', 'Scheduler', 'Tables', 'Tally', 'legs_of', 'policy', 'quantile', 'rad_offsets',
 ]

@@ -48,6 +48,13 @@ from msg_graph import Callback, Dag, TaskSet, Vertex
 from msg_graph.analysis import path_lengths
 
 NEVER = 2 ** 62
+
+DEFAULT_DEADLINE_NS = 100_000_000
+"""The deadline that an undeclared callback is ordered by, after its release."""
+MAX_ACTIVE_JOBS = 64
+"""So many jobs of a DAG may be unfinished at a time."""
+EXPIRE_AFTER_NS = 1_000_000_000
+"""A job that nothing of runs or waits expires so long after its latest deadline."""
 """A time that is never reached (ns): larger than any clock, small enough to add to."""
 
 CONTINUE = 0
@@ -102,7 +109,7 @@ class Tables(NamedTuple):
         *,
         legs: bool = False,
         groups: bool = True,
-        default_deadline: int = 100_000_000,
+        default_deadline: int = DEFAULT_DEADLINE_NS,
         max_active_jobs: int = NEVER,
         expire_after: int = NEVER,
     ) -> Tables:

@@ -26,6 +26,7 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.clocks import TraceClock
+from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE_JOBS
 from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.live import hooks
 from mddag_executor.live.announcements import Announcements
@@ -84,9 +85,6 @@ LOOK_AFTER_S = 0.1
 SETTLE_TURNS = 20
 """So many milliseconds after a future is done its action's callbacks may still take."""
 SETTLED_TURNS = 3
-
-EXPIRE_AFTER_NS = 1_000_000_000
-MAX_ACTIVE_JOBS = 64
 
 
 def deadline_of(timeout_sec: float | None) -> float | None:
@@ -147,7 +145,7 @@ class MultiDeadlineExecutor(BareExecutor):
         context: Context | None = None,
         trace: str | None = None,
         on_deadline_miss: Callable[[DeadlineMiss], None] | None = None,
-        default_deadline: int | str = 100_000_000,
+        default_deadline: int | str = DEFAULT_DEADLINE_NS,
         intake: str = 'auto',
         max_active_jobs: int = MAX_ACTIVE_JOBS,
         worker_policy: str | None = None,

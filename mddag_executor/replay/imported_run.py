@@ -35,7 +35,7 @@ from collections.abc import Callable as Function
 from collections.abc import Sequence
 from typing import Any
 
-from mddag_executor.core import legs_of, NEVER
+from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, legs_of, NEVER
 from mddag_executor.replay.doubts import Doubts
 from mddag_executor.replay.entities import as_table, Callback, Entities, fields_of, INIT_EVENTS
 from mddag_executor.replay.happenings import (
@@ -67,13 +67,11 @@ from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
 import numpy as np
 
-EXPIRE_AFTER_NS = 1_000_000_000
 _SLACK_NS = 1_000_000
 _PROGRESS_STEP = 4096
 _KEEP_LEGS = 65_536
 _START = 'ros2:callback_start'
 _OWN = ('mddag:job_release', 'mddag:dispatch')
-_DEFAULT_DEADLINE = 100_000_000
 
 
 class ImportedRun(LinkObserver):
@@ -112,7 +110,7 @@ class ImportedRun(LinkObserver):
         self.entities = Entities(init)
         self.who = _Who(self.entities)
         # What another executor goes by is not recorded; it takes the place of the pool.
-        self.head = Head(first, '', '', 'ros2', len(threads), _DEFAULT_DEADLINE, 0, False)
+        self.head = Head(first, '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
         self._matching = Matching(name, self.entities, threads, task_set)
         #: The declaration that judges.
         self.task_set = self._matching.task_set

@@ -22,6 +22,7 @@ import time
 from typing import Any, BinaryIO
 
 from mddag_executor import defaults
+from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE_JOBS
 from mddag_executor.live import hooks
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import WAITABLE
@@ -61,9 +62,6 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.utilities import get_default_context, try_shutdown
 
-DEFAULT_DEADLINE = 100_000_000
-MAX_ACTIVE_JOBS = 64
-EXPIRE_AFTER = 1_000_000_000
 PATIENCE_S = 30.0
 _OF_ALL_NODES = {'/parameter_events'}
 _ENDS = (ExternalShutdownException, KeyboardInterrupt, ROSInterruptException)
@@ -163,11 +161,11 @@ class Rerun:
         writer = None if self._trace is None else VirtualTraceWriter(self._trace)
         clock = _TraceTime(source.start)
         self._recorder = None if writer is None else Recorder(
-            writer.path, task_set, settings.policy, settings.workers, DEFAULT_DEADLINE,
+            writer.path, task_set, settings.policy, settings.workers, DEFAULT_DEADLINE_NS,
             MAX_ACTIVE_JOBS, clock, writer, settings.cpus or 0)
         self._engine = Engine(
-            task_set, settings.workers, settings.policy, default_deadline=DEFAULT_DEADLINE,
-            max_active_jobs=MAX_ACTIVE_JOBS, expire_after=EXPIRE_AFTER,
+            task_set, settings.workers, settings.policy, default_deadline=DEFAULT_DEADLINE_NS,
+            max_active_jobs=MAX_ACTIVE_JOBS, expire_after=EXPIRE_AFTER_NS,
             record=None if writer is None else writer.record)
         self._engine.other_processes = OtherProcesses(
             task_set, self._engine.tables, self._engine.scheduler, self._engine.jobs,

@@ -19,13 +19,11 @@ from typing import Any
 
 from mddag_executor.live.compat import ends_sleep, with_timer_info
 from mddag_executor.live.entity import Entity
+from mddag_executor.live.intake.timers import ZERO_PERIOD_NS
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.loop import Loop, TIMER
 from rclpy.exceptions import InvalidHandle
 from rclpy.timer import Timer
-
-ZERO_PERIOD_NS = 1_000_000
-"""How often a timer is due whose period is zero."""
 
 
 class _Known:

@@ -23,7 +23,7 @@ from collections.abc import Iterator
 import os
 from typing import Any
 
-from mddag_executor.core import legs_of, rad_offsets
+from mddag_executor.core import DEFAULT_DEADLINE_NS, legs_of, rad_offsets
 from mddag_executor.core.state import (
     ABORTED,
     Decision,
@@ -42,7 +42,6 @@ from msg_graph import TaskSet
 
 PROCESS = 1
 _MOST = 2 ** 31 - 1
-_DEFAULT_DEADLINE = 100_000_000
 
 _NO_DECISION = (-1, -1, -1, -1, -1, -1)
 
@@ -91,7 +90,7 @@ class _Merger:
         """Yield the events in the order of the core."""
         settings = self._run.settings
         yield ('task_set', 0, 0, self._task_set.text, self._task_set.file, settings.policy,
-               settings.workers, _DEFAULT_DEADLINE, _MOST, self._run.preemptive,
+               settings.workers, DEFAULT_DEADLINE_NS, _MOST, self._run.preemptive,
                settings.cpus or 0)
         for place, callback in enumerate(self._task_set.callbacks, 1):
             yield ('rclcpp_callback_register', 0, 0, place, callback.key)
