@@ -16,9 +16,10 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 from typing import Any
 
-from mddag_executor.live.bench import campaign
+from mddag_executor.live.bench import campaign, publisher
 from mddag_executor.live.bench.campaign import CrashError, measure, run_all
 from mddag_executor.live.bench.spec import BenchError, Spec
 from mddag_executor.resources import find
@@ -87,6 +88,38 @@ def test_every_executor_is_offered_the_same(tmp_path: Path, mddag: Mddag) -> Non
     assert process.stdout.splitlines()[0].split()[:5] == [
         'topics', 'rate', 'executor', 'published', 'lost']
     assert plot.read_bytes().startswith(b'\x89PNG')
+
+
+class VirtualStop:
+    """An event that is set after a time of a virtual clock."""
+
+    def __init__(self, after_ns: int) -> None:
+        self.now, self.end = 0, after_ns
+
+    def is_set(self) -> bool:
+        return self.now >= self.end
+
+    def wait(self, seconds: float) -> bool:
+        self.now = min(self.end, self.now + round(seconds * 1e9))
+        return self.is_set()
+
+
+@pytest.mark.parametrize('seed', [None, 1])
+def test_topics_are_published_in_rows_or_at_drawn_phases(
+    seed: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop: Any = VirtualStop(1_000_000_000)
+    monkeypatch.setattr(publisher, 'time', SimpleNamespace(monotonic_ns=lambda: stop.now))
+    published: list[tuple[int, int]] = []
+    topics: Any = [SimpleNamespace(publish=lambda _, index=index: published.append(
+        (stop.now, index))) for index in range(5)]
+    assert publisher.publish(topics, 20.0, seed, stop) == [20] * 5
+    times = [time for time, _ in published]
+    if seed is None:
+        assert [index for _, index in published] == [0, 1, 2, 3, 4] * 20
+        assert len(set(times)) == 20
+    else:
+        assert len(set(times)) == 100
 
 
 def test_topics_that_are_published_together(mddag: Mddag) -> None:
