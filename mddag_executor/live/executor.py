@@ -327,10 +327,6 @@ class MultiDeadlineExecutor(BareExecutor):
             self._ring()
         return task
 
-    def create_future(self) -> Future:
-        """Return a future whose callbacks run in this executor (rclpy from 7.1.6 on)."""
-        return Future(executor=self)
-
     def _submit_tasks(self) -> None:
         """Have the tasks run that were created while nobody spun, in rclpy's order."""
         take = self._new_tasks.pop if TASKS_NEWEST_FIRST else self._new_tasks.popleft

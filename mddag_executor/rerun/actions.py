@@ -103,9 +103,8 @@ class Actions:
     def wait_for_server(self, client: Any, timeout_sec: float | None = None) -> bool:
         """Wait until a client's action is offered."""
         handle = action_handle(client)
-        deadline = None if timeout_sec is None else self._loop.now + round(timeout_sec * 1e9)
         return self._loop.wait(
-            lambda: self._is_offered(handle), deadline,
+            lambda: self._is_offered(handle), self._loop.deadline_after(timeout_sec),
             f'for action {self._clients[id(handle)][0]}')
 
     def _ask(self, kind: str, handle: Any, request: Any) -> int:

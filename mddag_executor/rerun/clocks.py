@@ -24,7 +24,6 @@ Threads that are no strands get what they always do, except from a node's clock.
 from __future__ import annotations
 
 from collections.abc import Callable
-import math
 import queue
 import random
 import sys
@@ -184,9 +183,7 @@ class VirtualTime:
             loop = self._loop
             if loop.strands.mine() is None or loop.strands.over:
                 return original(condition, timeout)
-            deadline = None
-            if timeout is not None and math.isfinite(timeout):
-                deadline = loop.now + max(0, round(timeout * 1e9))
+            deadline = loop.deadline_after(timeout)
             return _wait_for_notify(
                 condition, lambda until: loop.wait(until, deadline, 'for another thread'))
 
@@ -212,8 +209,8 @@ class VirtualTime:
             if strand is None or loop.strands.mine() is None or loop.strands.over:
                 original(thread, timeout)
                 return
-            deadline = None if timeout is None else loop.now + round(max(0.0, timeout) * 1e9)
-            loop.wait(lambda: strand.ended, deadline, f'for thread {thread.name}')
+            loop.wait(lambda: strand.ended, loop.deadline_after(timeout),
+                      f'for thread {thread.name}')
 
         return join
 

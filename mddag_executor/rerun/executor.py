@@ -15,7 +15,7 @@ from mddag_executor.live.tasks import make_task, Unclaimed
 from mddag_executor.live.work import QuickCallback, Work
 from mddag_executor.rerun.loop import Loop, POLL_NS
 from rclpy.node import Node
-from rclpy.task import Future, Task
+from rclpy.task import Task
 
 
 class NodeHolder(BareExecutor):
@@ -74,10 +74,6 @@ class NodeHolder(BareExecutor):
         assert self.loop is not None
         self.loop.soon(partial(self.loop.engine.resume, work))
 
-    def create_future(self) -> Future:
-        """Return a future whose callbacks run in the run."""
-        return Future(executor=self)
-
 
 class RerunHost(Host):
     """Runs programs as strands: their waiting takes virtual time."""
@@ -107,7 +103,7 @@ class RerunHost(Host):
             return
         deadline = None
         if timeout_s is not None and timeout_s >= 0:  # callbacks are to run meanwhile
-            deadline = loop.now + max(POLL_NS, round(timeout_s * 1e9))
+            deadline = loop.deadline_after(max(POLL_NS / 1e9, timeout_s))
 
         def over() -> bool:
             return (guest is not None and guest.ended.is_set()

@@ -30,6 +30,7 @@ from collections.abc import Callable
 from functools import partial
 from heapq import heappop, heappush
 import itertools
+import math
 from typing import Any, Protocol
 
 from mddag_executor.core import NEVER
@@ -338,6 +339,12 @@ class Loop:
             self.soon(partial(held.leave, None, 0, self.now))
 
     # --- waiting ---------------------------------------------------------------------------------
+
+    def deadline_after(self, timeout_s: float | None) -> int | None:
+        """Return the virtual time at which a time-out is over; None for never."""
+        if timeout_s is None or not math.isfinite(timeout_s):
+            return None
+        return self.now + max(0, round(timeout_s * 1e9))
 
     def wait(
         self, until: Callable[[], bool] | None, deadline: int | None, place: str,

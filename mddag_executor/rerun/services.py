@@ -94,13 +94,8 @@ class Services:
     def wait_for_service(self, client: Client, timeout_sec: float | None = None) -> bool:
         """Wait until a client's service is offered."""
         return self._loop.wait(
-            lambda: self.is_offered(client), self._deadline(timeout_sec),
+            lambda: self.is_offered(client), self._loop.deadline_after(timeout_sec),
             f'for service {service_name(client)}')
-
-    def _deadline(self, timeout_sec: float | None) -> int | None:
-        if timeout_sec is None or timeout_sec == float('inf'):
-            return None
-        return self._loop.now + max(0, round(timeout_sec * 1e9))
 
     def call_async(self, client: Any, request: Any) -> Future:
         """Send a request; return the future of its response."""
@@ -119,7 +114,7 @@ class Services:
         """Send a request and wait for its response; None where it does not come in time."""
         future = self.call_async(client, request)
         if not self._loop.wait(
-                future.done, self._deadline(timeout_sec),
+                future.done, self._loop.deadline_after(timeout_sec),
                 f'for service {service_name(client)}', lends=True):
             client.remove_pending_request(future)
         error = future.exception()

@@ -264,6 +264,10 @@ class BareExecutor(Executor):
         """Return whether ``shutdown`` has let go of everything."""
         return self._guard is None
 
+    def create_future(self) -> Future:
+        """Return a future whose callbacks run in this executor (rclpy from 7.1.6 on)."""
+        return Future(executor=self)
+
     def ring(self) -> None:
         """Trigger the executor's guard condition; from any thread, also after its end."""
         guard = self._guard
