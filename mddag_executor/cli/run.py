@@ -115,11 +115,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='the rest of the command line goes to rclpy.init, as -r from:=to')
 
 
-def _ros_arguments(args: argparse.Namespace) -> list[str]:
-    """Return what programs see of `--ros-args`."""
-    return ['--ros-args', *args.ros_args] if args.ros_args else []
-
-
 def _or_off(text: str) -> int:
     """Return the nanoseconds of a time, 0 for `off`."""
     return 0 if text == 'off' else options.duration(text)
@@ -161,9 +156,9 @@ def part(args: argparse.Namespace) -> int:
     task_set = loads(the_part.text, name=args.graph)
     if args.process is None:
         from mddag_executor.live.hosting import nodes_of
-        from mddag_executor.live.loading import resolve
+        from mddag_executor.live.loading import resolve, ros_arguments
         with _rclpy(args.ros_args or []):
-            ros = _ros_arguments(args)
+            ros = ros_arguments(args.ros_args)
             names = nodes_of([resolve(spec, ros) for spec in args.node], ros)
         the_part.leave(names)
         sys.stdout.flush()
@@ -193,8 +188,8 @@ def run_here(
         from mddag_executor.live.execution import ExecutionPlan
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
     else:
-        from mddag_executor.live.loading import resolve
-        programs = [resolve(spec, _ros_arguments(args)) for spec in args.node]
+        from mddag_executor.live.loading import resolve, ros_arguments
+        programs = [resolve(spec, ros_arguments(args.ros_args)) for spec in args.node]
     with told_when_stuck() as ends, Signals(
             _PART_ENDS_S if args.part else 0) as signals, _rclpy(args.ros_args or []):
         from mddag_executor.live.executor import MultiDeadlineExecutor
@@ -314,7 +309,7 @@ def _run(
                 warn_of(plan, args.ros_args)
             books = _run_synthetic(args, session, task_set, plan, seconds, progress)
         else:
-            _run_programs(session, executor, programs, _ros_arguments(args), seconds, progress)
+            _run_programs(session, executor, programs, args.ros_args, seconds, progress)
     result = {
         'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
         **executor.statistics(),
@@ -347,14 +342,15 @@ def _run_synthetic(
 
 def _run_programs(
     session: Session, executor: MultiDeadlineExecutor, programs: list[Program],
-    ros_args: list[str], seconds: float | None, progress: Progress,
+    ros_args: list[str] | None, seconds: float | None, progress: Progress,
 ) -> None:
     from mddag_executor.live.hosting import Host
+    from mddag_executor.live.loading import ros_arguments
     with Host(executor, session.stop) as host:
         executor.set_judging(False)
         try:
             with session:
-                host.start(programs, ros_args)
+                host.start(programs, ros_arguments(ros_args))
                 executor.set_judging(True)
                 session.wait(seconds, progress.update)
                 host.close()

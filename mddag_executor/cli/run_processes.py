@@ -58,6 +58,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     from mddag_executor.live.execution import ExecutionPlan
+    from mddag_executor.live.loading import ros_arguments
     from mddag_executor.live.parts import left, Part, together
     from mddag_executor.live.supervisor import Supervisor
     plan = None
@@ -79,7 +80,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         def command(name: str, nth: int) -> list[str]:
             trace = traces.of(name, nth)
             return [*_command(args, folder, specs.get(name, ())), '--process', name,
-                    *(() if trace is None else ('--trace', trace)), *_ros_args(args)]
+                    *(() if trace is None else ('--trace', trace)), *ros_arguments(args.ros_args)]
 
         out = sys.stdout if common.wants_tables(args) else sys.stderr
         supervisor = Supervisor(
@@ -178,12 +179,13 @@ def _probe(
     args: argparse.Namespace, folder: str, specs: Sequence[str]
 ) -> Mapping[str, Sequence[str]]:
     """Return the names of the nodes that each SPEC brings."""
+    from mddag_executor.live.loading import ros_arguments
     from mddag_executor.live.parts import left
     from mddag_executor.live.supervisor import ProcessError
     # Nobody is to hear of these nodes.
     environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
     with subprocess.Popen(
-        [*_command(args, folder, specs), *_ros_args(args)], stdin=subprocess.DEVNULL,
+        [*_command(args, folder, specs), *ros_arguments(args.ros_args)], stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors='replace',
         env=environment,
     ) as process:
@@ -219,10 +221,6 @@ def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> lis
         if value is not None:
             command += [option, str(value)]
     return command
-
-
-def _ros_args(args: argparse.Namespace) -> list[str]:
-    return ['--ros-args', *args.ros_args] if args.ros_args else []
 
 
 class _Traces:

@@ -21,7 +21,7 @@ any node starts; ``hosting`` then runs the ``Program`` that it returns.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module, metadata
 import inspect
@@ -92,6 +92,11 @@ def resolve(text: str, ros_arguments: Iterable[str] = ()) -> Program:
         return replace(_find(spec), spec=text, arguments=tuple(arguments))
     finally:
         sys.argv = argv
+
+
+def ros_arguments(given: Sequence[str] | None) -> list[str]:
+    """Return what programs and rclpy get of ``--ros-args``."""
+    return ['--ros-args', *given] if given else []
 
 
 def _find(spec: str) -> Program:

@@ -37,6 +37,7 @@ from typing import Any
 from mddag_executor.errors import InputError
 from mddag_executor.text import counted
 from mddag_executor.trace import MessageReader, TraceError, TraceReader
+from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.messages import Topic
 from mddag_executor.trace.times import joined, NEVER, stretches, Times
 import zstandard
@@ -165,8 +166,8 @@ class Bag:
                 self._add(topic, log_time, publish_time, data)
         except TraceError as error:
             raise BagError(str(file), error.problem, error.remedy) from None
-        self.warnings += [self._called(file) + text[len(reader.path):]
-                          for text in reader.warnings]
+        self.warnings += [
+            renamed(text, reader.path, self._called(file)) for text in reader.warnings]
         self.topics |= {_absolute(topic) for topic in reader.topics}
         self.count += reader.count
         self._look_through(reader.times)

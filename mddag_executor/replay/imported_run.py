@@ -63,6 +63,7 @@ from mddag_executor.replay.recording import Head, named_errors, no_run
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.census import Census
+from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
 import numpy as np
@@ -348,8 +349,7 @@ class ImportedRun(LinkObserver):
     def warnings(self) -> list[str]:
         """Return what is missing or doubtful, one line each, once it has been played."""
         name, path = self.name, self._reader.path
-        lines = [name + text[len(path):] if text.startswith(path) else text
-                 for text in self._reader.warnings]
+        lines = [renamed(text, path, name) for text in self._reader.warnings]
         if self.entities.incomplete:
             lines.append(
                 f'{name}: left out: {counted(self.entities.incomplete, "event")} of the '

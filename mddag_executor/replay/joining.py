@@ -41,6 +41,7 @@ from mddag_executor.replay.recording import (
 )
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceFile, TraceReader
+from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.schema import EVENTS
 from msg_graph import Dag
 
@@ -272,10 +273,8 @@ class Joined:
     def _say(self, end: int) -> None:
         """Say what is missing of each trace, and what ended with its process (rule 5)."""
         for part in self._parts:
-            path = part.reader.path
             self.warnings += [
-                part.name + text[len(path):] if text.startswith(path) else text
-                for text in part.reader.warnings]
+                renamed(text, part.reader.path, part.name) for text in part.reader.warnings]
             if part.end is not None:
                 continue
             jobs = [f'{self.task_set.dags[dag].name} {number}' for dag, number in part.open]

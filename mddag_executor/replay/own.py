@@ -51,6 +51,7 @@ from mddag_executor.replay.recording import declared, Head, named_errors, TASK_S
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.census import Census
+from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.events import Events
 from mddag_executor.trace.times import FAR_NS
 from msg_graph import TaskSet
@@ -158,8 +159,8 @@ class OwnRun:
     def warnings(self) -> list[str]:
         """Return what is missing or wrong, one line each, once it has been played."""
         name, path = self.name, self._reader.path
-        lines = [name + text[len(path):] if text.startswith(path) else text
-                 for text in self._reader.warnings] + self._mapping.warnings + self.notes
+        lines = [renamed(text, path, name) for text in self._reader.warnings]
+        lines += self._mapping.warnings + self.notes
         if not self.shut_down:
             lines.append(
                 f'{name}: the end of the run is not recorded (the process was killed, or the '

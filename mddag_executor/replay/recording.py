@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from mddag_executor.errors import InputError
 from mddag_executor.trace import TraceError, TraceReader
+from mddag_executor.trace.errors import renamed
 from msg_graph import GraphError, loads, TaskSet
 
 TASK_SET = 'mddag:task_set'
@@ -87,12 +88,9 @@ def no_run(reader: TraceReader) -> ReplayError:
 @contextmanager
 def named_errors(path: str, name: str) -> Iterator[None]:
     """Let errors about a file call it by its name."""
-    def rename(text: str) -> str:
-        return name + text[len(path):] if text.startswith(path) else text
-
     try:
         yield
     except TraceError as error:
-        raise TraceError(rename(error.file), error.problem, error.remedy) from None
+        raise TraceError(renamed(error.file, path, name), error.problem, error.remedy) from None
     except ReplayError as error:
-        raise ReplayError(rename(error.file), error.problem, error.remedy) from None
+        raise ReplayError(renamed(error.file, path, name), error.problem, error.remedy) from None

@@ -21,7 +21,7 @@ from typing import Any
 
 from mddag_executor import defaults
 from mddag_executor.core import policy as find_policy
-from mddag_executor.live.loading import Program, resolve
+from mddag_executor.live.loading import Program, resolve, ros_arguments
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.outputs import Output
@@ -84,9 +84,8 @@ def rerun(
 
 def programs(nodes: Sequence[NodeSpec], ros_args: Sequence[str] = ()) -> list[Program]:
     """Find the programs that bring nodes."""
-    arguments = ['--ros-args', *ros_args] if ros_args else []
     return [
-        resolve(node, arguments) if isinstance(node, str)
+        resolve(node, ros_arguments(ros_args)) if isinstance(node, str)
         else Program(getattr(node, '__name__', repr(node)), 'rerun', node) for node in nodes]
 
 

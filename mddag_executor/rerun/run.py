@@ -28,7 +28,7 @@ from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import WAITABLE
 from mddag_executor.live.hosting import Guest
 from mddag_executor.live.intake.entities import is_qos_event
-from mddag_executor.live.loading import describe, Program
+from mddag_executor.live.loading import describe, Program, ros_arguments
 from mddag_executor.live.other_processes import OtherProcesses
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
@@ -286,8 +286,7 @@ class Rerun:
 
     def _begin(self) -> None:
         """Start the programs, one after the other; each runs until it waits for something."""
-        ros_args = self._settings.ros_args
-        self._host.start(self._programs(), ['--ros-args', *ros_args] if ros_args else [])
+        self._host.start(self._programs(), ros_arguments(self._settings.ros_args))
         self._loop.at(self._loop.start, ENDED, self._started)
 
     def _started(self) -> None:
@@ -414,8 +413,7 @@ def _context(ros_args: Sequence[str]) -> Iterator[Any]:
     os.environ[_NO_DISCOVERY] = 'OFF'
     try:
         rclpy.init(
-            args=['--ros-args', *ros_args] if ros_args else [],
-            signal_handler_options=SignalHandlerOptions.NO)
+            args=ros_arguments(ros_args), signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:
         raise RerunError(
             f'--ros-args {" ".join(ros_args)}: {" ".join(str(error).split())[:200]}: correct it'

@@ -25,9 +25,9 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 from mddag_executor.trace.cdr import FieldType
-from mddag_executor.trace.errors import TraceError
+from mddag_executor.trace.errors import renamed, TraceError
 from mddag_executor.trace.reader import TraceReader
-from mddag_executor.trace.schema import EVENTS
+from mddag_executor.trace.schema import EVENTS, PROCESS
 
 _MAGIC = 0xC1FC1FC1
 _PACKET_BYTES = 256 * 1024
@@ -35,7 +35,6 @@ _HEADER = struct.Struct('<IIQQQQQI')
 _EVENT = struct.Struct('<IQii')
 _LENGTH = struct.Struct('<I')
 _LATEST = 2 ** 63 - 1
-_PROCESS = 'mddag:process'
 _CODES = {'byte': 'B', 'char': 'B', 'bool': 'B', 'float32': 'f', 'float64': 'd', **{
     f'{sign}int{bits}': code if sign else code.lower()
     for bits, code in ((8, 'B'), (16, 'H'), (32, 'I'), (64, 'Q')) for sign in ('u', '')}}
@@ -82,9 +81,7 @@ def export_ctf(
             session.add(layout.name, time, vpid, vtid, layout.fields, layout.types, values)
             if progress is not None and number % 5000 == 0:
                 progress(number)
-    own = os.fspath(path)
-    return [f'{name}{text[len(own):]}' if name and text.startswith(own) else text
-            for text in reader.warnings]
+    return [renamed(text, reader.path, name or reader.path) for text in reader.warnings]
 
 
 def export_dicts(
@@ -166,7 +163,7 @@ class CtfSession:
         types: tuple[FieldType, ...], values: Sequence[Any],
     ) -> None:
         """Add an event; times never decrease."""
-        if name == _PROCESS and len(values) == 1:
+        if name == PROCESS and len(values) == 1:
             self._names[vpid, vtid] = _text(values[0])
             return
         kind = self._kinds.get((name, fields, types))

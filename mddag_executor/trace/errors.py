@@ -13,3 +13,8 @@ class TraceError(InputError):
 
 class TraceWarning(UserWarning):
     """A trace of which something is missing; its text says what, with counts."""
+
+
+def renamed(text: str, path: str, name: str) -> str:
+    """Return a message with what the user calls a file in place of its path at the beginning."""
+    return name + text[len(path):] if text.startswith(path) else text

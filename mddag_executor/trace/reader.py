@@ -30,8 +30,8 @@ from mddag_executor.trace.errors import TraceError, TraceWarning
 from mddag_executor.trace.events import Event, Events
 from mddag_executor.trace.reading import Reading
 from mddag_executor.trace.records import LIBRARY
+from mddag_executor.trace.schema import PROCESS
 
-_PROCESS = 'mddag:process'
 _REMEDY = 'check its name, that you may read it, and the disk it is on'
 
 
@@ -215,11 +215,11 @@ def read_events(path: str | os.PathLike[str],
     wanted = None if names is None else set(names)
     named: dict[tuple[int, int], dict[str, Any]] = {}       # by process and thread
     for layout, timestamp, vpid, vtid, *fields in reader.layout_events(
-            None if wanted is None else wanted | {_PROCESS}):
+            None if wanted is None else wanted | {PROCESS}):
         values = dict(zip(layout.fields, fields))
-        if layout.name == _PROCESS:
+        if layout.name == PROCESS:
             named[vpid, vtid] = {'_procname': values.get('procname', '')}
-            if wanted is None or _PROCESS not in wanted:
+            if wanted is None or PROCESS not in wanted:
                 continue
         yield {'_name': layout.name, '_timestamp': timestamp, '_vpid': vpid, '_vtid': vtid,
                **named.get((vpid, vtid), {}), **values}

@@ -28,7 +28,6 @@ FOOTER_CONTENT = struct.Struct('<QQI')      # summary start, summary offset star
 # messages, schemas, channels, attachments, metadata, chunks, start, end; per channel counts follow
 STATISTICS_HEAD = struct.Struct('<QHIIIIQQ')
 
-UINT16 = struct.Struct('<H')
 UINT32 = struct.Struct('<I')
 UINT64 = struct.Struct('<Q')
 

@@ -158,5 +158,7 @@ _ALL = (
 #: Every event of the table by its full name.
 EVENTS = {event.key: event for event in _ALL}
 
+PROCESS = 'mddag:process'
+
 #: The providers whose events replay goes by, also of other recorders.
 PROVIDERS = frozenset({event.provider for event in _ALL} | {'dds', 'ros2_hook'})
