@@ -67,7 +67,7 @@ def opened(browser: Any, path: Path) -> Any:
     browser.get(path.as_uri())
     wait_for(lambda: browser.execute_script(
         'return !!(window.mddag && mddag.ready) '
-        '|| document.getElementById("mddag-status").textContent'))
+        '|| document.getElementById("mddag-status")?.textContent'))
     assert browser.execute_script('return !!(window.mddag && mddag.ready)')
     return browser
 
@@ -78,7 +78,7 @@ def complaints(browser: Any) -> list[str]:
 
 
 def status(browser: Any) -> str:
-    text = browser.execute_script('return document.getElementById("mddag-status").textContent')
+    text = browser.execute_script('return document.getElementById("mddag-status")?.textContent')
     assert isinstance(text, str)
     return text
 
