@@ -5,9 +5,9 @@ A placement in virtual time: what the scheduler's rules make of it.
 
 Theory of operation
 -------------------
-1. Each process computes Python in one callback at a time, the most urgent of its own first.  So in
-   the core the vertices of a process that hold the interpreter are one mutually exclusive group.
-2. All processes share the CPUs (``simulate.machine``), and each has its workers.
+1. Each process has its workers and its interpreter, all in one state of the core (its rules 11 and
+   12): of those that compute in Python the most urgent goes first, and one at a time computes.
+2. All processes share the CPUs (``simulate.machine``).
 3. What the executor and the middleware take is added to execution times: ``CALLBACK_NS`` for each
    callback, ``TRANSPORT_NS`` at either end for each message between processes, which also arrives
    ``DELAY_NS`` later.
@@ -19,13 +19,14 @@ Theory of operation
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from itertools import islice
 
 from mddag_executor.assign.placement import Placing, TRANSPORT_NS
 from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import new_state
+from mddag_executor.core.state import divide, new_state
 from mddag_executor.core.tally import total
 from mddag_executor.simulate import engine
 from mddag_executor.simulate.deliveries import Deliveries, edges_of, Transports
@@ -63,24 +64,20 @@ class Predictor:
         self, processes: Sequence[Process], execution_ns: Sequence[Sequence[int]]
     ) -> Tally:
         """Return the verdicts about a placement, with these execution times in each job."""
-        task_set = self._task_set
-        place = {node: i for i, process in enumerate(processes) for node in process.nodes}
+        task_set = replace(self._task_set, processes=tuple(processes))
         tables = Tables.build(task_set, max_active_jobs=NEVER)
-        own = len(processes)
-        groups = [place[v.callback.node] if v.callback.holds_interpreter is not False
-                  else (group + own if group >= 0 else -1)
-                  for v, group in zip(task_set.vertices, tables.group)]
-        tables = tables._replace(
-            group=groups + tables.group[len(groups):], n_groups=own + tables.n_groups)
-        times, transports = self._with_transport(tables, place, execution_ns)
-        load = periodic_load(task_set, times, self._duration)
+        times, transports = self._with_transport(tables, execution_ns)
+        holds = [process if vertex.callback.holds_interpreter is not False else 0
+                 for process, vertex in zip(tables.process, task_set.vertices)]
+        load = periodic_load(task_set, times, self._duration)._replace(holds=holds)
+        pools = [self._workers] * len(processes)
         state = new_state(
-            tables, self._workers * own, preemptive=self._policy.mode(False), propagate=2,
+            tables, sum(pools), propagate=2, preemptive=self._policy.mode(False, len(pools)),
             polling=self._policy.polling)
-        deliveries = Deliveries(
-            tables, state, self._policy.key, transports, stops=self._cpus is not None)
-        machine = None if self._cpus is None else Machine(
-            tables, state, load, self._cpus, deliveries=deliveries)
+        if len(pools) > 1:
+            divide(state, pools)
+        deliveries = Deliveries(tables, state, self._policy.key, transports, stops=True)
+        machine = Machine(tables, state, load, self._cpus, deliveries=deliveries)
         ended = engine.run(tables, state, self._policy.key, load, self._duration, False,
                            deliveries=deliveries, machine=machine)
         finish(tables, state, ended)
@@ -91,7 +88,7 @@ class Predictor:
         return tally
 
     def _with_transport(
-        self, tables: Tables, place: dict[str, int], execution_ns: Sequence[Sequence[int]],
+        self, tables: Tables, execution_ns: Sequence[Sequence[int]],
     ) -> tuple[list[list[int]], Transports]:
         """Return execution times and messages with what they take more (rule 3)."""
         times = [[ns + CALLBACK_NS for ns in row] for row in execution_ns]
@@ -100,8 +97,9 @@ class Predictor:
         for dag, row in zip(self._task_set.dags, times):
             base.append(len(delays))
             for vertex in dag.vertices:
-                here = place[vertex.callback.node]
-                away = [place[dag.vertices[v].callback.node] != here for v in vertex.successors]
+                first = tables.first_vertex[dag.index]
+                here = tables.process[first + vertex.index]
+                away = [tables.process[first + v] != here for v in vertex.successors]
                 for after, leaves in zip(vertex.successors, away):
                     row[after] += TRANSPORT_NS * leaves
                     delays.append(DELAY_NS * leaves)

@@ -10,6 +10,7 @@ from mddag_executor.core.tables import (
     legs_of,
     MAX_ACTIVE_JOBS,
     NEVER,
+    processes_of,
     rad_offsets,
     Tables,
 )
@@ -17,5 +18,6 @@ from mddag_executor.core.tally import quantile, Tally
 
 __all__ = [
     'DEFAULT_DEADLINE_NS', 'EXPIRE_AFTER_NS', 'MAX_ACTIVE_JOBS', 'NEVER', 'POLICIES', 'Policy',
-    'PolicyError', 'Scheduler', 'Tables', 'Tally', 'legs_of', 'policy', 'quantile', 'rad_offsets',
+    'PolicyError', 'Scheduler', 'Tables', 'Tally', 'legs_of', 'policy', 'processes_of', 'quantile',
+    'rad_offsets',
 ]

@@ -101,12 +101,18 @@ class Policy(NamedTuple):
     meaning: str
     polling: bool = False
 
-    def mode(self, preemptive: bool | None) -> bool:
+    def mode(self, preemptive: bool | None, processes: int = 1) -> bool:
         """
         Return whether to preempt: as was asked for, else as the policy does by itself.
 
-        :raises PolicyError: when the policy knows no preemption.
+        :raises PolicyError: when the policy knows no preemption, or that is not known of so many
+            processes (rule 12).
         """
+        if processes > 1 and (preemptive or self.polling):
+            what = 'polling' if self.polling else 'preemption'
+            raise PolicyError(
+                f"policy '{self.name}': {what} is known of one process only: give "
+                f"{'another policy' if self.polling else 'no preemption'}, or one process")
         if preemptive and self.polling:
             raise PolicyError(
                 f"policy '{self.name}': an executor that polls preempts no callback: "

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The queues in which executions wait: rules 3, 4, 9 and 11 of the scheduling rules (see ``rules``).
+The queues in which executions wait: rules 3, 4, 9, 11 and 12 (see ``rules``).
 
 Theory of operation
 -------------------
@@ -10,7 +10,7 @@ A waiting execution stands in exactly one of
 * the ready queue (``State.ready``), a heap by the keys of the policy;
 * the heap of its callback group (``State.group_heap``), if the group was busy when its turn came;
 * the heap of those that are held back (``State.held_back``), if the interpreter was held when its
-  turn came by one that is as urgent;
+  turn came by one that is as urgent, or no worker of its process was idle;
 * under a policy that polls, the queue of its *entity* (``State.entity_queue``): what the wait set
   of rclpy and rclcpp knows, a timer or a subscription with the messages that wait for it.
 
@@ -31,9 +31,7 @@ from mddag_executor.core.state import (
     ABORTED,
     N_HOLDING,
     N_STALE,
-    OVERTAKING,
     QueueEntry,
-    SEVERAL_INTERPRETERS,
     State,
     WAITING,
 )
@@ -94,30 +92,32 @@ def _keep_valid(s: State, heap: list[QueueEntry]) -> None:
     heapify(heap)
 
 
-def next_queue(s: State) -> list[QueueEntry]:
+def next_queue(t: Tables, s: State, first: bool) -> list[QueueEntry]:
     """
     Return the queue whose first entry goes first; it is empty when nothing is there to go.
 
-    What was held back counts as soon as the interpreter is free for it (rule 11).
+    What was held back counts as soon as it may start (rules 11 and 12).
+
+    :param first: nothing has been set aside since anything became free.
     """
     if s.scalars[N_STALE] > 0:
         _drop_stale(s, s.ready)
         _drop_stale(s, s.held_back)
+    if len(s.overtaking) > 2:
+        if first:
+            _bring_forward(t, s)
+        return s.ready
     if len(s.held_back) == 0 or (len(s.ready) > 0 and s.ready[0] < s.held_back[0]):
         return s.ready
-    if interpreter_is_free(s, s.held_back[0]):
-        return s.held_back
-    if s.scalars[SEVERAL_INTERPRETERS] != 0:
-        _bring_forward(s)
-    return s.ready
+    return s.held_back if may_start(t, s, s.held_back[0]) else s.ready
 
 
-def _bring_forward(s: State) -> None:
-    """Put what was held back into the ready queue where its interpreter is free now."""
+def _bring_forward(t: Tables, s: State) -> None:
+    """Put what was held back and may start now into the ready queue."""
     kept = 0
     for i in range(len(s.held_back)):
         entry = s.held_back[i]
-        if not is_stale(s, entry) and interpreter_is_free(s, entry):
+        if not is_stale(s, entry) and may_start(t, s, entry):
             heappush(s.ready, entry)
         else:
             s.held_back[kept] = entry
@@ -132,21 +132,49 @@ def _drop_stale(s: State, queue: list[QueueEntry]) -> None:
         s.scalars[N_STALE] -= 1
 
 
-def interpreter_is_free(s: State, entry: QueueEntry) -> bool:
-    """Tell whether nothing that is as urgent or more holds its interpreter (rule 11)."""
-    if s.scalars[N_HOLDING] > 0:
-        interpreter = s.x_holds[entry[4]]
+def idle_worker(t: Tables, s: State, x: int) -> int:
+    """Return the idle worker of its process with the lowest number, or -1 (rule 12)."""
+    process = t.process[s.x_vertex[x]]
+    for worker in range(len(s.worker_x)):
+        if s.worker_x[worker] < 0 and s.pool[worker] == process:
+            return worker
+    return -1
+
+
+def may_start(t: Tables, s: State, entry: QueueEntry) -> bool:
+    """
+    Tell whether what waits may start.
+
+    Its process has an idle worker (rule 12), and nothing that is as urgent or more holds the
+    interpreter that it is to hold (rule 11).
+    """
+    interpreter = s.x_holds[entry[4]]
+    if interpreter != 0 and s.scalars[N_HOLDING] > 0:
         for worker in range(len(s.worker_x)):
             x = s.worker_x[worker]
-            if (x >= 0 and s.x_holds[x] != 0 and s.x_holds[x] == interpreter
-                    and (s.scalars[OVERTAKING] == 0 or s.x_key[x][0] <= entry[0])):
+            if (x >= 0 and s.x_holds[x] == interpreter
+                    and (s.overtaking[interpreter] == 0 or s.x_key[x][0] <= entry[0])):
                 return False
-    return True
+    return len(s.pool) == 0 or idle_worker(t, s, entry[4]) >= 0
 
 
-def overtaking_pays(t: Tables, s: State, held: int, usual: int, preempts: bool) -> bool:
+def first_waiting(t: Tables, s: State, process: int) -> int:
+    """Return what comes first of all that waits, or of one process where there are several."""
+    first = -1
+    for queue in (s.ready, s.held_back):
+        for i in range(len(queue) if len(s.overtaking) > 2 else min(1, len(queue))):
+            x = queue[i][4]
+            if ((len(s.overtaking) == 2 or t.process[s.x_vertex[x]] == process)
+                    and (first < 0 or queue[i] < s.x_key[first])):
+                first = x
+    return first
+
+
+def overtaking_pays(
+    t: Tables, s: State, process: int, held: int, usual: int, preempts: bool
+) -> bool:
     """
-    Tell whether what waits first may overtake one that holds the interpreter (rule 11).
+    Tell whether what waits first may overtake one that holds its process' interpreter (rule 11).
 
     The two would share the interpreter, and lose by that.  So it waits where that is short
     beside the time that it has.  (Not beside what is left of that: when all are late, all
@@ -159,9 +187,8 @@ def overtaking_pays(t: Tables, s: State, held: int, usual: int, preempts: bool) 
     left = usual - held if held < LONGER * usual + LONG_NS else held
     if left < TURN_NS or preempts:
         return left >= TURN_NS
-    ready = len(s.held_back) == 0 or (len(s.ready) > 0 and s.ready[0] < s.held_back[0])
-    first = s.ready[0][4] if ready else s.held_back[0][4]
-    return PATIENCE * left >= t.rad_offset[s.x_vertex[first]]
+    first = first_waiting(t, s, process)
+    return first < 0 or PATIENCE * left >= t.rad_offset[s.x_vertex[first]]
 
 
 def wait_for_poll(t: Tables, s: State, entry: QueueEntry) -> None:

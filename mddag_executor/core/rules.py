@@ -63,10 +63,13 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
     the interpreter (the driver says so, ``State.x_holds``) starts only if none on a worker whose
     priority is the same or smaller holds it; until then it is held back, and others go past it.
     One that is more urgent than all that hold it overtakes them, unless the driver says that
-    nothing does for the moment (``OVERTAKING``, by ``queues.overtaking_pays``: where the wait is
-    short).  An execution that lends its worker, is suspended or turns out to wait
-    (``stop_holding``) holds it no more.  In virtual time there may be one interpreter for each
-    process (``SEVERAL_INTERPRETERS``); each has this rule for itself.
+    nothing does for the moment (``State.overtaking``, by ``queues.overtaking_pays``: where the
+    wait is short).  An execution that lends its worker, is suspended or turns out to wait
+    (``stop_holding``) holds it no more.
+12. **One machine, several processes.**  In virtual time one state can stand for all processes of a
+    run (``state.divide``).  Each has workers and an interpreter of its own, for which rules 5 and
+    11 hold by themselves; what finds none of its workers idle is held back.  There is no
+    preemption then, and no polling.
 """
 
 from __future__ import annotations
@@ -77,8 +80,9 @@ from mddag_executor.core.jobs import abort_job, close_job, deactivate, fail_job,
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import (
     add_stale,
-    interpreter_is_free,
+    idle_worker,
     is_stale,
+    may_start,
     next_queue,
     poll,
     wait_for_poll,
@@ -168,12 +172,13 @@ def peek(t: Tables, s: State, now: int) -> int:
 
     On the way, what cannot go next leaves the queue: dropped and aborted executions for good,
     those whose group is busy into their group's heap (rule 4) or to the next poll (rule 9), those
-    for which the interpreter is not free into the heap of what is held back (rule 11).
+    that may not start into the heap of what is held back (rules 11 and 12).
     """
     again = True
+    divided = len(s.pool) > 0
     while True:
         plain = s.scalars[N_STALE] == 0 and len(s.held_back) == 0
-        queue = s.ready if plain else next_queue(s)
+        queue = s.ready if plain else next_queue(t, s, True)
         while queue:
             entry = queue[0]
             x = entry[4]
@@ -184,14 +189,14 @@ def peek(t: Tables, s: State, now: int) -> int:
                     heappush(s.group_heap[group], entry)
                 else:
                     wait_for_poll(t, s, entry)
-                queue = next_queue(s)
+                queue = next_queue(t, s, False)
                 continue
-            if s.x_holds[x] != 0 and not interpreter_is_free(s, entry):
+            if (divided or s.x_holds[x] != 0) and not may_start(t, s, entry):
                 heappop(queue)
                 heappush(s.held_back, entry)
                 if group >= 0 and s.group_owner[group] == -1:
                     _release_group(s, group)  # others of it may go first
-                queue = next_queue(s)
+                queue = next_queue(t, s, False)
                 continue
             slot = s.x_slot[x]
             if (t.on_miss[s.job_dag[slot]] == ABORT and s.job_state[slot] == OPEN
@@ -200,7 +205,7 @@ def peek(t: Tables, s: State, now: int) -> int:
             if s.job_state[slot] != ABORTED or s.x_started[x] >= 0:
                 return x
             drop(s, x, now)
-            queue = next_queue(s)
+            queue = next_queue(t, s, False)
             again = True
         if not again or len(s.unpolled) == 0:
             return -1
@@ -232,6 +237,9 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
 
     A driver calls this until it answers -1.
     """
+    if s.scalars[N_IDLE] > 0 and len(s.pool) > 0:
+        x = peek(t, s, now)
+        return -1 if x < 0 else take(t, s, idle_worker(t, s, x), now)
     if s.scalars[N_IDLE] > 0:
         worker = 0
         while s.worker_x[worker] >= 0:

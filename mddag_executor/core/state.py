@@ -26,7 +26,7 @@ ELSEWHERE, HERE, ENDS_HERE = range(3)
 
 # Columns of ``scalars``.
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
- JUDGE_FROM, SKIP, N_HOLDING, OVERTAKING, SEVERAL_INTERPRETERS, N_SCALARS) = range(14)
+ JUDGE_FROM, SKIP, N_HOLDING, N_SCALARS) = range(12)
 
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  Each sink of a job is in time,
 # or late: it completed; or missed: it had not completed when the run ended past its deadline; or
@@ -57,8 +57,11 @@ class State(NamedTuple):
     # under a policy that polls: a heap for each entity, and the entities that have any entry there
     entity_queue: list[list[QueueEntry]]
     unpolled: list[int]
-    # workers
+    # workers: what each runs, and where processes have pools of their own, whose it is (from 1)
     worker_x: list[int]
+    pool: list[int]
+    # by interpreter, from 1: whether what is more urgent may overtake who holds it
+    overtaking: list[int]
     # by DAG
     free_slot: list[int]
     oldest: list[int]
@@ -140,7 +143,8 @@ def fill_state(
     s.scalars[SWITCH_OVERHEAD] = switch_overhead
     s.scalars[POLLING] = polling
     s.scalars[JUDGE_FROM] = -NEVER
-    s.scalars[OVERTAKING] = 1
+    for _ in range(2):
+        s.overtaking.append(1)
     if polling != 0:
         for _ in range(t.n_entities + 1):
             add_queue(s.entity_queue)
@@ -187,6 +191,15 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
             s.x_started.append(-1)
             s.x_left.append(0)
             s.x_cost.append(0)
+
+
+def divide(s: State, workers: list[int]) -> None:
+    """Give each process so many of the workers, and an interpreter (rule 12)."""
+    for process in range(len(workers)):
+        for _ in range(workers[process]):
+            s.pool.append(process + 1)
+        if process > 0:
+            s.overtaking.append(1)
 
 
 def add_group(s: State) -> int:

@@ -26,6 +26,8 @@ The offsets are relative to a job's release:
   in time, if each vertex takes its mean execution time (0 where none is declared) and never waits:
   the least of these sinks' deadlines minus the longest path to them (least laxity first).
 
+``process`` is the number of the declared process that a callback runs in, from 1.
+
 For policies that know callbacks, not jobs:
 
 * ``entity``: place of the callback in the wait set of an executor of ROS 2: timers, then
@@ -100,6 +102,7 @@ class Tables(NamedTuple):
     first_successor: list[int]
     successors: list[int]
     group: list[int]
+    process: list[int]
     n_groups: int
     n_entities: int
 
@@ -127,6 +130,7 @@ class Tables(NamedTuple):
         columns.enter(task_set.callbacks if task_set is not None else ())
         for dag in task_set.dags if task_set is not None else ():
             columns.add_dag(dag)
+        columns.lists['process'] += [] if task_set is None else processes_of(task_set)
         return columns.finish(default_deadline)
 
     def source_depth(self, dag: int) -> int:
@@ -218,7 +222,7 @@ class _Columns:
             'entity': self._n_entities, 'region_offset': 0,
             'n_legs': 1, 'first_leg': len(lists['leg_topic']), 'leg_topic': 0,
             'n_predecessors': 0, 'first_successor': len(lists['successors']),
-            'group': -1,
+            'group': -1, 'process': 1,
             'period': default_deadline, 'dag_deadline': default_deadline, 'on_miss': CONTINUE,
             'max_active_jobs': NEVER, 'expire_after': NEVER, 'first_vertex': n_vertices,
             'n_region': 1, 'source': n_vertices, 'first_sink': len(lists['sinks']),
@@ -239,6 +243,13 @@ class _Columns:
             best[key] = min(chain, best.get(key, chain))
         ranks = {key: rank for rank, key in enumerate(sorted(best, key=lambda key: best[key]))}
         return [ranks[key] for key in keys]
+
+
+def processes_of(task_set: TaskSet) -> list[int]:
+    """Return by vertex the number of the declared process that it runs in, from 1."""
+    place = {node: number for number, process in enumerate(task_set.processes, 1)
+             for node in process.nodes}
+    return [place.get(vertex.callback.node, 1) for vertex in task_set.vertices]
 
 
 def legs_of(vertex: Vertex, vertices: Sequence[Vertex]) -> list[tuple[int, int]]:

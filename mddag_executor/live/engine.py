@@ -39,7 +39,6 @@ from mddag_executor.core.state import (
     N_HOLDING,
     N_IDLE,
     OPEN,
-    OVERTAKING,
     SUSPENDED,
 )
 from mddag_executor.live.entity import Entity, TIMER
@@ -347,7 +346,7 @@ class Engine:
                 return None
             worker = state.worker_x.index(-1)
         if state.scalars[N_HOLDING]:
-            state.scalars[OVERTAKING] = self._may_be_overtaken(now)
+            state.overtaking[1] = self._may_be_overtaken(now)
         x = self.scheduler.take(worker, now)
         if state.decisions:
             self._decided(now)
@@ -381,7 +380,7 @@ class Engine:
         habit = work.entity.habit
         usual = habit.computed_ns or work.entity.busy_ns / max(1, work.entity.ran)
         return overtaking_pays(
-            self.tables, self._state, now - self._holds_since, int(usual), self.preempts)
+            self.tables, self._state, 1, now - self._holds_since, int(usual), self.preempts)
 
     def interpreter_holder(self) -> Work | None:
         """Return the most urgent execution that holds the interpreter."""

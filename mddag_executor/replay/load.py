@@ -46,7 +46,6 @@ from mddag_executor.replay.dispatches import Dispatches
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.simulate import Load
 from mddag_executor.simulate.deliveries import edge_numbers, edges_of, Transports
-from mddag_executor.simulate.workload import interpreters_of
 from mddag_executor.trace.census import Census
 from msg_graph import Dag, TaskSet
 
@@ -79,7 +78,6 @@ class RecordedLoad(NamedTuple):
     computed: Sequence[int] = ()
     dispatches: Sequence[int] = ()
     skipped: frozenset[tuple[int, int]] = frozenset()
-    interpreters: Sequence[int] = ()
 
 
 class _Jobs:
@@ -128,7 +126,7 @@ class LoadBuilder(Observer):
         self._first = tables.first_vertex
         self._declared_group = tables.group
         self._who = who
-        self._interpreters = interpreters_of(task_set)
+        self._process = tables.process
         self._cpus = cpus
         self._jobs = [_Jobs(dag, n) for dag, n in zip(task_set.dags, edges_of(tables))]
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
@@ -175,7 +173,7 @@ class LoadBuilder(Observer):
         if group in (_NO_GROUP, _UNTOLD):
             group = None
         number = self._dispatches.add(worker, group, ready if first else start, start, end,
-                                      self._interpreters[vertex])
+                                      self._process[vertex])
         if vertex < 0:
             self._others.append((ready if first else start, end - start, number))
             return
@@ -296,7 +294,7 @@ class LoadBuilder(Observer):
             [jobs.numbers for jobs in self._jobs], demand, executions, estimated, list(unknown),
             transports, usual if len(measured) else None, transport,
             frozenset(self._failed), computed if max(computed, default=-1) >= 0 else (),
-            dispatches, frozenset(self._skipped), self._interpreters)
+            dispatches, frozenset(self._skipped))
 
     def _take_back(self) -> None:
         """Make the execution times those that the executions would have taken alone."""
@@ -306,7 +304,7 @@ class LoadBuilder(Observer):
             np.concatenate([np.asarray(getattr(jobs, name)) for jobs in self._jobs])
             for name in ('took', 'start', 'cpu', 'held'))
         interpreter = np.concatenate([
-            np.tile(self._interpreters[first:first + jobs.size], len(jobs.numbers))
+            np.tile(self._process[first:first + jobs.size], len(jobs.numbers))
             for first, jobs in zip(self._first, self._jobs)])
         ran = took >= 0
         if not (cpu[ran] >= 0).any():
@@ -339,7 +337,7 @@ class LoadBuilder(Observer):
                 held[:, v] = vertex.callback.holds_interpreter
                 if vertex.callback.holds_interpreter:
                     cpu[~known, v] = took[~known, v]
-            held[:, v] *= self._interpreters[self._first[dag.index] + v]
+            held[:, v] *= self._process[self._first[dag.index] + v]
         computed.extend(cpu.ravel().tolist())
         holds.extend(held.ravel().tolist())
 

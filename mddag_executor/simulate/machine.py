@@ -31,14 +31,8 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from mddag_executor.core import NEVER, Tables
-from mddag_executor.core.queues import overtaking_pays
-from mddag_executor.core.state import (
-    N_HOLDING,
-    OVERTAKING,
-    PREEMPTIVE,
-    SEVERAL_INTERPRETERS,
-    State,
-)
+from mddag_executor.core.queues import first_waiting, overtaking_pays
+from mddag_executor.core.state import N_HOLDING, PREEMPTIVE, State
 from mddag_executor.simulate.engine import Load
 
 SWITCH_NS = 1_000_000
@@ -93,14 +87,12 @@ class Machine:
     :param computed: CPU time of the executions, as ``load.costs``; -1: it waits, as far as is
         known.  Empty: all of them compute all the time.
     :param python: whether executions that do not hold the interpreter need it at their end.
-    :param interpreters: by vertex that of its process, from 1; empty: there is one.
     :ivar next_time: when somebody needs something else, or must wait.
     """
 
     def __init__(
         self, tables: Tables, state: State, load: Load, cpus: int | None = None,
         computed: Sequence[int] = (), python: bool = False, deliveries: Places | None = None,
-        interpreters: Sequence[int] = (),
     ) -> None:
         self._t = tables
         self._s = state
@@ -109,13 +101,12 @@ class Machine:
         self._computed = computed
         self._python = python
         self._deliveries = deliveries
-        self._interpreters = interpreters
-        state.scalars[SEVERAL_INTERPRETERS] = int(max(load.holds, default=0) > 1)
+        state.overtaking.extend([1] * (max(tables.process) + 1 - len(state.overtaking)))
         # by execution that was started: up to where it needs what
         self._parts: dict[int, tuple[int, int, int]] = {}
         self._still: list[int] = []
         self._settled = 0
-        self._locks = [_Lock() for _ in range(max((1, *interpreters, *load.holds)))]
+        self._locks = [_Lock() for _ in state.overtaking[1:]]
         # those that compute, first who have a CPU
         self._cpu: list[int] = []
         self._slice_at = NEVER
@@ -128,17 +119,19 @@ class Machine:
         self._settled = now
 
     def decide(self, now: int) -> None:
-        """Decide whether what waits first may overtake who began last to hold its interpreter."""
+        """Decide by process whether what waits first may overtake who began last to hold it."""
         s = self._s
         if s.scalars[N_HOLDING] == 0 or not (s.ready or s.held_back):
             return
-        first = min(queue[0] for queue in (s.ready, s.held_back) if queue)[4]
-        holders = [x for x in s.worker_x if x >= 0 and 0 != s.x_holds[x] == s.x_holds[first]]
-        s.scalars[OVERTAKING] = 1
-        if holders:
-            last = max(holders, key=lambda x: (s.x_started[x], s.x_worker[x]))
-            s.scalars[OVERTAKING] = int(overtaking_pays(
-                self._t, s, now - s.x_started[last], s.x_cost[last], s.scalars[PREEMPTIVE] != 0))
+        for process in range(1, len(s.overtaking)):
+            holders = [x for x in s.worker_x if x >= 0 and s.x_holds[x] == process]
+            first = first_waiting(self._t, s, process) if holders else -1
+            s.overtaking[process] = 1
+            if first >= 0 and s.x_holds[first] == process:
+                last = max(holders, key=lambda x: (s.x_started[x], s.x_worker[x]))
+                s.overtaking[process] = int(overtaking_pays(
+                    self._t, s, process, now - s.x_started[last], s.x_cost[last],
+                    s.scalars[PREEMPTIVE] != 0))
 
     def started(self, x: int) -> None:
         """Take in that an execution has been dispatched."""
@@ -220,8 +213,7 @@ class Machine:
     def _interpreter(self, x: int) -> int:
         """Return which interpreter an execution computes with."""
         s = self._s
-        return s.x_holds[x] or (
-            self._interpreters[s.x_vertex[x]] if self._interpreters else 1)
+        return s.x_holds[x] or self._t.process[s.x_vertex[x]]
 
     def _take_turns_with_cpus(self, now: int, wanted: list[int]) -> None:
         queue = [x for x in self._cpu if x in wanted]

@@ -15,6 +15,7 @@ import math
 import random
 from typing import Any
 
+from mddag_executor.core import processes_of
 from mddag_executor.simulate.engine import Load
 from mddag_executor.simulate.errors import SimulationError
 from msg_graph import Dag, TaskSet
@@ -148,14 +149,7 @@ def periodic_load(task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns
 
 def declared_holds(task_set: TaskSet) -> list[list[int]]:
     """Return by DAG which interpreter vertices are declared to hold, 0: none; empty: no vertex."""
-    number = iter(interpreters_of(task_set))
+    number = iter(processes_of(task_set))
     holds = [[next(number) * int(vertex.callback.holds_interpreter or False)
               for vertex in dag.vertices] for dag in task_set.dags]
     return holds if any(map(any, holds)) else []
-
-
-def interpreters_of(task_set: TaskSet) -> list[int]:
-    """Return by vertex the number of its process, from 1; at last that of undeclared callbacks."""
-    place = {node: number for number, process in enumerate(task_set.processes, 1)
-             for node in process.nodes}
-    return [*(place.get(vertex.callback.node, 1) for vertex in task_set.vertices), 1]

@@ -80,6 +80,7 @@ def test_times_of_a_recorded_run(graph: Path, mddag: Mddag) -> None:
     (['graph.yaml', '--processes', '2', '--trace', 'no.mcap'], 'no.mcap'),
     (['graph.yaml', '--processes', '2', '--trace', 'no.mcap', '--utilisation', '0.2'],
      '--utilisation'),
+    (['graph.yaml', '--processes', '2', '--policy', 'ros2'], 'polling is known of one process'),
     (['none.yaml', '--processes', '2'], 'none.yaml'),
     (['bare.yaml', '--processes', '1'], 'declares no execution_time'),
 ])

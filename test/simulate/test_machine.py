@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core import queues, Tables
-from mddag_executor.core.state import new_state
+from mddag_executor.core.state import divide, new_state
 from mddag_executor.simulate import (
     END,
     Load,
@@ -53,22 +53,25 @@ class Job:
 
 def times(
     jobs: Sequence[Job], workers: int, cpus: int | None = None, python: bool = False,
-    preemptive: bool = False,
+    preemptive: bool = False, divided: bool = False,
 ) -> list[tuple[int, int]]:
     """Return when each job starts first, and when it ends."""
     task_set = declaration([
         single(f'd{n}', 10 ** 9, job.deadline) for n, job in enumerate(jobs)])
-    tables = Tables.build(task_set)._replace(rad_offset=[job.deadline for job in jobs] + [0])
+    tables = Tables.build(task_set)._replace(
+        rad_offset=[job.deadline for job in jobs] + [0],
+        process=[*(job.interpreter for job in jobs), 1])
     order = sorted(range(len(jobs)), key=lambda n: (jobs[n].release, n))
     n = len(jobs)
     load = Load([jobs[i].release for i in order], order, [0] * n, [job.cost for job in jobs],
                 list(range(n)), [0] * n, holds=[job.interpreter * job.holds for job in jobs])
-    state = new_state(tables, workers, preemptive=preemptive)
+    state = new_state(tables, workers * (1 + divided), preemptive=preemptive)
+    if divided:
+        divide(state, [workers, workers])
     computed = [job.cost if job.cpu is None else job.cpu for job in jobs]
     log: list[LogEntry] = []
     run(tables, state, find_policy('rad').key, load, 10 ** 12, False, log,
-        machine=Machine(tables, state, load, cpus, computed, python, None,
-                        [*(job.interpreter for job in jobs), 1]))
+        machine=Machine(tables, state, load, cpus, computed, python))
     found = [(-1, -1)] * n
     for now, kind, _, dag, _, _ in log:
         if kind == START and found[dag][0] < 0:
@@ -113,6 +116,13 @@ def test_each_process_has_its_interpreter() -> None:
     assert in_ms(times(jobs, 4)) == [(0, 4), (0, 6), (4, 7), (6, 8)]
     jobs[0].cost = 9 * MS
     assert in_ms(times(jobs, 4)) == [(0, 9), (0, 6), (9, 12), (6, 8)]
+
+
+def test_each_process_has_its_workers() -> None:
+    """The third waits for the only worker of its process; that of the other one is idle."""
+    jobs = of_ms(Job(0, 50, 4), Job(0, 60, 1, interpreter=2), Job(1, 70, 3))
+    assert in_ms(times(jobs, 1, divided=True)) == [(0, 4), (0, 1), (4, 7)]
+    assert in_ms(times(jobs, 2)) == [(0, 4), (0, 1), (1, 4)]
 
 
 def test_cpus_are_shared_by_slices() -> None:
@@ -211,6 +221,7 @@ class Ticks:
     workers: int
     cpus: int
     python: bool
+    divided: bool
     on: list[Job | None] = field(default_factory=list)
     waiting: list[Job] = field(default_factory=list)
     locks: dict[int, Lock] = field(default_factory=dict)
@@ -218,7 +229,7 @@ class Ticks:
     slice_left: int | None = None
 
     def times(self) -> list[tuple[int, int]]:
-        self.on = [None] * self.workers
+        self.on = [None] * self.workers * (1 + self.divided)
         now = 0
         while any(job.end < 0 for job in self.jobs):
             self._instant(now)
@@ -247,15 +258,18 @@ class Ticks:
 
     def _start_one(self, now: int) -> bool:
         waiting = sorted(self.waiting, key=lambda j: j.release + j.deadline)
-        if None not in self.on or not waiting:
-            return False
-        pays = self._overtaking_pays(waiting[0], now)
         for job in waiting:
+            idle = [w for w, other in enumerate(self.on) if other is None and (
+                not self.divided or w // self.workers + 1 == job.interpreter)]
+            if not idle:
+                continue
+            first = next(each for each in waiting if each.interpreter == job.interpreter)
+            pays = self._overtaking_pays(first, now)
             holders = self._holders(job) if job.holds else []
             if all(pays and other.release + other.deadline > job.release + job.deadline
                    for other in holders):
                 self.waiting.remove(job)
-                self.on[self.on.index(None)] = job
+                self.on[idle[0]] = job
                 job.start, job.left = now, job.cost
                 return True
         return False
@@ -317,14 +331,14 @@ def some_jobs(draw: st.DrawFn) -> list[Job]:
 
 
 @examples(400)
-@given(some_jobs(), st.integers(1, 4), st.integers(1, 4), st.booleans())
+@given(some_jobs(), st.integers(1, 4), st.integers(1, 4), st.booleans(), st.booleans())
 def test_as_the_model_that_goes_by_ticks(
-    jobs: list[Job], workers: int, cpus: int, python: bool
+    jobs: list[Job], workers: int, cpus: int, python: bool, divided: bool
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
         for name, ticks in (('SWITCH_NS', SWITCH), ('SLICE_NS', SLICE), ('BRIEF_NS', BRIEF)):
             patch.setattr(machine, name, ticks)
         for name, ticks in (('TURN_NS', TURN), ('LONG_NS', LONG)):
             patch.setattr(queues, name, ticks)
-        found: Any = times(jobs, workers, cpus, python)
-    assert found == Ticks(jobs, workers, cpus, python).times()
+        found: Any = times(jobs, workers, cpus, python, divided=divided)
+    assert found == Ticks(jobs, workers, cpus, python, divided).times()
