@@ -108,12 +108,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Make all measurements and print them.
-
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else cannot be used
-    """
+    """Make all measurements and print them."""
     _check(args)
     executors = parse_executors(args.executors, args.policies)
     if args.load not in DECLARED and any(name == NONE for name, _ in executors):

@@ -85,12 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Measure and print.
-
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else cannot be used
-    """
+    """Measure and print."""
     common.check_output(args.json)
     if args.accuracy and args.slack:
         raise UsageError('--slack: it is another measurement: leave it or --accuracy out')

@@ -74,11 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Run the steps and print what each found.
-
-    :raises mddag_executor.errors.MddagError: when a step fails
-    """
+    """Run the steps and print what each found."""
     common.check_output(args.json)
     output = Path(args.output)
     output.mkdir(parents=True, exist_ok=True)

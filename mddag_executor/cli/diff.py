@@ -63,13 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Compare two runs.
-
-    :raises mddag_executor.trace.TraceError: when a trace cannot be used
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else cannot be used
-    """
+    """Compare two runs."""
     from mddag_executor.report import diff
     _check_arguments(args)
     task_set = None if args.graph is None else common.load_graph(args.graph)

@@ -81,12 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Evaluate a declaration and print the acceptance ratios.
-
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else cannot be used
-    """
+    """Evaluate a declaration and print the acceptance ratios."""
     policies = options.policies(args.policies)
     _check_outputs(args)
     task_sets = _load(_graphs(args.graph))

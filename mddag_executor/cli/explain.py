@@ -39,13 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Explain the misses of a trace.
-
-    :raises mddag_executor.trace.TraceError: when the trace cannot be used
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else cannot be used
-    """
+    """Explain the misses of a trace."""
     common.recording_and_graph(args)
     common.check_output(args.json)
     if args.trace == '-' and args.graph == '-':

@@ -60,13 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Export a trace.
-
-    :raises mddag_executor.trace.TraceError: when the trace cannot be used
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else cannot be used
-    """
+    """Export a trace."""
     from mddag_executor.report.export import check_available, layout_of, target
     common.recording_and_graph(args)
     form = _form(args)

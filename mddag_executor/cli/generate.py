@@ -97,11 +97,7 @@ def _periods(text: str) -> tuple[int, ...]:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Make task sets.
-
-    :raises mddag_executor.errors.MddagError: when there can be none like that
-    """
+    """Make task sets."""
     from mddag_executor.generate import generate
     every = list(_every(args))
     for each in (every[0], every[-1]):

@@ -62,12 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Analyse.
-
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.analysis.AnalysisError: when an execution time is not declared
-    """
+    """Analyse."""
     from mddag_executor.analysis import analyse
     common.check_output(args.json)
     task_set = common.load_graph(args.graph)

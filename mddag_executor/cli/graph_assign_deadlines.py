@@ -68,12 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Assign deadlines.
-
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when no deadlines can be found as asked
-    """
+    """Assign deadlines."""
     from msg_graph.deadlines import deadlines_in_text, load_with_or_without_deadlines
     if args.by == 'path' and args.target is not None:
         raise UsageError("--target: '--by path' has none: give --by search, or leave it out")

@@ -41,11 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Check.
-
-    :raises msg_graph.GraphError: when the declaration is wrong
-    """
+    """Check."""
     common.check_output(args.json)
     task_set = common.load_graph(args.graph)
     result = check_result(task_set)

@@ -46,13 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Draw.
-
-    :raises mddag_executor.errors.UsageError: OUT has no ending that is known
-    :raises mddag_executor.errors.InputError: Graphviz is needed and not there, or it failed
-    :raises msg_graph.GraphError: when the declaration is wrong
-    """
+    """Draw."""
     ending = Path(args.output).suffix.lower()
     if ending not in _ENDINGS:
         raise UsageError(

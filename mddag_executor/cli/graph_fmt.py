@@ -34,7 +34,6 @@ def main(args: argparse.Namespace) -> int:
     Lay out.
 
     :returns: 1 with `--check` if there is something to change
-    :raises msg_graph.GraphError: when the declaration is wrong
     """
     from msg_graph.layout import format_text
     name, text = common.read_text(args.graph)

@@ -43,12 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Write the declaration.
-
-    :raises msg_graph.GraphError: when the file is no architecture file
-    :raises mddag_executor.trace.TraceError: when the recording cannot be used
-    """
+    """Write the declaration."""
     from mddag_executor.cli.systems import recorded_system, write_declaration
     from msg_graph.caret import declaration_from_caret
     common.check_output(args.output)

@@ -34,11 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Write the declaration.
-
-    :raises mddag_executor.errors.InputError: when no node is found
-    """
+    """Write the declaration."""
     common.check_output(args.output)
     from mddag_executor.cli.systems import write_declaration
     from mddag_executor.live.graph_probe import draft_of, probe

@@ -34,12 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Write the declaration.
-
-    :raises mddag_executor.trace.TraceError: when it is no recording
-    :raises mddag_executor.errors.InputError: when no system is recorded in it
-    """
+    """Write the declaration."""
     from mddag_executor.cli.systems import recorded_system, write_declaration
     from msg_graph.draft_text import declaration_of
     common.check_output(args.output)

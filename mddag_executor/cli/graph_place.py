@@ -66,12 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Place nodes.
-
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when they cannot be placed as asked
-    """
+    """Place nodes."""
     from mddag_executor.assign.placed import cost_of, improve, Predictor
     from mddag_executor.assign.placement import Placing
     from msg_graph.processes import with_processes

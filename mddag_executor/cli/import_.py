@@ -37,11 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Import a session and say what was in it.
-
-    :raises mddag_executor.trace.TraceError: when it cannot be read, or the trace not be written
-    """
+    """Import a session and say what was in it."""
     if args.output == '-':
         raise UsageError('-o -: a trace is not written to standard output: name a file')
     common.check_output(args.output)

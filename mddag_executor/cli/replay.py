@@ -48,13 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Replay a trace and print what came of its deadlines.
-
-    :raises mddag_executor.trace.TraceError: when the trace cannot be used
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else cannot be used
-    """
+    """Replay a trace and print what came of its deadlines."""
     common.recording_and_graph(args)
     common.check_output(args.json)
     common.check_report(args.report)

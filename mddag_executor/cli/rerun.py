@@ -71,13 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Run the nodes, and say what came of it.
-
-    :raises OSError: when a file cannot be read
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else cannot be used, or a node fails
-    """
+    """Run the nodes, and say what came of it."""
     _check(args)
     _fix_hashes()
     # With `--json -` what nodes print must not get into the JSON.

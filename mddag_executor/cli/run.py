@@ -121,12 +121,7 @@ def _or_off(text: str) -> int:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Run nodes until the run ends, and print what came of the deadlines.
-
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else cannot be used
-    """
+    """Run nodes until the run ends, and print what came of the deadlines."""
     common.check_output(args.json)
     _check_arguments(args)
     if args.part is not None:

@@ -60,12 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Simulate and print what came of the deadlines.
-
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else cannot be used
-    """
+    """Simulate and print what came of the deadlines."""
     from mddag_executor.simulate import periodic_load, Settings, utilisation
     _check_arguments(args)
     task_set = common.load_graph(args.graph)

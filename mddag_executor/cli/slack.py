@@ -63,13 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Find the slack and print it.
-
-    :raises mddag_executor.trace.TraceError: when the trace cannot be used
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else cannot be used
-    """
+    """Find the slack and print it."""
     from mddag_executor.replay.slack import find_slack, slack_result
     common.check_output(args.json)
     common.check_output(args.report)

@@ -46,11 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """
-    Listen and show.
-
-    :raises mddag_executor.errors.MddagError: when nothing is to be heard, or shown
-    """
+    """Listen and show."""
     common.check_output(args.json)
     live = sys.stdout.isatty() and not args.once and common.wants_tables(args)
     if live:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import json
 import os
 from pathlib import Path
@@ -194,19 +194,26 @@ class Nodes:
                         and all(map(is_idle, executors)))
 
 
+def in_two(
+    make_executor: Any, make_node: Any, text: str,
+    elsewhere: Sequence[str] = ('second', 'last'),
+) -> tuple[Nodes, Any, Any]:
+    """Run the chain's nodes, some of them in a second executor; return both."""
+    nodes = Nodes(make_node)
+    here, there = make_executor(loads(text)), make_executor(loads(text))
+    for name, node in nodes.nodes.items():
+        (there if name in elsewhere else here).add_node(node)
+    with Spinning(here), Spinning(there):
+        nodes.run(here, there)
+    return nodes, here, there
+
+
 def ends(executor: Any) -> dict[str, int]:
     return executor.statistics()['dags']['chain']['ends']
 
 
 def test_a_job_goes_on_in_another_executor_with_its_stamp_as_release(make_executor, make_node):
-    nodes = Nodes(make_node)
-    text = CHAIN.replace('100ms', '60s')
-    up, down = make_executor(loads(text)), make_executor(loads(text))
-    for executor, names in ((up, ('sensor', 'first')), (down, ('second', 'last'))):
-        for name in names:
-            executor.add_node(nodes.nodes[name])
-    with Spinning(up), Spinning(down):
-        nodes.run(up, down)
+    nodes, up, down = in_two(make_executor, make_node, CHAIN.replace('100ms', '60s'))
     n = len(nodes.stamps)
     for name in ('second', 'last'):
         assert [job.job for job, _ in nodes.jobs[name]] == list(range(n))
@@ -227,14 +234,9 @@ def test_a_job_goes_on_in_another_executor_with_its_stamp_as_release(make_execut
 
 
 def test_a_dag_leaves_and_comes_back_to_the_same_job(make_executor, make_node):
-    nodes = Nodes(make_node)
-    graph = loads(CHAIN.replace('100ms', '60s'))  # nothing is late on a busy machine
-    outer, inner = make_executor(graph), make_executor(graph)
-    for executor, names in ((outer, ('sensor', 'first', 'last')), (inner, ('second',))):
-        for name in names:
-            executor.add_node(nodes.nodes[name])
-    with Spinning(outer), Spinning(inner):
-        nodes.run(outer, inner)
+    # nothing is late on a busy machine
+    nodes, outer, inner = in_two(
+        make_executor, make_node, CHAIN.replace('100ms', '60s'), elsewhere=('second',))
     n = len(nodes.stamps)
     # at home the release is the timer's due time, not the stamp
     assert [job for job, _ in nodes.jobs['last']] == [job for job, _ in nodes.jobs['first']]
@@ -248,14 +250,9 @@ def test_a_dag_leaves_and_comes_back_to_the_same_job(make_executor, make_node):
 
 def test_without_the_declaration_messages_from_elsewhere_are_undeclared(
         make_executor, make_node):
-    nodes = Nodes(make_node)
-    text = CHAIN.replace(',\n                 release_from: header_stamp', '')
-    up, down = make_executor(loads(text)), make_executor(loads(text))
-    for executor, names in ((up, ('sensor', 'first')), (down, ('second', 'last'))):
-        for name in names:
-            executor.add_node(nodes.nodes[name])
-    with Spinning(up), Spinning(down):
-        nodes.run(up, down)
+    nodes, _, down = in_two(
+        make_executor, make_node,
+        CHAIN.replace(',\n                 release_from: header_stamp', ''))
     assert {job for job, _ in nodes.jobs['last']} == {None}
     assert down.statistics()['dags']['chain']['jobs'] == 0
 

@@ -63,19 +63,6 @@ class Sink(Node):
         self.publisher.publish(Float64(data=GAIN * int(message.frame_id)))
 
 
-@pytest.fixture
-def bag(tmp_path: Path) -> str:
-    return write_bag(tmp_path / 'in.mcap', [
-        (i * 100 * MS, '/points', Header(frame_id=str(i))) for i in range(20)])
-
-
-@pytest.fixture
-def graph(tmp_path: Path) -> Path:
-    path = tmp_path / 'graph.yaml'
-    path.write_text(GRAPH)
-    return path
-
-
 def published(result: Result, topic: str) -> list[tuple[float, Any]]:
     """Return what was published on a topic: when (ms after the start), and the message."""
     return [((each.time - START) / MS, deserialize_message(each.data, each.kind))
@@ -195,17 +182,7 @@ def test_an_overload_shows_in_the_outputs(bag: str, graph: Path) -> None:
     assert rerun(bag, graph, [Filter, Sink]).digest == result.digest
 
 
-TWO = """\
-mddag: 1
-workers: 2
-nodes:
-  - node: /driver
-    callbacks:
-      - {name: drive, timer: 100ms, publishes: [/points], dag: main}
-  - node: /filter
-    callbacks:
-      - {name: take, subscription: /points, publishes: [/filtered], execution_time: 10ms,
-         deadline: 50ms}
+TWO = GRAPH.partition('  - node: /sink')[0].replace('10ms}', '10ms, deadline: 50ms}') + """\
   - node: /other
     callbacks:
       - {name: take, subscription: /points, execution_time: 10ms, publishes: [/out],

@@ -29,7 +29,7 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
-from .helpers import GRAPH, MS, START, write_bag
+from .helpers import MS, START, write_bag
 
 Seen = list[tuple[float, Any]]
 
@@ -48,19 +48,6 @@ def main():
         publisher.publish(Header(frame_id=f'{time()} {uuid4()}'))
         sleep(0.5)
 """
-
-
-@pytest.fixture
-def bag(tmp_path: Path) -> str:
-    return write_bag(tmp_path / 'in.mcap', [
-        (i * 100 * MS, '/points', Header(frame_id=str(i))) for i in range(20)])
-
-
-@pytest.fixture
-def graph(tmp_path: Path) -> Path:
-    path = tmp_path / 'graph.yaml'
-    path.write_text(GRAPH)
-    return path
 
 
 class Filter(Node):

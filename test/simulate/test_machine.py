@@ -148,8 +148,7 @@ def test_who_waits_gets_the_lock_back_after_a_switch_interval() -> None:
     assert found[1][1] == pytest.approx(4 + 1 + 0.9, abs=1.0)
 
 
-def test_declared_holders_in_the_simulator() -> None:
-    text = """\
+HOLDERS = """\
 mddag: 1
 nodes:
   - node: /n
@@ -157,9 +156,12 @@ nodes:
       - {name: a, timer: 20ms, deadline: 20ms, dag: a, execution_time: 6ms, holds_interpreter: H}
       - {name: b, timer: 20ms, deadline: 20ms, dag: b, execution_time: 6ms, holds_interpreter: H}
 """
+
+
+def test_declared_holders_in_the_simulator() -> None:
     worst = []
     for holds, cpus in (('false', None), ('true', None), ('false', 1)):
-        task_set = loads(text.replace('H', holds), 'g.yaml')
+        task_set = loads(HOLDERS.replace('H', holds), 'g.yaml')
         from mddag_executor.simulate import draw_execution_times, periodic_load
         load = periodic_load(task_set, draw_execution_times(task_set, 0), 40 * MS)
         result = simulate(task_set, load, Settings(workers=2, duration_ns=40 * MS, cpus=cpus)
@@ -173,14 +175,7 @@ nodes:
 
 
 def test_declared_holders_in_an_evaluation() -> None:
-    text = """\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: a, timer: 20ms, deadline: 10ms, dag: a, execution_time: 6ms, holds_interpreter: H}
-      - {name: b, timer: 20ms, deadline: 10ms, dag: b, execution_time: 6ms, holds_interpreter: H}
-"""
+    text = HOLDERS.replace('deadline: 20ms', 'deadline: 10ms')
     accepted = []
     for holds in ('false', 'true'):
         experiment = Experiment(

@@ -1,0 +1,25 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""A recording to run nodes again from, and the declaration that goes with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from std_msgs.msg import Header
+
+from .helpers import GRAPH, MS, write_bag
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> str:
+    return write_bag(tmp_path / 'in.mcap', [
+        (i * 100 * MS, '/points', Header(frame_id=str(i))) for i in range(20)])
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Path:
+    path = tmp_path / 'graph.yaml'
+    path.write_text(GRAPH)
+    return path
