@@ -199,66 +199,6 @@
       'least slack in it. Zoom in to see each execution.';
   }
 
-  // --- the flow of messages along a path -----------------------------------------------------------
-
-  function flow(view, path) {
-    const x0 = view.range.start * SECOND, x1 = view.range.end * SECOND;
-    const bars = empty(COLUMNS), lines = empty(['x0', 'y0', 'x1', 'y1', 'colour', 'width']);
-    const steps = path.steps.map((rows) => new Set(rows)), runs = steps.map(() => []);
-    const y = (step) => path.steps.length - 1 - step;
-    const line = (xa, ya, xb, yb, colour, width) => [xa / SECOND, ya, xb / SECOND, yb, colour, width]
-      .forEach((value, k) => lines[Object.keys(lines)[k]].push(value));
-    const [from, to] = inView(x0 - (x1 - x0), x1);
-    let drawn = 0, left = 0;
-    for (let i = from; i < to; i++) {
-      steps.forEach((rows, step) => {
-        if (!rows.has(c.row[i])) return;
-        if (drawn++ >= EXACT) left++; else runs[step].push(i);
-      });
-    }
-    runs.forEach((found, step) => found.forEach((i) => {
-      bar(bars, c.start[i] - c.wait[i], c.start[i], y(step), 0.08, '#bbbbbb', '#bbbbbb', facts(i));
-      bar(bars, c.start[i], c.start[i] + c.took[i], y(step), 0.4, COLOURS[ratio[i]], '#444444',
-          facts(i));
-      if (!step) return;
-      const before = sender(runs[step - 1], i);
-      if (before >= 0) {
-        line(Math.min(c.start[before] + c.took[before], c.start[i] - c.wait[i]), y(step - 1),
-             c.start[i] - c.wait[i], y(step), COLOURS[ratio[i]], 1.2);
-      }
-    }));
-    if (path.worst) {
-      path.worst.steps.forEach(([ready, start, end], step) => {
-        line(ready, y(step), start, y(step), '#000000', 2.5);
-        line(start, y(step), end, y(step), '#000000', 5);
-        if (!step) return;              // a callback may publish before its end
-        line(Math.min(path.worst.steps[step - 1][2], ready), y(step - 1), ready, y(step),
-             '#000000', 2.5);
-      });
-    }
-    view.bars.data = bars;
-    view.lines.data = lines;
-    element('mddag-flow-note').textContent = (path.worst ?
-      `The worst job, ${path.worst.job}, in black: response ` +
-      `${time(path.worst.completed - path.worst.release)}, deadline ` +
-      `${time(path.worst.deadline - path.worst.release)}. ` : '') +
-      (left ? `${left} executions are left out: zoom in.` : '');
-  }
-
-  function sender(before, i) {          // of the same job, or else the latest that had ended
-    const ready = c.start[i] - c.wait[i], dag = meta.rows[c.row[i]].dag;
-    let found = -1, latest = -1;
-    for (const k of before) {
-      if (c.start[k] > c.start[i]) break;
-      if (meta.rows[c.row[k]].dag === dag) {
-        if (c.job[k] === c.job[i] && c.start[k] <= ready) found = k;
-      } else if (c.start[k] + c.took[k] <= c.start[i]) {
-        latest = k;
-      }
-    }
-    return found >= 0 ? found : latest;
-  }
-
   // --- putting it together -----------------------------------------------------------------------
 
   const NARROW = 700;                   // pixels, as in html.css
@@ -270,12 +210,12 @@
 
   function fit(model) {                 // leave most of a narrow screen to the pictures
     if (window.innerWidth > NARROW) return;
-    for (const name of ['workers', 'callbacks', 'flow']) {
+    for (const name of ['workers', 'callbacks']) {
       const axis = model(`${name}_axis`);
       axis.major_label_text_font_size = '9px';
       axis.major_label_overrides = brief(axis.major_label_overrides);
     }
-    for (const name of ['overview', 'workers', 'callbacks', 'flow']) model(name).min_border_left = 110;
+    for (const name of ['overview', 'workers', 'callbacks']) model(name).min_border_left = 110;
   }
 
   function start(doc) {
@@ -288,12 +228,6 @@
         asked = true;
         requestAnimationFrame(() => { asked = false; work(); });
       };
-    };
-    const follow = (range, work) => {
-      const again = later(work);
-      range.properties.start.change.connect(again);
-      range.properties.end.change.connect(again);
-      work();
     };
     const range = model('timeline_range');
     const ys = meta.rows.map((row) => row.y);
@@ -308,12 +242,8 @@
       Object.assign(view, {range, bars: model(`${view.name}_bars`),
                            marks: model(`${view.name}_marks`)});
     }
-    const flowView = {range: model('flow_range'), bars: model('flow_bars'),
-                      lines: model('flow_lines')};
     const boxes = ['job', 'late'].map((kind) =>
       ['workers', 'callbacks'].map((name) => model(`${name}_${kind}`)));
-    const flowDue = model('flow_due'), choice = element('mddag-path');
-    let path = null;
 
     function show(from, to) {
       const margin = Math.max(1, to - from) * 0.15;
@@ -331,41 +261,13 @@
       element('mddag-status').textContent =
         `job ${miss.job} of ${meta.dags[meta.sinks[miss.sink].dag]}: ${verdictText(miss.at)}`;
       show(miss.release, Math.max(miss.shown, miss.deadline));
-      const at = meta.paths.findIndex((each) => each.sink === miss.sink);
-      if (at >= 0) choosePath(at, miss.release, miss.deadline, miss.shown);
     }
 
-    function choosePath(at, release, deadline, end) {
-      path = meta.paths[at];
-      choice.value = String(at);
-      const labels = new Map(path.labels.map((text, i) => [path.labels.length - 1 - i, text]));
-      model('flow_ticks').ticks = [...labels.keys()];
-      model('flow_axis').major_label_overrides = brief(labels);
-      model('flow').height = 110 + 34 * path.labels.length;
-      model('flow_lines_range').setv({start: -0.7, end: path.labels.length - 0.3});
-      const margin = (Math.max(end, deadline) - release) * 0.1 + 1;
-      flowDue.setv({location: deadline / SECOND, visible: deadline > release});
-      flowView.range.setv({start: (release - margin) / SECOND,
-                           end: (Math.max(end, deadline) + margin) / SECOND});
-      drawFlow();
-    }
+    const redraw = later(() => views.forEach(draw));
+    range.properties.start.change.connect(redraw);
+    range.properties.end.change.connect(redraw);
+    views.forEach(draw);
 
-    const drawFlow = later(() => path && flow(flowView, path));
-    const chooseByNumber = (at) => {
-      const worst = meta.paths[at].worst;
-      if (worst) return choosePath(at, worst.release, worst.deadline, worst.completed);
-      const now = range.start * SECOND;
-      const span = Math.min(meta.duration, Math.max(1, range.end * SECOND - now));
-      return choosePath(at, now, now, now + Math.min(span, 1.5 * SECOND));
-    };
-
-    const later2 = () => views.forEach(draw);
-    follow(range, later2);
-    if (meta.paths.length) {
-      choice.addEventListener('change', () => chooseByNumber(Number(choice.value)));
-      chooseByNumber(meta.first_path);
-      follow(flowView.range, drawFlow);
-    }
     function step(forward) {
       let now = (range.start + range.end) / 2 * SECOND;
       if ((range.end - range.start) * SECOND > 0.9 * meta.duration) {

@@ -174,7 +174,7 @@ def write(file: BinaryIO, data: ReportData) -> None:
     from mddag_executor.report.html_plots import figures
     prepared = prepare(data)
     drawn = figures(data, prepared)
-    roots = (drawn.overview, drawn.workers, drawn.callbacks, drawn.flow, *drawn.histograms)
+    roots = (drawn.overview, drawn.workers, drawn.callbacks, *drawn.histograms)
     script, divisions = components(roots)
     library = Resources(mode='inline', components=['bokeh']).render_js()
     for part in _page(data, prepared, library, script, list(divisions)):
@@ -209,15 +209,14 @@ def _page(
            '<button id="mddag-whole">whole run</button> <span id="mddag-status"></span></p>\n')
     yield f'{plots[0]}\n<p class="note" id="mddag-detail"></p>\n'
     yield f'<h3>By worker</h3>\n{plots[1]}\n<h3>By callback</h3>\n{plots[2]}\n'
-    yield from _flow(prepared, plots[3])
     if data.paths:
         yield ('<h2>End to end</h2>\n<p class="note">From the first publication to the start of '
                f'the last callback.</p>\n{paths_html(data)}\n')
-    if plots[4:]:
+    if plots[3:]:
         yield '<h2>Response times against deadlines</h2>\n'
         yield ('<p class="note">Nearest to its deadline, or furthest past it, first. What never '
                'completed is in the table of sinks only.</p>\n')
-        yield '<div class="grid">' + ''.join(plots[4:]) + '</div>\n'
+        yield '<div class="grid">' + ''.join(plots[3:]) + '</div>\n'
         yield f'<h2>Where the time of the worst jobs went</h2>\n{worst_html(data)}\n'
     yield f'<h2>Callbacks</h2>\n{callbacks_html(data)}\n'
     yield f'<footer>mddag_executor {escape(__version__)}</footer>\n'
@@ -248,16 +247,3 @@ def _head(data: ReportData) -> Iterator[str]:
         yield (f'<p class="warning">The timelines show {timeline.kept} of '
                f'{counted(timeline.n_executions, "execution")}: around missed deadlines, '
                'and evenly spread over the run elsewhere. Tables and histograms are of all.</p>\n')
-
-
-def _flow(prepared: Prepared, plot: str) -> Iterator[str]:
-    paths = prepared.meta['paths']
-    if paths:
-        yield '<h2>Message flow along a path</h2>\n'
-    hidden = '' if paths else ' style="display:none"'
-    options = ''.join(
-        f'<option value="{i}">{escape(path["name"])}</option>' for i, path in enumerate(paths))
-    yield (f'<div{hidden}><p><label>Path <select id="mddag-path">{options}</select></label> '
-           '<span class="note" id="mddag-flow-note"></span></p>\n'
-           '<p class="note">Thin grey: waiting; bars: executing; slanted lines: messages, in the '
-           f'colour of the slack of what they start.</p>\n{plot}</div>\n')

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import zlib
 
 from mddag_executor.core import Tables, Tally
-from mddag_executor.replay.chains import Chains, Worst
+from mddag_executor.replay.chains import Chains
 from mddag_executor.replay.usage import Usage
 from mddag_executor.report.tables import short_names
 from mddag_executor.report.text import format_ns, printable
@@ -142,7 +142,6 @@ def prepare(data: ReportData) -> Prepared:
     misses = _misses(verdicts, origin, [data.tables.sink_deadline[v] for v in data.tables.sinks])
     names = [vertex.name for vertex in data.task_set.vertices]
     short = short_names(names)
-    paths = list(_paths(data, place, short, origin))
     meta = {
         'unit_ns': UNIT_NS, 'origin_ns': origin, 'workers': data.workers,
         'duration': data.duration_ns // UNIT_NS,
@@ -156,7 +155,6 @@ def prepare(data: ReportData) -> Prepared:
                    'deadline': data.tables.sink_deadline[v] // UNIT_NS} for v in sinks],
         'worker_lines': _worker_lines(data),
         'worker_names': [printable(name) for name in data.worker_names],
-        'paths': paths, 'first_path': _tightest(paths),
         'misses': [miss[:2] for miss in misses], 'columns': packer.columns}
     return Prepared(meta, packer.blob(), lines, origin, misses)
 
@@ -245,18 +243,6 @@ def _worker_lines(data: ReportData) -> list[int]:
     return [data.workers - w + spare for w in range(data.workers)] + [int(spare)]
 
 
-def _tightest(paths: list[dict[str, Any]]) -> int:
-    """Return the place of the path whose worst job used most of its deadline."""
-    def used(place: int) -> float:
-        worst = paths[place]['worst']
-        if worst is None:
-            return -1.0
-        return float((worst['completed'] - worst['release'])
-                     / max(1, worst['deadline'] - worst['release']))
-
-    return max(range(len(paths)), key=used, default=0)
-
-
 def _rows(
     data: ReportData, names: list[str], ys: list[int], place: dict[int, int]
 ) -> Iterator[dict[str, Any]]:
@@ -291,37 +277,3 @@ def _misses(verdicts: Ints, origin: int, relative: list[int]) -> list[Miss]:
         Miss(sink, job, deadline - origin, None if completed < 0 else completed - origin, kind)
         for sink, job, deadline, completed, kind in found[:, order].T.tolist()]
     return sorted(misses, key=lambda miss: (miss.deadline - relative[miss.sink], miss.sink))
-
-
-def _paths(
-    data: ReportData, place: dict[int, int], short: dict[str, str], origin: int
-) -> Iterator[dict[str, Any]]:
-    """Yield the paths to choose from: to each sink as its worst job took it, and declared ones."""
-    vertices = data.task_set.vertices
-    for vertex, times in data.chains.sinks.items():
-        if times.worst is None or not times.worst.chain:
-            continue
-        rows = [step.vertex for step in times.worst.chain]
-        yield {
-            'name': printable(f'to {short[vertices[vertex].name]}, as its worst job took it'),
-            'sink': place[vertex], 'steps': [[row] for row in rows],
-            'labels': [label(short[vertices[row].name]) for row in rows],
-            'worst': _worst(times.worst, data.tables.sink_deadline[vertex], origin)}
-    by_key: dict[str, list[int]] = {}
-    for row, one in enumerate(vertices):
-        by_key.setdefault(one.callback.key, []).append(row)
-    keys = short_names(by_key)
-    for path in data.task_set.paths:
-        steps = [by_key.get(key, []) for key in path.callbacks]
-        yield {'name': printable(f'path {path.name}'), 'sink': None, 'steps': steps,
-               'labels': [label(keys.get(key, key)) for key in path.callbacks], 'worst': None}
-
-
-def _worst(worst: Worst, deadline: int, origin: int) -> dict[str, Any]:
-    return {
-        'job': worst.job, 'release': _unit(worst.release, origin),
-        'completed': _unit(worst.completed, origin),
-        'deadline': _unit(worst.release + deadline, origin),
-        'steps': [[_unit(step.execution.ready, origin), _unit(step.execution.start, origin),
-                   _unit(min(step.execution.end, worst.completed), origin)]
-                  for step in worst.chain]}

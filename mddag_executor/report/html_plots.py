@@ -3,8 +3,8 @@
 """
 The figures of an HTML report, made with Bokeh.
 
-Those that are zoomed (timelines, message flow) hold nothing yet: ``html.js`` fills them with what
-is in view.  Overview and histograms are whole.
+The timelines, which are zoomed, hold nothing yet: ``html.js`` fills them with what is in view.
+Overview and histograms are whole.
 """
 
 from __future__ import annotations
@@ -44,7 +44,6 @@ class Figures(NamedTuple):
     overview: Any
     workers: Any
     callbacks: Any
-    flow: Any
     histograms: list[Any]
 
 
@@ -60,7 +59,7 @@ def figures(data: ReportData, prepared: Prepared) -> Figures:
     gaps = prepared.meta['gaps']
     return Figures(
         _overview(data, prepared, time), _timeline('workers', workers, time, gaps),
-        _timeline('callbacks', prepared.lines, time, gaps), _flow(), _histograms(data))
+        _timeline('callbacks', prepared.lines, time, gaps), _histograms(data))
 
 
 def _style(plot: Any, grid: bool = True) -> None:
@@ -172,29 +171,6 @@ def _lines(plot: Any, lines: list[Line]) -> None:
     plot.yaxis.major_label_overrides = {line.y: line.label for line in lines}
     plot.yaxis.major_tick_line_color = None
     plot.yaxis.name = f'{plot.name}_axis'
-
-
-def _flow() -> Any:
-    """Return the empty picture of messages along a path."""
-    plot: Any = figure(
-        height=420, sizing_mode='stretch_width',
-        x_range=Range1d(start=0, end=1, name='flow_range'),
-        y_range=Range1d(start=-0.7, end=0.7, name='flow_lines_range'), tools=_ZOOM,
-        active_drag='xpan', toolbar_location='above', min_border_left=_LEFT, name='flow')
-    lines = ColumnDataSource(
-        {key: [] for key in ('x0', 'y0', 'x1', 'y1', 'colour', 'width')}, name='flow_lines')
-    _wheel(plot)
-    _bars(plot, 'flow_bars')
-    plot.segment('x0', 'y0', 'x1', 'y1', source=lines, line_color='colour', line_width='width',
-                 line_alpha=0.8)
-    plot.add_layout(Span(
-        location=0, dimension='height', line_color=_RED, line_dash='dashed', line_width=2,
-        visible=False, name='flow_due'))
-    _lines(plot, [])
-    plot.yaxis[0].ticker.name = 'flow_ticks'
-    _seconds(plot, 'time (s); the red line is the deadline')
-    _style(plot)
-    return plot
 
 
 def _histograms(data: ReportData) -> list[Any]:

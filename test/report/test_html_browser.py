@@ -249,28 +249,6 @@ def test_sums_add_up_to_what_ran(browser: Any, large: Path) -> None:
     assert busy == pytest.approx(took, rel=1e-3)
 
 
-def test_the_flow_of_messages_along_a_path(browser: Any, small: Path) -> None:
-    opened(browser, small)
-    choice = browser.find_element('id', 'mddag-path')
-    options = [option.text for option in choice.find_elements('tag name', 'option')]
-    assert options == ['to filter:run, as its worst job took it', 'path whole']
-    find = 'return Bokeh.documents[0].get_model_by_name("flow_lines").data'
-    lines = wait_for(lambda: browser.execute_script(f'{find}.x0.length') and
-                     browser.execute_script(find))
-    black = [i for i, colour in enumerate(lines['colour']) if colour == '#000000']
-    assert len(black) == 5      # two callbacks, wait and run each, and the message
-    sent = [(round(lines['x0'][i], 6), round(lines['x1'][i], 6))
-            for i, colour in enumerate(lines['colour']) if colour != '#000000']
-    assert (0.026, 0.026) in sent       # job 2: sent at its end, there at once
-    assert 'The worst job, 2' in browser.find_element('id', 'mddag-flow-note').text
-    assert browser.execute_script(
-        'return Array.from(Bokeh.documents[0].get_model_by_name("flow_axis")'
-        '.major_label_overrides.values())') == ['driver:tick', 'filter:run']
-    choice.find_elements('tag name', 'option')[1].click()
-    wait_for(lambda: 'worst' not in browser.find_element('id', 'mddag-flow-note').text)
-    assert complaints(browser) == []
-
-
 def test_what_is_drawn_is_visible(browser: Any, large: Path, tmp_path: Path) -> None:
     """The canvas of the timeline has pixels in the colours of the legend."""
     opened(browser, large)
