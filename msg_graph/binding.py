@@ -60,7 +60,7 @@ class Binder:
 
     def __init__(self, task_set: TaskSet) -> None:
         self._callbacks = task_set.callbacks
-        self._place = {callback.key: place for place, callback in enumerate(task_set.callbacks)}
+        self._place = task_set.places()
         self._free: dict[Entity, list[int]] = {}
         self._timers: dict[str, set[Entity]] = {}
         self._bound: set[tuple[int, Entity]] = set()

@@ -269,3 +269,12 @@ class TaskSet:
         :raises KeyError: there is none.
         """
         return self._callback[key]
+
+    def places(self) -> dict[str, int]:
+        """Return the place of each callback in ``callbacks``, by its key."""
+        return {callback.key: place for place, callback in enumerate(self.callbacks)}
+
+    def places_of_vertices(self) -> list[int]:
+        """Return by vertex (see ``vertices``) the place of its callback in ``callbacks``."""
+        places = self.places()
+        return [places[vertex.callback.key] for vertex in self.vertices]

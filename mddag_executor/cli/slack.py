@@ -88,7 +88,7 @@ def main(args: argparse.Namespace) -> int:
 def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any]]:
     """Return the problem that a recording is."""
     from mddag_executor.replay import reschedule
-    from mddag_executor.replay.slack import callbacks_of, Problem
+    from mddag_executor.replay.slack import Problem
     for option in _ONLY_GRAPH:
         if getattr(args, option) is not None:
             raise UsageError(f'--{option.replace("_", "-")}: a recording has its own: leave the '
@@ -105,14 +105,14 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
     for warning in outcome.warnings:
         warn(warning)
     problem = Problem(outcome.work, outcome.how, outcome.tables, outcome.end_ns,
-                      callbacks_of(outcome.task_set))
+                      outcome.task_set.places_of_vertices())
     return problem, outcome.task_set, outcome.result()['dags']
 
 
 def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any]]:
     """Return the problem that a declaration is."""
     from mddag_executor.core import Tables
-    from mddag_executor.replay.slack import callbacks_of, Problem
+    from mddag_executor.replay.slack import Problem
     from mddag_executor.simulate import periodic_load, Settings
     from mddag_executor.simulate import simulate as simulated
     if args.graph is not None:
@@ -131,7 +131,7 @@ def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
     load = periodic_load(task_set, times, settings.duration_ns)
     run = simulated(task_set, load, settings)
     problem = Problem(load, settings, Tables.build(task_set), settings.duration_ns,
-                      callbacks_of(task_set))
+                      task_set.places_of_vertices())
     return problem, task_set, run.result()['dags']
 
 

@@ -42,7 +42,7 @@ def check_slack(
 
     :raises mddag_executor.errors.MddagError: when a live run fails, or nothing can be tried
     """
-    from mddag_executor.replay.slack import callbacks_of, find_slack, NOTHING, Problem
+    from mddag_executor.replay.slack import find_slack, NOTHING, Problem
     from mddag_executor.simulate import draw_execution_times, periodic_load, Settings
     from msg_graph import loads
     times = _times(task_set, args.utilisation[0], args.workers[0])
@@ -51,7 +51,7 @@ def check_slack(
     load = periodic_load(fixed, draw_execution_times(fixed, 0), settings.duration_ns)
     with Progress('recording', 2 * args.callbacks) as line:
         slack = find_slack(Problem(
-            load, settings, Tables.build(fixed), settings.duration_ns, callbacks_of(fixed)),
+            load, settings, Tables.build(fixed), settings.duration_ns, fixed.places_of_vertices()),
             jobs=processors())
         found = sorted((one.factor, task_set.callbacks[i].key, one.breaks)
                        for i, one in slack.factors.items()

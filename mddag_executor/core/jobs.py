@@ -25,6 +25,7 @@ from mddag_executor.core.state import (
     SINK_ABORTED,
     SINK_EXPIRED,
     SINK_FAILED,
+    SINK_IN_TIME,
     SINK_MISSED,
     SKIP,
     State,
@@ -142,6 +143,11 @@ def judge_from(s: State, release: int) -> None:
 def is_judged(s: State, slot: int) -> bool:
     """Tell whether a job was released when there are verdicts already (rule 6)."""
     return s.job_release[slot] >= s.scalars[JUDGE_FROM]
+
+
+def is_miss(kind: int) -> bool:
+    """Tell whether a decision of that kind is a miss: of a sink, and not in time (rule 6)."""
+    return SINK_IN_TIME < kind < JOB_END
 
 
 def judge(s: State, slot: int, kind: int, vertex: int, deadline: int, time: int) -> None:

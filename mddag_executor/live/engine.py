@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.queues import overtaking_pays
+from mddag_executor.core.rules import progress
 from mddag_executor.core.state import (
     DONE,
     IDLE,
@@ -417,9 +418,8 @@ class Engine:
         state.x_cost[x] = ns
 
     def progress(self, x: int, now: int) -> int:
-        """Return how far a running execution is, ns; see ``simulate.machine``."""
-        state = self._state
-        return state.x_cost[x] - state.x_left[x] + now - state.x_started[x]
+        """Return how far a running execution is, ns; see ``takes``."""
+        return progress(self._state, x, now)
 
     def lend(self, work: Work) -> None:
         """Free the worker of an execution that goes on without one."""

@@ -97,8 +97,7 @@ class _Teller:
         for dag in task_set.dags:
             self._first.append(self._first[-1] + len(dag.vertices))
         self._sources = [self._first[dag.index] + dag.source for dag in task_set.dags]
-        places = {callback.key: i for i, callback in enumerate(task_set.callbacks, 1)}
-        self._callback = [places[vertex.callback.key] for vertex in self._vertices]
+        self._callback = [place + 1 for place in task_set.places_of_vertices()]
         self._next = 0
         self._ends = self._job_ends()
         self._next_end = next(self._ends, None)

@@ -127,7 +127,7 @@ class System:
         """Return the nodes in the order of the recorded declaration, which counts for ties."""
         if self.task_set is None:
             return list(nodes.values())
-        place = {c.key: i for i, c in enumerate(self.task_set.callbacks)}
+        place = self.task_set.places()
         every = [callback for node in nodes.values() for callback in node.callbacks.values()]
         found: list[DraftNode] = []
         for callback in sorted(every, key=lambda c: place.get(c.key, len(place))):

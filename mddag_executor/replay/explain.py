@@ -115,16 +115,15 @@ class Explainer(Observer):
         self._workers = run.head.workers if isinstance(run, OwnRun) and run.processes == 1 \
             and not (policy is not None and policy.polling) else 0
         vertices = task_set.vertices
-        places = {callback.key: i for i, callback in enumerate(task_set.callbacks)}
-        self._place = np.array([*(places[v.callback.key] for v in vertices), 0], dtype=np.int64)
+        self._place = np.array([*task_set.places_of_vertices(), 0], dtype=np.int64)
         longest = [_NO_END if v.callback.execution_time is None
                    else v.callback.execution_time.quantiles_ns[-1] for v in vertices]
         self._longest = np.array([*longest, 0], dtype=np.int64)
         self._is_source = np.array([not v.predecessors for v in vertices] + [False])
         self._is_timer = np.array(
             [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags] + [False])
-        self._runs = Typical(len(places) + 1)
-        self._cpu = Typical(len(places) + 1)
+        self._runs = Typical(len(task_set.callbacks) + 1)
+        self._cpu = Typical(len(task_set.callbacks) + 1)
         self._lags = Typical(len(task_set.dags) + 1)
         self._kept: list[list[Ints]] = [[] for _ in _WIDTHS]
         self._n_new = 0

@@ -101,7 +101,7 @@ class PathBook:
     def __init__(self, task_set: TaskSet, kept: int = KEPT) -> None:
         self.paths: list[Path] = list(task_set.paths)
         self.hops = [hops(task_set, path) for path in self.paths]
-        self.callbacks = {c.key: i for i, c in enumerate(task_set.callbacks)}
+        self.callbacks = task_set.places()
         self.nodes = {node: i for i, node in enumerate(
             dict.fromkeys(c.node for c in task_set.callbacks))}
         #: The topics that paths lead over; publications on others need not be told.

@@ -34,8 +34,8 @@ import time
 from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER, Tables
-from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import Decision, DROP, JOB_END, SINK_IN_TIME
+from mddag_executor.core.jobs import finish, is_miss
+from mddag_executor.core.state import Decision
 from mddag_executor.memory import no_garbage
 from mddag_executor.replay.as_recorded import slack as margin
 from mddag_executor.replay.load import RecordedLoad
@@ -185,8 +185,7 @@ class Search:
         self, scaled: tuple[Load, list[int], int], stop: bool, of_any: bool = False
     ) -> Iterator[Miss]:
         for kind, _, vertex, _, deadline, _ in self._problem.decide(*scaled, stop):
-            if kind not in (SINK_IN_TIME, JOB_END, DROP) and (
-                    of_any or vertex not in self.left_out):
+            if is_miss(kind) and (of_any or vertex not in self.left_out):
                 yield Miss(vertex, deadline,
                            deadline - self._problem.tables.sink_deadline[vertex])
 
@@ -266,12 +265,6 @@ class Search:
             else:
                 high, breaks = middle, miss.sink
         return low, breaks
-
-
-def callbacks_of(task_set: TaskSet) -> list[int]:
-    """Return by global vertex the number of its callback."""
-    places = {callback.key: i for i, callback in enumerate(task_set.callbacks)}
-    return [places[vertex.callback.key] for vertex in task_set.vertices]
 
 
 class Slack(NamedTuple):

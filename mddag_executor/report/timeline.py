@@ -25,6 +25,7 @@ from array import array
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from mddag_executor.core.jobs import is_miss
 from mddag_executor.core.state import (
     Decision,
     DROP,
@@ -234,8 +235,7 @@ class Timeline(Observer):
             return
         for (kind, *_, deadline, time), after in zip(
                 batch.decisions, decided_after.tolist()):
-            if after == 0 and kind not in (JOB_END, DROP) and (
-                    kind != SINK_IN_TIME):
+            if after == 0 and is_miss(kind):
                 self.bins.place(max(time, deadline))
                 return
         if len(batch.columns(RAN)):

@@ -149,7 +149,7 @@ class Deliveries:
         for x in s.worker_x:
             to_come = self._to_come.get(x)
             if to_come:
-                at = s.x_cost[x] - s.x_left[x] + now - s.x_started[x]
+                at = rules.progress(s, x, now)
                 while to_come and to_come[-1][0] <= at:
                     slot = s.x_slot[x]
                     self._arrive(slot, s.job_index[slot], to_come.pop()[1], now)

@@ -33,7 +33,7 @@ from typing import NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.state import add_slot, DROP, JOB_END, SINK_IN_TIME, State
+from mddag_executor.core.state import add_slot, State
 from mddag_executor.core.tables import NEVER, Tables
 
 if TYPE_CHECKING:
@@ -195,8 +195,7 @@ def _note(
 def any_missed(s: State, first: int) -> bool:
     """Tell whether a miss is among the decisions from number ``first`` on."""
     for i in range(first, len(s.decisions)):
-        kind = s.decisions[i][0]
-        if kind != SINK_IN_TIME and kind != JOB_END and kind != DROP:
+        if jobs.is_miss(s.decisions[i][0]):
             return True
     return False
 

@@ -32,6 +32,7 @@ from typing import Protocol
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core.queues import first_waiting, overtaking_pays
+from mddag_executor.core.rules import progress
 from mddag_executor.core.state import N_HOLDING, PREEMPTIVE, State
 from mddag_executor.simulate.engine import Load
 
@@ -171,7 +172,7 @@ class Machine:
         waiting: list[list[int]] = [[] for _ in self._locks]
         for x in s.worker_x:
             if x >= 0:
-                at = s.x_cost[x] - s.x_left[x] + now - s.x_started[x]
+                at = progress(s, x, now)
                 need, until = self._need(x, at)
                 if need == _LOCK:
                     waiting[self._interpreter(x) - 1].append(x)

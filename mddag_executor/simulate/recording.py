@@ -74,8 +74,7 @@ class _Merger:
         self._last_leg = [
             max(1, len(legs_of(vertex, task_set.dags[vertex.dag].vertices))) - 1
             for vertex in self._vertices]
-        address = {callback.key: i for i, callback in enumerate(task_set.callbacks, 1)}
-        self._address = [address[vertex.callback.key] for vertex in self._vertices]
+        self._address = [place + 1 for place in task_set.places_of_vertices()]
         self._rad = [offset for dag in task_set.dags for offset in rad_offsets(dag)]
         self._first = [0]
         for dag in task_set.dags:

@@ -11,7 +11,7 @@ from typing import Any
 from mddag_executor.cli import main as program
 from mddag_executor.replay import reschedule
 from mddag_executor.replay import slack as module
-from mddag_executor.replay.slack import callbacks_of, find_slack, Problem, Search
+from mddag_executor.replay.slack import find_slack, Problem, Search
 import pytest
 
 from .helpers import Chances, MS, small, VirtualRun
@@ -94,7 +94,7 @@ def test_windows_find_what_plain_bisection_finds(
                chances=Chances(0, 0, 0, 0, 0, 0, 0))
     run = reschedule(path)
     problem = Problem(
-        run.work, run.how, run.tables, run.end_ns, callbacks_of(run.task_set))
+        run.work, run.how, run.tables, run.end_ns, run.task_set.places_of_vertices())
     found = []
     for long in (10 ** 9, 1):
         monkeypatch.setattr(module, 'LONG', long)
