@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 HELP = 'measure the replayer'
 DESCRIPTION = """\
 Measure the replayer: the speed and memory of reading and linking, beside other readers; with
---accuracy how well reschedule predicts a live run; with --slack whether the slack that is told
+--accuracy how well reschedule predicts a live run; with --slack whether the slack that it finds
 holds in live runs."""
 EXAMPLE = """\
 mddag bench replay

@@ -201,7 +201,7 @@ def _draws(
 
 
 def _told(result: dict[str, Any]) -> Iterator[str]:
-    """Yield what is told of a placement."""
+    """Yield the lines about a placement."""
     from mddag_executor.report.tables import sink_table, verdicts_line
     rows: list[list[Cell]] = [
         [process['name'], len(process['nodes']), f'{load:.2f}',

@@ -105,7 +105,7 @@ def as_recorded(
     """
     Replay a recorded run.
 
-    :param more: who else is told of the run.
+    :param more: makes further observers.
     :param jobs: whether to keep of each miss why.
     :raises mddag_executor.errors.MddagError: where that cannot be
     """

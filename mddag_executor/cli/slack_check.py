@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What `bench replay --slack` does: whether slack that was told holds in live runs.
+What `bench replay --slack` does: whether the slack that was found holds in live runs.
 
 Theory of operation
 -------------------

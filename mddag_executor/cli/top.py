@@ -127,7 +127,7 @@ def _ticks(spin: Callable[[float], None], seconds: float | None) -> Iterator[Non
 
 @contextmanager
 def _listening(topic: str, board: Board) -> Iterator[Callable[[float], None]]:
-    """Subscribe; give a function that takes in what comes within a time."""
+    """Subscribe; give a function that collects what comes within a time."""
     from diagnostic_msgs.msg import DiagnosticArray
     import rclpy
     from rclpy.context import Context

@@ -30,7 +30,7 @@ class Replay:
     """
     Plays a recorded run, and tells what came of it.
 
-    :param more: makes further observers, who are told after the judge.
+    :param more: makes further observers, who come after the judge.
     :param paths: whether to follow the declared paths, to look for drift, and to count why
         deadlines were missed.
     :param jobs: whether to keep of each miss why.
@@ -157,8 +157,8 @@ def replay(
     :param path: a trace of this executor, or an imported one.
     :param task_set: the declaration that judges; None: the one in the trace, if it has one.
     :param name: what messages call the trace, where that is not its path.
-    :param progress: told now and then how many events have been read.
-    :param more: who else is told of the run; see ``Replay``.
+    :param progress: called now and then with the number of events read so far.
+    :param more: makes further observers; see ``Replay``.
     :param skip: how long after the first release jobs are not judged (a warm-up), ns.
     :param jobs: whether to keep of each miss why.
     :raises mddag_executor.trace.TraceError: when it is no trace.

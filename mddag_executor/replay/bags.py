@@ -82,8 +82,8 @@ class Bag:
     """
     What a bag says about some topics.
 
-    :param keep: told of each message of these topics: its topic, with an absolute name, when it
-        came, when it was published (or `UNKNOWN`), and its bytes.
+    :param keep: called with each message of these topics: its topic with an absolute name, when
+        it came, when it was published (or `UNKNOWN`), and its bytes.
     :ivar topics: every topic in it.
     :ivar stamps: by topic that was asked for and is in it.
     :ivar stretches: from when to when messages came, of any topic, without a gap (``times``).

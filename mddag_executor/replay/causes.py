@@ -192,7 +192,7 @@ def _spans(rows: Ints, chain: Ints, is_source: Any) -> Ints:
     n, lengths = len(rows), rows[:, M_LENGTH]
     first = np.cumsum(lengths) - lengths
     of = np.repeat(np.arange(n), lengths)
-    is_last = np.zeros(len(chain), dtype=np.bool_)      # of its chain: it is told first
+    is_last = np.zeros(len(chain), dtype=np.bool_)      # of its chain: it stands first
     is_last[first[lengths > 0]] = True
     until = rows[of, M_UNTIL]
     ready, start, end = chain[:, L_READY], chain[:, L_START], chain[:, L_END]
@@ -341,7 +341,7 @@ MOST_BEHIND = 5
 
 
 def to_explain(found: Found) -> Ints:
-    """Return the parts of which it is to be told behind what they waited."""
+    """Return the parts for which to find what they waited behind."""
     parts, rows = found.parts, found.misses
     share = 10 * parts[:, P_NS] >= (rows[:, M_UNTIL] - rows[:, M_RELEASE])[parts[:, P_MISS]]
     which: Ints = np.flatnonzero(np.isin(parts[:, P_CAUSE], _WAITS) & share)

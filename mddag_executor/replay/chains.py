@@ -248,7 +248,7 @@ class Chains:
         first = np.cumsum(lengths) - lengths
         of = np.repeat(np.arange(len(lengths)), lengths)
         at, leg, ready, start, end, busy, group, _ = chain.T
-        is_last = np.zeros(len(chain), dtype=np.bool_)      # of its chain: it is told first
+        is_last = np.zeros(len(chain), dtype=np.bool_)      # of its chain: it stands first
         is_last[first[lengths > 0]] = True
         after = np.r_[0, ready[:-1]]
         published = np.where(is_last, completed[of], np.minimum(end, after))

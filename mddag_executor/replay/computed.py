@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 The simulator and the rescheduler keep a log: which worker began, ended or preempted what, and
 when.  Together with the load and with the ends of jobs that the core decided that is all that a
-recording has, so whoever is told of it finds the same verdicts again and, as with a recording,
+recording has, so every observer finds the same verdicts again and, as with a recording,
 where the time went.
 
 At one instant the ends of executions come first, then jobs that are given up, then releases, then

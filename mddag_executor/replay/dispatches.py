@@ -47,7 +47,7 @@ class Dispatches:
         interpreter: int = 1,
     ) -> int:
         """
-        Take in an execution; times in ns.
+        Add an execution; times in ns.
 
         :param worker: which one ran it, -1 where that is not known.
         :param group: what identifies its mutually exclusive callback group, or None.
@@ -69,7 +69,7 @@ class Dispatches:
         return len(self._start) - 1
 
     def holds(self, number: int) -> None:
-        """Take in that an execution holds the interpreter."""
+        """Note that an execution holds the interpreter."""
         self._holding.append(number)
 
     def late(self) -> Any:

@@ -5,7 +5,7 @@ Which jobs of an imported recording cannot be judged, because what they did may 
 
 Theory of operation
 -------------------
-A job that has not completed is told to be late or expired only where the recording shows it.  It
+A job that has not completed counts as late or expired only where the recording shows it.  It
 is in doubt where, at or after its release,
 
 * a callback of one of its vertices that has not completed ran, and nobody can tell for which job:
@@ -47,7 +47,7 @@ class Doubts:
 
     def ran_for_unknown(self, key: str, time: int, stamped: bool = False) -> None:
         """
-        Take in that a callback ran for a job that is not known.
+        Note that a callback ran for a job that is not known.
 
         :param stamped: whether the source timestamp of its message is known.
         """

@@ -57,7 +57,7 @@ class OwnDrift(Observer):
         self._running: dict[tuple[int, int], list[int]] = {}
 
     def handlers(self) -> Handlers:
-        """Return what takes in what is dropped."""
+        """Return the method for what is dropped."""
         return {_DROP: self._drop}
 
     def _drop(self, event: Event) -> None:
@@ -207,7 +207,7 @@ class ImportedDrift(LinkObserver):
         self._declared = bool(run.task_set.dags)
 
     def raw_handlers(self) -> Handlers:
-        """Return what takes in who there is, and what callbacks do."""
+        """Return the methods for who there is, and for what callbacks do."""
         return dict.fromkeys(self._census.handlers, self._census.take) if self._declared else {}
 
     def drift(self, judge: TaskSet) -> list[Drift]:

@@ -18,8 +18,8 @@ The events of the initialisation say which address is what.
 3. A subscription's callback is the one that was added to the rclcpp subscription of its handle;
    for communication within a process rclcpp adds a second one.  Both are the same callback here.
 4. A callback is described by its node and what starts it: timer and period, subscription and
-   topic, service and its name.  Several in one node that look the same are told apart by the order
-   in which they were made.
+   topic, service and its name.  Several in one node that look the same are distinguished by the
+   order in which they were made.
 """
 
 from __future__ import annotations

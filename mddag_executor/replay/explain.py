@@ -98,7 +98,7 @@ class Typical:
 
 class Explainer(Observer):
     """
-    Finds out why deadlines were missed; told after the judge.
+    Finds out why deadlines were missed; comes after the judge.
 
     :param jobs: whether to keep what is found of each job; else causes are counted only.
     """
@@ -138,7 +138,7 @@ class Explainer(Observer):
         self._counts = np.zeros((len(vertices) + 1, len(CAUSES)), dtype=np.int64)
         self._in_stalls: dict[tuple[int, int], int] = {}
 
-    # --- being told ------------------------------------------------------------------------------
+    # --- input -----------------------------------------------------------------------------------
 
     def was_dropped(self, vertex: int, job: int, reason: str) -> None:
         """Keep why it was dropped."""
@@ -296,7 +296,7 @@ class Explainer(Observer):
         """
         Return the result format of ``explain --json``.
 
-        :param sink: the global vertex of the only sink whose jobs are told of.
+        :param sink: the global vertex of the only sink whose jobs are wanted.
         :param job: the only job.
         """
         jobs = [each for found, waited in self._found

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What happened in a run, many things at once, and who is told of it.
+What happened in a run, many things at once, and who gets it.
 
 Theory of operation
 -------------------
@@ -15,9 +15,9 @@ coroutine was suspended in between; they have the same vertex, job and ready tim
 ends an execution of a declared callback; several in a row end the legs of a sync callback that ran
 only once (a simulator's).
 
-The judge (see ``judge``) is told first; what its core decides is put into the batch, for the
-others.  Who wants one thing after the other overrides the methods of ``Observer``; who can take
-them together, its ``take``.
+The judge (see ``judge``) is first; what its core decides is put into the batch, for the
+others.  An observer overrides the methods of ``Observer`` to get one thing after the other, or its
+``take`` to get a whole batch.
 """
 
 from __future__ import annotations
@@ -122,10 +122,10 @@ class Batch:
 
 
 class Observer:
-    """Is told what happened; does nothing with it."""
+    """Gets what happened, and does nothing with it."""
 
     def handlers(self) -> Handlers:
-        """Return what takes in events that say who is who, by full name."""
+        """Return the methods for events that say who is who, by full name."""
         return {}
 
     def take(self, batch: Batch) -> None:
@@ -151,34 +151,34 @@ class Observer:
             self.decided(batch.decisions[at:])
 
     def hosted(self, dag: int, vertices: set[int]) -> None:
-        """Hear that from here on the process has these (global) vertices of a DAG."""
+        """Note that from here on the process has these (global) vertices of a DAG."""
 
     def judging(self, release: int) -> None:
-        """Hear that from here on only jobs released at a time or later are judged."""
+        """Note that from here on only jobs released at a time or later are judged."""
 
     def was_dropped(self, vertex: int, job: int, reason: str) -> None:
-        """Hear that an execution of a (global) vertex was dropped before it ran."""
+        """Note that an execution of a (global) vertex was dropped before it ran."""
 
     def released(self, dag: int, job: int, release: int, now: int) -> None:
-        """Hear that a job was released; `now` is when the executor noticed it."""
+        """Note that a job was released; `now` is when the executor noticed it."""
 
     def started(
         self, dag: int, vertex: int, job: int, ready: int, start: int, callback: int
     ) -> None:
-        """Hear that an execution of a vertex was dispatched (or a coroutine went on)."""
+        """Note that an execution of a vertex was dispatched (or a coroutine went on)."""
 
     def ran(
         self, callback: int, dag: int, vertex: int, job: int, worker: int, ready: int, start: int,
         end: int, first: int,
     ) -> None:
-        """Hear that a callback ran; see ``Piece``."""
+        """Note that a callback ran; see ``Piece``."""
 
     def completed(
         self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, ready: int,
         start: int, ended: int, busy: int, number: int, cpu: int, held: int,
     ) -> None:
         """
-        Hear that an execution of a vertex has completed.
+        Note that an execution of a vertex has completed.
 
         :param whole: whether that completed the vertex, as the executor saw it.
         :param ready: of the execution, as ``start`` to ``number``: see ``Execution``; the same
@@ -188,30 +188,30 @@ class Observer:
         """
 
     def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
-        """Hear that a job was aborted or, else, has expired."""
+        """Note that a job was aborted or, else, has expired."""
 
     def withdrawn(self, dag: int, job: int) -> None:
-        """Hear that nobody can tell what became of a job: it is not to be judged."""
+        """Note that nobody can tell what became of a job: it is not to be judged."""
 
     def failed(self, dag: int, vertex: int, job: int, now: int) -> None:
-        """Hear that an execution of a vertex failed: its job does; told before it completes."""
+        """Note that an execution of a vertex failed, and with it its job, before it completes."""
 
     def missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> None:
-        """Hear of a miss as the executor saw it; `completed` is -1 where it never did."""
+        """Note a miss as the executor saw it; `completed` is -1 where it never did."""
 
     def published(
         self, publisher: int, callback: int, dag: int, vertex: int, job: int, ready: int, now: int
     ) -> None:
-        """Hear of a publication; the DAG is -1 where no declared callback did it."""
+        """Note a publication; the DAG is -1 where no declared callback did it."""
 
     def decided(self, decisions: Sequence[Decision]) -> None:
-        """Hear what the judge's core has decided."""
+        """Note what the judge's core has decided."""
 
     def finished(self, now: int, batch: Batch) -> None:
         """
-        Hear that the run has ended; what it had begun may still complete.
+        Note that the run has ended; what it had begun may still complete.
 
-        :param batch: is told after it; the judge puts in what the core decides.
+        :param batch: comes after it; the judge adds what the core decides.
         """
 
 
@@ -224,7 +224,7 @@ class Batches:
         self._rows: dict[int, list[tuple[int, ...]]] = {}
 
     def add(self, kind: int, *row: int) -> None:
-        """Take in what happened."""
+        """Add what happened."""
         self._order.append(kind)
         self._rows.setdefault(kind, []).append(row)
 

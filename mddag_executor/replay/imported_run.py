@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 A first pass over the trace finds out who is who (``entities``) and which of them the declaration
 means (``matching``).  The second links executions and messages (``linker``); jobs are made from
-what is linked, and the observers are told.
+what is linked, and go to the observers.
 
 1. *Releases.*  A timer is due at t_init + n * period (rcl keeps that grid, also after it was late
    by more than a period: it leaves out what it missed).  An execution's release is the last such
@@ -23,7 +23,7 @@ what is linked, and the observers are told.
 3. *Ready* is a timer's release, else the source timestamp (the publication, within a process):
    when a message has reached its reader is not recorded, so the way there counts as waiting.
 4. A job that has not completed `EXPIRE_AFTER_NS` past its latest deadline, and of which nothing
-   runs, is told to have expired, as the executor's core does it.  What is open at the end of the
+   runs, counts as expired, as in the executor's core does it.  What is open at the end of the
    recording is judged as of the last event.  A job of which nobody can tell what it did, because
    of what is missing in the recording (see ``doubts``), is withdrawn instead: it is not judged.
 """
@@ -176,7 +176,7 @@ class ImportedRun(LinkObserver):
         """
         Tell the observers everything, with the numbers of callbacks in place of addresses.
 
-        :param progress: told now and then how many events there have been.
+        :param progress: called now and then with the number of events so far.
         """
         self._batches = Batches(observers)
         self._tell = self._batches.add
@@ -436,7 +436,7 @@ class ImportedPaths(LinkObserver):
         self._number = 0
 
     def take(self, batch: Batch) -> None:
-        """Hand over what was told since the last batch."""
+        """Hand over what came since the last batch."""
         self.book.tell(self._order + 1, *(
             np.array(rows, dtype=np.int64).reshape(len(rows), width)
             for rows, width in zip(self._told, (7, 4, 7, 4))))

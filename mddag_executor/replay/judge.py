@@ -78,7 +78,7 @@ class Judge(Observer):
 
     :param task_set: the declaration that judges.
     :param compare: whether recorded misses must equal those found.
-    :param waits: knows what was waited for; told before.
+    :param waits: knows what was waited for; comes before.
     :param skip: how long after the first release jobs are not judged, ns.
     :param judge_from: jobs released before are not judged.
     """
@@ -190,7 +190,7 @@ class Judge(Observer):
                 self._waited[tuple(key)] = waited
 
     def _take_waited(self, batch: Batch, link: int) -> int:
-        """Return what an execution waited for its group, which is told once."""
+        """Return what an execution waited for its group, but only once."""
         dag, vertex, job, _, _, _, ready, *_ = batch.rows(COMPLETED)[link - self.chains.first]
         return self._waited.pop((dag, vertex, job, ready), 0)
 

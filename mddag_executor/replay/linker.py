@@ -37,7 +37,7 @@ subscriber may run before the tracer has recorded the stamp of the message that 
 5. `rmw_take` inside an execution is a message that the callback took itself (a queue edge).
 6. What does not fit (an end without a start, a start without an end, a message whose publication
    is not in the recording, a publisher's that lacks a tracepoint) is counted by callback or topic,
-   and the observer is told where nobody can tell what a callback ran for.
+   and the observer learns where it is not known what a callback ran for.
 
 Publications are kept until `KEEP` newer ones of their topic have come.
 """
@@ -133,27 +133,27 @@ class Publication:
 
 
 class LinkObserver(Observer):
-    """Is told, in the order of time, what the linker finds; does nothing with it."""
+    """Gets what the linker finds, in the order of time, and does nothing with it."""
 
     def raw_handlers(self) -> Handlers:
-        """Return what takes in events as they were recorded, by full name."""
+        """Return the methods for events as they were recorded, by full name."""
         return {}
 
     def began(self, run: Execution, message: Publication | None) -> None:
-        """Hear that an execution has begun, with the message that it runs for."""
+        """Note that an execution has begun, with the message that it runs for."""
 
     def sent(self, message: Publication) -> None:
-        """Hear that a message was published."""
+        """Note that a message was published."""
 
     def took(self, run: Execution, message: Publication) -> None:
-        """Hear that a running callback took a message itself."""
+        """Note that a running callback took a message itself."""
 
     def over(self, run: Execution) -> None:
-        """Hear that an execution has ended."""
+        """Note that an execution has ended."""
 
     def lost_sight(self, callback: Callback | None, run: Execution | None, time: int) -> None:
         """
-        Hear that something is not recorded.
+        Note that something is not recorded.
 
         :param callback: it ran, nobody can tell for what; None: events were discarded.
         :param run: its execution, where only the end is not recorded.

@@ -112,9 +112,9 @@ class _Jobs:
 
 class LoadBuilder(Observer):
     """
-    Collects a load while it is told what happened.
+    Collects a load from what happened.
 
-    :param who: who is who, as far as the recording has told.
+    :param who: who is who, as far as the recording says.
     :param n_workers: how many workers it was recorded with.
     :param cpus: how many there were; 0: not known.
     """

@@ -13,7 +13,7 @@ found by its node's name and by what starts it:
 * a subscription, and each leg of a sync callback, by its topic,
 * a service by its name.
 
-Several that look the same are told apart by order: in the file, and in which they were made.  A
+Several that look the same are distinguished by order: in the file, and in which they were made.  A
 node that was started more than once, or in several processes, is matched each time.
 """
 

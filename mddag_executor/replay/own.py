@@ -130,7 +130,7 @@ class OwnRun:
         """
         Tell the observers everything.
 
-        :param progress: told now and then how many events there have been.
+        :param progress: called now and then with the number of events so far.
         """
         self._observers = observers
         who = merged([dict.fromkeys(self.who.who, self.who.take),

@@ -128,7 +128,7 @@ class OwnPaths(Observer):
 
 
 class _Book(PathBook):
-    """The paths; messages are told by their job, and the vertex and topic that published them."""
+    """The paths; a message is known by its job, and the vertex and topic that published it."""
 
     def __init__(self, task_set: TaskSet) -> None:
         super().__init__(task_set)

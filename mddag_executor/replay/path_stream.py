@@ -60,7 +60,7 @@ class CaseBook:
 
     def add(self, start: Column, end: Column, least_start: int, least_end: int) -> None:
         """
-        Take in flows, and count what is complete.
+        Add flows, and count what is complete.
 
         :param start: of each flow, -1 where it has none: it is left out.
         :param end: of each flow, -1 where it did not arrive.

@@ -48,12 +48,12 @@ HopKind = Literal['trigger', 'topic', 'variable']
 SETTLE = 1 << 18
 """Events from which on steps are made of them, and flows that are over are taken out."""
 KEPT = 1024
-"""Executions and messages of a place that may still be referred to, unless told otherwise."""
+"""Executions and messages of a place that may still be referred to, by default."""
 LAG_NS = 1_000_000_000
-"""Nothing is told later than this after it happened."""
+"""Nothing comes later than this after it happened."""
 _ORDER = 40     # bits of an event's number in the order
 
-# Columns of what is told; all begin with the place in the order and the callback's number.
+# Columns of the input; all begin with the place in the order and the callback's number.
 S_RUN, S_TIME, S_TOPIC, S_MESSAGE, S_VERTEX, _N_STARTED = range(2, 8)
 _E_RUN, _E_TIME, _N_ENDED = range(2, 5)
 _U_NODE, _U_RUN, _U_TOPIC, _U_MESSAGE, _U_TIME, _N_PUBLISHED = range(2, 8)
@@ -90,10 +90,10 @@ class _Place:
 
 class PathBook:
     """
-    Collects the flows along the declared paths while it is told what happened, in order of time.
+    Collects the flows along the declared paths from what happened, in order of time.
 
-    Callbacks, topics and nodes are told by their numbers, executions and messages by any that
-    tell them apart; -1 stands for none.
+    Callbacks, topics and nodes are given by their numbers, executions and messages by any
+    numbers that differ; -1 stands for none.
 
     :param kept: how many executions and messages of a place may still be referred to.
     """
@@ -104,7 +104,7 @@ class PathBook:
         self.callbacks = task_set.places()
         self.nodes = {node: i for i, node in enumerate(
             dict.fromkeys(c.node for c in task_set.callbacks))}
-        #: The topics that paths lead over; publications on others need not be told.
+        #: The topics that paths lead over; publications on others are not needed.
         self.topics = {topic: i for i, topic in enumerate(sorted(
             {topic for path in self.hops for hop in path for topic in hop.topics}))}
         self.on_path = {key for path in self.paths for key in path.callbacks}
@@ -136,7 +136,7 @@ class PathBook:
             place.topics = [self.topics[topic] for topic in path_hops[position].topics]
         return place
 
-    # --- what is told ----------------------------------------------------------------------------
+    # --- input -----------------------------------------------------------------------------------
 
     def tell(
         self, length: int, started: Ints, ended: Ints, published: Ints,
@@ -173,7 +173,7 @@ class PathBook:
     # --- steps -----------------------------------------------------------------------------------
 
     def _round(self) -> None:
-        """Make steps of what was told."""
+        """Make steps of the input."""
         told = [np.concatenate(each) if each else np.empty((0, width), dtype=np.int64)
                 for each, width in zip(
                     self._told, (_N_STARTED, _N_ENDED, _N_PUBLISHED, _N_TOOK))]
@@ -311,7 +311,7 @@ class PathBook:
             place.messages[:, 2] = numbers[place.messages[:, 2]]
 
     def figures(self) -> list[dict[str, Any]]:
-        """Return the figures of each path, once everything has been told."""
+        """Return the figures of each path, once all input is there."""
         if self._results is None:
             self._round()
             self._settle(True)

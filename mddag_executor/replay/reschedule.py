@@ -208,7 +208,7 @@ def reschedule(
         recording, or none.
     :param dispatch_overhead: added to each execution, ns.
     :param name: what messages call the trace, where that is not its path.
-    :param progress: told now and then how many events have been read.
+    :param progress: called now and then with the number of events read so far.
     :param skip: how long after the first release jobs are not judged (a warm-up), ns.
     :param cpus: that those who compute share; None: as recorded, enough where that is not known.
     :raises mddag_executor.trace.TraceError: when it is no trace.

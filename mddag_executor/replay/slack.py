@@ -287,7 +287,7 @@ def find_slack(
     """
     Find the greatest factors of all callbacks, and of all together.
 
-    :param progress: told how many callbacks are done.
+    :param progress: called with the number of callbacks that are done.
     :param jobs: how many processes search, where it is not quick.
     """
     search = Search(problem)

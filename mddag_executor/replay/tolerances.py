@@ -36,7 +36,7 @@ NOTHING_DUE = 'no job was due at any sink, so no deadline was judged'
 
 
 class Runs:
-    """A set of numbers, told in any order, as runs of consecutive ones: memory is that of runs."""
+    """A set of numbers, added in any order, as runs of consecutive ones; only runs take memory."""
 
     def __init__(self) -> None:
         self._new = array('q')

@@ -101,7 +101,7 @@ class Usage(Observer):
     """
     Adds up what ran.
 
-    What was waited for ``waits`` knows, which is told before.
+    ``waits``, which comes before, knows what was waited for.
     An execution of a declared callback counts when it has completed; what it took so far counts
     at once, also where it never completed.
     """

@@ -20,7 +20,7 @@ class GroupWaits(Observer):
 
     Told before those who ask it.
 
-    :ivar found: of the batch that was told last: by piece, how long its group was busy, ns.
+    :ivar found: of the last batch: by piece, how long its group was busy, ns.
     """
 
     def __init__(self, who: Census) -> None:

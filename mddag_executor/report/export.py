@@ -99,7 +99,7 @@ class JobRow(NamedTuple):
 
 class Ran(NamedTuple):
     """
-    An execution that is to be told.
+    An execution to export.
 
     ``legs`` are those of its vertex that it completed (none: it was not its last piece, or never
     did), ``whole`` whether it completed the vertex, which then publishes.
@@ -142,7 +142,7 @@ class Exporter(Observer):
         self._origin: int | None = None
 
     def of(self, replay: Replay) -> list[Observer]:
-        """Export a replay: return what is told of the run, after the judge."""
+        """Export a replay: return the observers to come after the judge."""
         self._name_of = replay.run.who.name
         return self._begin(replay.task_set, replay.judge)
 

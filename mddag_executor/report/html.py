@@ -63,7 +63,7 @@ class Watch:
         self.usage: Usage
 
     def of(self, replay: Replay) -> list[Observer]:
-        """Watch a replay: return what is told of the run, after the judge."""
+        """Watch a replay: return the observers to come after the judge."""
         return self._watch(replay.judge, replay.usage, replay.run.who.name)
 
     def _watch(

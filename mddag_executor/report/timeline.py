@@ -5,7 +5,7 @@ What ran when, kept for pictures: every execution while there is room, and sums 
 
 Theory of operation
 -------------------
-``Timeline`` is told what the judge of a replay is told, and needs as much memory however long the
+``Timeline`` gets what the judge of a replay gets, and needs as much memory however long the
 run was:
 
 1. *Detail.*  Executions, releases and verdicts go into blocks of ``BLOCK`` executions, in the
@@ -178,7 +178,7 @@ class Timeline(Observer):
         self._undeclared: dict[int, int] = {}
         self._name_of = names
 
-    # --- what is told ----------------------------------------------------------------------------
+    # --- input -----------------------------------------------------------------------------------
 
     def _decided(self, decisions: Sequence[Decision], filled: int) -> None:
         """Keep verdicts; so many executions were in the open block then."""

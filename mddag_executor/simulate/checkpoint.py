@@ -53,7 +53,7 @@ class Checkpoint:
 
     def restore(self, outcome: Evaluation) -> None:
         """
-        Take in what was done before, if there is such a file.
+        Read what was done before, if there is such a file.
 
         :raises InputError: it is damaged, or from another evaluation.
         :raises OSError: it cannot be read.

@@ -122,7 +122,7 @@ def usable(
     """
     Yield the blocks of the data section that count, in the order of the file (rules 6 and 7).
 
-    :param twice: takes in the offsets of chunks that are left out
+    :param twice: gets the offsets of chunks that are left out
     :raises Damage: as ``scan`` does, and where chunks are missing
     """
     index = list(summary.index) if summary and summary.index is not None else None

@@ -76,9 +76,9 @@ class Runs:
 
 class Census:
     """
-    Takes in events (tuples as ``TraceReader.events`` yields them) in the order of time.
+    Collects events (tuples as ``TraceReader.events`` yields them), in the order of time.
 
-    ``handlers`` has what takes in which event, by full name.
+    ``handlers`` has the method for each event, by full name.
 
     :param keep_times: how many times of each callback's runs to keep.
     """
@@ -101,7 +101,7 @@ class Census:
         self._groups: dict[int, int] | None = None      # None: something new has come
         self._names: dict[int, str] | None = None
         self._running: dict[tuple[int, int], list[tuple[Address, int]]] = {}
-        #: What takes in who there is.
+        #: The methods for events that say who there is.
         self.who: dict[str, Callable[[Event], None]] = {
             'ros2:rcl_node_init': self._node,
             'ros2:rcl_publisher_init': self._publisher,

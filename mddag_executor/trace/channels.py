@@ -73,7 +73,7 @@ class Channels:
 
     def add_schema(self, content: bytes) -> None:
         """
-        Take in the content of a schema record.
+        Add the content of a schema record.
 
         :raises ValueError: where it is malformed, or defines a known schema anew
         """
@@ -85,7 +85,7 @@ class Channels:
 
     def add_channel(self, content: bytes) -> None:
         """
-        Take in the content of a channel record.
+        Add the content of a channel record.
 
         :raises ValueError: where it is malformed, or defines a known channel anew
         """

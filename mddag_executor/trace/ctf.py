@@ -78,7 +78,7 @@ def import_ctf(
 
     :param session: the folder of the session; traces are looked for in all folders below it
     :param output: the trace; it is not complete when an exception comes up
-    :param progress: told now and then how many events there have been
+    :param progress: called now and then with the number of events so far
     :raises TraceError: where the session or the file cannot be used, or babeltrace2 is missing
     """
     path = os.fspath(session)
