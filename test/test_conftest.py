@@ -64,16 +64,17 @@ def test_an_exception_in_a_thread_fails_the_test(suite: Path) -> None:
 @pytest.mark.parametrize('options', [(), ('-n', '1')], ids=['', 'xdist'])
 def test_what_is_left_behind_is_found(suite: Path, options: tuple[str, ...]) -> None:
     (suite / 'test_it.py').write_text(
-        'import os, subprocess, tempfile\n'
+        'import subprocess, sys, tempfile\n'
+        'STAYS = "import time; print(flush=True); time.sleep(123)"\n'
         'def test_leaves(tmp_path):\n'
         '    open(tempfile.gettempdir() + "/forgotten", "w").close()\n'
-        '    child = subprocess.Popen(["sh", "-c", "echo; exec sleep 123"], stdout=-1)\n'
+        '    child = subprocess.Popen([sys.executable, "-c", STAYS], stdout=-1)\n'
         '    child.stdout.readline()\n')
     place = suite / 'tmp'
     place.mkdir()
     result = run(suite, *options, TMPDIR=str(place))
     assert '1 passed, 1 error' in result.stdout
-    assert 'sleep 123' in result.stdout and "'forgotten'" in result.stdout
+    assert 'time.sleep(123)' in result.stdout and "'forgotten'" in result.stdout
     assert [*place.iterdir()] == []
 
 
