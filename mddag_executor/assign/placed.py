@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from itertools import islice
+from itertools import accumulate, islice
 
 from mddag_executor.assign.placement import Placing, TRANSPORT_NS
 from mddag_executor.core import NEVER, Tables, Tally
@@ -29,13 +29,18 @@ from mddag_executor.core.jobs import finish
 from mddag_executor.core.state import divide, new_state
 from mddag_executor.core.tally import total
 from mddag_executor.simulate import engine
-from mddag_executor.simulate.deliveries import Deliveries, edges_of, Transports
+from mddag_executor.simulate.deliveries import (
+    DELAY_NS,
+    Deliveries,
+    edge_numbers,
+    edges_of,
+    Transports,
+)
 from mddag_executor.simulate.machine import Machine
 from mddag_executor.simulate.workload import periodic_load
 from msg_graph import Process, TaskSet
 
 CALLBACK_NS = 100_000
-DELAY_NS = 300_000
 MOST_TRIES = 150
 _AHEAD = 40
 
@@ -93,18 +98,16 @@ class Predictor:
         """Return execution times and messages with what they take more (rule 3)."""
         times = [[ns + CALLBACK_NS for ns in row] for row in execution_ns]
         delays: list[int] = []
-        base = []
-        for dag, row in zip(self._task_set.dags, times):
-            base.append(len(delays))
-            for vertex in dag.vertices:
-                first = tables.first_vertex[dag.index]
-                here = tables.process[first + vertex.index]
-                away = [tables.process[first + v] != here for v in vertex.successors]
-                for after, leaves in zip(vertex.successors, away):
-                    row[after] += TRANSPORT_NS * leaves
-                    delays.append(DELAY_NS * leaves)
-                row[vertex.index] += TRANSPORT_NS * any(away)
-            assert len(delays) - base[-1] == edges_of(tables)[dag.index]
+        sends = set()
+        for vertex, after in edge_numbers(tables):
+            leaves = tables.process[vertex] != tables.process[after]
+            times[tables.dag_of[after]][tables.index_in_dag[after]] += TRANSPORT_NS * leaves
+            delays.append(DELAY_NS * leaves)
+            if leaves:
+                sends.add(vertex)
+        for vertex in sends:
+            times[tables.dag_of[vertex]][tables.index_in_dag[vertex]] += TRANSPORT_NS
+        base = list(accumulate(edges_of(tables), initial=0))[:-1]
         return times, Transports(delays, base, [0] * len(base))
 
 

@@ -187,3 +187,12 @@ class Placing:
         return tuple(
             Process(f'p{i}', tuple(n for n in self.nodes if place[self._block[n]] == process))
             for i, process in enumerate(order, 1))
+
+
+def packed(
+    task_set: TaskSet, n: int, execution_ns: Sequence[Sequence[int]],
+    together: Iterable[Sequence[str]] = (),
+) -> tuple[Process, ...]:
+    """Return the nodes of a task set packed into N processes; see ``Placing``."""
+    placing = Placing(task_set, n, execution_ns, together)
+    return placing.processes(placing.place())

@@ -14,7 +14,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from mddag_executor.cli import bags, options
+from mddag_executor.cli import bags, common, options
 from mddag_executor.cli.text import Progress
 from mddag_executor.core import POLICIES
 from mddag_executor.core import policy as find_policy
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from mddag_executor.replay.bags_reschedule import BagReschedule
     from mddag_executor.replay.happenings import Observer
     from mddag_executor.replay.run import Recording
-    from msg_graph import TaskSet
+    from msg_graph import Process, TaskSet
 
 _ONLY_RESCHEDULED = (
-    'workers', 'cpus', 'policy', 'preemptive', 'overheads', 'execution_times', 'seed')
+    'workers', 'cpus', 'processes', 'policy', 'preemptive', 'overheads', 'execution_times', 'seed')
 
 
 def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
@@ -36,10 +36,14 @@ def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
     add = parser.add_argument
     add('--reschedule', action='store_true', help=what)
     add('--workers', type=options.positive_int, metavar='M',
-        help='with --reschedule: threads that run callbacks (default: as recorded)')
+        help='with --reschedule: threads that run callbacks, of each process (default: as '
+        'recorded)')
     add('--cpus', type=options.positive_int, metavar='C',
         help='with --reschedule: CPUs that callbacks which compute share (default: as recorded, '
         'else enough for all)')
+    add('--processes', metavar='N|FILE',
+        help='with --reschedule: the nodes in N processes, packed by the recorded times, or in '
+        'those of a YAML file with `processes:` (default: as recorded)')
     add('--policy', metavar='P',
         help=f'with --reschedule: one of {", ".join(POLICIES)} (default: as recorded)')
     add('--preemptive', action=argparse.BooleanOptionalAction,
@@ -66,6 +70,8 @@ def check(args: argparse.Namespace, *files: str | None) -> None:
     """
     if args.policy is not None:
         find_policy(args.policy)
+    if args.processes == '0':
+        raise UsageError('--processes 0: give 1 or more, or a file')
     bags.check(args, *files)
     if args.reschedule:
         if getattr(args, 'callbacks', False):
@@ -125,6 +131,9 @@ def rescheduled(
     :raises mddag_executor.errors.MddagError: where that cannot be
     """
     if isinstance(path, str) and is_bag(path):
+        if args.processes is not None:
+            raise UsageError('--processes: an ordinary bag does not say what computes: leave the '
+                             'option out')
         return bags.reschedule_bag(args, path, name, task_set)
     if args.execution_times is not None:
         raise UsageError('--execution-times: a trace has its own: leave the option out')
@@ -137,4 +146,19 @@ def rescheduled(
         return reschedule(
             path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
             overheads=recorded, dispatch_overhead=0 if recorded else args.overheads, name=name,
-            progress=line.events, skip=args.skip, cpus=args.cpus)
+            progress=line.events, skip=args.skip, cpus=args.cpus, processes=_processes(args))
+
+
+def _processes(
+    args: argparse.Namespace
+) -> Callable[[TaskSet, list[list[int]]], Sequence[Process]] | None:
+    """Return what tells which node runs in which process, as `--processes` says."""
+    from msg_graph.processes import load_processes
+    given = args.processes
+    if given is None:
+        return None
+    if given.isdecimal():
+        from mddag_executor.assign.placement import packed
+        return lambda task_set, times: packed(task_set, int(given), times)
+    name, text = common.read_text(given)
+    return lambda task_set, times: load_processes(text, name, task_set)

@@ -153,14 +153,13 @@ def _place(
     together: Sequence[Sequence[str]],
 ) -> TaskSet:
     """Place the nodes in N processes; what one program brings stays together."""
-    from mddag_executor.assign.placement import Placing
+    from mddag_executor.assign.placement import packed
     from mddag_executor.simulate.workload import draw_execution_times
     times = draw_execution_times(task_set, args.seed, undeclared=0) if plan is None else [
         [plan.execution_ns(v.dag, v.index) for v in dag.vertices] for dag in task_set.dags]
     declared = {callback.node for callback in task_set.callbacks}
-    placing = Placing(task_set, n, times, [
-        group for each in together if (group := [node for node in each if node in declared])])
-    return with_processes(task_set, placing.processes(placing.place()))
+    return with_processes(task_set, packed(task_set, n, times, [
+        group for each in together if (group := [node for node in each if node in declared])]))
 
 
 def _process_of(task_set: TaskSet, spec: str, nodes: Sequence[str]) -> str:

@@ -30,7 +30,7 @@ class Dispatches:
     """
     Collects executions, in the order of their ends on each worker, and tells how late they were.
 
-    :param n_workers: how many there were.
+    :param n_workers: how many there were in each process.
     """
 
     def __init__(self, n_workers: int) -> None:
@@ -78,9 +78,13 @@ class Dispatches:
         free, start, end, worker = (
             np.array(column, dtype=np.int64) for column in (
                 self._free, self._start, self._end, self._worker))
-        n_free, n_ended = (
-            np.searchsorted(np.sort(times), free, 'right') for times in (free, end))
-        could = np.where(n_free - n_ended <= self._n_workers, free, worker)
+        process = np.array(self._interpreter, dtype=np.int64)
+        could = worker.copy()
+        for number in np.unique(process).tolist():
+            here = process == number
+            n_free, n_ended = (
+                np.searchsorted(np.sort(times[here]), free, 'right') for times in (free, end))
+            could = np.where(here & (n_free - n_ended <= self._n_workers), free, could)
         if self._holding:
             self._for_interpreter(start, end, could)
         return np.maximum(0, start - could)

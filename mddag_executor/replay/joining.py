@@ -43,7 +43,7 @@ from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceFile, TraceReader
 from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.schema import EVENTS
-from msg_graph import Dag
+from msg_graph import Dag, Process
 
 SAME_CLOCK = 500_000_000
 SAME_RELEASE = 100_000
@@ -84,6 +84,8 @@ class _Part:
                 else:
                     self.judges_from = event[4]
         self.shift = 0
+        self.label = os.path.basename(name).removesuffix('.mcap').rpartition('.')[2]
+        self.nodes: dict[str, None] = {}
         self.first_worker = 0
         self.first_spare = 0
         self.last = 0
@@ -163,10 +165,12 @@ class Joined:
                 f'{self.name}: they are of several machines, whose clocks are taken as '
                 'synchronised')
         self._workers = workers
+        #: How many workers each process has, at most.
+        self.workers_each = max(part.head.workers for part in self._parts)
         #: Which worker is of which process: by the last word of its trace's name.
         self.worker_names = [
-            f'{os.path.basename(part.name).removesuffix(".mcap").rpartition(".")[2]} {worker}'
-            for part in self._parts for worker in range(part.head.workers)]
+            f'{part.label} {worker}' for part in self._parts
+            for worker in range(part.head.workers)]
         # of each DAG: releases with their numbers, and in which parts they have been seen
         self._releases: list[deque[tuple[int, int, set[int]]]] = [
             deque(maxlen=_KEPT) for _ in self.task_set.dags]
@@ -204,6 +208,12 @@ class Joined:
                 file.add(_SHUTDOWN, end, 0, 0, end)
         self._say(end)
 
+    def placed(self) -> list[Process]:
+        """Return which nodes ran in which process, once the joined trace is written."""
+        if self.task_set.processes:
+            return list(self.task_set.processes)
+        return [Process(part.label, tuple(part.nodes)) for part in self._parts]
+
     def _told(self, part: _Part, event: Event) -> Event | None:
         """Return an event as it is in the joined trace, None where it is not."""
         name = event[0]
@@ -219,6 +229,9 @@ class Joined:
         if number is None:
             return event if event[at_dag] < 0 else None
         job = event[at_dag], number
+        if name == _DISPATCH and 0 <= event[at_dag + 1] < len(self._legs[event[at_dag]]):
+            vertex = self.task_set.dags[event[at_dag]].vertices[event[at_dag + 1]]
+            part.nodes[vertex.callback.node] = None
         if name == _COMPLETE and job in part.open:
             part.open[job] -= 1
             if part.open[job] <= 0:

@@ -45,7 +45,7 @@ from mddag_executor.core import legs_of, quantile, Tables
 from mddag_executor.replay.dispatches import Dispatches
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.simulate import Load
-from mddag_executor.simulate.deliveries import edge_numbers, edges_of, Transports
+from mddag_executor.simulate.deliveries import DELAY_NS, edge_numbers, edges_of, Transports
 from mddag_executor.trace.census import Census
 from msg_graph import Dag, TaskSet
 
@@ -115,23 +115,27 @@ class LoadBuilder(Observer):
     Collects a load from what happened.
 
     :param who: who is who, as far as the recording says.
-    :param n_workers: how many workers it was recorded with.
+    :param n_workers: how many workers each process was recorded with.
     :param cpus: how many there were; 0: not known.
+    :param recorded: by vertex the process that it ran in, from 1; None: all in one.
     """
 
     def __init__(
-        self, task_set: TaskSet, tables: Tables, who: Census, n_workers: int, cpus: int = 0
+        self, task_set: TaskSet, tables: Tables, who: Census, n_workers: int, cpus: int = 0,
+        recorded: Sequence[int] | None = None,
     ) -> None:
         self._task_set = task_set
         self._first = tables.first_vertex
         self._declared_group = tables.group
         self._who = who
-        self._process = tables.process
+        self._tables = tables
+        self._process = [*(recorded or [1] * tables.n_vertices), 1]
         self._cpus = cpus
         self._jobs = [_Jobs(dag, n) for dag, n in zip(task_set.dags, edges_of(tables))]
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
-        # when each round of timers ended
+        # when each round of timers ended, and the last one of each process
         self._rounds = array('q')
+        self._last_round: dict[int, int] = {}
         # by global vertex and leg: the edge (number in its DAG) that its message makes true
         numbers = edge_numbers(tables)
         self._edges_into = [
@@ -153,10 +157,12 @@ class LoadBuilder(Observer):
         """Add a job."""
         number = _UNKNOWN
         if self._timer[dag]:
-            if not self._rounds or release > self._rounds[-1]:
+            process = self._process[self._tables.source[dag]]
+            number = self._last_round.get(process, _UNKNOWN)
+            if number < 0 or release > self._rounds[number]:
+                number = self._last_round[process] = len(self._rounds)
                 self._rounds.append(now)
-            self._rounds[-1] = now
-            number = len(self._rounds) - 1
+            self._rounds[number] = now
         self._jobs[dag].add(job, release, now, number)
 
     def ran(
@@ -240,13 +246,26 @@ class LoadBuilder(Observer):
         if row is not None:
             self._failed.add((vertex, row))
 
-    def build(self, overheads: bool = True) -> RecordedLoad:
-        """Return what was collected."""
+    def times(self) -> list[list[int]]:
+        """Return by DAG and vertex what an execution takes, 0 where nothing says it."""
+        typical = self._typical()
+        return [[typical.get(vertex.callback.key, 0) for vertex in dag.vertices]
+                for dag in self._task_set.dags]
+
+    def build(
+        self, overheads: bool = True, process: Sequence[int] | None = None
+    ) -> RecordedLoad:
+        """
+        Return what was collected.
+
+        :param process: by vertex the process that it is to run in; None: as recorded.
+        """
         import numpy as np
         if self._leg is not None:
             self._others.append(self._leg[1])
             self._leg = None
         self._take_back()
+        process = process or self._process
         typical = self._typical()
         unknown: dict[str, None] = {}
         estimated = 0
@@ -274,7 +293,7 @@ class LoadBuilder(Observer):
                         unknown[key] = None
                     took[missing[:, vertex.index], vertex.index] = typical.get(key, 0)
             demand += int(took.sum())
-            self._computing(dag, jobs, took, missing, computed, holds)
+            self._computing(dag, jobs, took, missing, computed, holds, process)
             if overheads:
                 added = late[np.array(jobs.dispatch, dtype=np.int64).reshape(-1, jobs.size)]
                 took += added
@@ -287,7 +306,7 @@ class LoadBuilder(Observer):
                      for _, took, number in others)
         computed += [_UNKNOWN] * len(others)
         holds += [0] * len(others)
-        transports, transport = self._transports(overheads)
+        transports, transport = self._transports(overheads, process)
         return RecordedLoad(
             self._load(costs, bases, [ready for ready, _, _ in others], overheads)._replace(
                 holds=holds if any(holds) else []),
@@ -319,7 +338,7 @@ class LoadBuilder(Observer):
 
     def _computing(
         self, dag: Dag, jobs: _Jobs, took: Any, missing: Any, computed: list[int],
-        holds: list[int],
+        holds: list[int], process: Sequence[int],
     ) -> None:
         """Add what the executions of a DAG computed, and which held the interpreter."""
         import numpy as np
@@ -337,7 +356,7 @@ class LoadBuilder(Observer):
                 held[:, v] = vertex.callback.holds_interpreter
                 if vertex.callback.holds_interpreter:
                     cpu[~known, v] = took[~known, v]
-            held[:, v] *= self._process[self._first[dag.index] + v]
+            held[:, v] *= process[self._first[dag.index] + v]
         computed.extend(cpu.ravel().tolist())
         holds.extend(held.ravel().tolist())
 
@@ -356,30 +375,52 @@ class LoadBuilder(Observer):
             [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases], costs,
             bases, [*(jobs.size for jobs in self._jobs), 1], [r[3] for r in releases])
 
-    def _transports(self, overheads: bool) -> tuple[Transports, int | None]:
-        """Return the transports by job, and the median of all that were measured."""
+    def _transports(
+        self, overheads: bool, process: Sequence[int]
+    ) -> tuple[Transports, int | None]:
+        """
+        Return the transports by job, and the median of all that were measured.
+
+        Where an edge is to cross from one process to another and did not, or did and is not to,
+        it takes what is usual of such edges.
+        """
         import numpy as np
-        delays: list[int] = []
-        bases: list[int] = []
-        measured = []
-        for jobs in self._jobs:
-            bases.append(len(delays))
-            if jobs.n_edges == 0:
-                continue
+        delays: list[Any] = []
+        measured: dict[bool, list[Any]] = {False: [np.zeros(0)], True: [np.zeros(0)]}
+        changed: list[tuple[Any, bool]] = []
+        for jobs, crosses in zip(self._jobs, self._crossings(process)):
             start, end = (np.array(column, dtype=np.int64).reshape(-1, jobs.size)
                           for column in (jobs.start, jobs.end))
-            arrived = np.array(jobs.arrived, dtype=np.int64).reshape(-1, jobs.n_edges)
+            arrived = np.array(jobs.arrived, dtype=np.int64).reshape(
+                len(jobs.numbers), jobs.n_edges)
             ended = end[:, jobs.publishers]
             found = arrived - ended
             known = (arrived >= start[:, jobs.publishers]) & (ended >= 0)
-            for edge in range(jobs.n_edges):
+            for edge, (before, after) in enumerate(crosses):
                 column = found[known[:, edge], edge]
                 found[~known[:, edge], edge] = np.median(column) if len(column) else 0
-            measured.append(found[known])
-            delays.extend((found if overheads else np.zeros_like(found)).ravel().tolist())
-        everything = np.concatenate([[], *measured])
-        return (Transports(delays, bases, [jobs.n_edges for jobs in self._jobs]),
+                measured[before].append(column)
+                if before != after:
+                    changed.append((found[:, edge], after))
+            delays.append(found)
+        usual = {after: np.concatenate(each) for after, each in measured.items()}
+        for view, after in changed:
+            times = usual[after]
+            view[:] = np.median(times) if len(times) else DELAY_NS * after
+        bases = np.cumsum([0, *(each.size for each in delays)]).tolist()[:-1]
+        flat = np.concatenate([each.ravel() for each in delays] or [np.zeros(0, dtype=np.int64)])
+        everything = np.concatenate(list(usual.values()))
+        return (Transports((flat if overheads else np.zeros_like(flat)).tolist(), bases,
+                           [jobs.n_edges for jobs in self._jobs]),
                 int(np.median(everything)) if len(everything) else None)
+
+    def _crossings(self, process: Sequence[int]) -> list[list[tuple[bool, bool]]]:
+        """Return by DAG for each edge whether it left its process, and whether it is to."""
+        found: list[list[tuple[bool, bool]]] = [[] for _ in self._jobs]
+        was = self._process
+        for a, b in edge_numbers(self._tables):
+            found[self._tables.dag_of[a]].append((was[a] != was[b], process[a] != process[b]))
+        return found
 
     def _typical(self) -> dict[str, int]:
         """Return by callback the median of its recorded times, or else the declared mean."""

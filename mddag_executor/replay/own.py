@@ -54,7 +54,7 @@ from mddag_executor.trace.census import Census
 from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.events import Events
 from mddag_executor.trace.times import FAR_NS
-from msg_graph import TaskSet
+from msg_graph import Process, TaskSet
 import numpy as np
 
 _KEEP_UNDECLARED = 4096
@@ -106,8 +106,11 @@ class OwnRun:
         #: The run's end, ns: as recorded, or the last thing that the executor's core saw.
         self.end = 0
         self.shut_down = False
-        #: How many processes' traces are in it; each has workers of its own.
+        #: How many processes' traces are in it; each has so many workers of its own.
         self.processes = 1
+        self.workers_each = head.workers
+        #: Which nodes ran in which of them; empty: all in one.
+        self.placed: Sequence[Process] = ()
         #: The greatest time of an event, ns.
         self.last = 0
         #: Called when it has been played.

@@ -10,20 +10,23 @@ took, and how long the executor took to notice, to dispatch and to carry message
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
-from mddag_executor.core import NEVER, POLICIES, Tables
+from mddag_executor.core import NEVER, POLICIES, processes_of, Tables
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import Decision, JUDGE_FROM, new_state
+from mddag_executor.core.state import Decision, divide, JUDGE_FROM, new_state
 from mddag_executor.errors import UsageError
 from mddag_executor.memory import no_garbage
 from mddag_executor.replay.as_recorded import Progress, recording_result, Replay
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.groups import with_groups
 from mddag_executor.replay.load import LoadBuilder, RecordedLoad
+from mddag_executor.replay.own import OwnRun
 from mddag_executor.replay.recording import Head, ReplayError
-from mddag_executor.replay.run import open_run, Recording
+from mddag_executor.replay.run import open_run, Recording, Run
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import engine, LogEntry
@@ -31,13 +34,13 @@ from mddag_executor.simulate.deliveries import Deliveries, edge_numbers
 from mddag_executor.simulate.engine import busy_times
 from mddag_executor.simulate.machine import Machine
 from mddag_executor.text import counted, listed
-from msg_graph import TaskSet
+from msg_graph import Process, TaskSet
 
 MAX_WORKERS = 4096
 
 
 class How(NamedTuple):
-    """How a recorded load is scheduled; see ``Reschedule``."""
+    """How a recorded load is scheduled, with so many workers in each process."""
 
     policy: str
     workers: int
@@ -45,6 +48,7 @@ class How(NamedTuple):
     dispatch_overhead: int
     judge_from: int
     cpus: int | None
+    processes: int = 1
 
     def schedule(
         self, work: RecordedLoad, tables: Tables, end: int, log: list[LogEntry] | None = None,
@@ -53,8 +57,11 @@ class How(NamedTuple):
         """Run the core over a load; return what it decided."""
         policy = find_policy(self.policy)
         state = new_state(
-            tables, self.workers, preemptive=policy.mode(self.preemptive), propagate=2,
+            tables, self.workers * self.processes, propagate=2,
+            preemptive=policy.mode(self.preemptive, self.processes),
             dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
+        if self.processes > 1:
+            divide(state, [self.workers] * self.processes)
         state.scalars[JUDGE_FROM] = self.judge_from
         load = work.load
         stops = bool(load.holds) or self.cpus is not None
@@ -74,6 +81,8 @@ class Reschedule:
     What the core makes of a recorded load.
 
     :ivar recorded: the same recording as it was.
+    :ivar processes: which nodes run in which process; empty: all in one.
+    :ivar workers: of all processes.
     :ivar log: every start, end and preemption, on the trace's clock.
     :ivar decisions: what the core decided.
     :ivar warnings: what is missing or doubtful, one line each.
@@ -83,6 +92,7 @@ class Reschedule:
         self, recorded: Replay, work: RecordedLoad, tables: Tables, policy: str, workers: int,
         preemptive: bool, overheads: bool, dispatch_overhead: int = 0,
         judge_from: int = -NEVER, skip: int = 0, cpus: int | None = None,
+        processes: Sequence[Process] = (),
     ) -> None:
         self._work = work
         self.cpus = cpus
@@ -90,7 +100,8 @@ class Reschedule:
         self.task_set = recorded.task_set
         self.tables = tables
         self.policy = policy
-        self.workers = workers
+        self.processes = processes
+        self.workers = workers * max(1, len(processes))
         self.preemptive = preemptive
         self.overheads = overheads
         self.dispatch_overhead = dispatch_overhead
@@ -118,8 +129,15 @@ class Reschedule:
     @property
     def how(self) -> How:
         """Return how the load is scheduled."""
-        return How(self.policy, self.workers, self.preemptive, self.dispatch_overhead,
-                   self.judge_from, self.cpus)
+        processes = max(1, len(self.processes))
+        return How(self.policy, self.workers // processes, self.preemptive,
+                   self.dispatch_overhead, self.judge_from, self.cpus, processes)
+
+    @property
+    def worker_names(self) -> list[str]:
+        """Return what workers are called, where that is more than a number."""
+        each = self.workers // max(1, len(self.processes))
+        return [f'{process.name} {w}' for process in self.processes for w in range(each)]
 
     @property
     def work(self) -> RecordedLoad:
@@ -164,6 +182,8 @@ class Reschedule:
         return {
             'policy': self.policy, 'workers': self.workers, 'preemptive': self.preemptive,
             **({} if self.cpus is None else {'cpus': self.cpus}), 'duration_ns': duration,
+            **({'processes': [asdict(each) for each in self.processes]}
+               if self.processes else {}),
             'utilisation': share(self._work.demand, self.workers, duration),
             **verdicts, 'first_miss': miss, 'rescheduled': True, 'skip_ns': self.skip,
             'executions': self._work.executions, 'estimated_executions': self._work.estimated,
@@ -194,6 +214,7 @@ def reschedule(
     progress: Progress | None = None,
     skip: int = 0,
     cpus: int | None = None,
+    processes: Callable[[TaskSet, list[list[int]]], Sequence[Process]] | None = None,
 ) -> Reschedule:
     """
     Run the core over the releases and execution times of a trace.
@@ -201,7 +222,7 @@ def reschedule(
     :param path: a trace of this executor.
     :param task_set: the declaration to schedule by; None: the one in the trace.
     :param policy: a row of ``mddag_executor.core.POLICIES``; None: as recorded.
-    :param workers: size of the pool; None: as recorded.
+    :param workers: size of the pool of each process; None: as recorded.
     :param preemptive: whether a smaller key takes the worker of a larger one; None: as recorded,
         where the policy can.
     :param overheads: whether noticing, dispatch and transport take the time that they took in the
@@ -211,6 +232,8 @@ def reschedule(
     :param progress: called now and then with the number of events read so far.
     :param skip: how long after the first release jobs are not judged (a warm-up), ns.
     :param cpus: that those who compute share; None: as recorded, enough where that is not known.
+    :param processes: returns which node runs in which process, from the task set and the time of
+        each vertex; None: as recorded, or as ``task_set`` says.
     :raises mddag_executor.trace.TraceError: when it is no trace.
     :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, none of the
         declaration's callbacks, or an execution time that is neither recorded nor declared.
@@ -221,8 +244,9 @@ def reschedule(
     if workers is not None and not 1 <= workers <= MAX_WORKERS:
         raise UsageError(f'workers: {workers} is out of range: give 1 to {MAX_WORKERS}')
     run = open_run(path, task_set, name, needs_declaration=True)
-    policy, workers = _settings(run.head, run.name, policy, workers)
     head = run.head
+    each, ran = (run.workers_each, run.placed) if isinstance(run, OwnRun) else (head.workers, ())
+    policy, workers = _settings(head._replace(workers=each), run.name, policy, workers)
     cpus = cpus or head.cpus or None
     if preemptive is None:
         preemptive = head.preemptive and not find_policy(policy).polling
@@ -233,13 +257,19 @@ def reschedule(
 
     def build(recorded: Replay) -> list[LoadBuilder]:
         builders.append(LoadBuilder(
-            run.task_set, tables, run.who, head.workers, max(0, head.cpus)))
+            run.task_set, tables, run.who, each, max(0, head.cpus), _processes(run, ran)))
         return builders
 
     recorded = Replay(run, skip, progress, build, paths=False)
     builder, = builders
+    placed = _placed(run, ran, builder) if processes is None else processes(
+        run.task_set, builder.times())
+    if len(placed) < 2:
+        placed = ()
+    tables = tables._replace(process=[*_processes(run, placed), 1])
+    find_policy(policy).mode(preemptive, len(placed))
     with no_garbage():
-        work = builder.build(overheads)
+        work = builder.build(overheads, tables.process)
     if work.unknown:
         raise ReplayError(
             run.name, f'{counted(len(work.unknown), "callback")} did not complete in it, '
@@ -250,7 +280,27 @@ def reschedule(
     with no_garbage():
         return Reschedule(
             recorded, work, tables, policy, workers, preemptive, overheads, dispatch_overhead,
-            recorded.judge.judge_from, skip, cpus)
+            recorded.judge.judge_from, skip, cpus, placed)
+
+
+def _processes(run: Run, placed: Sequence[Process]) -> list[int]:
+    return processes_of(replace(run.task_set, processes=tuple(placed)))
+
+
+def _placed(
+    run: Run, recorded: Sequence[Process], builder: LoadBuilder
+) -> Sequence[Process]:
+    """
+    Return the processes of a recording, or those of another declaration that judges it.
+
+    The trace of one process of several has callbacks of that only.
+    """
+    declared = run.task_set.processes
+    if recorded:
+        return declared or recorded
+    vertices = run.task_set.vertices
+    ran = {run.task_set.process_of(vertices[v].callback.node) for v in builder.callback_of}
+    return declared if len(ran) == 1 or not run.same else ()
 
 
 def _settings(

@@ -75,7 +75,8 @@ def _joined(paths: Sequence[str], task_set: TaskSet | None) -> OwnRun:
             head = read_head(reader)
             assert head is not None
             run = OwnRun(reader, joined.name, head, task_set)
-            run.processes = len(paths)
+            run.processes, run.placed = len(paths), joined.placed()
+            run.workers_each = joined.workers_each
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise

@@ -131,8 +131,9 @@ def of_reschedule(outcome: Reschedule) -> ReportData:
     watch = Watch().of_computed(outcome.computed())
     result = outcome.result()
     facts = [('recording', result['recording']['trace']), *_facts(result)]
-    return watch.data('Replay, rescheduled', facts, outcome.task_set, outcome.workers,
-                      result['duration_ns'], outcome.warnings)
+    return watch.data(
+        'Replay, rescheduled', facts, outcome.task_set, outcome.workers, result['duration_ns'],
+        outcome.warnings)._replace(worker_names=outcome.worker_names)
 
 
 def of_bag(outcome: BagReschedule) -> ReportData:

@@ -164,6 +164,8 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
     pool = f'policy {printable(result["policy"])}, ' + counted(result['workers'], 'worker')
     if 'recorded_callbacks' in result:      # another executor ran it
         pool = f'imported: {counted(result["workers"], "thread")} ran callbacks'
+    if result.get('processes'):
+        pool += f' in {counted(len(result["processes"]), "process", "processes")}'
     yield (pool + (', preemptive' if result['preemptive'] else '')
            + f', {format_ns(result["duration_ns"])}, utilisation {_share(result["utilisation"])}'
            + f' (all callbacks: {_share(result["worker_use"]["use"])})')

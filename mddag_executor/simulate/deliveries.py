@@ -25,6 +25,9 @@ from mddag_executor.core import NEVER, rules, Tables
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.state import OPEN, PREEMPTIVE, State
 
+DELAY_NS = 300_000
+"""What a message takes from one process to another of this machine, as far as is known."""
+
 
 class Transports(NamedTuple):
     """

@@ -4,9 +4,10 @@
 
 from __future__ import annotations
 
-from mddag_executor.assign.placed import CALLBACK_NS, cost_of, DELAY_NS, improve, Predictor
+from mddag_executor.assign.placed import CALLBACK_NS, cost_of, improve, Predictor
 from mddag_executor.assign.placement import Placing, TRANSPORT_NS
 from mddag_executor.core.tally import total
+from mddag_executor.simulate.deliveries import DELAY_NS
 from msg_graph import loads, Process, TaskSet
 import pytest
 

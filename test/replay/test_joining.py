@@ -29,31 +29,34 @@ class Trace:
     """The trace of a process that runs one vertex; its clock is late by some ns."""
 
     def __init__(self, folder: Path, name: str, vertex: int, late: int = 0, graph: str = GRAPH,
-                 judges_from: int = 0) -> None:
+                 judges_from: int = 0, dag: int = 0) -> None:
         self.path = str(folder / f'run.{name}.mcap')
         self.file = TraceFile(self.path)
-        self.vertex, self.late, self.pid, self.job = vertex, late, 100 + vertex, 0
+        self.vertex, self.late, self.pid, self.job = vertex, late, 100 + vertex + dag, 0
+        self.dag = dag
         self.add('task_set', 0, graph, 'graph.yaml', 'rad', 2, 100 * MS, 64, False, 2)
         self.add('caret_init', 0, BASE - late, 'jazzy')
         self.add('rclcpp_callback_register', 0, ADDRESS, f'callback of {name}')
-        self.add('hosted', 0, 0, str(vertex))
+        self.add('hosted', 0, dag, str(vertex))
         self.add('judge_from', 0, BASE + judges_from - late)
 
     def add(self, name: str, at: int, *fields: Any) -> None:
-        self.file.add(name, BASE + at - self.late, self.pid, 1, *fields)
+        self.file.add(name, BASE + at - self.late, self.pid, self.pid, *fields)
 
-    def runs(self, release: int, start: int, took: int = MS, completes: bool = True) -> None:
+    def runs(self, release: int, start: int, took: int = MS, completes: bool = True,
+             ready: int | None = None) -> None:
         """Run its vertex for the next job; times in ns since the base."""
         t = BASE - self.late
-        self.add('job_release', start, 0, self.job, t + release)
-        self.add('dispatch', start, ADDRESS, 0, self.vertex, self.job, 0, t + start,
+        ready = start if ready is None else ready
+        self.add('job_release', ready, self.dag, self.job, t + release)
+        self.add('dispatch', start, ADDRESS, self.dag, self.vertex, self.job, 0, t + ready,
                  t + release + 8 * MS)
         self.add('callback_start', start, ADDRESS, False)
         if completes:
             end = start + took
             self.add('callback_end', end, ADDRESS)
-            self.add('complete', end, ADDRESS, 0, self.vertex, self.job, True, t + end, 0, took,
-                     True)
+            self.add('complete', end, ADDRESS, self.dag, self.vertex, self.job, True, t + end, 0,
+                     took, True)
         self.job += 1
 
     def end(self, at: int | None) -> str:
@@ -144,6 +147,73 @@ def test_a_joined_run_is_rescheduled(tmp_path: Path) -> None:
         down.runs(i * 10 * MS, i * 10 * MS + 3 * MS)
     outcome = reschedule([up.end(90 * MS), down.end(90 * MS)], workers=1)
     assert counts(sink(outcome.result())).in_time == 3
+
+
+TWO = """
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: t, timer: 10ms, deadline: 8ms}]}
+  - {node: /b, callbacks: [{name: t, timer: 10ms, deadline: 8ms}]}
+"""
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> list[str]:
+    """Return the traces of two processes that compute for 5 ms at the same time."""
+    paths = []
+    for dag, name in enumerate(('up', 'down')):
+        trace = Trace(tmp_path, name, 0, dag=dag, graph=TWO)
+        for i in range(9):
+            trace.runs(i * 10 * MS, i * 10 * MS, 5 * MS)
+        paths.append(trace.end(100 * MS))
+    return paths
+
+
+def test_each_process_has_its_workers_and_interpreter_again(
+        two: list[str], tmp_path: Path, mddag: Any) -> None:
+    outcome = reschedule(two)
+    assert [(p.name, p.nodes) for p in outcome.processes] == [('up', ('/a',)), ('down', ('/b',))]
+    assert (outcome.workers, outcome.how.workers) == (4, 2) and not outcome.tally.missed
+    assert outcome.worker_names == ['up 0', 'up 1', 'down 0', 'down 1']
+    assert reschedule(two, cpus=1).tally.missed
+
+    run = mddag('replay', *two, '--reschedule')
+    assert '18 in time' in run.stdout and '4 workers in 2 processes' in run.stdout
+    assert '9 late' in mddag('replay', *two, '--reschedule', '--processes', '1').stdout
+    for given in ('processes: {p: [/a, /b]}', 'processes: {p: [/a], q: [/b]}'):
+        (tmp_path / 'placed.yaml').write_text(given)
+        late = '9 late' if 'q:' not in given else ' 0 late'
+        run = mddag('replay', *two, '--reschedule', '--processes', tmp_path / 'placed.yaml')
+        assert late in run.stdout, (given, run.stdout, run.stderr)
+    (tmp_path / 'graph.yaml').write_text(TWO + 'processes: {p: [/a, /b]}')
+    assert '9 late' in mddag('replay', *two, tmp_path / 'graph.yaml', '--reschedule').stdout
+
+
+def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, mddag: Any) -> None:
+    trace = Trace(tmp_path, 'whole', 0, graph=TWO)
+    for i in range(9):
+        for trace.dag in range(2):
+            trace.runs(i * 10 * MS, i * 10 * MS + trace.dag * 5 * MS, 5 * MS,
+                       ready=i * 10 * MS)
+            trace.job -= not trace.dag
+    path = trace.end(100 * MS)
+    assert ' 0 late' not in mddag('replay', path, '--reschedule').stdout
+    assert ' 0 late' in mddag('replay', path, '--reschedule', '--processes', '2').stdout
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (['--processes', '2'], 'add --reschedule'),
+    (['--reschedule', '--processes', '0'], 'give 1 or more'),
+    (['--reschedule', '--processes', '3'], 'there are only 2 nodes'),
+    (['--reschedule', '--processes', 'none.yaml'], 'none.yaml'),
+    (['--reschedule', '--policy', 'ros2'], 'polling is known of one process only'),
+    (['--reschedule', '--preemptive'], 'preemption is known of one process only'),
+])
+def test_bad_placements_are_one_line(
+        two: list[str], mddag: Any, arguments: list[str], message: str) -> None:
+    run = mddag('replay', *two, *arguments)
+    assert (run.returncode, run.stdout) == (2, '')
+    assert message in run.stderr and run.stderr.count('\n') == 1
 
 
 def test_traces_of_different_runs_are_refused(tmp_path: Path) -> None:
