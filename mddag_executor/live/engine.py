@@ -572,10 +572,16 @@ class Engine:
 
     # --- the end ---------------------------------------------------------------------------------
 
-    def finish(self, now: int) -> None:
-        """Judge what is open, once, when the run ends."""
-        self.scheduler.expire_idle(now)
+    def finish(self, now: int, end: int | None = None) -> None:
+        """
+        Judge what is open, once, when the run ends.
+
+        :param end: when it began to start nothing more, if that was before now: what ran has ended
+            since, but a deadline after it could no longer be met.
+        """
+        end = now if end is None else end
+        self.scheduler.expire_idle(end)
         self._decided(now)
-        self.scheduler.finish(now)
+        self.scheduler.finish(end)
         self._decided(now)
         self._finished = True

@@ -527,6 +527,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._check_context()
                 self._look_after()
                 self._raise_error()
+                self._pool.stopped_at = 0
                 if self._stepper is None:
                     self._stepper = Stepper(
                         self.context, self._receiver, self.guards(), self._upkeep, self._pool,
@@ -578,11 +579,12 @@ class MultiDeadlineExecutor(BareExecutor):
         if self._announcements is not None:
             self._announcements.close()
         with self._pool.lock:
-            end = self._pool.tick()
-            self._engine.finish(end)
+            now = self._pool.tick()
+            end = min(now, self._pool.stopped_at or now)
+            self._engine.finish(now, end)
         self._engine.verdicts.report_misses()
         if self._recorder is not None:
-            self._recorder.close(end)
+            self._recorder.close(now, end)
 
     def halt(self) -> None:
         """Start nothing more, since the interpreter ends; see ``wait_halted``."""

@@ -75,6 +75,8 @@ class Pool:
         self.clock = clock
         self.lock = threading.Lock()
         self.running = False
+        # when it began to start nothing more; 0: it has not
+        self.stopped_at = 0
         self.lent = 0
         # called to have another thread do what the intake's does not (True), and no longer
         self.relieve_intake: Callable[[bool], None] = lambda relieved: None
@@ -167,18 +169,21 @@ class Pool:
             for worker in range(len(self._seats), self.engine.n_workers):
                 self._new_thread(worker)
             self.running = True
+            self.stopped_at = 0
             self._hand_out(self.tick())
 
     def pause(self) -> None:
         """Start nothing more; what runs goes on."""
         with self.lock:
-            self.running = False
+            self.start_no_more()
             if self.preemption is not None:
                 self.preemption.update(())
 
     def start_no_more(self) -> None:
         """Start nothing more, from now on; for those who must not wait for the lock."""
-        self.running = False
+        if self.running:
+            self.stopped_at = self.clock.now()
+            self.running = False
 
     def close(self, timeout: float | None) -> bool:
         """
@@ -187,7 +192,7 @@ class Pool:
         A callback that waits for a service is not waited for: nobody would answer it any more.
         """
         with self.lock:
-            self.running = False
+            self.start_no_more()
             seats = self._seats + self._spares + self._lenders
             for seat in seats:
                 if not self._closed and seat.work is None:

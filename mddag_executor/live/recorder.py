@@ -139,13 +139,16 @@ class Recorder:
         """Record that a message was taken."""
         self._say('rmw_take', id(entity.rclpy), id(message), source_timestamp, True)
 
-    def close(self, end: int) -> None:
+    def close(self, now: int, end: int | None = None) -> None:
         """
-        Record the run's end (trace's clock) and complete the file.
+        Record the run's end and complete the file.
 
         Where it could not be written, the run has gone on without it; this says so in the log.
+
+        :param end: up to when deadlines are judged, if that is before now; in the trace's clock.
         """
-        self.record('shutdown', end, threading.get_native_id(), end)
+        self.record(
+            'shutdown', now, threading.get_native_id(), now if end is None else end)
         try:
             self.writer.close()
         except TraceError as error:

@@ -188,7 +188,7 @@ class Joined:
         begin = min(part.head.time + part.shift for part in self._parts)
         judges_from = max(part.judges_from + part.shift * (part.judges_from > 0)
                           for part in self._parts)
-        end = 0
+        end = judged = 0
         with TraceFile(path) as file:
             file.add(TASK_SET, begin, 0, 0, head.yaml, head.file, head.policy, self._workers,
                      head.default_deadline, head.max_active_jobs, head.preemptive, head.cpus)
@@ -198,15 +198,15 @@ class Joined:
             streams = [part.events() for part in self._parts]
             for part, event in heapq.merge(*streams, key=lambda each: int(each[1][1])):
                 if event[0] == _SHUTDOWN:
-                    end = max(end, event[4])
+                    judged = max(judged, event[4])
                 elif event[0] not in (TASK_SET, _INIT, _JUDGE_FROM):
                     told = self._told(part, event)
                     if told is not None:
                         end = max(end, event[1])
                         file.add(*told)
             if any(part.end is not None for part in self._parts):
-                file.add(_SHUTDOWN, end, 0, 0, end)
-        self._say(end)
+                file.add(_SHUTDOWN, max(end, judged), 0, 0, judged)
+        self._say(max(end, judged))
 
     def placed(self) -> list[Process]:
         """Return which nodes ran in which process, once the joined trace is written."""

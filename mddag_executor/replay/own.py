@@ -149,13 +149,14 @@ class OwnRun:
         if not self.shut_down:
             if self.end == 0:
                 self.end = min(max(0, self.head.time), NEVER - 1)
-            self._finish()
+            self._finish(self.end)
         self.when_played()
 
-    def _finish(self) -> None:
+    def _finish(self, judged: int) -> None:
+        """Have deadlines judged up to a time."""
         batch = Batch((), {})
         for observer in self._observers:
-            observer.finished(self.end, batch)
+            observer.finished(judged, batch)
             observer.take(batch)
 
     @property
@@ -359,12 +360,12 @@ class OwnRun:
             if event[4] != self.head.yaml:
                 self._strange[f'{name} with another declaration'] += 1
         elif name == _SHUTDOWN and not self.shut_down:
-            if not self.end <= event[4] < NEVER:
+            if not (self.end <= event[1] < NEVER and 0 <= event[4] <= event[1]):
                 self._strange[f'{name} at an impossible time'] += 1
                 return
-            self.end = event[4]
+            self.end = event[1]
             self.shut_down = True
-            self._finish()
+            self._finish(event[4])
 
     def _dropped(self, dag: int, vertex: int, job: int, reason: str) -> None:
         if 0 <= dag < len(self._mapping.vertex) and 0 <= vertex < len(self._mapping.vertex[dag]):

@@ -14,6 +14,7 @@ from mddag_executor import DeadlineMiss
 from mddag_executor.live import current_job
 from mddag_executor.live.work import Work
 from mddag_executor.replay import replay
+from mddag_executor.trace import read_events
 from msg_graph import loads, TaskSet
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -432,6 +433,7 @@ def test_what_completes_after_the_end_is_not_counted(make_executor, make_node, r
     with Spinning(executor) as spinning:
         chain.start(executor)
         assert begun.wait(30.0)
+        time.sleep(0.02)    # its deadline is over, and it still runs
         ros_context.shutdown()
         spinning.join()
         counts = sinks(executor)
@@ -439,6 +441,37 @@ def test_what_completes_after_the_end_is_not_counted(make_executor, make_node, r
         assert counts['/middle:early']['overdue'] > 0
         assert ended.wait(30.0)
     assert sinks(executor) == counts
+
+
+def test_deadlines_after_the_stop_are_not_judged(make_executor, make_node, tmp_path):
+    """A relay still runs when the executor stops; what it publishes then starts nothing."""
+    runs, go_on = threading.Event(), threading.Event()
+
+    def relay() -> None:
+        job = current_job()
+        if job is not None and job.job >= 3:
+            runs.set()
+            go_on.wait(30.0)
+
+    chain = Chain(make_node, {'relay': relay})
+    path = str(tmp_path / 'run.mcap')
+    executor = make_executor(loads(CHAIN), num_workers=2, trace=path)
+    with Spinning(executor):
+        chain.start(executor)
+        assert runs.wait(30.0)
+        assert not executor.shutdown(0)
+        stopped = time.time_ns()
+        time.sleep(0.1)     # the deadline of what runs comes meanwhile
+        go_on.set()
+    events = list(read_events(path))
+    end = next(event['end'] for event in events if event['_name'] == 'mddag:shutdown')
+    assert end <= stopped
+    assert all(event['deadline'] <= end for event in events
+               if event['_name'] == 'mddag:deadline' and event['completed'] < 0)
+    replayed = replay(path)
+    assert not replayed.warnings
+    assert replayed.result()['dags']['chain']['ends'] == \
+        executor.statistics()['dags']['chain']['ends']
 
 
 TWO_PUBLISHERS = """
