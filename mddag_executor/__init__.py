@@ -9,7 +9,9 @@ so that importing this package (and `mddag --help`) does not load rclpy.
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
+
+from mddag_executor.lazy import on_first_use
 
 if TYPE_CHECKING:
     from mddag_executor.live.executor import MultiDeadlineExecutor
@@ -18,21 +20,7 @@ if TYPE_CHECKING:
 __all__ = ['DeadlineMiss', 'MultiDeadlineExecutor', '__version__']
 __version__ = '1.0.0'
 
-_LAZY = {
+__getattr__, __dir__ = on_first_use(__name__, {
     'DeadlineMiss': 'mddag_executor.live',
     'MultiDeadlineExecutor': 'mddag_executor.live',
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use (PEP 562)."""
-    if name not in _LAZY:
-        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    from importlib import import_module
-    value = getattr(import_module(_LAZY[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY})
+})

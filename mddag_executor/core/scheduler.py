@@ -100,10 +100,6 @@ class Scheduler:
             slot = jobs.open_undeclared(self.state, self.tables.n_dags, job, now)
         return self.state.job_base[slot]
 
-    def record(self, x: int, now: int) -> bool:
-        """End an execution as it was recorded, past the ready queue; see ``complete``."""
-        return rules.record(self.tables, self.state, self.policy.key, x, now)
-
     def fail_open(self, slot: int, now: int) -> None:
         """Fail the job in a slot unless it has ended already."""
         if self.state.job_state[slot] == OPEN:

@@ -5,15 +5,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.memory import no_garbage
-from mddag_executor.replay.communications import Communications
-from mddag_executor.replay.drift import ImportedDrift, OwnDrift
+from mddag_executor.replay.drift import OwnDrift
 from mddag_executor.replay.explain import Explainer
 from mddag_executor.replay.happenings import Observer
-from mddag_executor.replay.imported_run import ImportedPaths, ImportedRun
 from mddag_executor.replay.judge import Judge
+from mddag_executor.replay.own import OwnRun
 from mddag_executor.replay.own_paths import OwnPaths
 from mddag_executor.replay.path_results import path_results
 from mddag_executor.replay.run import open_run, Recording, Run
@@ -22,6 +21,10 @@ from mddag_executor.replay.waits import GroupWaits
 from mddag_executor.text import counted
 from msg_graph import TaskSet
 from msg_graph.drift import Drift
+
+if TYPE_CHECKING:
+    from mddag_executor.replay.communications import Communications
+    from mddag_executor.replay.imported_figures import ImportedDrift, ImportedPaths
 
 Progress = Callable[[int], None]
 
@@ -52,7 +55,9 @@ class Replay:
         self._seen: Communications | None = None
         self._paths: ImportedPaths | OwnPaths | None = None
         self._drift: ImportedDrift | OwnDrift | None = None
-        if isinstance(run, ImportedRun):
+        if not isinstance(run, OwnRun):
+            from mddag_executor.replay.communications import Communications
+            from mddag_executor.replay.imported_figures import ImportedDrift, ImportedPaths
             self._seen = Communications()
             if paths:
                 self._paths, self._drift = ImportedPaths(run), ImportedDrift(run)
@@ -101,7 +106,7 @@ class Replay:
                 sink = sinks[dag.vertices[local].name]
                 sink['breakdown'] = self.judge.chains.result(self.task_set, first + local)
                 sink['slack_ns'] = slack(sink)
-            if isinstance(self.run, ImportedRun):
+            if not isinstance(self.run, OwnRun):
                 result['dags'][dag.name]['unjudged'] = self.run.unjudged.get(dag.index, 0)
         return {
             **result, 'rescheduled': False, 'skip_ns': self.judge.skip,

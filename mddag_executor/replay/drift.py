@@ -18,6 +18,7 @@ from collections import Counter
 
 from mddag_executor.replay.happenings import (
     Batch,
+    different,
     Event,
     FIELD,
     Handlers,
@@ -26,8 +27,6 @@ from mddag_executor.replay.happenings import (
     Observer,
     PROCESS,
 )
-from mddag_executor.replay.imported_run import ImportedRun
-from mddag_executor.replay.linker import LinkObserver
 from mddag_executor.replay.own import OwnRun
 from mddag_executor.trace.census import ADDRESS, Address, Census
 from msg_graph import TaskSet
@@ -69,7 +68,7 @@ class OwnDrift(Observer):
         if _RELEASE in batch.events:
             places, rows = batch.events[_RELEASE]
             known = (rows[:, FIELD] >= 0) & (rows[:, FIELD] < len(self._sources))
-            for dag in np.unique(rows[known, FIELD]).tolist():
+            for dag in different(rows[known, FIELD]):
                 mine = rows[rows[:, FIELD] == dag, FIELD + 2]
                 releases = self._observed.releases.setdefault(self._sources[dag], Releases())
                 releases.add(int(mine.min()))
@@ -78,7 +77,7 @@ class OwnDrift(Observer):
             first += zip(places[known][:1].tolist(), rows[known][:1, NOW].tolist())
         if _DISPATCH in batch.events:
             places, rows = batch.events[_DISPATCH]
-            for pid in np.unique(rows[:, PROCESS]).tolist():
+            for pid in different(rows[:, PROCESS]):
                 self._dispatched(pid, rows[rows[:, PROCESS] == pid, FIELD:FIELD + 3])
             first += zip(places[:1].tolist(), rows[:1, NOW].tolist())
         if first and self._first is None:
@@ -108,9 +107,9 @@ class OwnDrift(Observer):
         pid, thread, what = np.concatenate(
             [each[:, PROCESS:FIELD + 1] for each in rows])[order].T
         found: set[tuple[int, int, int]] = set()
-        for process in np.unique(pid).tolist():
+        for process in different(pid):
             threads = thread[pid == process]
-            for one in np.unique(threads).tolist():
+            for one in different(threads):
                 mine = np.flatnonzero((pid == process) & (thread == one))
                 stack = self._running.setdefault((process, one), [])
                 found.update((process, *pair) for pair in _published(
@@ -138,7 +137,7 @@ class OwnDrift(Observer):
         observed.got, observed.ran = dict(got), dict(ran)
         observed.publishes = dict(publishes)
         observed.nodes = set(self._census.publishers) or None
-        observed.undeclared = _undeclared(self._census, judge)
+        observed.undeclared = undeclared(self._census, judge)
         return drift(judge, observed)
 
 
@@ -188,55 +187,8 @@ def declared_keys(census: Census, task_set: TaskSet) -> dict[Address, str]:
     return found
 
 
-def _undeclared(census: Census, judge: TaskSet) -> list[Entity]:
+def undeclared(census: Census, judge: TaskSet) -> list[Entity]:
     """Return what a declaration does not name."""
     declared = declared_keys(census, judge)
     return [Entity(e.node, e.kind, e.start, e.period_ns) for e in census.entities()
             if e.callback not in declared]
-
-
-class ImportedDrift(LinkObserver):
-    """
-    Collects, while an imported run is played, what tells where it drifted.
-
-    Such a recording has no jobs; the starts of a source's callback count as its releases.
-    """
-
-    def __init__(self, run: ImportedRun) -> None:
-        self._census = Census(keep_times=0)
-        self._declared = bool(run.task_set.dags)
-
-    def raw_handlers(self) -> Handlers:
-        """Return the methods for who there is, and for what callbacks do."""
-        return dict.fromkeys(self._census.handlers, self._census.take) if self._declared else {}
-
-    def drift(self, judge: TaskSet) -> list[Drift]:
-        """Return where the run and a declaration disagree."""
-        if not self._declared:
-            return []
-        return drift_of_import(self._census, judge)
-
-
-def drift_of_import(census: Census, judge: TaskSet) -> list[Drift]:
-    """
-    Return where a recording of another executor and a declaration disagree.
-
-    Such a recording has no jobs; the starts of a source's callback count as its releases.
-    """
-    observed = Observed(
-        nodes=set(census.publishers), undeclared=_undeclared(census, judge))
-    first, last = [], []
-    sources = {dag.vertices[dag.source].callback.key for dag in judge.dags}
-    for address, key in declared_keys(census, judge).items():
-        runs = census.runs.get(address)
-        if runs is None:
-            continue
-        observed.ran[key] = observed.ran.get(key, 0) + runs.count
-        observed.got[key] = observed.ran[key]
-        observed.publishes[key] = {*observed.publishes.get(key, ()), *runs.publishes}
-        if key in sources:
-            observed.releases[key] = Releases(runs.count, runs.first, runs.last)
-        first.append(runs.first)
-        last.append(runs.last)
-    observed.duration_ns = max(last) - min(first) if first else 0
-    return drift(judge, observed)

@@ -39,7 +39,6 @@ from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, legs_of, N
 from mddag_executor.replay.doubts import Doubts
 from mddag_executor.replay.entities import as_table, Callback, Entities, fields_of, INIT_EVENTS
 from mddag_executor.replay.happenings import (
-    Batch,
     Batches,
     COMPLETED,
     ENDED,
@@ -52,13 +51,11 @@ from mddag_executor.replay.happenings import (
 )
 from mddag_executor.replay.linker import (
     Execution,
-    KEEP,
     Linker,
     LinkObserver,
     Publication,
 )
 from mddag_executor.replay.matching import Matching, Target
-from mddag_executor.replay.paths import PathBook
 from mddag_executor.replay.recording import Head, named_errors, no_run
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
@@ -66,7 +63,6 @@ from mddag_executor.trace.census import Census
 from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
-import numpy as np
 
 _SLACK_NS = 1_000_000
 _PROGRESS_STEP = 4096
@@ -423,66 +419,3 @@ class _Timers:
         return [f'{counted(sum(counts.values()), noun)} {text}: '
                 + listed([f'{name} ({n})' for name, n in counts.most_common()])
                 for counts, noun, text in said if counts]
-
-
-class ImportedPaths(LinkObserver):
-    """Collects the flows along the declared paths of an imported run."""
-
-    def __init__(self, run: ImportedRun) -> None:
-        self.book = PathBook(run.task_set, kept=KEEP)
-        self._target = run.targets
-        self._order = 0
-        self._told: list[list[tuple[int, ...]]] = [[], [], [], []]
-        self._number = 0
-
-    def take(self, batch: Batch) -> None:
-        """Hand over what came since the last batch."""
-        self.book.tell(self._order + 1, *(
-            np.array(rows, dtype=np.int64).reshape(len(rows), width)
-            for rows, width in zip(self._told, (7, 4, 7, 4))))
-        self._order, self._told = 0, [[], [], [], []]
-
-    def _tell(self, what: int, run: Execution | None, *row: int) -> None:
-        """Note what a callback did, if it is on a path."""
-        target = None if run is None else self._target.get(run.callback.number)
-        if run is None or target is None or target.callback.key not in self.book.on_path:
-            return
-        self._order += 1
-        self._told[what].append(
-            (self._order, self.book.callbacks[target.callback.key], *row))
-
-    def began(self, run: Execution, message: Publication | None) -> None:
-        """Note what an execution runs for."""
-        self._number += 1
-        run.number = self._number
-        target = self._target.get(run.callback.number)
-        topic = '' if target is None else target.topic
-        self._tell(0, run, run.number, run.start,
-                   self.book.topics.get(topic, -2) if topic else -1,
-                   -1 if message is None else message.number, -1)
-
-    def over(self, run: Execution) -> None:
-        """Note the end of an execution."""
-        self._tell(1, run, run.number, run.end)
-
-    def sent(self, message: Publication) -> None:
-        """Note a publication."""
-        self._number += 1
-        message.number = self._number
-        publisher, run = message.publisher, message.run
-        if (publisher is None or publisher.node is None
-                or publisher.topic not in self.book.topics):
-            return
-        node, topic = publisher.node.name, self.book.topics[publisher.topic]
-        target = None if run is None else self._target.get(run.callback.number)
-        if target is not None and run is not None and target.callback.node == node:
-            self._tell(2, run, -1, run.number, topic, message.number, message.time)
-        else:
-            self._order += 1
-            self._told[2].append((
-                self._order, -1, self.book.nodes.get(node, -1), -1, topic, message.number,
-                message.time))
-
-    def took(self, run: Execution, message: Publication) -> None:
-        """Note a message that a callback took itself."""
-        self._tell(3, run, run.number, message.number)

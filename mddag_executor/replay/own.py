@@ -29,6 +29,7 @@ from mddag_executor.core import NEVER
 from mddag_executor.replay.happenings import (
     Batch,
     COMPLETED,
+    different,
     ENDED,
     Event,
     FAILED,
@@ -305,7 +306,7 @@ class OwnRun:
         self.left_out(_RELEASE, 'of a release years ago', old)
         good &= ~old
         again = np.zeros(len(dag), dtype=np.bool_)
-        for number in np.unique(dag[good]).tolist():
+        for number in different(dag[good]):
             mine = np.flatnonzero(good & (dag == number))
             newest = np.maximum.accumulate(np.r_[self._newest[number], job[mine]])
             again[mine] = job[mine] <= newest[:-1]

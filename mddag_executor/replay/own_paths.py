@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from mddag_executor.replay.happenings import (
     Batch,
+    different,
     Ints,
     Observer,
     PUBLISHED,
@@ -152,7 +153,7 @@ class _Book(PathBook):
     def messages_of(self, place: int, started: Ints) -> list[Ints]:
         """Return what the vertices before executions may have published for them."""
         found: list[Ints] = []
-        for vertex in np.unique(started[:, S_VERTEX]).tolist():
+        for vertex in different(started[:, S_VERTEX]):
             mine = started[:, S_VERTEX] == vertex
             topics, job = started[:, S_TOPIC], started[:, S_MESSAGE]
             for before in self._before[place].get(vertex, ()):

@@ -8,16 +8,18 @@ from collections.abc import Sequence
 import os
 import shutil
 import tempfile
+from typing import TYPE_CHECKING, Union
 import weakref
 
-from mddag_executor.replay.imported_run import ImportedRun
-from mddag_executor.replay.joining import Joined
 from mddag_executor.replay.own import OwnRun
 from mddag_executor.replay.recording import named_errors, read_head, ReplayError
 from mddag_executor.trace import TraceReader
 from msg_graph import TaskSet
 
-Run = OwnRun | ImportedRun
+if TYPE_CHECKING:
+    from mddag_executor.replay.imported_run import ImportedRun
+
+Run = Union[OwnRun, 'ImportedRun']
 """
 What all have: ``play``, and
 
@@ -55,6 +57,7 @@ def open_run(
         head = read_head(reader)
         if head is not None:
             return OwnRun(reader, name or path, head, task_set)
+        from mddag_executor.replay.imported_run import ImportedRun
         run = ImportedRun(reader, name or path, task_set)
     if needs_declaration and task_set is None:
         raise ReplayError(
@@ -65,6 +68,7 @@ def open_run(
 
 def _joined(paths: Sequence[str], task_set: TaskSet | None) -> OwnRun:
     """Return the run of several traces; it can be played once."""
+    from mddag_executor.replay.joining import Joined
     joined = Joined([(path, path) for path in paths])
     folder = tempfile.mkdtemp(prefix='mddag-')
     path = os.path.join(folder, 'joined.mcap')

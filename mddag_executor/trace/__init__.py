@@ -12,7 +12,9 @@ loads no compression and no importer.
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
+
+from mddag_executor.lazy import on_first_use
 
 if TYPE_CHECKING:
     from mddag_executor.trace.ctf import import_ctf, Imported
@@ -28,30 +30,13 @@ __all__ = [
     'TraceWarning', 'TraceWriter', 'import_ctf', 'read_events',
 ]
 
-_LAZY = {
-    'EVENTS': 'schema',
-    'EventType': 'schema',
-    'Imported': 'ctf',
-    'MessageReader': 'messages',
-    'TraceError': 'errors',
-    'TraceFile': 'trace_file',
-    'TraceReader': 'reader',
-    'TraceWarning': 'errors',
-    'TraceWriter': 'writer',
-    'import_ctf': 'ctf',
-    'read_events': 'reader',
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use (PEP 562)."""
-    if name not in _LAZY:
-        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    from importlib import import_module
-    value = getattr(import_module(f'{__name__}.{_LAZY[name]}'), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY})
+__getattr__, __dir__ = on_first_use(__name__, {
+    name: f'{__name__}.{module}' for module, names in {
+        'ctf': ('Imported', 'import_ctf'),
+        'errors': ('TraceError', 'TraceWarning'),
+        'messages': ('MessageReader',),
+        'reader': ('TraceReader', 'read_events'),
+        'schema': ('EVENTS', 'EventType'),
+        'trace_file': ('TraceFile',),
+        'writer': ('TraceWriter',),
+    }.items() for name in names})

@@ -257,7 +257,8 @@ def test_a_recorded_execution_goes_past_queue_workers_and_groups() -> None:
     slot = scheduler.release(0, 0, 0, 0)
     source = scheduler.source(slot)
     scheduler.state.x_group[source] = group
-    assert scheduler.record(source, 2)
+    assert rules.record(
+        scheduler.tables, scheduler.state, scheduler.policy.key, source, 2)
     assert scheduler.idle_workers == 0
     assert scheduler.state.group_owner[group] == busy
     assert scheduler.state.job_active[slot] == 0

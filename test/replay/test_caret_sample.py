@@ -10,8 +10,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-from mddag_executor.replay import happenings, imported_run, paths, replay, reschedule
-from mddag_executor.replay.imported_run import ImportedPaths, ImportedRun
+from mddag_executor.replay import happenings, imported_figures, paths, replay, reschedule
+from mddag_executor.replay.imported_figures import ImportedPaths
+from mddag_executor.replay.imported_run import ImportedRun
 from mddag_executor.replay.linker import Execution, LinkObserver, Publication
 from mddag_executor.replay.paths import PathBook
 from mddag_executor.replay.run import open_run
@@ -172,7 +173,7 @@ def test_the_same_when_what_is_over_is_forgotten(
     left = note_steps(monkeypatch)
     monkeypatch.setattr(paths, 'SETTLE', 100)
     monkeypatch.setattr(happenings, 'BATCH', 50)
-    monkeypatch.setattr(imported_run, 'KEEP', 4)
+    monkeypatch.setattr(imported_figures, 'KEEP', 4)
     assert replay(trace, graph).result()['paths'] == expected
     assert len(left) > 3 and max(left) < 200, left
 
