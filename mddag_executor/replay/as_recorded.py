@@ -56,11 +56,8 @@ class Replay:
         self._paths: ImportedPaths | OwnPaths | None = None
         self._drift: ImportedDrift | OwnDrift | None = None
         if not isinstance(run, OwnRun):
-            from mddag_executor.replay.communications import Communications
-            from mddag_executor.replay.imported_figures import ImportedDrift, ImportedPaths
-            self._seen = Communications()
-            if paths:
-                self._paths, self._drift = ImportedPaths(run), ImportedDrift(run)
+            from mddag_executor.replay.imported_figures import observers_of
+            self._seen, self._paths, self._drift = observers_of(run, paths)
         elif paths:
             self._paths, self._drift = OwnPaths(run), OwnDrift(run)
         self.explainer = Explainer(run, self.judge, jobs) if paths else None

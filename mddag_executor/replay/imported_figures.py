@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from mddag_executor.replay.communications import Communications
 from mddag_executor.replay.drift import declared_keys, undeclared
 from mddag_executor.replay.happenings import Batch, Handlers
 from mddag_executor.replay.imported_run import ImportedRun
@@ -13,6 +14,15 @@ from mddag_executor.trace.census import Census
 from msg_graph import TaskSet
 from msg_graph.drift import Drift, drift, Observed, Releases
 import numpy as np
+
+
+def observers_of(
+    run: ImportedRun, paths: bool
+) -> tuple[Communications, ImportedPaths | None, ImportedDrift | None]:
+    """Return what collects the figures of a run; paths and drift only where ``paths`` says so."""
+    if not paths:
+        return Communications(), None, None
+    return Communications(), ImportedPaths(run), ImportedDrift(run)
 
 
 class ImportedPaths(LinkObserver):
