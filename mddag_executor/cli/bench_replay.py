@@ -66,8 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--accuracy', action='store_true',
         help='record live runs, reschedule them, and compare the response times of each sink')
     add('--slack', action='store_true',
-        help='record a live run, find its slack, and look in further live runs whether a callback '
-        'that takes 0.9 times its factor longer breaks nothing, and one of 1.1 times something')
+        help='find the slack of the declaration, and look in live runs whether a callback that '
+        'takes 0.9 times its factor longer breaks nothing, and one of 1.1 times something')
     add('--callbacks', type=options.positive_int, default=10, metavar='N',
         help='with --slack: how many callbacks to try (default: %(default)s)')
     add('--bodies', choices=('sleep', 'spin', 'native', 'mixed'), default='sleep',

@@ -152,7 +152,9 @@ class Explainer(Observer):
         done = done[done[:, 10] >= 0]
         released = batch.columns(RELEASED)
         self._keep(_PIECES, pieces[:, [0, 2, 8, 6, 7]])
-        self._keep(_TOOK, np.column_stack((done[:, 1], done[:, 8] - done[:, 7], done[:, 11])))
+        # of a sync the last message makes it run; the others are only kept
+        last = done[done[:, 4] != 0]
+        self._keep(_TOOK, np.column_stack((last[:, 1], last[:, 8] - last[:, 7], last[:, 11])))
         self._keep(_HELD, done[done[:, 12] != 0, 7:9])
         self._keep(_RELEASED, released[:, [0, 2, 3]])
         self._keep(_STARTED, started[:, 1:5])

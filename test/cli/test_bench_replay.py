@@ -10,6 +10,7 @@ from typing import Any
 
 from mddag_executor.cli import bench_replay
 from mddag_executor.cli import main as program
+from mddag_executor.cli.slack_check import is_told
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import replay
 from mddag_executor.replay.measure import measure, READERS, write_long_trace
@@ -161,9 +162,19 @@ def test_slack_holds_where_runs_are_simulated(
         '--workers', '2', '--callbacks', '3']) == 0
     out = capsys.readouterr().out
     assert out.endswith('3 of 3 callbacks behave as told\n')
-    assert '/c:c      10.37 times' in out     # (90 - 9 - 8) / 7
+    assert 'c:c       10.37 times' in out     # (90 - 9 - 8) / 7
     for arguments, error in (
             (['--slack', '--accuracy'], 'leave it or --accuracy out'),
             (['--slack', '--trace', 'x.mcap'], '--slack: it records its own runs')):
         assert program.main(['bench', 'replay', *arguments]) == 2
         assert error in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('late', 'parts', 'told'), [
+    (7, {'ran': 80, 'waited': 9}, True), (7, {'ran': 80, 'ran long': 4, 'machine': 2}, True),
+    (7, {'ran long': 4, 'released late': 3}, False), (None, {'lost': 4, 'ran long': 9}, True)])
+def test_what_a_disturbance_made_late_says_nothing_of_slack(
+    late: int | None, parts: dict[str, int], told: bool
+) -> None:
+    assert told == is_told({'late_ns': late, 'parts': [
+        {'cause': cause, 'ns': took} for cause, took in parts.items()]})

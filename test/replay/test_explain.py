@@ -35,6 +35,16 @@ HEAVY = VICTIM + """\
       - {name: first, dag: first, timer: 100ms, deadline: 90ms}
       - {name: second, dag: second, timer: 100ms, deadline: 90ms}
 """
+SYNC = """\
+mddag: 1
+nodes:
+  - node: /sensor
+    callbacks: [{name: tick, timer: 50ms, publishes: [/data, /more]}]
+  - node: /victim
+    callbacks: [{name: use, sync: [/data, /image], deadline: 22ms}]
+  - node: /camera
+    callbacks: [{name: take, subscription: /more, publishes: [/image]}]
+"""
 TICK, USE, FIRST, SECOND = range(4)
 
 
@@ -44,6 +54,7 @@ class Planned(VirtualRun):
     A run in virtual time in which callbacks take what is planned.
 
     :ivar times: by vertex (modulo its number) what it takes; the last one: every fifth time.
+    :ivar legs: of a sync only the last message takes time.
     :ivar late: releases that are noticed late, every fifth: by how much.
     :ivar slow: how long every fifth message takes.
     :ivar stops: every so often, for so long, nothing goes on.
@@ -55,6 +66,7 @@ class Planned(VirtualRun):
     duration: int = 26_000 * MS
     longest: int = MS
     times: dict[int, tuple[int, int]] = field(default_factory=dict)
+    legs: int = 1
     late: int = 0
     slow: int = 0
     stops: tuple[int, int] | None = None
@@ -68,6 +80,8 @@ class Planned(VirtualRun):
     def took(self, work: Any) -> int:
         usual, fifth = self.times.get(work.vertex, (MS // 2, MS // 2))
         took = fifth if work.job % 5 == 4 else usual
+        if work.vertex == USE and work.leg < self.legs - 1:
+            took = 10_000
         return self._shifted(self._now + took) - self._now
 
     def _start(self, work: Any, worker: int, now: int) -> None:
@@ -124,6 +138,9 @@ PLANS: dict[str, tuple[str, dict[str, Any]]] = {
     'interpreter': (HEAVY, {'times': BUSY, 'workers': 6, 'holds': True, 'policy': 'fifo',
                             'duration': 12_000 * MS}),
     'released late': (VICTIM, {'late': 15 * MS}),
+    # the message that comes first is only kept
+    'released late, sync': (SYNC, {
+        'late': 8 * MS, 'legs': 2, 'times': {USE: (15 * MS, 15 * MS)}}),
     'transport': (VICTIM, {'slow': 15 * MS}),
     'machine': (HEAVY, {'times': {FIRST: (5 * MS, 5 * MS), SECOND: (5 * MS, 5 * MS)},
                         'stops': (2_000 * MS, 300 * MS)}),
