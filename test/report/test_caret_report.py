@@ -120,9 +120,4 @@ def test_the_report_opens_and_shows_it(browser: Any, folder: Path) -> None:
         assert abs((left - min(starts)) * 1e9 - (start - expected[0])) <= 101
     assert browser.execute_script(
         'return document.documentElement.scrollWidth <= window.innerWidth')
-    # the declared path can be chosen, and is drawn
-    browser.execute_script("""
-        const choice = document.getElementById('mddag-path');
-        choice.selectedIndex = [...choice.options].findIndex(o => o.text === 'path target');
-        choice.dispatchEvent(new Event('change'));""")
     assert pages.complaints(browser) == []
