@@ -49,15 +49,17 @@ class PoolUse:
     """
     How busy the pool was over time: in each step, how long all workers together ran callbacks.
 
-    Steps begin at multiples of their length, `FIRST_STEP_NS` at first; where there would be more
-    than `MOST_STEPS`, it is doubled.
+    Steps begin at multiples of their length; where there would be more than `MOST_STEPS`, it is
+    doubled.
+
+    :param step: their length at first, ns.
     """
 
     FIRST_STEP_NS = 100_000_000
     MOST_STEPS = 600
 
-    def __init__(self) -> None:
-        self.step = self.FIRST_STEP_NS
+    def __init__(self, step: int = FIRST_STEP_NS) -> None:
+        self.step = step
         self._busy: dict[int, int] = {}
 
     def add(self, starts: Ints, ends: Ints) -> None:

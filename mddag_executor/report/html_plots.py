@@ -22,10 +22,10 @@ from bokeh.models import (
 )
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
+from mddag_executor.replay.usage import PoolUse
 from mddag_executor.report.html_data import label, Line, Prepared, ReportData, UNIT_NS
 from mddag_executor.report.tables import short_names
 from mddag_executor.report.text import format_ns
-from mddag_executor.report.timeline import Bins
 import numpy as np
 
 MOST_HISTOGRAMS = 30
@@ -87,14 +87,13 @@ def _overview(data: ReportData, prepared: Prepared, time: Range1d) -> Any:
         height=150, sizing_mode='stretch_width', tools='', toolbar_location=None,
         x_range=Range1d(start=0, end=duration), y_range=Range1d(start=0, end=data.workers * 1.08),
         min_border_left=_LEFT, name='overview')
-    bins = data.timeline.bins
-    if bins.origin is not None:
-        edges, busy, missed = _over_time(bins, prepared.origin)
-        plot.quad(left=edges[:-1], right=edges[1:], bottom=0, top=busy,
-                  fill_color=_BLUE, line_color=None)
-        late = missed > 0
-        plot.quad(left=edges[:-1][late], right=edges[1:][late], bottom=data.workers * 1.02,
-                  top=data.workers * 1.08, fill_color=_RED, line_color=_RED, line_width=1.5)
+    edges, busy = _over_time(data.timeline.busy_over_time, prepared.origin)
+    plot.quad(left=edges[:-1], right=edges[1:], bottom=0, top=busy,
+              fill_color=_BLUE, line_color=None)
+    edges, missed = _over_time(data.timeline.missed_over_time, prepared.origin)
+    late = missed > 0
+    plot.quad(left=edges[:-1][late], right=edges[1:][late], bottom=data.workers * 1.02,
+              top=data.workers * 1.08, fill_color=_RED, line_color=_RED, line_width=3)
     plot.yaxis.axis_label = 'busy workers'
     _seconds(plot, 'time (s)')
     tool = RangeTool(x_range=time)
@@ -105,17 +104,12 @@ def _overview(data: ReportData, prepared: Prepared, time: Range1d) -> Any:
     return plot
 
 
-def _over_time(bins: Bins, origin: int) -> tuple[Any, Any, Any]:
-    """Return edges (s), mean number of busy workers and missed deadlines, in at most 600 bins."""
-    step = max(1, -(-bins.used // 600))
-    used = -(-bins.used // step) * step
-    width = bins.width * step
-    assert bins.origin is not None
-    edges = (bins.origin - origin + width * np.arange(used // step + 1)) / 1e9
-    busy = np.array(bins.busy[:bins.used] + [0] * (used - bins.used), dtype=np.float64)
-    missed = np.array(bins.missed[:bins.used] + [0] * (used - bins.used))
-    return (edges, busy.reshape(-1, step).sum(axis=1) / width,
-            missed.reshape(-1, step).sum(axis=1))
+def _over_time(use: PoolUse, origin: int) -> tuple[Any, Any]:
+    """Return the edges of steps (s), and the mean number of busy workers in each."""
+    found = use.result()
+    steps = found['step_ns'] * np.arange(len(found['busy_ns']) + 1)
+    return (((found['start_ns'] or 0) - origin + steps) / 1e9,
+            np.array(found['busy_ns']) / found['step_ns'])
 
 
 def _timeline(name: str, lines: list[Line], time: Range1d, gaps: list[list[int]]) -> Any:

@@ -12,8 +12,8 @@ run was:
    order in which they ended.  When there are more than ``most`` executions, whole blocks go: first
    those with the fewest missed deadlines, and of equal ones every second, then every second of the
    rest, and so on.  So the misses stay, and what stays of the rest is spread over the run.
-2. *Sums.*  How busy the workers were and how many deadlines were missed is added up in at most
-   ``BINS`` intervals; when the run outgrows them, each two become one.
+2. *Sums.*  How busy the workers were and when deadlines were missed is added up in few steps
+   (``PoolUse``).
 
 A *row* says which line of a picture an execution belongs to: the global vertex of the declaration,
 or -1-k for the k-th undeclared callback.
@@ -38,12 +38,12 @@ from mddag_executor.core.state import (
     SINK_MISSED,
 )
 from mddag_executor.replay.happenings import Batch, Observer, RAN, RELEASED
+from mddag_executor.replay.usage import PoolUse
 import numpy as np
 import numpy.typing as npt
 
 MOST_EXECUTIONS = 1_000_000
 BLOCK = 8192
-BINS = 2048
 MOST_UNDECLARED = 200
 OTHERS = 'other undeclared callbacks'
 
@@ -53,7 +53,7 @@ _KINDS = {
     SINK_IN_TIME: DONE, SINK_LATE: DONE, SINK_MISSED: OVERDUE, SINK_EXPIRED: EXPIRED,
     SINK_ABORTED: ABORTED, SINK_FAILED: FAILED}
 
-_FIRST_WIDTH = 1 << 16      # of a bin, ns
+_FIRST_STEP = 1 << 16       # of the sums, ns
 _ADDRESS = 2 ** 64 - 1
 # Columns of a piece.
 CALLBACK, _, VERTEX, DONE_FOR, WORKED_BY, BECAME_READY, STARTED, ENDED = range(8)
@@ -100,61 +100,6 @@ class _Block:
         return self.missed, self.number & -self.number if self.number else 1 << 62
 
 
-class Bins:
-    """
-    Sums over time: ``busy`` ns of declared workers, ``lent`` beside them, ``missed`` deadlines.
-
-    What was before the first stretch that is added is left out.
-
-    :ivar width: of a bin, ns; bin 0 begins at ``origin``.
-    """
-
-    def __init__(self) -> None:
-        self.origin: int | None = None
-        self.width = _FIRST_WIDTH
-        self.busy = [0] * BINS
-        self.lent = [0] * BINS
-        self.missed = [0] * BINS
-        self.used = 0
-
-    def place(self, time: int) -> int:
-        """Return the bin of a time, after making room for it."""
-        if self.origin is None:
-            self.origin = time
-        place = max(0, time - self.origin) // self.width
-        while place >= BINS:
-            self._double()
-            place //= 2
-        if place >= self.used:
-            self.used = place + 1
-        return place
-
-    def _double(self) -> None:
-        self.width *= 2
-        self.used = (self.used + 1) // 2
-        for sums in (self.busy, self.lent, self.missed):
-            sums[:] = [a + b for a, b in zip(sums[::2], sums[1::2])] + [0] * (BINS // 2)
-
-    def add(self, lent: bool, starts: Ints, ends: Ints) -> None:
-        """Add stretches in which workers were busy; the origin is known."""
-        if not len(starts):
-            return
-        assert self.origin is not None
-        sums = self.lent if lent else self.busy
-        self.place(int(ends.max()))
-        starts = np.maximum(starts, self.origin)
-        starts, ends = starts[starts < ends], ends[starts < ends]
-        while len(starts):
-            places = (starts - self.origin) // self.width
-            until = np.minimum(ends, self.origin + (places + 1) * self.width)
-            first = int(places.min())
-            busy = np.zeros(int(places.max()) + 1 - first, dtype=np.int64)
-            np.add.at(busy, places - first, until - starts)
-            for i, more in enumerate(busy.tolist(), first):
-                sums[i] += more
-            starts, ends = until[until < ends], ends[until < ends]
-
-
 class Timeline(Observer):
     """
     Collects what ran when.
@@ -162,11 +107,13 @@ class Timeline(Observer):
     :param most: how many executions are kept at most.
     :param names: tells the names of callbacks that are not declared.
     :ivar n_executions: how many there were; ``n_missed`` the deadlines missed.
+    :ivar busy_over_time: how busy the workers were over time, without the threads beside them; in
+        ``missed_over_time`` each missed deadline is one nanosecond.
     """
 
     def __init__(self, most: int = MOST_EXECUTIONS, block: int = BLOCK,
                  names: Callable[[int], str] = no_names) -> None:
-        self.bins = Bins()
+        self.busy_over_time, self.missed_over_time = PoolUse(_FIRST_STEP), PoolUse(_FIRST_STEP)
         self.n_executions = 0
         self.n_missed = 0
         self.workers: set[int] = set()
@@ -193,7 +140,6 @@ class Timeline(Observer):
                 if 6 * filled < self._block_size and len(self._blocks) > 1:
                     self._blocks[-2].missed += 1    # where much of the job ran
                 self.n_missed += 1
-                self.bins.missed[self.bins.place(max(time, deadline))] += 1
 
     def take(self, batch: Batch) -> None:
         """Keep what happened in a stretch of the run."""
@@ -202,12 +148,12 @@ class Timeline(Observer):
         ended = np.cumsum(batch.order == RAN)       # how many had ended, with that one
         decided_at = np.array(batch.decided_at, dtype=np.int64)
         decided_after = ended[decided_at] if len(ended) else decided_at
-        self._find_origin(batch, decided_after)
         executions = self._rows_of(pieces)
-        lent = pieces[:, WORKED_BY] < 0
-        for which in (False, True):
-            chosen = lent == which
-            self.bins.add(which, pieces[chosen, STARTED], pieces[chosen, ENDED])
+        by_workers = pieces[pieces[:, WORKED_BY] >= 0]
+        self.busy_over_time.add(by_workers[:, STARTED], by_workers[:, ENDED])
+        missed = np.array([max(time, deadline) for kind, *_, deadline, time in batch.decisions
+                           if is_miss(kind)], dtype=np.int64)
+        self.missed_over_time.add(missed, missed + 1)
         self.n_executions += n
         self.workers.update(np.unique(pieces[:, WORKED_BY]).tolist())
         decided, released = decided_after.tolist(), ended[batch.places(RELEASED)]
@@ -228,18 +174,6 @@ class Timeline(Observer):
                 return
             self._next_block()
             at = end
-
-    def _find_origin(self, batch: Batch, decided_after: Ints) -> None:
-        """Let the sums begin with what happened first."""
-        if self.bins.origin is not None:
-            return
-        for (kind, *_, deadline, time), after in zip(
-                batch.decisions, decided_after.tolist()):
-            if after == 0 and is_miss(kind):
-                self.bins.place(max(time, deadline))
-                return
-        if len(batch.columns(RAN)):
-            self.bins.place(int(batch.columns(RAN)[0, STARTED]))
 
     def _rows_of(self, pieces: Ints) -> Ints:
         """Return executions as they are kept: ROW, JOB, WORKER, READY, START, END."""

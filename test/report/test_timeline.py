@@ -7,8 +7,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE, SINK_MISSED
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.bags_reschedule import reschedule_bag
@@ -16,8 +14,6 @@ from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.happenings import Batch, Observer, Piece, RAN, RELEASED
 from mddag_executor.report import html
 from mddag_executor.report.timeline import (
-    BINS,
-    Bins,
     END,
     JOB,
     MOST_UNDECLARED,
@@ -57,7 +53,7 @@ def test_a_schedule_is_told_as_its_trace_says(
     assert told.timeline.n_executions == len(told.timeline.columns().executions[0]) > 100
     for ours, theirs in zip(told.timeline.columns(), read.timeline.columns()):
         assert np.array_equal(ours, theirs)
-    assert told.timeline.bins.busy == read.timeline.bins.busy
+    assert told.timeline.busy_over_time.result() == read.timeline.busy_over_time.result()
     assert told.usage.callbacks() == read.usage.callbacks()
     for sink in told.tables.sinks:
         assert told.chains.result(task_set, sink) == read.chains.result(task_set, sink)
@@ -197,25 +193,8 @@ def test_detail_is_bounded_and_keeps_the_misses() -> None:
         inside = (columns.executions[START] > left) & (columns.executions[END] < right)
         assert not inside.any() and left < right
     assert len(timeline.gaps()) >= 3
-    assert sum(timeline.bins.busy) == 1000 * 50 and sum(timeline.bins.missed) == 2
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 10 ** 12), st.integers(0, 10 ** 11), st.booleans()),
-                min_size=1, max_size=40))
-def test_sums_hold_whatever_the_width(stretches: list[tuple[int, int, bool]]) -> None:
-    bins = Bins()
-    first = stretches[0][0]
-    bins.place(first)
-    for start, took, lent in stretches:
-        bins.add(lent, np.array([start]), np.array([start + took]))
-    assert bins.origin == first
-    for sums, of_lent in ((bins.lent, True), (bins.busy, False)):
-        assert sum(sums) == sum(
-            max(0, start + took - max(start, first))
-            for start, took, lent in stretches if lent == of_lent)
-        assert len(sums) == BINS and all(0 <= part for part in sums)
-    assert 0 < bins.used <= BINS
+    assert sum(timeline.busy_over_time.result()['busy_ns']) == 1000 * 50
+    assert sum(timeline.missed_over_time.result()['busy_ns']) == 2
 
 
 def test_undeclared_callbacks_have_names_and_a_bound() -> None:
