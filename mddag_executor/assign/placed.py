@@ -10,7 +10,8 @@ Theory of operation
 2. All processes share the CPUs (``simulate.machine``).
 3. What the executor and the middleware take is added to execution times: ``CALLBACK_NS`` for each
    callback, ``TRANSPORT_NS`` at either end for each message between processes, which also arrives
-   ``DELAY_NS`` later.
+   ``DELAY_NS`` later.  DAGs are released ``APART_NS`` after one another: timers that start
+   together are never due at the very same time, so there are no ties.
 4. One placement is better than another where fewer deadlines are missed, then where the response
    that uses most of its deadline uses less of it.  Placements that differ in one block of nodes or
    two are tried, those of the least load first, until none is better or ``MOST_TRIES`` were tried.
@@ -36,11 +37,13 @@ from mddag_executor.simulate.deliveries import (
     edges_of,
     Transports,
 )
+from mddag_executor.simulate.engine import Load
 from mddag_executor.simulate.machine import Machine
 from mddag_executor.simulate.workload import periodic_load
 from msg_graph import Process, TaskSet
 
-CALLBACK_NS = 100_000
+CALLBACK_NS = 180_000
+APART_NS = 20_000
 MOST_TRIES = 150
 _AHEAD = 40
 
@@ -74,7 +77,7 @@ class Predictor:
         times, transports = self._with_transport(tables, execution_ns)
         holds = [process if vertex.callback.holds_interpreter is not False else 0
                  for process, vertex in zip(tables.process, task_set.vertices)]
-        load = periodic_load(task_set, times, self._duration)._replace(holds=holds)
+        load = _apart(periodic_load(task_set, times, self._duration)._replace(holds=holds))
         pools = [self._workers] * len(processes)
         state = new_state(
             tables, sum(pools), propagate=2, preemptive=self._policy.mode(False, len(pools)),
@@ -87,8 +90,9 @@ class Predictor:
                            deliveries=deliveries, machine=machine)
         finish(tables, state, ended)
         tally = Tally(task_set, tables)
-        for dag in load.dags:
-            tally.released(dag)
+        for time, dag in zip(load.times, load.dags):
+            if time < self._duration:
+                tally.released(dag)
         tally.add(state.decisions)
         return tally
 
@@ -109,6 +113,14 @@ class Predictor:
             times[tables.dag_of[vertex]][tables.index_in_dag[vertex]] += TRANSPORT_NS
         base = list(accumulate(edges_of(tables), initial=0))[:-1]
         return times, Transports(delays, base, [0] * len(base))
+
+
+def _apart(load: Load) -> Load:
+    """Release each DAG a little after the one before it (rule 3)."""
+    releases = sorted((time + dag * APART_NS, dag, job) for time, dag, job in zip(
+        load.times, load.dags, load.jobs))
+    times, dags, jobs = (list(column) for column in zip(*releases))
+    return load._replace(times=times, dags=dags, jobs=jobs)
 
 
 def cost_of(tally: Tally) -> Cost:

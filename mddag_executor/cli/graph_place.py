@@ -93,8 +93,9 @@ def main(args: argparse.Namespace) -> int:
             'processes': [{'name': p.name, 'nodes': p.nodes} for p in processes],
             'loads': _loads(placing, place, processes), 'cpus': cpus, 'workers': workers,
             'policy': args.policy, 'tried': tried,
-            'predicted': predictor.predict(processes, times).result()['dags'],
-            'one_process': predictor.predict(_one(placing.nodes), times).result()['dags'],
+            **{name: _predicted(args, task_set, cpus, predictor, where, times)
+               for name, where in (('predicted', processes),
+                                   ('one_process', _one(placing.nodes)))},
             'factor': _factor(predictor, processes, times),
             'draws': _draws(args, task_set, workers, predictor, processes)}
     common.write_text(args.output, with_processes(task_set, processes).text)
@@ -159,6 +160,23 @@ def _recorded(traces: list[str], task_set: TaskSet) -> tuple[list[list[int]], Ta
             replace(vertex, callback=callbacks[vertex.callback.key]) for vertex in dag.vertices))
         for dag in task_set.dags))
     return [[times[v.callback.key] for v in dag.vertices] for dag in task_set.dags], judged
+
+
+def _predicted(
+    args: argparse.Namespace, task_set: TaskSet, cpus: int, predictor: Predictor,
+    processes: Sequence[Process], times: list[list[int]],
+) -> dict[str, Any]:
+    """Return the sinks of a placement; of recorded runs with what each job took, and when."""
+    if not args.trace:
+        dags: dict[str, Any] = predictor.predict(processes, times).result()['dags']
+        return dags
+    from mddag_executor.replay import reschedule
+    path = args.trace[0] if len(args.trace) == 1 else args.trace
+    outcome = reschedule(
+        path, task_set, policy=args.policy, workers=args.workers, preemptive=False, cpus=cpus,
+        name=', '.join(args.trace), processes=lambda *of: processes)
+    dags = outcome.result()['dags']
+    return dags
 
 
 def _loads(placing: Placing, place: dict[int, int], processes: Sequence[Process]) -> list[float]:

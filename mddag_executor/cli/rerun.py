@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import ExitStack, redirect_stdout
+from dataclasses import replace
 import os
 import sys
 import traceback
@@ -121,6 +122,10 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
     from mddag_executor.rerun.run import Rerun, Settings
     from mddag_executor.rerun.sources import open_source
     task_set = common.load_graph(args.graph)
+    if task_set.processes:
+        warn(f'{task_set.file}: processes: all nodes run in one here, with its workers and its '
+             'interpreter, and messages between them take no longer')
+        task_set = replace(task_set, processes=())
     settings = Settings(
         defaults.workers(args.workers, task_set), args.cpus, args.policy, args.seed,
         args.all_clocks, ros_args=tuple(args.ros_args))

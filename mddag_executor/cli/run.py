@@ -17,6 +17,7 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import replace
+from functools import partial
 import os
 from pathlib import Path
 import re
@@ -324,13 +325,18 @@ def _run_synthetic(
     from mddag_executor.live import current_job
     from mddag_executor.live.session import run_and_note
     from mddag_executor.live.synthetic import SyntheticWorkload
+    meet = None
+    if args.part is not None:
+        from mddag_executor.live.parts import Part
+        meet = partial(Part.read(args.part).meet, args.process,
+                       [process.name for process in task_set.processes])
     workload = SyntheticWorkload(
         task_set, plan, current_job=current_job, process=args.process)
     for node in workload.nodes:
         session.executor.add_node(node)
     try:
         with session:
-            return run_and_note(session, workload, seconds, progress.update)
+            return run_and_note(session, workload, seconds, progress.update, meet=meet)
     finally:
         workload.destroy()
 

@@ -10,6 +10,9 @@ there, under its process id, what came of it.  Sinks are judged where they are, 
 verdicts are put together by the core (``core.tally.of_processes``); callbacks are counted where
 they are; rules that need all of them (drift, what the synthetic nodes measured) get the sum of
 what was observed.
+
+Synthetic nodes start together in all processes, as they do in one: each process notes in the
+folder when it is ready, and starts ``LEAD_NS`` after the last of these times.
 """
 
 from __future__ import annotations
@@ -19,16 +22,19 @@ from dataclasses import asdict, dataclass
 import json
 import os
 from pathlib import Path
+import time
 from typing import Any
 
 from mddag_executor.core.tally import of_processes
 from mddag_executor.live.entity import COUNTS
 from mddag_executor.live.execution import ExecutionPlan
 from mddag_executor.live.measure import Books
-from mddag_executor.live.session import measured
+from mddag_executor.live.session import MATCH_TIMEOUT_S, measured, Session
 from msg_graph import TaskSet
 from msg_graph.binding import Entity
 from msg_graph.drift import drift, Observed, Releases
+
+LEAD_NS = 100_000_000
 
 Results = Sequence[tuple[str, Mapping[str, Any]]]
 """The name of each process that has left a result, and that."""
@@ -63,6 +69,20 @@ class Part:
         part = path.with_suffix('.part')
         part.write_text(json.dumps(result))
         part.replace(path)
+
+    def meet(self, name: str, names: Sequence[str], session: Session) -> None:
+        """Wait for the instant at which all processes start; not for ever, nor if the run ends."""
+        own = self.folder / f'{name}.ready'
+        part = own.with_suffix('.part')
+        part.write_text(str(time.monotonic_ns()))
+        part.replace(own)
+        paths = [self.folder / f'{each}.ready' for each in names]
+        end = time.monotonic() + MATCH_TIMEOUT_S
+        while not all(path.exists() for path in paths) and time.monotonic() < end:
+            if session.wait(0.01):
+                return
+        at = max(int(path.read_text()) for path in paths if path.exists()) + LEAD_NS
+        session.wait(max(0, at - time.monotonic_ns()) / 1e9)
 
 
 def left(folder: str, pid: int) -> Any:

@@ -188,12 +188,14 @@ def measured(books: Books, plan: ExecutionPlan, warm_up_s: float = WARM_UP_S) ->
 def run_and_note(
     session: Session, workload: SyntheticWorkload, duration_s: float | None,
     tick: Tick | None = None, warm_up_s: float = WARM_UP_S,
+    meet: Callable[[Session], None] | None = None,
 ) -> Books | None:
     """
     Run a synthetic workload as ``run_synthetic`` does.
 
     :param duration_s: length of the measured window, which begins ``warm_up_s`` after the timers;
         None: until the session is stopped.
+    :param meet: waits for the instant at which other processes start, too.
     :return: the books about it; None when the run was stopped before the window began.
     :raises SessionError: when publishers and subscriptions do not find each other.
     """
@@ -201,6 +203,8 @@ def run_and_note(
     try:
         executors: Callable[[], list[str]] = getattr(session.executor, 'unmatched', list)
         session.wait_until_matched(lambda: workload.unmatched() + executors())
+        if meet is not None:
+            meet(session)
         if not session.stopped:
             workload.start(session.executor.wake)
             if not session.wait(warm_up_s):

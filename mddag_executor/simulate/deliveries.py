@@ -25,8 +25,8 @@ from mddag_executor.core import NEVER, rules, Tables
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.state import OPEN, PREEMPTIVE, State
 
-DELAY_NS = 300_000
-"""What a message takes from one process to another of this machine, as far as is known."""
+DELAY_NS = 1_000_000
+"""What a message takes to another process of this machine, whose interpreter is in use."""
 
 
 class Transports(NamedTuple):

@@ -63,6 +63,15 @@ def test_a_run_and_its_result(drive: Path) -> None:
     assert 'the same as out.mcap' in same.stdout
 
 
+def test_processes_run_as_one_and_that_is_said(drive: Path) -> None:
+    text = (drive / 'graph.yaml').read_text()
+    (drive / 'placed.yaml').write_text(
+        text + 'processes: {eyes: [/lidar, /tracker], brake: [/brake]}\n')
+    done = mddag(drive, 'rerun', 'drive.mcap', 'placed.yaml', *NODES, '--json', '-')
+    assert 'placed.yaml: processes: all nodes run in one here' in done.stderr
+    assert json.loads(done.stdout)['digest'] == digest(drive, 'graph.yaml', *NODES)
+
+
 @pytest.mark.slow
 def test_the_same_each_time_also_beside_busy_processes(drive: Path) -> None:
     """Also where seven workers are too few, and with other hashes of strings."""

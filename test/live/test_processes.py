@@ -16,6 +16,7 @@ import time
 from typing import Any
 
 from mddag_executor.core.tally import counts
+from mddag_executor.live import parts
 from mddag_executor.replay import replay
 from mddag_executor.trace import read_events
 from msg_graph import loads
@@ -119,6 +120,34 @@ def test_synthetic_nodes_in_two_processes_are_measured_as_one_run(
         assert len(loads(said['yaml']).processes) == 2
         assert said['file'] == 'chain.yaml'
     assert 'measured by the nodes, ' in run.stdout and '1 declared callback' not in run.stdout
+
+
+def test_processes_start_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The one that is ready first waits for the other, and both until the same instant."""
+    parts.Part.make(str(tmp_path), CHAIN)
+    clock = {'first': 5 * 10 ** 9, 'second': 7 * 10 ** 9}
+    until = {}
+
+    class Waiting:
+
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def wait(self, seconds: float) -> bool:
+            if not (tmp_path / 'second.ready').exists():
+                meet('second')
+                monkeypatch.setattr(parts.time, 'monotonic_ns', lambda: clock[self.name])
+                return False
+            until[self.name] = clock[self.name] + round(seconds * 1e9)
+            return False
+
+    def meet(name: str) -> None:
+        monkeypatch.setattr(parts.time, 'monotonic_ns', lambda: clock[name])
+        waiting: Any = Waiting(name)
+        parts.Part.read(str(tmp_path)).meet(name, ['first', 'second'], waiting)
+
+    meet('first')
+    assert until == dict.fromkeys(('second', 'first'), clock['second'] + parts.LEAD_NS)
 
 
 def test_programs_run_in_the_process_of_their_nodes(world: Path) -> None:
