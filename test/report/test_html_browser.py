@@ -4,10 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-import os
+from collections.abc import Callable
 from pathlib import Path
-import shutil
 import time
 from typing import Any
 
@@ -16,40 +14,12 @@ from mddag_executor.report import html
 import pytest
 
 from . import runs
+from .conftest import PATIENCE_S
 
 pytest.importorskip('bokeh', reason='Bokeh is not installed')
-webdriver = pytest.importorskip('selenium.webdriver', reason='selenium is not installed')
-
-CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') \
-    or shutil.which('google-chrome')
-DRIVER = shutil.which('chromedriver')
+pytest.importorskip('selenium.webdriver', reason='selenium is not installed')
 
 pytestmark = pytest.mark.needs('chromium')
-
-FLAGS = (
-    '--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
-    '--disable-background-networking', '--disable-component-update', '--disable-sync',
-    '--disable-dev-shm-usage', '--window-size=1400,1000',
-    # whatever a page asked for over the network would fail and be an error on its console
-    '--host-resolver-rules=MAP * ~NOTFOUND')
-PATIENCE_S = 60.0
-
-
-@pytest.fixture(scope='module')
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    from selenium.webdriver.chrome.service import Service
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    profile = tmp_path_factory.mktemp('profile')
-    for flag in (*FLAGS, f'--user-data-dir={profile}'):
-        options.add_argument(flag)
-    options.set_capability('goog:loggingPrefs', {'browser': 'ALL'})
-    os.environ.setdefault('SE_OFFLINE', 'true')
-    driver = webdriver.Chrome(options=options, service=Service(DRIVER))
-    driver.set_script_timeout(PATIENCE_S)
-    driver.set_page_load_timeout(PATIENCE_S)
-    yield driver
-    driver.quit()
 
 
 def wait_for(condition: Callable[[], Any]) -> Any:
