@@ -15,9 +15,9 @@ it could have started at once.  (It may still have waited: a worker that is abou
 to take what it has started itself.)  Else it had to wait for the worker that took it, until that
 had ended what it did before.
 
-One that holds the interpreter also had to wait until the last one before it that did so had ended.
-One that starts while another holds it waits for a switch interval at most, with whatever a thread
-does before it runs a callback: that is the interpreter's time, not the executor's.
+What passed while another execution of its process computed is not the executor's, beyond what is
+usual: one that computes had to wait for its turn, and a thread that begins for the interpreter or
+a CPU.
 """
 
 from __future__ import annotations
@@ -40,18 +40,17 @@ class Dispatches:
         # from when it was free, and from when its worker was, too
         self._free, self._worker = array('q'), array('q')
         self._start, self._end = array('q'), array('q')
-        self._interpreter, self._holding = array('q'), array('q')
+        self._process = array('q')
 
     def add(
         self, worker: int, group: int | None, ready: int, start: int, end: int,
-        interpreter: int = 1,
+        process: int = 1,
     ) -> int:
         """
         Add an execution; times in ns.
 
         :param worker: which one ran it, -1 where that is not known.
         :param group: what identifies its mutually exclusive callback group, or None.
-        :param interpreter: that of its process.
         :return: its number.
         """
         could = ready
@@ -65,43 +64,36 @@ class Dispatches:
         self._worker.append(could)
         self._start.append(start)
         self._end.append(end)
-        self._interpreter.append(interpreter)
+        self._process.append(process)
         return len(self._start) - 1
 
-    def holds(self, number: int) -> None:
-        """Note that an execution holds the interpreter."""
-        self._holding.append(number)
+    def late(self, computing: Any = ()) -> Any:
+        """
+        Return by number how late it was dispatched, ns, as an array.
 
-    def late(self) -> Any:
-        """Return by number how late it was dispatched, ns, as an array."""
+        :param computing: the numbers of those that compute.
+        """
+        from mddag_executor.replay.alone import time_of
         import numpy as np
         free, start, end, worker = (
             np.array(column, dtype=np.int64) for column in (
                 self._free, self._start, self._end, self._worker))
-        process = np.array(self._interpreter, dtype=np.int64)
+        process = np.array(self._process, dtype=np.int64)
         could = worker.copy()
         for number in np.unique(process).tolist():
             here = process == number
             n_free, n_ended = (
                 np.searchsorted(np.sort(times[here]), free, 'right') for times in (free, end))
             could = np.where(here & (n_free - n_ended <= self._n_workers), free, could)
-        if self._holding:
-            self._for_interpreter(start, end, could)
-        return np.maximum(0, start - could)
-
-    def _for_interpreter(self, start: Any, end: Any, could: Any) -> None:
-        """Let executions start later that had to wait for an interpreter."""
-        from mddag_executor.replay.alone import held_for
-        from mddag_executor.simulate.machine import SWITCH_NS
-        import numpy as np
-        interpreter = np.array(self._interpreter, dtype=np.int64)
-        holding = np.array(self._holding, dtype=np.int64)
-        for number in np.unique(interpreter[holding]).tolist():
-            mine = holding[interpreter[holding] == number]
-            before = np.sort(end[mine])
-            place = np.searchsorted(before, start[mine], 'right') - 1
-            could[mine] = np.maximum(
-                could[mine], np.where(place >= 0, before[place], could[mine]))
-            here = interpreter == number
-            could[here] += np.minimum(
-                held_for(start[here], start[mine], end[mine]), SWITCH_NS)
+        computing = np.array(computing, dtype=np.int64)
+        beside = np.zeros(len(start), dtype=np.int64)
+        for number in np.unique(process[computing]).tolist():
+            mine, here = computing[process[computing] == number], process == number
+            ended = np.sort(end[mine])
+            place = np.searchsorted(ended, start[mine], 'right') - 1
+            could[mine] = np.maximum(could[mine], np.where(place >= 0, ended[place], 0))
+            until = time_of(start[mine], end[mine], 0)
+            beside[here] = (until(start) - until(np.minimum(could, start)))[here]
+        late = np.maximum(0, start - could)
+        usual = np.median(late[beside == 0]) if (beside == 0).any() else 0
+        return np.maximum(np.minimum(late, usual), late - beside).astype(np.int64)

@@ -21,7 +21,8 @@ Theory of operation
   DAG, ready when it was in the recording.  Callback groups of undeclared callbacks are not kept.
 * Where CPU times are recorded, an execution time is what the execution would have taken alone (see
   ``alone``), and the load says what it computed and whether it held the interpreter: as recorded,
-  or as the declaration says.
+  or as the declaration says.  What the executor did not take for one that holds it, though the
+  callback usually does, computes with Python's lock all the same; only nobody waits for it.
 * *Transport*: a message is there some time after the callback that published it has ended (or
   before that: it published early).  That is the time from its end to the successor's readiness.
 * *Dispatch*: the time from when an execution could have started to when it did (see
@@ -63,6 +64,7 @@ class RecordedLoad(NamedTuple):
     ``dispatches`` is what of ``load.costs`` is dispatch; it is empty without overheads.
     ``dispatch_ns`` and ``transport_ns`` are medians of what was measured, None where nothing was.
     ``computed`` has the CPU times, as ``load.costs``; it is empty where none is recorded.
+    ``locks`` tells, as ``computed``, which of them computed with Python's lock.
     """
 
     load: Load
@@ -78,6 +80,7 @@ class RecordedLoad(NamedTuple):
     computed: Sequence[int] = ()
     dispatches: Sequence[int] = ()
     skipped: frozenset[tuple[int, int]] = frozenset()
+    locks: Sequence[bool] = ()
 
 
 class _Jobs:
@@ -130,6 +133,7 @@ class LoadBuilder(Observer):
         self._who = who
         self._tables = tables
         self._process = [*(recorded or [1] * tables.n_vertices), 1]
+        self._callbacks = task_set.places_of_vertices()
         self._cpus = cpus
         self._jobs = [_Jobs(dag, n) for dag, n in zip(task_set.dags, edges_of(tables))]
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
@@ -217,8 +221,6 @@ class LoadBuilder(Observer):
         jobs.took[place] = busy
         jobs.cpu[place] = cpu
         jobs.held[place] = held
-        if held and jobs.dispatch[place] >= 0:
-            self._dispatches.holds(jobs.dispatch[place])
         jobs.start[place] = start
         jobs.end[place] = ended
         if several:
@@ -264,7 +266,8 @@ class LoadBuilder(Observer):
         if self._leg is not None:
             self._others.append(self._leg[1])
             self._leg = None
-        self._take_back()
+        locks = self._locks()
+        computing = self._take_back(locks)
         process = process or self._process
         typical = self._typical()
         unknown: dict[str, None] = {}
@@ -274,8 +277,8 @@ class LoadBuilder(Observer):
         holds: list[int] = []
         bases: list[int] = []
         dispatches: list[int] = []
-        late = self._dispatches.late()
-        measured = np.concatenate([np.asarray(jobs.dispatch) for jobs in self._jobs])
+        measured = self._all('dispatch')
+        late = self._dispatches.late(measured[(measured >= 0) & computing])
         measured = measured[measured >= 0]
         usual = quantile(np.sort(late[measured]).tolist(), 0.5) if len(measured) else 0
         late = np.append(late, usual)  # number -1
@@ -313,28 +316,58 @@ class LoadBuilder(Observer):
             [jobs.numbers for jobs in self._jobs], demand, executions, estimated, list(unknown),
             transports, usual if len(measured) else None, transport,
             frozenset(self._failed), computed if max(computed, default=-1) >= 0 else (),
-            dispatches, frozenset(self._skipped))
+            dispatches, frozenset(self._skipped),
+            [*locks.tolist(), *([False] * len(others))])
 
-    def _take_back(self) -> None:
-        """Make the execution times those that the executions would have taken alone."""
-        from mddag_executor.replay.alone import alone
+    def _all(self, column: str) -> Any:
+        """Return a column of all jobs, DAG by DAG."""
         import numpy as np
-        took, start, cpu, held = (
-            np.concatenate([np.asarray(getattr(jobs, name)) for jobs in self._jobs])
-            for name in ('took', 'start', 'cpu', 'held'))
-        interpreter = np.concatenate([
-            np.tile(self._process[first:first + jobs.size], len(jobs.numbers))
+        return np.concatenate([np.asarray(getattr(jobs, column)) for jobs in self._jobs])
+
+    def _locks(self) -> Any:
+        """
+        Return which executions computed with Python's lock.
+
+        Those that hold the interpreter, and those of callbacks that usually do: the executor did
+        not know it yet, or thought once that one waits.
+        """
+        import numpy as np
+        callback = self._by_execution(self._callbacks)
+        held, known = self._all('held') > 0, self._all('cpu') >= 0
+        n_held, n_known = (
+            np.bincount(callback[which], minlength=len(self._task_set.callbacks))
+            for which in (known & held, known))
+        return known & (held | (2 * n_held >= np.maximum(1, n_known))[callback])
+
+    def _by_execution(self, by_vertex: Sequence[int]) -> Any:
+        import numpy as np
+        return np.concatenate([
+            np.tile(by_vertex[first:first + jobs.size], len(jobs.numbers))
             for first, jobs in zip(self._first, self._jobs)])
+
+    def _take_back(self, locks: Any) -> Any:
+        """
+        Make the execution times those that the executions would have taken alone.
+
+        :return: which of them compute, all in all.
+        """
+        from mddag_executor.replay.alone import alone, computing
+        took, start, cpu = (self._all(name) for name in ('took', 'start', 'cpu'))
+        interpreter, callback = (
+            self._by_execution(self._process), self._by_execution(self._callbacks))
+        cpu[took < 0] = _UNKNOWN
+        computes = computing(callback, took, cpu)
+        if not (cpu >= 0).any():
+            return computes
         ran = took >= 0
-        if not (cpu[ran] >= 0).any():
-            return
-        took[ran] = alone(start[ran], took[ran], cpu[ran], held[ran], interpreter[ran],
-                          self._cpus)
+        took[ran] = alone(start[ran], took[ran], cpu[ran], callback[ran], locks[ran],
+                          interpreter[ran], self._cpus)
         first = 0
         for jobs in self._jobs:
             n = len(jobs.took)
             jobs.took = array('q', took[first:first + n].tobytes())
             first += n
+        return computes
 
     def _computing(
         self, dag: Dag, jobs: _Jobs, took: Any, missing: Any, computed: list[int],

@@ -68,7 +68,7 @@ class How(NamedTuple):
         deliveries = Deliveries(
             tables, state, policy.key, work.transports, work.failed, stops, work.skipped)
         machine = Machine(tables, state, load, self.cpus, work.computed,
-                          bool(work.computed and load.holds), deliveries)
+                          bool(work.computed and load.holds), deliveries, work.locks)
         ended = engine.run(tables, state, policy.key, load, end, stop_at_first_miss, log,
                            deliveries=deliveries, machine=machine if stops else None)
         if ended == end:

@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 Alone, an execution takes its cost.  What it needs meanwhile depends on how far it is; in turn
 
-1.  it computes with Python's lock: half of its CPU time if it holds the interpreter, all of it if
+1.  it computes with Python's lock: half of its CPU time if it is one that does so, all of it if
     it hardly waits besides; if it only waits, the little that Python takes to begin;
 2.  it computes without the lock: CPU time of one that computes and does not hold the interpreter;
 3.  it waits, and needs nothing;
@@ -88,18 +88,22 @@ class Machine:
     :param computed: CPU time of the executions, as ``load.costs``; -1: it waits, as far as is
         known.  Empty: all of them compute all the time.
     :param python: whether executions that do not hold the interpreter need it at their end.
+    :param locks: whether they compute with Python's lock, as ``computed``; empty: those do that
+        hold the interpreter.
     :ivar next_time: when somebody needs something else, or must wait.
     """
 
     def __init__(
         self, tables: Tables, state: State, load: Load, cpus: int | None = None,
         computed: Sequence[int] = (), python: bool = False, deliveries: Places | None = None,
+        locks: Sequence[bool] = (),
     ) -> None:
         self._t = tables
         self._s = state
         self._load = load
         self._cpus = cpus or NEVER
         self._computed = computed
+        self._locks_of = locks
         self._python = python
         self._deliveries = deliveries
         state.overtaking.extend([1] * (max(tables.process) + 1 - len(state.overtaking)))
@@ -142,15 +146,16 @@ class Machine:
         place = (load.cost_base[dag] + s.job_index[slot] * load.cost_stride[dag]
                  + x - s.job_base[slot])
         cost = s.x_cost[x]
-        self.begins(x, cost, self._computed[place] if self._computed else cost)
+        self.begins(x, cost, self._computed[place] if self._computed else cost,
+                    bool(self._locks_of and self._locks_of[place]))
 
-    def begins(self, x: int, cost: int, cpu: int) -> None:
+    def begins(self, x: int, cost: int, cpu: int, locks: bool = False) -> None:
         """Take in what an execution that has been dispatched takes, and what it computes of it."""
-        self._parts[x] = self._ends(cost, min(cpu, cost), self._s.x_holds[x] != 0)
+        self._parts[x] = self._ends(cost, min(cpu, cost), locks or self._s.x_holds[x] != 0)
 
-    def _ends(self, cost: int, cpu: int, holds: bool) -> tuple[int, int, int]:
+    def _ends(self, cost: int, cpu: int, locks: bool) -> tuple[int, int, int]:
         """Return where the first three parts of an execution end."""
-        if holds:
+        if locks:
             if (cost - cpu) * HARDLY <= cpu:
                 return cost, cost, cost
             half = cpu // 2

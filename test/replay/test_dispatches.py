@@ -58,17 +58,15 @@ def test_a_schedule_without_overhead_has_none(jobs: list[tuple[int, int]]) -> No
     assert late(3, *executions) == [0] * len(jobs)
 
 
-def test_waiting_for_the_interpreter_is_not_late() -> None:
-    """Three that hold it, one after the other; a fourth overtakes; one that does not hold it."""
+def test_waiting_for_what_computes_is_not_late() -> None:
+    """Three that compute, one after the other; a fourth overtakes; one that only waits."""
     found = Dispatches(5)
     ms = 1_000_000
-    first = found.add(0, None, 0, 0, 10 * ms)
+    first = found.add(0, None, 0, 30, 10 * ms)
     overtakes = found.add(3, None, 4 * ms, 5 * ms + 7, 6 * ms)
     second = found.add(1, None, 0, 10 * ms + 50, 20 * ms)
-    other = found.add(4, None, 12 * ms, 13 * ms + 9, 22 * ms)
+    waits = found.add(4, None, 12 * ms, 13 * ms + 9, 22 * ms)
     third = found.add(2, None, 15 * ms, 20 * ms + 60, 30 * ms)
-    elsewhere = found.add(2, None, 15 * ms, 15 * ms + 70, 30 * ms, interpreter=2)
-    for number in (first, second, third, overtakes):
-        found.holds(number)
-    assert found.late().tolist() == [0, 7, 50, 9, 60, 70]
-    assert [first, overtakes, second, other, third, elsewhere] == list(range(6))
+    # what passed beside another is no more than usual: 50
+    assert found.late([first, second, third, overtakes]).tolist() == [30, 50, 50, 50, 60]
+    assert [first, overtakes, second, waits, third] == list(range(5))

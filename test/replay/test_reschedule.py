@@ -455,18 +455,23 @@ def of_python(path: Path, jobs: list[tuple[int, int, int, int, bool]], cpus: int
         f'{{name: d{dag}, timer: 100ms, deadline: {deadline}ms, dag: d{dag}}}'
         for dag, deadline in enumerate((20, 50, 90)))
     text = f'mddag: 1\nnodes: [{{node: /n, callbacks: [{callbacks}]}}]'
-    ends = sorted((end, dag, start, cpu, held) for dag, start, end, cpu, held in jobs)
+    seen: list[int] = []
+    ends = []
+    for dag, start, end, cpu, held in jobs:
+        ends.append((end, dag, seen.count(dag), start, cpu, held))
+        seen.append(dag)
+    ends.sort()
     with TraceFile(path) as file:
         file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 3, 100 * MS, 64, False, cpus)
-        for dag, start, *_ in jobs:
+        for _, dag, job, start, *_ in sorted(ends, key=lambda each: each[3]):
             now = START_TIME + start * MS
-            file.add('job_release', now, 1, 1, dag, 0, now)
-        for end, dag, start, cpu, held in ends:
+            file.add('job_release', now, 1, 1, dag, job, now)
+        for end, dag, job, start, cpu, held in ends:
             now, end = START_TIME + start * MS, START_TIME + end * MS
-            file.add('dispatch', now, 1, 10 + dag, 9 + dag, dag, 0, 0, dag, now, 0)
+            file.add('dispatch', now, 1, 10 + dag, 9 + dag, dag, 0, job, dag, now, 0)
             file.add('callback_start', now, 1, 10 + dag, 9 + dag, False)
             file.add('callback_end', end, 1, 10 + dag, 9 + dag)
-            file.add('complete', end, 1, 10 + dag, 9 + dag, dag, 0, 0, True, end, 0, cpu * MS,
+            file.add('complete', end, 1, 10 + dag, 9 + dag, dag, 0, job, True, end, 0, cpu * MS,
                      held)
         file.add('shutdown', START_TIME + 200 * MS, 1, 1, START_TIME + 200 * MS)
 
@@ -487,6 +492,16 @@ def test_what_was_stretched_by_the_interpreter_is_taken_back(tmp_path: Path) -> 
     # what waited for nobody else keeps its waiting
     of_python(path, [(0, 0, 20, 10, True)])
     assert responses(path, workers=1) == [20]
+
+
+def test_one_that_was_not_known_to_compute_does_so_all_the_same(tmp_path: Path) -> None:
+    """At first nobody knows who holds the interpreter: they take turns, in each what-if, too."""
+    path = tmp_path / 'a.mcap'
+    later = [(dag, start, start + 10, 10, True) for start in (100, 120) for dag in (0,)]
+    later += [(1, start, start + 10, 10, True) for start in (140, 160)]
+    of_python(path, [(0, 0, 20, 10, False), (1, 0, 20, 10, False), *later])
+    assert responses(path, workers=1) == [10, 20]
+    assert responses(path, workers=3) == [19, 20]
 
 
 def test_what_computes_without_the_interpreter_shares_the_cpus(tmp_path: Path) -> None:
