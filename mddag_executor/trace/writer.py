@@ -74,6 +74,7 @@ class TraceWriter:
         self._pending: deque[tuple[Any, ...]] = deque()
         self._capacity = capacity       # 0: nothing is taken any more
         self._lost = 0
+        self._after_end = 0             # not in the trace, which ends before, and no loss of it
         # Reentrant, for a finalizer or signal handler that records while its thread counts a loss.
         self._lost_lock = threading.RLock()
         self._slice: list[tuple[Any, ...]] = []     # what went to the file object last,
@@ -83,7 +84,7 @@ class TraceWriter:
         self._vpid = os.getpid()
         self._stop = threading.Event()
         self._close_lock = threading.Lock()
-        self._closed = False
+        self._ending = self._closed = False
         # A daemon, so that a program that forgets close() ends; atexit completes its file.
         self._thread = threading.Thread(target=self._run, name='mddag trace writer', daemon=True)
         self._thread.start()
@@ -105,7 +106,10 @@ class TraceWriter:
             self._pending.append(event)
         else:
             with self._lost_lock:
-                self._lost += events_of(event)
+                if self._ending:
+                    self._after_end += events_of(event)
+                else:
+                    self._lost += events_of(event)
 
     def now(self) -> int:
         """Return the time in ns on the trace's clock."""
@@ -120,7 +124,7 @@ class TraceWriter:
     def dropped(self) -> int:
         """Return how many recorded events are not in the file and will not be."""
         late = sum(map(events_of, self._pending)) if self._closed or self.error else 0
-        return self._lost + self._file.rejected + late
+        return self._lost + self._after_end + self._file.rejected + late
 
     def close(self) -> None:
         """
@@ -136,6 +140,7 @@ class TraceWriter:
             # In a forked child there is neither the thread nor a right to the parent's file.
             if self._closed or os.getpid() != self._vpid:
                 return False
+            self._ending = True
             self._capacity = 0
             self._stop.set()
             self._thread.join()

@@ -44,6 +44,24 @@ def test_it_records(tmp_path: Path) -> None:
     assert writer.dropped == 1
 
 
+def test_what_comes_while_it_closes_is_no_loss(tmp_path: Path) -> None:
+    """Under load its thread may need a while for the rest, and callbacks that were left end."""
+    path = tmp_path / 'a.mcap'
+    writer = TraceWriter(path, flush_interval_s=60.0)
+    writer.record('callback_end', 7, 8, 9)
+    drain = writer._drain
+
+    def slow_drain() -> None:
+        writer.record('callback_end', 8, 8, 9)
+        drain()
+
+    writer._drain = slow_drain  # type: ignore[method-assign]
+    writer.close()
+    events, warnings = read(path)
+    assert [event[0] for event in events] == ['ros2:callback_end'] and warnings == []
+    assert writer.dropped == 1
+
+
 def test_the_clock(tmp_path: Path) -> None:
     with TraceWriter(tmp_path / 'a.mcap') as writer:
         assert abs(writer.now() - time.time_ns()) < 1_000_000_000
