@@ -214,7 +214,11 @@ class Search:
                 times=load.times[first:last], dags=load.dags[first:last],
                 jobs=load.jobs[first:last], releases=load.releases[first:last])
         with no_garbage():
-            return min(self._misses((load, computed, end), self._stops), default=None,
+            missed = list(self._misses((load, computed, end), self._stops, True))
+            if self._stops and missed and all(miss.sink in self.left_out for miss in missed):
+                # it stopped where a job of what is left out expired
+                missed = list(self._misses((load, computed, end), False))
+            return min((miss for miss in missed if miss.sink not in self.left_out), default=None,
                        key=lambda miss: miss.deadline)
 
     def factor(self, callback: int) -> Found:

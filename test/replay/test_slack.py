@@ -67,6 +67,18 @@ def test_what_misses_already_is_left_out(
     assert result['callbacks']['/a:first']['factor'] > 10     # the other worker is free
 
 
+def test_what_is_left_out_and_expires_hides_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph = tmp_path / 'g.yaml'
+    graph.write_text(BY_HAND.replace('deadline: 8ms', 'deadline: 2ms').replace(
+        'timer: 10ms,', 'timer: 10ms, max_active_jobs: 2,').replace(
+        'deadline: 100ms, execution_time: 100us', 'deadline: 90ms, execution_time: 10ms'))
+    _, result = slack_of(capsys, str(graph))
+    assert result['left_out'] == ['/b:last']
+    assert result['load']['breaks'] == '/c:alone' and result['load']['factor'] <= 9
+
+
 def test_what_people_see(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     graph, page = tmp_path / 'g.yaml', tmp_path / 's.html'
     graph.write_text(BY_HAND)
