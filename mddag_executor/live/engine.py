@@ -339,9 +339,10 @@ class Engine:
         :param worker: -1: the idle one with the lowest number, if there is any.
         """
         state = self._state
-        self.has_more = bool(state.ready or state.held_back or state.unpolled)
-        if not self.has_more:
+        if not (state.ready or state.held_back or state.unpolled):
+            self.has_more = False
             return None
+        self.has_more = True
         if worker < 0:
             if not state.scalars[N_IDLE]:
                 return None

@@ -37,8 +37,13 @@ GAP_NS = 100_000
 LATELY = 8
 """The last execution counts for one in so many."""
 FIRST = 16
-SAMPLE = 8
+SAMPLE = 32
 """After the first executions one in so many is measured, and more where it behaves otherwise."""
+TRY_SAMPLE = 8
+"""
+One in so many is looked at whether it computes with the lock released; and is measured where it
+does.
+"""
 MIXED, RELEASED, STILL_RELEASED = 0.1, 0.4, 0.25
 """
 Parts of its time in which a callback computes with the lock released: more than the first, and it
@@ -80,15 +85,14 @@ class Habit:
     def is_to_be_measured(self) -> bool:
         """Return whether to measure the execution that begins now."""
         self._runs += 1
-        is_sample = self._runs % SAMPLE == 0
-        self._sampled = is_sample and self.computed_ns >= LOOK_NS and (
-            self._tries < FIRST or self._runs % (SAMPLE * FIRST) == 0)
+        self._sampled = self.computed_ns >= LOOK_NS and self._runs % TRY_SAMPLE == 0 and (
+            self._tries < FIRST or self._runs % (TRY_SAMPLE * FIRST) == 0)
         if self._declared:
             return False
         if self._close > 0:
             self._close -= 1
             return True
-        return is_sample
+        return self._runs % (TRY_SAMPLE if self._overlaps else SAMPLE) == 0
 
     @property
     def is_trusted(self) -> bool:
@@ -155,7 +159,7 @@ class Habit:
         """Return whether to find out, at a look, whether it computes with the lock released."""
         self._looks += 1
         return not self._declared and (
-            self._looks <= FIRST or self._released > MIXED or self._looks % SAMPLE == 0)
+            self._looks <= FIRST or self._released > MIXED or self._looks % TRY_SAMPLE == 0)
 
     @property
     def is_to_be_learnt(self) -> bool:
@@ -166,7 +170,10 @@ class Habit:
         """Learn whether it computed with the lock released, and return that."""
         self._tries += 1
         self._released += (released - self._released) / min(LATELY, self._tries)
-        self._overlaps = self._released >= (STILL_RELEASED if self._overlaps else RELEASED)
+        overlapped = self._overlaps
+        self._overlaps = self._released >= (STILL_RELEASED if overlapped else RELEASED)
         if self._overlaps:
             self.holds = 0
+        elif overlapped:
+            self._close = LATELY  # it may hold it now
         return released

@@ -40,7 +40,7 @@ from mddag_executor.clocks import TraceClock
 from mddag_executor.live.compat import UNKNOWN
 from mddag_executor.live.cpu_order import CpuOrder
 from mddag_executor.live.engine import Engine
-from mddag_executor.live.entity import BRIEF_NS
+from mddag_executor.live.entity import BRIEF_NS, SOON_NS
 from mddag_executor.live.gates import Refused
 from mddag_executor.live.interpreter import Interpreter
 from mddag_executor.live.preemption import Preemption
@@ -321,16 +321,15 @@ class Pool:
 
         :return: False when its callback group did not let it run.
         """
-        work, engine = seat.work, self.engine
+        work, engine, offset = seat.work, self.engine, self.clock.offset_ns
         assert work is not None
         entity = work.entity
         before, current.running = current.running, seat
         waits_for: Any = None
         raised: BaseException | None = None
-        start = monotonic_ns() + self.clock.offset_ns
+        seat.began_ns = start = monotonic_ns() + offset
         if self.cpu_order is not None and seat.thread is not None:
             self.cpu_order.starts(seat, start)
-        seat.began_ns = start
         seat.reading = None
         if seat.cpu_clock is not None and entity.habit.is_to_be_measured():
             self._interpreter.begins(seat, entity.habit)
@@ -343,10 +342,12 @@ class Pool:
             raised = error
         if traced:
             work.cpu_ns += thread_time_ns()
-        end = monotonic_ns() + self.clock.offset_ns
+        end = monotonic_ns() + offset
         current.running = before
         if seat.published:
-            entity.ends_soon.took(end - self.clock.offset_ns - seat.published)
+            after = end - offset - seat.published
+            if entity.ends_soon.debt or after > SOON_NS:
+                entity.ends_soon.took(after)
             seat.published = 0
         if entity.is_brief.debt or end - start > BRIEF_NS:
             entity.is_brief.took(end - start)

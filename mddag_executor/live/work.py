@@ -78,12 +78,10 @@ class Work:
         self.due = due
         self.missed = missed
         self.entity: Entity = entity  # type: ignore[assignment]  # else the receiver sets it
-        self.x = -1
         self.coroutine: Any = None
         self.origin: Origin | None = None
-        self.worker = -1
-        self.ready_ns = 0
-        self.cpu_ns = 0
+        self.x = self.worker = -1
+        self.ready_ns = self.cpu_ns = 0
 
     def step(self) -> Any:
         """

@@ -55,7 +55,7 @@ from rclpy.timer import Timer
 
 # Scans happen at most and at least that often, and at most while a timer is cancelled; and they
 # are repeated only after so many times what the last one took, so they have 1 % of a CPU at most.
-SCAN_GAP_NS, SCAN_LATEST_NS, SCAN_CANCELLED_NS = 10_000_000, 100_000_000, 5_000_000
+SCAN_GAP_NS, SCAN_LATEST_NS, SCAN_CANCELLED_NS = 50_000_000, 100_000_000, 5_000_000
 SCAN_SHARE = 100
 
 # A timer without a period is always due; so often it is handed over.
