@@ -42,7 +42,9 @@ class NoExecutor(Executor):
     def _run(self, timer: Timer) -> None:
         _, call, _ = timer_functions(timer)
         while self.context.ok():
-            left = timer.time_until_next_call()
+            left: int | None = timer.time_until_next_call()
+            if left is None:
+                return  # it was cancelled, at the end
             if left > 0:
                 time.sleep(left / 1e9)
                 continue
