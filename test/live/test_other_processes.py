@@ -13,7 +13,7 @@ import sys
 import time
 from typing import Any
 
-from mddag_executor.core import Scheduler, Tables
+from mddag_executor.core import rules, Scheduler, Tables
 from mddag_executor.core.state import (
     COMPLETED,
     EXPIRED,
@@ -78,7 +78,8 @@ class Part:
     def run(self, vertex: int, end: int) -> list[tuple[int, int]]:
         """Run a vertex; return the kinds of decisions, and vertex or the job's end."""
         x = self.scheduler.execution(self.slot, vertex)
-        self.scheduler.record(x, end)
+        scheduler = self.scheduler
+        rules.record(scheduler.tables, scheduler.state, scheduler.policy.key, x, end)
         return self.decisions()
 
     def decisions(self) -> list[tuple[int, int]]:
