@@ -4,7 +4,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 import time
+
+
+def boot() -> str:
+    """Return which boot of which machine ``time.monotonic_ns()`` counts from; '' if unknown."""
+    try:
+        return Path('/proc/sys/kernel/random/boot_id').read_text('ascii').strip()
+    except (OSError, UnicodeDecodeError):
+        return ''
 
 
 def epoch_offset_ns() -> int:

@@ -12,7 +12,7 @@ starts, so a mistyped path costs nothing.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 import json
 import os
@@ -27,7 +27,7 @@ from mddag_executor.errors import InputError, UsageError
 from mddag_executor.resources import find
 
 if TYPE_CHECKING:
-    from mddag_executor.replay.run import Recording
+    from mddag_executor.replay.run import Recording, Traces
     from mddag_executor.report.html import Watch
     from mddag_executor.report.html_data import ReportData
     from msg_graph import TaskSet
@@ -120,9 +120,26 @@ def recording_and_graph(args: argparse.Namespace) -> None:
     traces = args.trace
     if len(traces) > 1 and not _is_trace(traces[-1]):
         *traces, args.graph = traces
-    args.trace = traces[0] if len(traces) == 1 else traces
-    if len(traces) > 1 and '-' in traces:
+    args.trace = one_run(traces, args.offset)
+
+
+def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | Traces:
+    """
+    Return the one recording that is given, or the several traces of one run.
+
+    :raises mddag_executor.errors.UsageError: where they cannot be taken together
+    """
+    if len(paths) == 1:
+        if offsets:
+            raise UsageError('--offset: one trace has one clock: give the traces of all '
+                             'processes, or leave the option out')
+        return paths[0]
+    if len(dict(offsets)) < len(offsets):
+        raise UsageError('--offset: a process is named twice: give one offset for each')
+    if '-' in paths:
         raise UsageError('-: of several traces none can be standard input: name them')
+    from mddag_executor.replay import Traces
+    return Traces(paths, dict(offsets))
 
 
 def _is_trace(path: str) -> bool:
@@ -136,10 +153,10 @@ def _is_trace(path: str) -> bool:
 
 
 @contextmanager
-def input_recording(given: str | list[str]) -> Iterator[tuple[Recording, str]]:
-    """Give what `input_trace` gives, or the paths of several traces of one run."""
+def input_recording(given: str | Traces) -> Iterator[tuple[Recording, str]]:
+    """Give what `input_trace` gives, or the several traces of one run."""
     if not isinstance(given, str):
-        yield given, ', '.join(given)
+        yield given, str(given)
         return
     with input_trace(given) as found:
         yield found

@@ -19,6 +19,7 @@ from mddag_executor import defaults
 from mddag_executor.errors import UsageError
 
 T = TypeVar('T')
+_MOST_OFFSET = 10 ** 18
 
 
 # --- kinds of arguments --------------------------------------------------------------------------
@@ -120,6 +121,30 @@ def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
         'graph', metavar='GRAPH', nargs='?',
         help="the declaration that judges, a YAML file ('-': standard input; default: the one "
         'that the trace was recorded with)')
+    add_offset(parser)
+
+
+def add_offset(parser: argparse.ArgumentParser) -> None:
+    """Declare `--offset`."""
+    parser.add_argument(
+        '--offset', metavar='NAME=TIME', type=_offset, action='append', default=[],
+        help='of several machines: how far the clock of process NAME (of RUN.NAME.mcap) is ahead '
+        "of the first trace's, as 2.5ms, or -2.5ms where it is behind (default: as messages both "
+        'ways tell)')
+
+
+def _offset(text: str) -> tuple[str, int]:
+    """Return the process and the time that `NAME=TIME` gives."""
+    import msg_graph
+    name, _, time = text.rpartition('=')
+    if not name:
+        raise argparse.ArgumentTypeError(f'{text!r} is not NAME=TIME, as control=2.5ms')
+    try:
+        ahead = msg_graph.parse_duration(
+            time.removeprefix('-'), minimum_ns=0, maximum_ns=_MOST_OFFSET)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return name, -ahead if time.startswith('-') else ahead
 
 
 def add_workload(parser: argparse.ArgumentParser) -> None:

@@ -68,10 +68,10 @@ def judge(args: argparse.Namespace, tally: MissTally, result: dict[str, Any]) ->
     if args.junit is not None:
         from mddag_executor.report.junit import junit
         with common.output_file(args.junit) as file:
-            file.write(junit(result, broken, args.trace))
+            file.write(junit(result, broken, str(args.trace)))
     if not args.fail_on_miss:
         return 0
-    return exit_status(result['dags'], bool(broken), args.trace)
+    return exit_status(result['dags'], bool(broken), str(args.trace))
 
 
 def exit_status(

@@ -5,11 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+import socket
 import threading
 from typing import Any, Protocol
 import weakref
 
 from mddag_executor import defaults
+from mddag_executor.clocks import boot
 from mddag_executor.live.entity import Entity, SERVICE, SUBSCRIPTION, TIMER
 from mddag_executor.trace.errors import TraceError
 from msg_graph import TaskSet
@@ -74,6 +76,7 @@ class Recorder:
             policy, workers, default_deadline, max_active_jobs, False,
             defaults.processors() if cpus is None else cpus)
         self._say('caret_init', clock.offset_ns, 'jazzy')
+        self._say('host', socket.gethostname(), boot())
         self._say('rmw_implementation', get_rmw_implementation_identifier())
         self._say('construct_executor', id(self), 'multi_deadline_executor')
 

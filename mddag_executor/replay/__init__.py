@@ -11,5 +11,7 @@ from mddag_executor.replay.as_recorded import Replay, replay
 from mddag_executor.replay.for_caret import caret_events
 from mddag_executor.replay.recording import ReplayError
 from mddag_executor.replay.reschedule import Reschedule, reschedule
+from mddag_executor.replay.run import Traces
 
-__all__ = ['Replay', 'ReplayError', 'Reschedule', 'caret_events', 'replay', 'reschedule']
+__all__ = [
+    'Replay', 'ReplayError', 'Reschedule', 'Traces', 'caret_events', 'replay', 'reschedule']

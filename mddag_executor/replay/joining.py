@@ -8,15 +8,16 @@ Theory of operation
 The joined trace has the events of all in the order of time, and is replayed like any other.
 
 1. *Clocks.*  Each process counts its trace's time from the steady clock of the machine, by an
-   offset that is recorded (``caret_init``).  Where two offsets differ by less than ``SAME_CLOCK``
-   the machine is the same, and times are put on the first trace's clock exactly; else they are
-   taken as they are.
+   offset that is recorded (``caret_init``).  So the times of one machine are put on the first
+   trace's clock exactly; those of others by an offset that is given, or that messages tell
+   (``clocks``), else they are taken as they are.
 2. *Who is who.*  Addresses, which are those of one process, get the number of the trace above
    their 48 bits; workers are counted through.
 3. *Jobs* are numbered anew, in the order of their first release.  A release is that of a job that
    another process has released already if it is the same, to ``SAME_RELEASE``; of a DAG whose jobs
    header stamps join, also if it follows that within the DAG's period: the stamp is taken later
-   than a timer is due.  What fits nothing is a job of its own.
+   than a timer is due.  What fits nothing is a job of its own.  A stamp is a time of the source's
+   clock, wherever it is recorded.
 4. Of a DAG that several run, those vertices are expected that are in any of the processes.  Jobs
    are judged from the time on from which all processes have judged.
 5. A process whose end is not recorded was killed.  Its open jobs are said, and the run goes on.
@@ -25,12 +26,14 @@ The joined trace has the events of all in the order of time, and is replayed lik
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import heapq
 import os
 from typing import Any
 
 from mddag_executor.core import legs_of
+from mddag_executor.errors import UsageError
+from mddag_executor.replay import clocks
 from mddag_executor.replay.recording import (
     declared,
     Head,
@@ -45,7 +48,6 @@ from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.schema import EVENTS
 from msg_graph import Dag, Process
 
-SAME_CLOCK = 500_000_000
 SAME_RELEASE = 100_000
 _KEPT = 1024
 _BITS = 48
@@ -74,11 +76,14 @@ class _Part:
             self.head: Head = head
             self.clock = self.judges_from = 0
             self.end: int | None = None
-            for event in self.reader.events({_INIT, _SHUTDOWN, _JUDGE_FROM}):
+            self.boot = ''
+            for event in self.reader.events({_INIT, clocks.HOST, _SHUTDOWN, _JUDGE_FROM}):
                 if None in event:
                     continue
                 if event[0] == _INIT:
                     self.clock = event[4]
+                elif event[0] == clocks.HOST:
+                    self.boot = event[5]
                 elif event[0] == _SHUTDOWN:
                     self.end = event[4]
                 else:
@@ -136,12 +141,16 @@ class Joined:
     Joins traces of this executor.
 
     :param files: path of each, and what messages call it.
+    :param offsets: how far clocks of other machines are ahead of the first trace's, ns, by the
+        last word of a trace's name.
     :ivar warnings: what is to be said of them beside what the joined trace says, once written.
     :raises mddag_executor.trace.TraceError: when one is no trace.
     :raises ReplayError: when they are not of one run.
     """
 
-    def __init__(self, files: Sequence[tuple[str, str]]) -> None:
+    def __init__(
+        self, files: Sequence[tuple[str, str]], offsets: Mapping[str, int],
+    ) -> None:
         self._parts = [_Part(i, path, name) for i, (path, name) in enumerate(files)]
         first = self._parts[0]
         self.head, self.name = first.head, ', '.join(part.name for part in self._parts)
@@ -158,12 +167,8 @@ class Joined:
         for part in self._parts:
             part.first_spare = workers + spare
             spare += part.head.workers
-            if abs(part.clock - first.clock) < SAME_CLOCK:
-                part.shift = first.clock - part.clock
-        if any(abs(part.clock - first.clock) >= SAME_CLOCK for part in self._parts):
-            self.warnings.append(
-                f'{self.name}: they are of several machines, whose clocks are taken as '
-                'synchronised')
+        self._machines = clocks.machines([(part.boot, part.clock) for part in self._parts])
+        self._set_clocks(self._given(offsets))
         self._workers = workers
         #: How many workers each process has, at most.
         self.workers_each = max(part.head.workers for part in self._parts)
@@ -177,6 +182,45 @@ class Joined:
         self._next = [0] * len(self.task_set.dags)
         self._legs = [[max(1, len(legs_of(v, dag.vertices))) for v in dag.vertices]
                       for dag in self.task_set.dags]
+
+    def _given(self, offsets: Mapping[str, int]) -> dict[int, int]:
+        """Return the offsets that are given, by machine."""
+        found: dict[int, int] = {}
+        for label, ahead in offsets.items():
+            machine = next(
+                (m for m, part in zip(self._machines, self._parts) if part.label == label), None)
+            if machine is None:
+                raise UsageError(f'--offset: there is no trace of {label}: name one of '
+                                 + listed([part.label for part in self._parts]))
+            if machine == 0:
+                raise UsageError(f"--offset: {label} is on the first trace's machine, whose clock "
+                                 'the others are compared with: name a process of another one')
+            if machine in found:
+                raise UsageError(f'--offset: {label} is on a machine whose offset is given '
+                                 'already: give one for each machine')
+            found[machine] = ahead
+        return found
+
+    def _set_clocks(self, given: Mapping[int, int]) -> None:
+        """Put all on the first trace's clock (rule 1)."""
+        several = set(self._machines) - {0}
+        for part, machine in zip(self._parts, self._machines):
+            part.shift = self._parts[machine].clock - part.clock
+        ways: clocks.Ways = {}
+        if several - given.keys():
+            ways = clocks.ways(
+                [clocks.Messages(part.reader) for part in self._parts], self._machines,
+                [part.shift for part in self._parts])
+        known = clocks.offsets(several, ways, given)
+        for machine in sorted(several):
+            parts = [p for p, m in zip(self._parts, self._machines) if m == machine]
+            for part in parts:
+                part.shift -= known[machine].ahead if machine in known else 0
+            if machine not in given:
+                self.warnings.append(
+                    f'{", ".join(part.name for part in parts)}: recorded on another machine than '
+                    f'{self._parts[0].name}: '
+                    + clocks.said(known.get(machine), ways.get((0, machine)), parts[0].label))
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """
@@ -199,7 +243,7 @@ class Joined:
             for part, event in heapq.merge(*streams, key=lambda each: int(each[1][1])):
                 if event[0] == _SHUTDOWN:
                     judged = max(judged, event[4])
-                elif event[0] not in (TASK_SET, _INIT, _JUDGE_FROM):
+                elif event[0] not in (TASK_SET, _INIT, _JUDGE_FROM, clocks.HOST):
                     told = self._told(part, event)
                     if told is not None:
                         end = max(end, event[1])
@@ -252,6 +296,8 @@ class Joined:
         dag, job, release = event[4:7]
         if not 0 <= dag < len(self.task_set.dags):
             return event
+        if release < event[1]:      # else that of a stamp which was still to come there
+            release = self._by_source(self.task_set.dags[dag], release, part)
         found = self._find(self.task_set.dags[dag], release, part.place)
         told = None
         if found is None:
@@ -266,6 +312,18 @@ class Joined:
         here = part.hosted.get(dag, range(len(self._legs[dag])))
         part.open[dag, number] = sum(self._legs[dag][v] for v in here if v < len(self._legs[dag]))
         return told
+
+    def _by_source(self, dag: Dag, release: int, part: _Part) -> int:
+        """Return a release from a stamp of another machine, by the clock of that."""
+        if dag.release_from != 'header_stamp' or dag.source in part.hosted.get(
+                dag.index, (dag.source,)):
+            return release
+        machine, found = next(
+            ((m, p) for m, p in zip(self._machines, self._parts)
+             if dag.source in p.hosted.get(dag.index, ())), (0, part))
+        if machine == self._machines[part.place]:
+            return release
+        return release - part.shift + found.shift
 
     def _find(self, dag: Dag, release: int, place: int) -> tuple[int, int, set[int]] | None:
         """Return the job of a release that another process has told of (rule 3)."""

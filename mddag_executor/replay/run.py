@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 import os
 import shutil
 import tempfile
@@ -31,7 +32,25 @@ What all have: ``play``, and
 """
 
 
-Recording = str | os.PathLike[str] | Sequence[str]
+@dataclass(frozen=True)
+class Traces:
+    """
+    The traces of the processes of one run.
+
+    :ivar paths: of the traces.
+    :ivar offsets: how far clocks of other machines are ahead of the first trace's, ns, by the
+        last word of a trace's name, as ``control`` of ``run.control.mcap``.  Else messages tell.
+    """
+
+    paths: Sequence[str]
+    offsets: Mapping[str, int] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        """Return what messages call them."""
+        return ', '.join(self.paths)
+
+
+Recording = str | os.PathLike[str] | Sequence[str] | Traces
 """The path of a trace, or those of the traces of all processes of one run."""
 
 
@@ -50,7 +69,7 @@ def open_run(
     :raises msg_graph.GraphError: when the recorded declaration is wrong.
     """
     if not isinstance(path, (str, os.PathLike)):
-        return _joined(path, task_set)
+        return _joined(path if isinstance(path, Traces) else Traces(path), task_set)
     path = os.fspath(path)
     with named_errors(path, name or path):
         reader = TraceReader(path)
@@ -66,10 +85,10 @@ def open_run(
     return run
 
 
-def _joined(paths: Sequence[str], task_set: TaskSet | None) -> OwnRun:
+def _joined(traces: Traces, task_set: TaskSet | None) -> OwnRun:
     """Return the run of several traces; it can be played once."""
     from mddag_executor.replay.joining import Joined
-    joined = Joined([(path, path) for path in paths])
+    joined = Joined([(path, path) for path in traces.paths], traces.offsets)
     folder = tempfile.mkdtemp(prefix='mddag-')
     path = os.path.join(folder, 'joined.mcap')
     try:
@@ -79,7 +98,7 @@ def _joined(paths: Sequence[str], task_set: TaskSet | None) -> OwnRun:
             head = read_head(reader)
             assert head is not None
             run = OwnRun(reader, joined.name, head, task_set)
-            run.processes, run.placed = len(paths), joined.placed()
+            run.processes, run.placed = len(traces.paths), joined.placed()
             run.workers_each = joined.workers_each
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)

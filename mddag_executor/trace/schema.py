@@ -133,6 +133,8 @@ _ALL = (
     # the CPUs that the process might use, 0 where that is not known
     _event('mddag', 'task_set', (0,), yaml=_STR, file=_STR, policy=_STR, workers=_I32,
            default_deadline=_I64, max_active_jobs=_I32, preemptive=_BOOL, cpus=_I32),
+    # the boot of the machine that the steady clock counts from, '' where that is not known
+    _event('mddag', 'host', name=_STR, boot=_STR),
     _event('mddag', 'hosted', dag=_I32, vertices=_STR),
     _event('mddag', 'judge_from', release=_I64),
     _event('mddag', 'job_release', dag=_I32, job=_I64, release=_I64),

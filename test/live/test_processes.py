@@ -15,6 +15,7 @@ import sys
 import time
 from typing import Any
 
+from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
 from mddag_executor.live import parts
 from mddag_executor.replay import replay
@@ -180,6 +181,8 @@ def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world: Path) ->
     assert result['dags']['chain']['sinks']['/last:sink']['completed'] > 0
     assert sum(e['_name'] == 'mddag:complete' for e in read_events('out.down.mcap')) >= 60
     assert f'trace: {world / "out.up.mcap"}' in out
+    assert [e['boot'] for name in ('up', 'down') for e in read_events(
+        f'out.{name}.mcap', {'mddag:host'})] == [boot()] * 2
     replayed = replay(['out.up.mcap', 'out.down.mcap']).result()
     assert any(warning.startswith('out.up.mcap: its end is not recorded (the process was killed')
                and 'with it' in warning or warning.endswith('no job was open in it')

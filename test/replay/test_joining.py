@@ -29,13 +29,15 @@ class Trace:
     """The trace of a process that runs one vertex; its clock is late by some ns."""
 
     def __init__(self, folder: Path, name: str, vertex: int, late: int = 0, graph: str = GRAPH,
-                 judges_from: int = 0, dag: int = 0) -> None:
+                 judges_from: int = 0, dag: int = 0, boot: str = '') -> None:
         self.path = str(folder / f'run.{name}.mcap')
         self.file = TraceFile(self.path)
         self.vertex, self.late, self.pid, self.job = vertex, late, 100 + vertex + dag, 0
         self.dag = dag
         self.add('task_set', 0, graph, 'graph.yaml', 'rad', 2, 100 * MS, 64, False, 2)
         self.add('caret_init', 0, BASE - late, 'jazzy')
+        if boot:
+            self.add('host', 0, f'computer of {name}', boot)
         self.add('rclcpp_callback_register', 0, ADDRESS, f'callback of {name}')
         self.add('hosted', 0, dag, str(vertex))
         self.add('judge_from', 0, BASE + judges_from - late)
@@ -58,6 +60,16 @@ class Trace:
             self.add('complete', end, ADDRESS, self.dag, self.vertex, self.job, True, t + end, 0,
                      took, True)
         self.job += 1
+
+    def knows(self, topic: str, handle: int) -> None:
+        """Publish a topic and subscribe to it."""
+        for kind in ('publisher', 'subscription'):
+            self.add(f'rcl_{kind}_init', 0, handle, 1, handle, topic, 10)
+
+    def sends(self, other: Trace, handle: int, sent: int, transport: int) -> None:
+        """Send a message to another trace."""
+        self.add('rclcpp_publish', sent, handle, 1, 0)
+        other.add('rmw_take', sent + transport, handle, 1, BASE + sent - self.late, True)
 
     def end(self, at: int | None) -> str:
         if at is not None:
@@ -105,6 +117,84 @@ def test_a_stamp_is_taken_later_than_its_timer_was_due(tmp_path: Path) -> None:
     assert result['dags']['chain']['jobs'] == 4
     assert sink(result)['response_ns']['max'] == 4 * MS
     assert counts(sink(result)).in_time == 4
+
+
+def two_machines(folder: Path, late: int, back: bool = True, stranger: bool = False) -> list[str]:
+    """Return the traces of a run on two machines, the clock of the other is late."""
+    up = Trace(folder, 'up', 0, graph=STAMPED, boot='one')
+    down = Trace(folder, 'down', 1, late, STAMPED, boot='other')
+    for trace in (up, down):
+        trace.knows('/x', 1)
+        trace.knows('/back', 2)
+    for i, takes in enumerate((2, 2, 7)):
+        release = i * 10 * MS
+        up.runs(release, release + MS)
+        ready = release + 3 * MS
+        # the stamp, by the clock of its source, but no time to come
+        down.runs(min(release + 1000 + late, ready), ready, takes * MS)
+        up.sends(down, 1, release + 2 * MS, (i + 4) * MS // 10)
+        if back:
+            down.sends(up, 2, release + 4 * MS, (i + 2) * MS // 10)
+        if stranger:    # the same topic, from elsewhere: it was long on its way
+            down.add('rmw_take', release + 60 * MS, 1, 1, BASE + release + 20 * MS, True)
+    return [up.end(100 * MS), down.end(100 * MS)]
+
+
+@pytest.mark.parametrize('late', [0, 3 * MS, -3 * MS, 40_000 * MS, -40_000 * MS])
+def test_messages_both_ways_tell_how_clocks_of_two_machines_differ(
+        tmp_path: Path, late: int, mddag: Any) -> None:
+    paths = two_machines(tmp_path, late)
+    result = replay(paths).result()
+    warning, = result['warnings']
+    # from up to down 0.4 ms at least, back 0.2 ms
+    ahead = f'{abs(100_000 - late) / 1e6:.3f} ms ' + ('ahead' if late < 100_000 else 'behind')
+    assert f'is taken to be {ahead}, within 0.300 ms, by the messages' in warning, warning
+    verdicts = counts(sink(result))
+    assert (verdicts.due, verdicts.in_time, verdicts.late) == (3, 2, 1)
+    assert sink(result)['response_ns']['max'] == 10 * MS - 100_000
+
+    run = mddag('replay', *paths, '--offset', f'down={-late}ns', '--json', '-')
+    assert run.stderr == '' and '"max": 10000000' in run.stdout
+    reversed_paths = replay(paths[::-1]).result()
+    assert counts(sink(reversed_paths)).in_time == 2 and sink(
+        reversed_paths)['response_ns']['max'] == 10 * MS - 100_000
+
+
+def test_clocks_are_taken_as_they_are_where_messages_go_one_way(tmp_path: Path) -> None:
+    warning, = replay(two_machines(tmp_path, 0, back=False)).warnings
+    assert 'is taken as synchronised: give --offset down=TIME' in warning
+    warning, = replay(two_machines(tmp_path, 5 * MS, back=False)).warnings
+    assert 'come there 4.600 ms before they are sent: give --offset down=TIME' in warning
+
+
+def test_what_a_trace_has_not_sent_tells_nothing_of_its_clock(tmp_path: Path) -> None:
+    warning, = replay(two_machines(tmp_path, 50 * MS, stranger=True)).warnings
+    assert '49.900 ms behind, within 0.300 ms' in warning
+
+
+def test_one_machine_has_one_clock_whatever_it_was_set_to(tmp_path: Path) -> None:
+    up = Trace(tmp_path, 'up', 0, boot='one')
+    down = Trace(tmp_path, 'down', 1, 3600_000 * MS, boot='one')
+    up.runs(0, MS)
+    down.runs(0, 3 * MS)
+    outcome = replay([up.end(90 * MS), down.end(90 * MS)])
+    assert outcome.warnings == [] and counts(sink(outcome.result())).in_time == 1
+
+
+@pytest.mark.parametrize(('offsets', 'message'), [
+    (['down'], 'is not NAME=TIME'),
+    (['down=3'], 'has no unit'),
+    (['down=1ms', 'down=2ms'], 'a process is named twice'),
+    (['across=1ms'], 'there is no trace of across: name one of up, down'),
+    (['up=1ms'], "up is on the first trace's machine"),
+])
+def test_offsets_that_cannot_be_are_one_line(
+        tmp_path: Path, mddag: Any, offsets: list[str], message: str) -> None:
+    paths = two_machines(tmp_path, 0)
+    run = mddag('replay', *paths, *(f'--offset={each}' for each in offsets))
+    assert run.returncode == 2 and message in run.stderr and run.stderr.count('\n') == 1
+    one = mddag('replay', paths[0], '--offset', 'up=1ms')
+    assert one.returncode == 2 and 'one trace has one clock' in one.stderr
 
 
 def test_what_follows_without_a_stamp_is_another_job(tmp_path: Path) -> None:
