@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = """\
 mddag slack run.mcap
+mddag slack run.perception.mcap run.control.mcap
 mddag slack config/autoware.yaml --utilisation 0.6 --workers 6
 mddag slack run.mcap --fail-under 1.2 --json slack.json --report slack.html"""
 
@@ -34,12 +35,12 @@ _GRAPHS = ('.yaml', '.yml')
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('recording', metavar='TRACE|GRAPH',
-        help='a recorded run, an MCAP file, or a declaration, a YAML file')
-    add('graph', metavar='GRAPH', nargs='?',
-        help='with TRACE: the declaration to schedule by (default: the recorded one)')
+    options.add_recording(
+        parser, "a recorded run, an MCAP file ('-': standard input), or a declaration alone, a "
+        'YAML file')
     add('--workers', type=options.positive_int, metavar='M',
-        help="threads that run callbacks (default: as recorded, or the declaration's)")
+        help='threads that run callbacks, of each process (default: as recorded, or the '
+        "declaration's)")
     options.add_cpus(parser, 'as recorded, or enough for all')
     add('--policy', metavar='P',
         help=f'one of {", ".join(POLICIES)} (default: as recorded, or rad)')
@@ -65,17 +66,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Find the slack and print it."""
     from mddag_executor.replay.slack import find_slack, slack_result
+    common.recording_and_graph(args)
     common.check_output(args.json)
     common.check_output(args.report)
-    is_graph = args.recording.lower().endswith(_GRAPHS)
+    is_graph = str(args.trace).lower().endswith(_GRAPHS)
     problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
     callbacks = len(set(problem.callback_of))
     with Progress('looking for slack', callbacks) as line:
         slack = find_slack(problem, line.update, args.jobs or defaults.processors())
-    result = slack_result(slack, task_set, dags)
+    result = slack_result(slack, task_set, dags, problem.processes)
     if args.report is not None:
         from mddag_executor.report.slack import page
-        common.write_text(args.report, ''.join(page(result, args.recording)))
+        common.write_text(args.report, ''.join(page(result, str(args.trace))))
     if common.write_result(args, result):
         _show(result)
     if args.fail_under is None:
@@ -94,7 +96,7 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
             raise UsageError(f'--{option.replace("_", "-")}: a recording has its own: leave the '
                              'option out')
     task_set = None if args.graph is None else common.load_graph(args.graph)
-    with common.input_trace(args.recording) as (path, name), Progress('replaying') as line:
+    with common.input_recording(args.trace) as (path, name), Progress('replaying') as line:
         if recorded.is_bag(path):
             raise UsageError(
                 f'{name}: it has no execution times: give the declaration instead of an ordinary '
@@ -120,7 +122,7 @@ def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
                          'before it')
     if args.skip:
         raise UsageError('--skip: a simulation needs no warm-up: leave the option out')
-    task_set = common.load_graph(args.recording)
+    task_set = common.load_graph(args.trace)
     workers = defaults.workers(args.workers, task_set)
     args.seed = args.seed or 0
     times = simulate.execution_times(args, task_set, workers)

@@ -90,6 +90,11 @@ class Problem(NamedTuple):
             else replace(how, **{of: number}))      # type: ignore[arg-type]
 
     @property
+    def processes(self) -> int:
+        """Return how many processes have so many workers each."""
+        return self.how.processes if isinstance(self.how, How) else 1
+
+    @property
     def load(self) -> Load:
         """Return the load."""
         return self.work if isinstance(self.work, Load) else self.work.load
@@ -313,12 +318,13 @@ def find_slack(
 
 
 def slack_result(
-    slack: Slack, task_set: TaskSet, dags: Mapping[str, Any]
+    slack: Slack, task_set: TaskSet, dags: Mapping[str, Any], processes: int = 1
 ) -> dict[str, Any]:
     """
     Return the result format of ``slack --json``.
 
     :param dags: of the result of the run as things are.
+    :param processes: that have so many workers each.
     """
     names = [vertex.name for vertex in task_set.vertices]
 
@@ -331,6 +337,7 @@ def slack_result(
 
     return {
         'most': MOST,
+        'processes': processes,
         'callbacks': {callback.key: shown(slack.factors[i])
                       for i, callback in enumerate(task_set.callbacks) if i in slack.factors},
         'load': shown(slack.factors[ALL]),

@@ -58,10 +58,12 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
     yield 'the load as a whole: ' + (
         f'{most:g} times and more' if load['factor'] is None else
         f'{_times(load["factor"])}, then {printable(load["breaks"])} misses')
+    each = ' in each process' if result['processes'] > 1 else ''
     for of, name in (('workers', 'worker'), ('cpus', 'CPU')):
         fewer = result[of]
         if fewer is not None:
-            yield f'{fewer["least"]} of {counted(fewer["given"], name)} are enough' + (
+            of_each = each if of == 'workers' else ''
+            yield f'{fewer["least"]} of {counted(fewer["given"], name)}{of_each} are enough' + (
                 '' if fewer['breaks'] is None else
                 f'; with one less {printable(fewer["breaks"])} misses')
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -277,6 +278,23 @@ def test_each_process_has_its_workers_and_interpreter_again(
         assert late in run.stdout, (given, run.stdout, run.stderr)
     (tmp_path / 'graph.yaml').write_text(TWO + 'processes: {p: [/a, /b]}')
     assert '9 late' in mddag('replay', *two, tmp_path / 'graph.yaml', '--reschedule').stdout
+
+
+def test_slack_is_found_with_the_workers_and_interpreter_of_each(
+        two: list[str], tmp_path: Path, mddag: Any) -> None:
+    run = mddag('slack', *two, '--json', '-')
+    result = json.loads(run.stdout)
+    assert (run.returncode, result['processes'], result['left_out']) == (0, 2, [])
+    # 5 ms may become 8 ms in both, side by side
+    assert all(1.58 <= one <= 1.6 for one in (
+        result['load']['factor'], *(each['factor'] for each in result['callbacks'].values())))
+    assert result['workers'] == {'given': 2, 'least': 1, 'breaks': None}
+    (tmp_path / 'graph.yaml').write_text(TWO + 'processes: {p: [/a, /b]}')
+    run = mddag('slack', *two, tmp_path / 'graph.yaml')     # all in one
+    assert 'left out, because they miss' in run.stdout
+    assert '1 of 2 workers in each process are enough' in mddag('slack', *two).stdout
+    refused = mddag('slack', *two, '--offset', 'none=1ms')
+    assert refused.returncode == 2 and 'there is no trace of none' in refused.stderr
 
 
 def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, mddag: Any) -> None:
