@@ -127,8 +127,12 @@ def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | T
     """
     Return the one recording that is given, or the several traces of one run.
 
+    One folder stands for all traces in it, as `mddag run --trace FOLDER` leaves them.
+
     :raises mddag_executor.errors.UsageError: where they cannot be taken together
     """
+    if len(paths) == 1:
+        paths = _traces_in(paths[0])
     if len(paths) == 1:
         if offsets:
             raise UsageError('--offset: one trace has one clock: give the traces of all '
@@ -140,6 +144,15 @@ def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | T
         raise UsageError('-: of several traces none can be standard input: name them')
     from mddag_executor.replay import Traces
     return Traces(paths, dict(offsets))
+
+
+def _traces_in(path: str) -> Sequence[str]:
+    if os.path.isdir(path):
+        from mddag_executor.replay.bags import is_ordinary
+        found = sorted(name for name in os.listdir(path) if name.endswith('.mcap'))
+        if len(found) > 1 and 'metadata.yaml' not in os.listdir(path) and not is_ordinary(path):
+            return [os.path.join(path, name) for name in found]
+    return [path]
 
 
 def _is_trace(path: str) -> bool:

@@ -3,7 +3,8 @@
 """
 The verb `diff`: two recorded runs, sink by sink.
 
-The runs are of every kind that `replay` takes: traces of this executor, imported recordings, and
+The runs are of every kind that `replay` takes: traces of this executor, also those of several
+processes, which stand in a folder for each run, imported recordings, and
 with `--reschedule`, which is for the second run, ordinary bags.  Without a graph each is judged by
 the declaration that it was recorded with, and an imported one by the other run's.
 
@@ -26,14 +27,16 @@ from mddag_executor.errors import UsageError
 if TYPE_CHECKING:
     from mddag_executor.replay import Replay, Reschedule
     from mddag_executor.replay.bags_reschedule import BagReschedule
+    from mddag_executor.replay.run import Recording
     from msg_graph import TaskSet
 
-Trace = tuple[str, str]     # its path, and what messages call it
+    Trace = tuple[Recording, str]     # its path, and what messages call it
 
 EXAMPLE = """\
 mddag diff before.mcap after.mcap
 mddag diff before.mcap after.mcap graph.yaml --fail-on-worse --tolerance 10% --json diff.json
 mddag diff run.mcap run.mcap --reschedule --workers 2
+mddag diff before/ after/
 
 exit status: 0 compared; 1 with --fail-on-worse when a sink got worse; 2 bad input"""
 
@@ -42,9 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     add('first', metavar='A.mcap',
-        help="the run to compare with: a trace, also an imported one ('-': standard input); with "
-        '--reschedule also an ordinary bag')
-    add('second', metavar='B.mcap', help="the run to compare ('-': standard input)")
+        help="the run to compare with: a trace, also an imported one ('-': standard input), or a "
+        'folder with the traces of all its processes; with --reschedule also an ordinary bag')
+    add('second', metavar='B.mcap', help="the run to compare, likewise ('-': standard input)")
     add('graph', metavar='GRAPH', nargs='?',
         help="the declaration that judges both ('-': standard input; default: each by the one "
         "that it was recorded with, an imported one by the other's)")
@@ -67,9 +70,9 @@ def main(args: argparse.Namespace) -> int:
     from mddag_executor.report import diff
     _check_arguments(args)
     task_set = None if args.graph is None else common.load_graph(args.graph)
+    runs = [common.one_run([given], ()) for given in (args.first, args.second)]
     with ExitStack() as files:
-        first, second = (files.enter_context(common.input_trace(given))
-                         for given in (args.first, args.second))
+        first, second = (files.enter_context(common.input_recording(run)) for run in runs)
         before, after = _results(args, first, second, task_set)
     difference = diff.compare(before, after, args.tolerance)
     if args.json is not None:
@@ -114,7 +117,8 @@ def _results(
 
 def _has_declaration(trace: Trace) -> bool:
     from mddag_executor.replay.run import is_own
-    return not recorded.is_bag(trace[0]) and is_own(*trace)
+    path, name = trace      # several can be joined only where each has one
+    return not isinstance(path, str) or (not recorded.is_bag(path) and is_own(path, name))
 
 
 def _result(

@@ -297,6 +297,29 @@ def test_slack_is_found_with_the_workers_and_interpreter_of_each(
     assert refused.returncode == 2 and 'there is no trace of none' in refused.stderr
 
 
+def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path: Path, mddag: Any) -> None:
+    for folder, takes in (('before', 2), ('after', 7)):
+        (tmp_path / folder).mkdir()
+        up, down = Trace(tmp_path / folder, 'up', 0), Trace(tmp_path / folder, 'down', 1)
+        for i in range(3):
+            up.runs(i * 10 * MS, i * 10 * MS + MS)
+            down.runs(i * 10 * MS, i * 10 * MS + 3 * MS, takes * MS)
+        up.end(100 * MS)
+        down.end(100 * MS)
+    before, after = tmp_path / 'before', tmp_path / 'after'
+    assert '3 in time' in mddag('replay', before).stdout
+    assert '3 late' in mddag('explain', after).stdout
+    run = mddag('diff', before, after, '--fail-on-worse', '--json', '-')
+    found = json.loads(run.stdout)
+    sides = [found['dags']['chain']['sinks']['/b:take'][side] for side in 'ab']
+    assert run.returncode == 1 and [side['late'] for side in sides] == [0, 3]
+    run = mddag('diff', after, after, '--reschedule', '--processes', '1')
+    assert run.returncode == 0 and '3 late' in run.stdout and run.stderr == ''
+    Trace(before, 'other', 0, graph=TWO).end(MS)
+    refused = mddag('diff', before, after)
+    assert refused.returncode == 2 and 'another declaration' in refused.stderr
+
+
 def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, mddag: Any) -> None:
     trace = Trace(tmp_path, 'whole', 0, graph=TWO)
     for i in range(9):
