@@ -77,9 +77,9 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         if plan is not None:
             warn_of(plan, args.ros_args, len(names))
 
-        def command(name: str, nth: int) -> list[str]:
+        def command(name: str, nth: int, since: float) -> list[str]:
             trace = traces.of(name, nth)
-            return [*_command(args, folder, specs.get(name, ())), '--process', name,
+            return [*_command(args, folder, specs.get(name, ()), since), '--process', name,
                     *(() if trace is None else ('--trace', trace)), *ros_arguments(args.ros_args)]
 
         out = sys.stdout if common.wants_tables(args) else sys.stderr
@@ -203,8 +203,10 @@ def _probe(
     return dict(zip(specs, names))
 
 
-def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> list[str]:
-    """Return the command line of a part, up to its name."""
+def _command(
+    args: argparse.Namespace, folder: str, specs: Sequence[str], since: float = 0
+) -> list[str]:
+    """Return the command line of a part, up to its name, so many seconds after the begin."""
     command = [sys.executable, '-m', 'mddag_executor', 'run', args.graph, '--part', folder,
                '--policy', args.policy, '--intake', args.intake,
                '--diagnostics', f'{args.diagnostics}ns' if args.diagnostics else 'off']
@@ -215,8 +217,9 @@ def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> lis
             command += ['--node', spec]
     else:
         command += ['--synthetic', args.synthetic, '--seed', str(args.seed)]
+    left = args.duration and f'{max(1000, args.duration - round(since * 1e9))}ns'
     for option, value in (('--utilisation', args.utilisation), ('--workers', args.workers),
-                          ('--duration', args.duration and f'{args.duration}ns')):
+                          ('--duration', left)):
         if value is not None:
             command += [option, str(value)]
     return command

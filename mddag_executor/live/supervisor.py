@@ -14,7 +14,7 @@ error line of one that then ends with status 2 is the supervisor's error.
 
 A process that ends ahead of the run's end has *died*, unless its status is 0.  What follows is
 said by ``on_exit``: ``end`` ends all, ``continue`` lets the others go on, ``restart`` starts it
-again after ``REST_S``.  The run ends when nothing runs any more.
+again after ``REST_S``, for what is left of the run then.  The run ends when nothing runs any more.
 """
 
 from __future__ import annotations
@@ -102,14 +102,15 @@ class Supervisor:
     """
     Runs processes.
 
-    :param command: returns the command line of a process, by its name and number.
+    :param command: returns the command line of a process, by its name and number, and the seconds
+        since the run's begin.
     :param on_exit: ``end``, ``continue`` or ``restart``.
     :param out: where standard output goes; ``err``: standard error.
     :param tell: told of each that dies.
     """
 
     def __init__(
-        self, command: Callable[[str, int], Sequence[str]], on_exit: str, out: TextIO,
+        self, command: Callable[[str, int, float], Sequence[str]], on_exit: str, out: TextIO,
         err: TextIO, tell: Callable[[Run], None],
     ) -> None:
         self.runs: list[Run] = []
@@ -137,7 +138,7 @@ class Supervisor:
         begin = time.monotonic()
         try:
             for name in names:
-                self._start(name)
+                self._start(name, 0.0)
             while any(run.status is None for run in self.runs) or self._to_start:
                 time.sleep(_LOOK_S)
                 now = time.monotonic()
@@ -145,7 +146,9 @@ class Supervisor:
                     if run.status is None and run.process.poll() is not None:
                         is_over = seconds is not None and now - begin >= seconds
                         self._ended(run, now, is_over)
-                self._start_again(now)
+                if seconds is not None and now - begin >= seconds:
+                    self._to_start.clear()
+                self._start_again(now, now - begin)
                 self._end_if_asked(now)
         finally:
             for run in self.runs:
@@ -153,10 +156,10 @@ class Supervisor:
                     run.process.kill()
                     self._reap(run)
 
-    def _start(self, name: str) -> None:
+    def _start(self, name: str, since: float) -> None:
         nth = 1 + sum(run.name == name for run in self.runs)
         process = subprocess.Popen(
-            self._command(name, nth), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            self._command(name, nth, since), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, env={**os.environ, 'PYTHONUNBUFFERED': '1'})
         run = Run(name, nth, process)
         self.runs.append(run)
@@ -208,12 +211,12 @@ class Supervisor:
         elif self._on_exit == 'end':
             self._stop = True
 
-    def _start_again(self, now: float) -> None:
+    def _start_again(self, now: float, since: float) -> None:
         if self._stop:
             self._to_start.clear()
         for at, name in [each for each in self._to_start if each[0] <= now]:
             self._to_start.remove((at, name))
-            self._start(name)
+            self._start(name, since)
 
     def _end_if_asked(self, now: float) -> None:
         """Ask all to end, once; what has not ended long after that is killed."""

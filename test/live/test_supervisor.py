@@ -33,10 +33,12 @@ class Case:
     def __init__(self, on_exit: str = 'end', **programs: str | list[str]) -> None:
         self.out, self.err = io.StringIO(), io.StringIO()
         self.died: list[Run] = []
+        self.since: list[tuple[str, float]] = []
         self.programs = {n: p if isinstance(p, list) else [p] for n, p in programs.items()}
         self.supervisor = Supervisor(self.command, on_exit, self.out, self.err, self.died.append)
 
-    def command(self, name: str, nth: int) -> list[str]:
+    def command(self, name: str, nth: int, since: float) -> list[str]:
+        self.since.append((name, since))
         programs = self.programs[name]
         return [sys.executable, '-c', programs[min(nth, len(programs)) - 1]]
 
@@ -91,6 +93,14 @@ def test_one_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [name for name, _ in statuses] == ['a', 'b', 'a']
     assert statuses[0] == ('a', 3) and [run.nth for run in case.died] == [1]
     assert '[a] ends' in case.out.getvalue()
+    *first, (name, since) = case.since
+    assert first == [('a', 0), ('b', 0)] and (name, since > 0) == ('a', True)
+
+
+def test_nothing_is_started_again_once_the_run_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, 'REST_S', 3600)
+    case = Case('restart', a='raise SystemExit(3)')
+    assert case.run(seconds=0.01) == [('a', 3)]
 
 
 def test_bad_input_of_one_is_the_error_of_all() -> None:
