@@ -10,6 +10,7 @@ from typing import Any
 
 from mddag_executor.core.tally import counts
 from mddag_executor.replay import replay, ReplayError, reschedule
+from mddag_executor.replay.clocks import offsets
 from mddag_executor.trace import TraceFile
 import pytest
 
@@ -375,3 +376,11 @@ def test_the_command_takes_several_traces(tmp_path: Path, mddag: Any) -> None:
         ['/a:tick', '0'], ['/b:take', '2']]
     refused = mddag('replay', paths[0], '-', paths[1])
     assert refused.returncode == 2 and 'standard input' in refused.stderr
+
+
+def test_machines_are_compared_by_way_of_others_and_by_what_is_given() -> None:
+    # 1 is 10 ahead of 0, and 2 is 100 ahead of 1; from 2 to 0 messages go one way only
+    ways = {(0, 1): 14, (1, 0): -4, (1, 2): 103, (2, 1): -97, (2, 0): -50}
+    assert offsets({1, 2}, ways, {}) == {0: (0, 0), 1: (9, 5), 2: (109, 8)}
+    assert offsets({1, 2}, ways, {1: 10}) == {0: (0, 0), 1: (10, 0), 2: (110, 3)}
+    assert offsets({1, 2}, {(0, 1): 14}, {}) == {0: (0, 0)}
