@@ -50,6 +50,7 @@ from msg_graph import Callback, Dag, TaskSet, Vertex
 from msg_graph.analysis import path_lengths
 
 NEVER = 2 ** 62
+"""A time that is never reached (ns): larger than any clock, small enough to add to."""
 
 DEFAULT_DEADLINE_NS = 100_000_000
 """The deadline that an undeclared callback is ordered by, after its release."""
@@ -57,7 +58,6 @@ MAX_ACTIVE_JOBS = 64
 """So many jobs of a DAG may be unfinished at a time."""
 EXPIRE_AFTER_NS = 1_000_000_000
 """A job that nothing of runs or waits expires so long after its latest deadline."""
-"""A time that is never reached (ns): larger than any clock, small enough to add to."""
 
 CONTINUE = 0
 ABORT = 1
