@@ -5,7 +5,13 @@
 from __future__ import annotations
 
 import sys
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
+
+from mddag_executor.lazy import on_first_use
+
+if TYPE_CHECKING:
+    from mddag_executor.live.executor import MultiDeadlineExecutor
+    from mddag_executor.live.verdicts import DeadlineMiss
 
 __all__ = ['DeadlineMiss', 'Job', 'MultiDeadlineExecutor', 'current_job']
 
@@ -36,12 +42,7 @@ def current_job() -> Job | None:
     return None if job is None else Job(*job)
 
 
-def __getattr__(name: str) -> Any:
-    """Import the executor on first use: it loads rclpy."""
-    if name == 'MultiDeadlineExecutor':
-        from mddag_executor.live.executor import MultiDeadlineExecutor
-        return MultiDeadlineExecutor
-    if name == 'DeadlineMiss':
-        from mddag_executor.live.verdicts import DeadlineMiss
-        return DeadlineMiss
-    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+__getattr__, __dir__ = on_first_use(__name__, {
+    'DeadlineMiss': 'mddag_executor.live.verdicts',
+    'MultiDeadlineExecutor': 'mddag_executor.live.executor',
+})
