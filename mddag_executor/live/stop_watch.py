@@ -14,7 +14,9 @@ ran.  The CPU time of the process tells which: in a stop it does not grow.
   the stop counts, too, and that of threads beside each other, so it was longer, if anything.
 * What the spinning thread does between two waits belongs to the slice after it: it may be stopped
   there as well.
-* What is shorter than ``LEAST_NS`` is not noted.
+* What is shorter than ``SHORT_NS`` is not told.  A stop may begin up to a slice before what is
+  told of it, so what is told as too short for a stop is recorded, too, for `mddag explain`.
+* When it starts it tells a stop of no length: from then on stops are noticed.
 
 Nothing is added to the way of a message or a timer.  If a callback waits while it keeps the
 interpreter's lock, no thread runs either: that looks the same.
@@ -26,9 +28,8 @@ from collections.abc import Callable
 import threading
 import time
 
-from mddag_executor.core.stops import LEAST_NS
-
 SLICE_NS = 20_000_000
+SHORT_NS = 5_000_000
 
 
 class StopWatch:
@@ -52,10 +53,14 @@ class StopWatch:
         self._look = look
         self._clock = clock
         self._cpu = cpu
-        self.start()
+        self._look_at_clocks()
 
     def start(self) -> None:
         """Begin to watch now."""
+        self._look_at_clocks()
+        self._stopped(self._last, self._last)
+
+    def _look_at_clocks(self) -> None:
         self._last, self._used = self._clock(), self._cpu()
 
     def wait(self, seconds: float) -> None:
@@ -67,9 +72,9 @@ class StopWatch:
             slice_ns = min(end - now, SLICE_NS)
             is_set = self._event.wait(slice_ns / 1e9)
             last, used = self._last, self._used
-            self.start()
+            self._look_at_clocks()
             now = self._last
             stop = now - last - slice_ns - (self._used - used)
-            if stop >= LEAST_NS:
+            if stop >= SHORT_NS:
                 self._stopped(now - stop, now)
             self._look()

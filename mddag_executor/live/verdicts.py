@@ -22,7 +22,7 @@ from mddag_executor.core.state import (
     SINK_LATE,
     State,
 )
-from mddag_executor.core.stops import Stops
+from mddag_executor.core.stops import LEAST_NS, Stops
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.live.entity import Entity
 from mddag_executor.live.jobs import Origin
@@ -155,7 +155,7 @@ class Verdicts:
 
     def stopped(self, begin: int, end: int) -> None:
         """Take in that no thread of the process ran for a while, which has just ended."""
-        for dag, cause in self.stops.stopped(begin, end):
+        for dag, cause in self.stops.stopped(begin, end) if end - begin >= LEAST_NS else ():
             self.causes[dag][cause] -= 1
             self.causes[dag][MACHINE] += 1
         if self.record is not None:

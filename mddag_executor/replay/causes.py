@@ -29,8 +29,8 @@ The cause of a miss is that of which there is most, beyond what is usual.  Two r
   the deadline, and they count, too.
 
 A job whose callback raised has *failed*; one that expired for want of a message has *lost* it.
-Where a timer's release was skipped because the callback still waited for the one before, the job
-*waited*, too.
+Where a timer's release was skipped because the callback still waited for the one before, that
+one's cause is its cause, too; if that one was in time, the job *waited*.
 """
 
 from __future__ import annotations
@@ -126,10 +126,20 @@ class Never(NamedTuple):
     dropped: dict[tuple[int, int], str]
     started: Ints
 
-    def waited(self, vertex: int, at: int) -> bool:
-        """Tell whether an execution of a vertex waited at a time."""
-        mine = self.started[self.started[:, 0] == vertex]
-        return bool(((mine[:, 2] <= at) & (mine[:, 3] > at)).any())
+    def waiting(self, vertices: Ints, times: Ints) -> Ints:
+        """Return of each vertex the job whose execution waited at the time beside it, or -1."""
+        jobs = np.full(len(vertices), -1)
+        for vertex in np.unique(vertices).tolist():
+            mine = self.started[self.started[:, 0] == vertex, 1:]
+            job, ready, start = mine[mine[:, 1].argsort()].T
+            latest = np.maximum.accumulate(start)
+            asked = np.flatnonzero(vertices == vertex)
+            before = np.searchsorted(ready, times[asked], 'right') - 1
+            asked, before = asked[before >= 0], before[before >= 0]
+            waits = latest[before] > times[asked]
+            last = np.maximum.accumulate(np.where(start == latest, np.arange(len(start)), 0))
+            jobs[asked[waits]] = job[last[before[waits]]]
+        return jobs
 
 
 class Found(NamedTuple):
@@ -298,16 +308,36 @@ def _causes(
         credit -= moved
     causes: Ints = amounts.argmax(axis=1)
     causes[rows[:, M_KIND] == SINK_FAILED] = FAILED
-    given_up = (rows[:, M_KIND] == SINK_EXPIRED) | (rows[:, M_KIND] == SINK_ABORTED)
-    for miss in np.flatnonzero(given_up & ((total[:, LOST] > 0) | (amounts.max(axis=1) == 0))
-                               ).tolist():
-        key = int(rows[miss, M_AT]), int(rows[miss, M_JOB])
-        if is_source[key[0]] and key not in never.dropped:      # the release was skipped
-            waited = never.waited(key[0], int(rows[miss, M_UNTIL]))
-            causes[miss] = MACHINE if after_stall[miss] else WAITED if waited else RELEASED_LATE
-        elif rows[miss, M_KIND] == SINK_EXPIRED or key in never.dropped:
-            causes[miss] = LOST
+    given_up = np.flatnonzero(
+        np.isin(rows[:, M_KIND], (SINK_EXPIRED, SINK_ABORTED))
+        & ((total[:, LOST] > 0) | (amounts.max(axis=1) == 0)))
+    causes[given_up] = _given_up(
+        rows, given_up, causes, np.where(after_stall, MACHINE, RELEASED_LATE), never, is_source)
     return causes
+
+
+def _given_up(
+    rows: Ints, which: Ints, causes: Ints, skipped: Ints, never: Never, is_source: Any
+) -> Ints:
+    """
+    Return the causes of some misses whose jobs were given up.
+
+    :param causes: of all misses.
+    :param skipped: their causes if their releases were skipped, and nothing waited.
+    """
+    found = causes[which]
+    kind, job, at, until = rows[which][:, [M_KIND, M_JOB, M_AT, M_UNTIL]].T
+    dropped = np.array(
+        [key in never.dropped for key in zip(at.tolist(), job.tolist())], dtype=np.bool_)
+    skips = is_source[at] & ~dropped
+    found[~skips & (dropped | (kind == SINK_EXPIRED))] = LOST
+    found[skips] = skipped[which[skips]]
+    before = never.waiting(at, until)
+    waits = skips & (before >= 0) & (found != MACHINE)
+    of = dict(zip(zip(*rows[:, [M_SINK, M_JOB]].T.tolist()), causes.tolist()))
+    found[waits] = [of.get(key, WAITED) for key in zip(
+        rows[which[waits], M_SINK].tolist(), before[waits].tolist())]
+    return found
 
 
 def behind(

@@ -131,6 +131,7 @@ class Explainer(Observer):
         self._dropped: dict[tuple[int, int], str] = {}
         self._vertex_of: dict[int, int] = {}
         self._until = self._since = -_NO_END
+        self._noticed = _NO_END     # from then on stops are recorded
         #: Begin and end of each stall so far.
         self.stalls: list[tuple[int, int]] = []
         self._found: list[tuple[Found, dict[int, list[tuple[int, int]]]]] = []
@@ -163,7 +164,8 @@ class Explainer(Observer):
             done[:, 5], batch.columns(PUBLISHED)[:, 6]]).reshape(-1, 1))
         if STOP in batch.events:
             stops = batch.events[STOP][1][:, -2:]
-            self._keep(_STOPS, stops[stops[:, 0] < stops[:, 1]])
+            self._keep(_STOPS, stops)
+            self._noticed = min(self._noticed, int(stops[:, 1].min()))
         if len(self._chains.misses.rows):
             self._misses.append(self._chains.misses)
         self._n_new += len(pieces)
@@ -217,8 +219,8 @@ class Explainer(Observer):
         self.stalls += find_stalls(Seen(
             times[:, 0], released[self._is_timer[released[:, 0]], 1:],
             self._table(_STARTED)[:, 2:],
-            np.column_stack((pieces[:, [_START, _END]], more)), self._table(_STOPS)),
-            self._until, until)
+            np.column_stack((pieces[:, [_START, _END]], more)), self._table(_STOPS),
+            self._noticed), self._until, until)
         self._until = until
 
     def _one(self, misses: Misses, pieces: Ints, usual: Usual) -> None:

@@ -5,11 +5,11 @@ Stalls: times in which no thread of the process ran though something was ready o
 
 Theory of operation
 -------------------
-The executor itself notices most stops of the machine while it runs, and records them (``stop``).
-It does so up to a slice late, so such a stall begins with the last event before.
+The executor itself notices stops of the machine while it spins, and records them (``stop``).  It
+does so up to a slice late, so such a stall begins with the last event before.
 
-A trace without them is searched.  Where nothing at all was recorded for ``LEAST_NS`` or longer, it
-was a stall
+The rest of a trace is searched.  Where nothing at all was recorded for ``LEAST_NS`` or longer, it
+was a stall, unless the executor would have noticed that and did not,
 
 * if nothing ran, but a callback was ready all the while, or a timer was due and nobody noticed;
 * if something ran, a timer was due and nobody noticed, and all that ran took longer than usual by
@@ -40,15 +40,17 @@ class Seen:
     :ivar started: executions: ready and start.
     :ivar ran: pieces: start, end, and how much longer than usual they took.
     :ivar stops: as recorded: begin and end.
+    :ivar noticed: from then on stops are recorded.
     """
 
     def __init__(
-        self, times: Ints, timers: Ints, started: Ints, ran: Ints, stops: Ints
+        self, times: Ints, timers: Ints, started: Ints, ran: Ints, stops: Ints,
+        noticed: int,
     ) -> None:
         self.times = np.unique(times)
         self.timers = timers[timers[:, 1] - timers[:, 0] >= _UNNOTICED_NS]
         self.started = started[started[:, 1] - started[:, 0] >= LEAST_NS]
-        self.ran, self.stops = ran, stops
+        self.ran, self.stops, self.noticed = ran, stops, noticed
 
     def suspicious(self) -> Spans:
         """Return the times within which there may be stalls that are not recorded."""
@@ -60,9 +62,9 @@ class Seen:
 
 def find(seen: Seen, since: int, until: int) -> list[tuple[int, int]]:
     """Return begin and end of the stalls that ended within a time, in order."""
-    found = [_widened(seen.times, begin, end) for begin, end in seen.stops.tolist()
-             if since < end <= until]
-    times = seen.times
+    stops, times = seen.stops[seen.stops[:, 0] < seen.stops[:, 1]], seen.times
+    found = [_widened(times, begin, end) for begin, end in stops.tolist()
+             if since < end <= until and end - begin >= LEAST_NS]
     gaps = np.flatnonzero(np.diff(times) >= LEAST_NS)
     gaps = gaps[(times[gaps + 1] > since) & (times[gaps + 1] <= until)]
     if len(gaps):
@@ -70,6 +72,8 @@ def find(seen: Seen, since: int, until: int) -> list[tuple[int, int]]:
     for gap in gaps.tolist():
         begin, end = int(times[gap]), int(times[gap + 1])
         if any(first < end and begin < last for first, last in found):
+            continue
+        if seen.noticed <= begin and not ((stops[:, 0] < end) & (stops[:, 1] > begin)).any():
             continue
         stalled = _begin(seen, begin, end)
         if stalled is not None and end - stalled >= LEAST_NS:

@@ -80,6 +80,8 @@ def test_a_stop_that_is_known_later_was_the_cause() -> None:
     driven.run(0, 0, 1, 2)
     driven.run(1, 3, 12, 13)
     assert driven.causes() == {'waited': 1}
-    driven.verdicts.stopped(4 * MS, 12 * MS)
+    driven.verdicts.stopped(4 * MS, 12 * MS)      # too short for a stop
+    assert driven.causes() == {'waited': 1}
+    driven.verdicts.stopped(-10 * MS, 12 * MS)
     assert driven.causes() == {'machine': 1}
     assert driven.verdicts.stops.result()['misses'] == 1
