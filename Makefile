@@ -3,8 +3,8 @@
 
 VENV := .venv
 KILTED := .venv-kilted
-# Tests that run ROS go one after the other, the others beside them.
-PYTEST_ARGS ?= -n 2 --dist loadgroup
+# Tests that run ROS go one after the other, the others beside them (see test/conftest.py).
+PYTEST_ARGS ?= -n 2
 BIN := $(VENV)/bin
 
 # The environment brings its own ROS packages. What a sourced ROS (or another environment's

@@ -20,7 +20,7 @@ import contextlib
 from functools import cache
 import importlib
 import os
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 import signal
 import socket
 import subprocess
@@ -39,7 +39,7 @@ HERE = Path(__file__).resolve().parent
 
 # Fast and basic ones first, so that a mistake shows early; whatever starts ROS comes last.
 ORDER = ('msg_graph', 'core', 'trace', 'simulate', 'analysis', 'replay', 'report', 'cli', 'launch',
-         '', 'live', 'rerun', 'integration', 'bench')
+         '', 'live', 'rerun', 'bench')
 # Domains above 101 collide with the ephemeral ports of Linux; low ones are what people use.
 DOMAINS = range(40, 102)
 
@@ -130,27 +130,36 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 # What runs ROS, or looks at how time passes. Side by side (`make test`) they are one group, which
 # one process runs one after the other while the other process runs the rest.
-ALONE = ('live', 'integration', 'bench', 'launch', 'examples', 'hardening')
-ALONE_FILES = (
-    'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_bench_replay.py',
-    'cli/test_graph_systems.py', 'replay/test_live_replay.py', 'test_docs.py', 'test_readme.py')
+ALONE = (
+    'live', 'bench', 'launch', 'examples', 'hardening/test_misuse.py', 'cli/test_run.py',
+    'cli/test_demo.py', 'cli/test_top.py', 'cli/test_bench_replay.py', 'cli/test_graph_systems.py',
+    'replay/test_live_replay.py', 'test_docs.py', 'test_readme.py')
+# These only count how often they fail.
+NOT_ALONE = ('live/mutations',)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=_rank)
     if 'PYTEST_XDIST_WORKER' in os.environ:
-        for item in items:
-            if _is_alone(item):
-                item.add_marker(pytest.mark.xdist_group('alone'))
-        items.sort(key=lambda item: not _is_alone(item))  # the longest group first
+        items.sort(key=lambda item: not _is_alone(item.nodeid))  # the longest group first
 
 
-def _is_alone(item: pytest.Item) -> bool:
-    try:
-        path = item.path.relative_to(HERE)
-    except ValueError:
-        return False
-    return path.parts[0] in ALONE or path.as_posix() in ALONE_FILES
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Scheduling(LoadScopeScheduling):
+
+        def _split_scope(self, nodeid: str) -> str:
+            return 'alone' if _is_alone(nodeid) else nodeid
+
+    return Scheduling(config, log)
+
+
+def _is_alone(nodeid: str) -> bool:
+    path = PurePosixPath(nodeid.partition('::')[0])
+    return (any(path.is_relative_to(PurePosixPath(HERE.name, each)) for each in ALONE)
+            and not any(path.is_relative_to(PurePosixPath(HERE.name, each)) for each in NOT_ALONE))
 
 
 def _rank(item: pytest.Item) -> tuple[bool, int]:
