@@ -26,19 +26,10 @@ from itertools import accumulate, islice
 from mddag_executor.assign.placement import Placing, TRANSPORT_NS
 from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core import policy as find_policy
-from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import divide, new_state
 from mddag_executor.core.tally import total
-from mddag_executor.simulate import engine
-from mddag_executor.simulate.deliveries import (
-    DELAY_NS,
-    Deliveries,
-    edge_numbers,
-    edges_of,
-    Transports,
-)
-from mddag_executor.simulate.engine import Load
-from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.deliveries import DELAY_NS
+from mddag_executor.simulate.load import edge_numbers, edges_of, Load
+from mddag_executor.simulate.schedule import How, schedule
 from mddag_executor.simulate.workload import periodic_load
 from msg_graph import Process, TaskSet
 
@@ -74,32 +65,26 @@ class Predictor:
         """Return the verdicts about a placement, with these execution times in each job."""
         task_set = replace(self._task_set, processes=tuple(processes))
         tables = Tables.build(task_set, max_active_jobs=NEVER)
-        times, transports = self._with_transport(tables, execution_ns)
+        times, delays = self._with_transport(tables, execution_ns)
         holds = [process if vertex.callback.holds_interpreter is not False else 0
                  for process, vertex in zip(tables.process, task_set.vertices)]
-        load = _apart(periodic_load(task_set, times, self._duration)._replace(holds=holds))
-        pools = [self._workers] * len(processes)
-        state = new_state(
-            tables, sum(pools), propagate=2, preemptive=self._policy.mode(False, len(pools)),
-            polling=self._policy.polling)
-        if len(pools) > 1:
-            divide(state, pools)
-        deliveries = Deliveries(tables, state, self._policy.key, transports, stops=True)
-        machine = Machine(tables, state, load, self._cpus, deliveries=deliveries)
-        ended = engine.run(tables, state, self._policy.key, load, self._duration, False,
-                           deliveries=deliveries, machine=machine)
-        finish(tables, state, ended)
+        bases = list(accumulate(edges_of(tables), initial=0))[:-1]
+        load = _apart(periodic_load(task_set, times, self._duration)._replace(
+            holds=holds, delays=delays, delay_base=bases, delay_stride=[0] * len(bases)))
+        how = How(
+            self._policy.name, self._workers, cpus=self._cpus, processes=max(1, len(processes)))
+        decisions = schedule(tables, load, how, self._duration).decisions
         tally = Tally(task_set, tables)
         for time, dag in zip(load.times, load.dags):
             if time < self._duration:
                 tally.released(dag)
-        tally.add(state.decisions)
+        tally.add(decisions)
         return tally
 
     def _with_transport(
         self, tables: Tables, execution_ns: Sequence[Sequence[int]],
-    ) -> tuple[list[list[int]], Transports]:
-        """Return execution times and messages with what they take more (rule 3)."""
+    ) -> tuple[list[list[int]], list[int]]:
+        """Return execution times with what messages add, and how long these take (rule 3)."""
         times = [[ns + CALLBACK_NS for ns in row] for row in execution_ns]
         delays: list[int] = []
         sends = set()
@@ -111,8 +96,7 @@ class Predictor:
                 sends.add(vertex)
         for vertex in sends:
             times[tables.dag_of[vertex]][tables.index_in_dag[vertex]] += TRANSPORT_NS
-        base = list(accumulate(edges_of(tables), initial=0))[:-1]
-        return times, Transports(delays, base, [0] * len(base))
+        return times, delays
 
 
 def _apart(load: Load) -> Load:

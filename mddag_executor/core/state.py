@@ -11,7 +11,7 @@ arrays.  ``scalars`` holds what would be plain integers, because a named tuple's
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mddag_executor.core.tables import NEVER, Tables
 
@@ -209,6 +209,6 @@ def add_group(s: State) -> int:
     return len(s.group_owner) - 1
 
 
-def add_queue(queues: list[list[QueueEntry]]) -> None:
+def add_queue(queues: list[list[Any]]) -> None:
     """Add an empty queue."""
     queues.append([])

@@ -25,15 +25,13 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core import policy as find_policy
-from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import Decision, JUDGE_FROM, new_state
+from mddag_executor.core.state import Decision
 from mddag_executor.replay.bags import Bag, BagError, UNKNOWN
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
-from mddag_executor.simulate import Load, LogEntry, SimulationError
-from mddag_executor.simulate.engine import busy_times, run
-from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate import How, Load, LogEntry, schedule, SimulationError
+from mddag_executor.simulate.engine import busy_times
 from mddag_executor.simulate.workload import declared_holds
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.times import credible
@@ -172,21 +170,14 @@ class BagReschedule:
             self._bag.name, f'there are more than {_MOST_JOBS} jobs in it', 'give a shorter bag')
 
     def _run(self, load: Load) -> list[LogEntry]:
-        policy = find_policy(self.policy)
-        state = new_state(
-            self.tables, self.workers, preemptive=policy.mode(self.preemptive),
-            dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
-        state.scalars[JUDGE_FROM] = self.judge_from
-        log: list[LogEntry] = []
-        stops = bool(load.holds) or self.cpus is not None
-        machine = Machine(self.tables, state, load, self.cpus) if stops else None
-        run(self.tables, state, policy.key, load, self.end, False, log, machine=machine)
-        finish(self.tables, state, self.end)
+        how = How(
+            self.policy, self.workers, find_policy(self.policy).mode(self.preemptive),
+            self.dispatch_overhead, judge_from=self.judge_from, cpus=self.cpus)
+        _, log, self.decisions = schedule(self.tables, load, how, self.end, log=True)
         for dag, release in zip(load.dags, load.releases):
             if release >= self.judge_from:
                 self.tally.released(dag)
-        self.tally.add(state.decisions)
-        self.decisions = state.decisions
+        self.tally.add(self.decisions)
         return log
 
     @property

@@ -17,7 +17,7 @@ execution that publishes it, or as much later (or earlier) as ``delays`` says.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from mddag_executor.core import legs_of, NEVER
@@ -33,6 +33,7 @@ from mddag_executor.replay.happenings import (
     STARTED,
 )
 from mddag_executor.simulate import END, Load, LogEntry, START
+from mddag_executor.simulate.load import FAILS
 from msg_graph import TaskSet
 
 Delay = Callable[[int, int, int, int], int]
@@ -51,7 +52,6 @@ class ComputedRun(NamedTuple):
     :ivar numbers: by DAG, what a job of the load is called; None: as in the load.
     :ivar delay: how long messages take; None: no time.
     :ivar judge_from: jobs released before are not judged.
-    :ivar failed: the vertices and jobs (of the load) whose executions failed.
     """
 
     task_set: TaskSet
@@ -64,7 +64,6 @@ class ComputedRun(NamedTuple):
     numbers: list[list[int]] | None = None
     delay: Delay | None = None
     judge_from: int = -NEVER
-    failed: Set[tuple[int, int]] = frozenset()
 
     def play(self, observers: Sequence[Observer]) -> None:
         """Tell the observers everything."""
@@ -168,7 +167,7 @@ class _Teller:
         assert before is not None, 'what ends has begun'
         busy = before.busy + now - before.since
         self._running[what] = before._replace(busy=busy)
-        if kind == END and (v, job) in self._schedule.failed:
+        if kind == END and declared and self._fails(dag, v, job):
             self._tell(FAILED, dag, v, number, now)
         last = self._last_leg[v] if kind == END and declared else 0
         for leg in range(last):     # they took no time: the execution is the last one's
@@ -181,6 +180,11 @@ class _Teller:
             del self._running[what]
             if declared:
                 self._complete(what, last, before, now, busy)
+
+    def _fails(self, dag: int, v: int, job: int) -> bool:
+        load = self._schedule.load
+        return len(load.fates) > 0 and load.fates[
+            load.cost_base[dag] + job * load.cost_stride[dag] + v - self._first[dag]] == FAILS
 
     def _complete(self, what: Id, leg: int, ran: _Running, now: int, busy: int) -> None:
         dag, v, job = what

@@ -40,13 +40,15 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of, quantile, Tables
 from mddag_executor.replay.dispatches import Dispatches
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.simulate import Load
-from mddag_executor.simulate.deliveries import DELAY_NS, edge_numbers, edges_of, Transports
+from mddag_executor.simulate.deliveries import DELAY_NS
+from mddag_executor.simulate.load import edge_numbers, edges_of, FAILS, RUNS, SKIPPED
 from mddag_executor.trace.census import Census
 from msg_graph import Dag, TaskSet
 
@@ -63,8 +65,6 @@ class RecordedLoad(NamedTuple):
     ``executions`` all of them; ``unknown`` names callbacks of which no time is known at all.
     ``dispatches`` is what of ``load.costs`` is dispatch; it is empty without overheads.
     ``dispatch_ns`` and ``transport_ns`` are medians of what was measured, None where nothing was.
-    ``computed`` has the CPU times, as ``load.costs``; it is empty where none is recorded.
-    ``locks`` tells, as ``computed``, which of them computed with Python's lock.
     """
 
     load: Load
@@ -73,14 +73,9 @@ class RecordedLoad(NamedTuple):
     executions: int
     estimated: int
     unknown: list[str]
-    transports: Transports
     dispatch_ns: int | None = None
     transport_ns: int | None = None
-    failed: frozenset[tuple[int, int]] = frozenset()
-    computed: Sequence[int] = ()
     dispatches: Sequence[int] = ()
-    skipped: frozenset[tuple[int, int]] = frozenset()
-    locks: Sequence[bool] = ()
 
 
 class _Jobs:
@@ -309,15 +304,27 @@ class LoadBuilder(Observer):
                      for _, took, number in others)
         computed += [_UNKNOWN] * len(others)
         holds += [0] * len(others)
-        transports, transport = self._transports(overheads, process)
+        delays, transport = self._transports(overheads, process)
+        load = self._load(costs, bases, [ready for ready, _, _ in others], overheads)._replace(
+            holds=holds if any(holds) else [],
+            computed=computed if max(computed, default=-1) >= 0 else [],
+            locks=[*locks.tolist(), *([0] * len(others))], fates=self._fates(bases, len(costs)),
+            delays=delays, delay_stride=[jobs.n_edges for jobs in self._jobs],
+            delay_base=[0, *accumulate(len(jobs.arrived) for jobs in self._jobs[:-1])])
         return RecordedLoad(
-            self._load(costs, bases, [ready for ready, _, _ in others], overheads)._replace(
-                holds=holds if any(holds) else []),
-            [jobs.numbers for jobs in self._jobs], demand, executions, estimated, list(unknown),
-            transports, usual if len(measured) else None, transport,
-            frozenset(self._failed), computed if max(computed, default=-1) >= 0 else (),
-            dispatches, frozenset(self._skipped),
-            [*locks.tolist(), *([False] * len(others))])
+            load, [jobs.numbers for jobs in self._jobs], demand, executions, estimated,
+            list(unknown), usual if len(measured) else None, transport, dispatches)
+
+    def _fates(self, bases: list[int], executions: int) -> list[int]:
+        """Return which executions failed, or were skipped; empty: none."""
+        fates = [RUNS] * executions if self._failed or self._skipped else []
+        for vertex, row in self._failed:
+            dag = self._tables.dag_of[vertex]
+            fates[bases[dag] + row * self._jobs[dag].size + vertex - self._first[dag]] = FAILS
+        for dag, row in self._skipped:
+            source = self._tables.source[dag] - self._first[dag]
+            fates[bases[dag] + row * self._jobs[dag].size + source] = SKIPPED
+        return fates
 
     def _all(self, column: str) -> Any:
         """Return a column of all jobs, DAG by DAG."""
@@ -410,7 +417,7 @@ class LoadBuilder(Observer):
 
     def _transports(
         self, overheads: bool, process: Sequence[int]
-    ) -> tuple[Transports, int | None]:
+    ) -> tuple[list[int], int | None]:
         """
         Return the transports by job, and the median of all that were measured.
 
@@ -440,11 +447,9 @@ class LoadBuilder(Observer):
         for view, after in changed:
             times = usual[after]
             view[:] = np.median(times) if len(times) else DELAY_NS * after
-        bases = np.cumsum([0, *(each.size for each in delays)]).tolist()[:-1]
         flat = np.concatenate([each.ravel() for each in delays] or [np.zeros(0, dtype=np.int64)])
         everything = np.concatenate(list(usual.values()))
-        return (Transports((flat if overheads else np.zeros_like(flat)).tolist(), bases,
-                           [jobs.n_edges for jobs in self._jobs]),
+        return ((flat if overheads else np.zeros_like(flat)).tolist(),
                 int(np.median(everything)) if len(everything) else None)
 
     def _crossings(self, process: Sequence[int]) -> list[list[tuple[bool, bool]]]:

@@ -12,12 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from mddag_executor.core import NEVER, POLICIES, processes_of, Tables
 from mddag_executor.core import policy as find_policy
-from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import Decision, divide, JUDGE_FROM, new_state
+from mddag_executor.core.state import Decision
 from mddag_executor.errors import UsageError
 from mddag_executor.memory import no_garbage
 from mddag_executor.replay.as_recorded import Progress, recording_result, Replay
@@ -29,51 +28,13 @@ from mddag_executor.replay.recording import Head, ReplayError
 from mddag_executor.replay.run import open_run, Recording, Run
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
-from mddag_executor.simulate import engine, LogEntry
-from mddag_executor.simulate.deliveries import Deliveries, edge_numbers
+from mddag_executor.simulate import How, LogEntry, schedule
 from mddag_executor.simulate.engine import busy_times
-from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.load import edge_numbers
 from mddag_executor.text import counted, listed
 from msg_graph import Process, TaskSet
 
 MAX_WORKERS = 4096
-
-
-class How(NamedTuple):
-    """How a recorded load is scheduled, with so many workers in each process."""
-
-    policy: str
-    workers: int
-    preemptive: bool
-    dispatch_overhead: int
-    judge_from: int
-    cpus: int | None
-    processes: int = 1
-
-    def schedule(
-        self, work: RecordedLoad, tables: Tables, end: int, log: list[LogEntry] | None = None,
-        stop_at_first_miss: bool = False,
-    ) -> list[Decision]:
-        """Run the core over a load; return what it decided."""
-        policy = find_policy(self.policy)
-        state = new_state(
-            tables, self.workers * self.processes, propagate=2,
-            preemptive=policy.mode(self.preemptive, self.processes),
-            dispatch_overhead=self.dispatch_overhead, polling=policy.polling)
-        if self.processes > 1:
-            divide(state, [self.workers] * self.processes)
-        state.scalars[JUDGE_FROM] = self.judge_from
-        load = work.load
-        stops = bool(load.holds) or self.cpus is not None
-        deliveries = Deliveries(
-            tables, state, policy.key, work.transports, work.failed, stops, work.skipped)
-        machine = Machine(tables, state, load, self.cpus, work.computed,
-                          bool(work.computed and load.holds), deliveries, work.locks)
-        ended = engine.run(tables, state, policy.key, load, end, stop_at_first_miss, log,
-                           deliveries=deliveries, machine=machine if stops else None)
-        if ended == end:
-            finish(tables, state, end)
-        return state.decisions
 
 
 class Reschedule:
@@ -108,7 +69,7 @@ class Reschedule:
         self.judge_from = judge_from
         self.skip = skip
         self.warnings = recorded.warnings
-        if cpus is not None and recorded.run.declared and not work.computed:
+        if cpus is not None and recorded.run.declared and not work.load.computed:
             self.warnings.append(
                 f'{recorded.run.name}: CPU times are not recorded in it, so with --cpus each '
                 'execution computes all the time')
@@ -119,8 +80,7 @@ class Reschedule:
 
     def _run(self) -> None:
         load, end = self._work.load, self.recorded.run.end
-        self.log = []
-        self.decisions = self.how.schedule(self._work, self.tables, end, self.log)
+        _, self.log, self.decisions = schedule(self.tables, load, self.how, end, log=True)
         for time, dag, release in zip(load.times, load.dags, load.releases or load.times):
             if time < end and release >= self.judge_from:
                 self.tally.released(dag)
@@ -131,7 +91,8 @@ class Reschedule:
         """Return how the load is scheduled."""
         processes = max(1, len(self.processes))
         return How(self.policy, self.workers // processes, self.preemptive,
-                   self.dispatch_overhead, self.judge_from, self.cpus, processes)
+                   self.dispatch_overhead, judge_from=self.judge_from, cpus=self.cpus,
+                   processes=processes)
 
     @property
     def worker_names(self) -> list[str]:
@@ -151,16 +112,16 @@ class Reschedule:
 
     def computed(self) -> ComputedRun:
         """Return the schedule, to be played to observers."""
-        transports, edges = self._work.transports, edge_numbers(self.tables)
+        load, edges = self._work.load, edge_numbers(self.tables)
 
         def delay(dag: int, job: int, before: int, after: int) -> int:
-            return int(transports.delays[
-                transports.base[dag] + job * transports.stride[dag] + edges[before, after]])
+            return load.delays[
+                load.delay_base[dag] + job * load.delay_stride[dag] + edges[before, after]]
 
         end = self.end_ns
         return ComputedRun(
-            self.task_set, self._work.load, self.log, self.decisions, end, end, True,
-            self._work.jobs, delay, self.judge_from, self._work.failed)
+            self.task_set, load, self.log, self.decisions, end, end, True, self._work.jobs, delay,
+            self.judge_from)
 
     def recorded_job(self, dag: int, job: int) -> int:
         """Return the recorded index of a job of the log or tally."""

@@ -26,7 +26,6 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 import math
 import multiprocessing
 import signal
@@ -34,13 +33,12 @@ import time
 from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER, Tables
-from mddag_executor.core.jobs import finish, is_miss
+from mddag_executor.core.jobs import is_miss
 from mddag_executor.core.state import Decision
 from mddag_executor.memory import no_garbage
 from mddag_executor.replay.as_recorded import slack as margin
 from mddag_executor.replay.load import RecordedLoad
-from mddag_executor.replay.reschedule import How
-from mddag_executor.simulate import engine, Load, Settings
+from mddag_executor.simulate import How, Load, schedule
 from msg_graph import TaskSet
 import numpy as np
 
@@ -71,52 +69,30 @@ class Problem(NamedTuple):
     A load, and how it is scheduled.
 
     :ivar work: a recorded load, or a periodic one.
-    :ivar how: how the first is scheduled, or the second.
+    :ivar how: how it is scheduled.
     :ivar end: of the run, ns.
     :ivar callback_of: by global vertex the number of its callback.
     """
 
     work: RecordedLoad | Load
-    how: How | Settings
+    how: How
     tables: Tables
     end: int
     callback_of: list[int]
 
     def with_number(self, of: str, number: int) -> Problem:
         """Return the same problem for another number of ``workers`` or ``cpus``."""
-        how = self.how
         return self._replace(
-            how=how._replace(**{of: number}) if isinstance(how, How)    # type: ignore[arg-type]
-            else replace(how, **{of: number}))      # type: ignore[arg-type]
-
-    @property
-    def processes(self) -> int:
-        """Return how many processes have so many workers each."""
-        return self.how.processes if isinstance(self.how, How) else 1
+            how=self.how._replace(**{of: number}))      # type: ignore[arg-type]
 
     @property
     def load(self) -> Load:
         """Return the load."""
         return self.work if isinstance(self.work, Load) else self.work.load
 
-    def decide(
-        self, load: Load, computed: list[int], end: int, stop: bool
-    ) -> list[Decision]:
-        """
-        Schedule a load up to a time, or its first miss; return what was decided.
-
-        :param computed: of a recorded load, the CPU times.
-        """
-        if isinstance(self.how, How):
-            assert isinstance(self.work, RecordedLoad)
-            return self.how.schedule(
-                self.work._replace(load=load, computed=computed), self.tables, end,
-                stop_at_first_miss=stop)
-        state, key = self.how.start(self.tables)
-        if engine.run(self.tables, state, key, load, end, stop,
-                      machine=self.how.machine(self.tables, state, load)) == end:
-            finish(self.tables, state, end)
-        return state.decisions
+    def decide(self, load: Load, end: int, stop: bool) -> list[Decision]:
+        """Schedule a load up to a time, or its first miss; return what was decided."""
+        return schedule(self.tables, load, self.how, end, stop_at_first_miss=stop).decisions
 
 
 class Found(NamedTuple):
@@ -142,11 +118,10 @@ class Search:
         load, tables = problem.load, problem.tables
         self._costs = np.array(load.costs, dtype=np.int64)
         self._dispatches = np.zeros_like(self._costs)
-        self._computed = np.empty(0, dtype=np.int64)
+        self._computed = np.array(load.computed, dtype=np.int64)
         work = problem.work
         if isinstance(work, RecordedLoad):
             self._dispatches[:len(work.dispatches)] = work.dispatches
-            self._computed = np.array(work.computed, dtype=np.int64)
         self._of = self._callback_of_cost(load, tables)
         self._reach = WINDOW * max(
             [tables.sink_deadline[sink] for sink in tables.sinks], default=0)
@@ -187,15 +162,15 @@ class Search:
             self._stops = next(self._misses(self._scaled(ALL, 1), False, True), None) is None
 
     def _misses(
-        self, scaled: tuple[Load, list[int], int], stop: bool, of_any: bool = False
+        self, scaled: tuple[Load, int], stop: bool, of_any: bool = False
     ) -> Iterator[Miss]:
         for kind, _, vertex, _, deadline, _ in self._problem.decide(*scaled, stop):
             if is_miss(kind) and (of_any or vertex not in self.left_out):
                 yield Miss(vertex, deadline,
                            deadline - self._problem.tables.sink_deadline[vertex])
 
-    def _scaled(self, callback: int, factor: float) -> tuple[Load, list[int], int]:
-        """Return load and CPU times in which a callback takes longer, and the end of the run."""
+    def _scaled(self, callback: int, factor: float) -> tuple[Load, int]:
+        """Return the load with a callback that takes longer, and the end of the run."""
         which = self._of == callback if callback != ALL else self._of >= 0
         costs = self._costs.copy()
         pure = costs[which] - self._dispatches[which]
@@ -204,14 +179,14 @@ class Search:
         if len(computed):
             which &= computed >= 0
             computed[which] = np.minimum(computed[which] * factor, NEVER >> 8).astype(np.int64)
-        return (self._problem.load._replace(costs=costs.tolist()), computed.tolist(),
+        return (self._problem.load._replace(costs=costs.tolist(), computed=computed.tolist()),
                 self._problem.end)
 
     def first_miss(
         self, callback: int, factor: float, window: tuple[int, int] | None = None
     ) -> Miss | None:
         """Return a deadline that is missed with a factor, in a window or anywhere, if any is."""
-        load, computed, end = self._scaled(callback, factor)
+        load, end = self._scaled(callback, factor)
         if window is not None:
             first, last = (bisect_left(load.times, each) for each in window)
             end = min(end, window[1])
@@ -219,10 +194,10 @@ class Search:
                 times=load.times[first:last], dags=load.dags[first:last],
                 jobs=load.jobs[first:last], releases=load.releases[first:last])
         with no_garbage():
-            missed = list(self._misses((load, computed, end), self._stops, True))
+            missed = list(self._misses((load, end), self._stops, True))
             if self._stops and missed and all(miss.sink in self.left_out for miss in missed):
                 # it stopped where a job of what is left out expired
-                missed = list(self._misses((load, computed, end), False))
+                missed = list(self._misses((load, end), False))
             return min((miss for miss in missed if miss.sink not in self.left_out), default=None,
                        key=lambda miss: miss.deadline)
 

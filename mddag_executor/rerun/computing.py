@@ -15,10 +15,7 @@ from typing import Any
 from mddag_executor.core import NEVER
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.work import Work
-from mddag_executor.simulate import Load
-from mddag_executor.simulate.machine import Machine
-
-_NO_LOAD = Load([], [], [], [], [], [])
+from mddag_executor.simulate.machine import begins, new_machine, NEXT_TIME, settle, share
 
 
 class Computing:
@@ -36,9 +33,9 @@ class Computing:
         ended: Callable[[Any, int], None],
     ) -> None:
         self._engine = engine
-        self._machine = Machine(
-            engine.tables, engine.scheduler.state, _NO_LOAD, cpus, python=python, deliveries=self)
-        self._machine.settle(start)
+        self._state = engine.scheduler.state
+        self._machine = new_machine(engine.tables, self._state, cpus, python)
+        settle(self._state, self._machine, start)
         self._ended = ended
         self._finish_at = [NEVER] * engine.n_workers
         self._running: list[Any] = [None] * engine.n_workers
@@ -47,7 +44,7 @@ class Computing:
 
     def waits(self, work: Work) -> None:
         """Take in that an execution has a worker and, for now, needs nothing."""
-        self._machine.begins(work.x, 0, -1)
+        begins(self._state, self._machine, work.x, 0, -1, False)
 
     def begin(
         self, what: Any, work: Work, takes: int,
@@ -60,27 +57,28 @@ class Computing:
         :param leaving: what is to be done before its end, and how far it is then.
         """
         self._engine.takes(work, takes)
-        self._machine.begins(work.x, takes, work.cpu_ns)
+        begins(self._state, self._machine, work.x, takes, work.cpu_ns, False)
         self._running[work.worker] = what
         if leaving:
             self._places[work.x] = sorted(leaving, key=lambda each: each[0], reverse=True)
+            self._leaves_next(work.x)
 
-    def next_place(self, x: int) -> int:
-        """Return how far a running execution is when something of it leaves next."""
-        places = self._places.get(x)
-        return places[-1][0] if places else NEVER
+    def _leaves_next(self, x: int) -> None:
+        """Tell the machine how far an execution is when something of it leaves next."""
+        places = self._places[x]
+        self._machine.publishes_at[x] = places[-1][0] if places else NEVER
 
     def next_time(self) -> int:
         """Return when somebody ends, or needs something else."""
-        return min(self._machine.next_time, *self._finish_at)
+        return min(self._machine.scalars[NEXT_TIME], *self._finish_at)
 
     def settle(self, now: int) -> None:
         """Take in that time has passed."""
-        self._machine.settle(now)
+        settle(self._state, self._machine, now)
 
     def share(self, now: int) -> None:
         """Find out who goes on."""
-        self._machine.share(now, self._finish_at)
+        share(self._engine.tables, self._state, self._machine, now, self._finish_at)
         for worker, what in enumerate(self._running):
             if what is None:
                 self._finish_at[worker] = NEVER
@@ -89,7 +87,9 @@ class Computing:
         """Do what is due; False: there is nothing."""
         for x, places in self._places.items():
             if places and self._engine.progress(x, now) >= places[-1][0]:
-                places.pop()[1]()
+                leaves = places.pop()[1]
+                self._leaves_next(x)
+                leaves()
                 return True
         for worker, time in enumerate(self._finish_at):
             if time <= now:

@@ -23,7 +23,8 @@ from typing import Protocol
 
 from mddag_executor.core import quantile, Tables
 from mddag_executor.replay.load import RecordedLoad
-from mddag_executor.simulate.deliveries import edge_numbers
+from mddag_executor.simulate.load import edge_numbers
+from mddag_executor.simulate.schedule import needs_python
 
 
 class Times(Protocol):
@@ -84,8 +85,7 @@ class AsRecorded:
 
     def __init__(self, tables: Tables, work: RecordedLoad) -> None:
         self._tables = tables
-        self._load, self._transports, self._computed = work.load, work.transports, work.computed
-        load = work.load
+        self._load = load = work.load
         self._releases: list[list[tuple[int, int]]] = [[] for _ in range(tables.n_dags)]
         for dag, job, release in zip(load.dags, load.jobs, load.releases or load.times):
             if dag < tables.n_dags:
@@ -112,17 +112,17 @@ class AsRecorded:
         edge = self._edges.get((before, after))
         if edge is None:
             return 0
-        t = self._transports
-        return self._value(
-            t.delays, t.base[dag] + edge, t.stride[dag], dag, release, (before, after))
+        load = self._load
+        return self._value(load.delays, load.delay_base[dag] + edge, load.delay_stride[dag], dag,
+                           release, (before, after))
 
     def computed(self, dag: int, vertex: int, release: int) -> int:
         """Return the CPU time that a vertex of the job with that release took."""
-        if not self._computed:
-            return self.execution(dag, vertex, release)
         load, local = self._load, vertex - self._tables.first_vertex[dag]
+        if not load.computed:
+            return self.execution(dag, vertex, release)
         first, stride = load.cost_base[dag] + local, load.cost_stride[dag]
-        return self._value(self._computed, first, stride, dag, release, (vertex, -2))
+        return self._value(load.computed, first, stride, dag, release, (vertex, -2))
 
     def holds(self, vertex: int) -> bool:
         """Return whether a vertex held the interpreter in most jobs."""
@@ -135,7 +135,7 @@ class AsRecorded:
     @property
     def python(self) -> bool:
         """Return whether it is known what needs the interpreter."""
-        return bool(self._computed and self._load.holds)
+        return needs_python(self._load)
 
     def _value(
         self, values: Sequence[int], first: int, stride: int, dag: int, release: int,

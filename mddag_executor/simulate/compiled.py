@@ -19,8 +19,9 @@ from mddag_executor.simulate.compiling import (
     keeps_entries,
 )
 from mddag_executor.simulate.draws import Times
-from mddag_executor.simulate.engine import Load, LogEntry
+from mddag_executor.simulate.engine import LogEntry
 from mddag_executor.simulate.lending import EmptyMemory, LentTuple
+from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.run import Settings
 from mddag_executor.simulate.workload import periodic_load
 from msg_graph import TaskSet

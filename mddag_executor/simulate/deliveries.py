@@ -17,163 +17,147 @@ A message whose job has ended meanwhile is ignored.
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
 from heapq import heappop, heappush
 from typing import NamedTuple
 
-from mddag_executor.core import NEVER, rules, Tables
+from mddag_executor.core import rules
 from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.state import OPEN, PREEMPTIVE, State
+from mddag_executor.core.state import OPEN, PREEMPTIVE, QueueEntry, State
+from mddag_executor.core.tables import NEVER, Tables
+from mddag_executor.simulate.load import FAILS, Load, place_of
+from mddag_executor.simulate.machine import Machine
 
 DELAY_NS = 1_000_000
 """What a message takes to another process of this machine, whose interpreter is in use."""
 
 
-class Transports(NamedTuple):
+class Deliveries(NamedTuple):
     """
-    How long after a vertex's completion each of its edges comes true.
+    The messages of one run of a state that was made with ``propagate=2``; empty to begin with.
 
-    The delay (ns) of edge e in job k of DAG d is ``delays[base[d] + k * stride[d] + e]``; the
-    edges of a DAG are numbered as in ``Tables.successors``, from its first vertex on.
-    """
-
-    delays: Sequence[int]
-    base: list[int]
-    stride: list[int]
-
-
-def edges_of(tables: Tables) -> list[int]:
-    """Return the number of edges of each declared DAG."""
-    first = [tables.first_successor[v] for v in tables.first_vertex]
-    return [after - before for before, after in zip(first, first[1:])]
-
-
-def edge_numbers(tables: Tables) -> dict[tuple[int, int], int]:
-    """Return the number of each edge in its DAG, by the global vertices that it joins."""
-    first = tables.first_successor
-    return {
-        (vertex, tables.successors[i]): i - first[tables.first_vertex[tables.dag_of[vertex]]]
-        for vertex in range(tables.n_vertices) for i in range(first[vertex], first[vertex + 1])}
-
-
-class Deliveries:
-    """
-    The messages of one run, and which of its executions fail.
-
-    :param state: of the core, empty, made with ``propagate=2``.
-    :param failed: the vertices and jobs whose executions fail.
-    :param stops: whether executions may stand still.
-    :param skipped: the DAGs and jobs whose sources do not run: they expire at once.
+    ``messages`` are those under way, a heap: (time, order, slot, job, vertex that it starts);
+    ``sent`` has one element: how many there were.  ``next_vertex`` tells, by execution that runs
+    and may stand still, what it starts next before its end, at ``Machine.publishes_at``.
     """
 
-    def __init__(
-        self, tables: Tables, state: State, key: KeyFunction, transports: Transports,
-        failed: Set[tuple[int, int]] = frozenset(), stops: bool = False,
-        skipped: Set[tuple[int, int]] = frozenset(),
-    ) -> None:
-        self._t = tables
-        self._s = state
-        self._key = key
-        self._transports = transports
-        self._failed = failed
-        self.skipped = skipped
-        self._first_edge = [tables.first_successor[v] for v in tables.first_vertex]
-        self._early = not state.scalars[PREEMPTIVE]
-        # (time, order, slot, job, vertex that the message starts)
-        self._messages: list[tuple[int, int, int, int, int]] = []
-        self._sent = 0
-        self._stops = stops
-        # of those that run and may stand still, by execution: the places at which they publish
-        # before their end, and what that starts; the next one last
-        self._to_come: dict[int, list[tuple[int, int]]] = {}
+    messages: list[QueueEntry]
+    sent: list[int]
+    next_vertex: list[int]
 
-    def next_time(self) -> int:
-        """Return when the next message arrives, ns."""
-        return self._messages[0][0] if self._messages else NEVER
 
-    def started(self, x: int, now: int) -> None:
-        """Send what an execution that starts publishes before or after its end."""
-        if self._early and self._stops:
-            self._find_places(x)
-        elif self._early:
-            self._send(x, now + self._s.x_left[x], now)
+def new_deliveries() -> Deliveries:
+    """Return the messages of a run that begins."""
+    return Deliveries([], [0], [])
 
-    def _find_places(self, x: int) -> None:
-        s = self._s
-        cost = s.x_cost[x]
-        found = [(max(0, cost + delay), after) for after, delay in self._edges(x) if delay < 0]
-        if found:
-            self._to_come[x] = sorted(found, reverse=True)
 
-    def next_place(self, x: int) -> int:
-        """Return how far a running execution is when it publishes next."""
-        to_come = self._to_come.get(x)
-        return to_come[-1][0] if to_come else NEVER
+def next_arrival(d: Deliveries) -> int:
+    """Return when the next message arrives, ns."""
+    return d.messages[0][0] if len(d.messages) > 0 else NEVER
 
-    def _edges(self, x: int) -> list[tuple[int, int]]:
-        """Return what an execution starts, and how long after its end."""
-        t, s = self._t, self._s
-        vertex = s.x_vertex[x]
-        first, end = t.first_successor[vertex], t.first_successor[vertex + 1]
-        if first == end:
-            return []
-        base = self._base(t.dag_of[vertex], s.job_index[s.x_slot[x]])
-        delays = self._transports.delays
-        return [(t.successors[i], delays[base + i]) for i in range(first, end)]
 
-    def complete(self, x: int, now: int) -> None:
-        """End an execution, and send what it publishes."""
-        t, s = self._t, self._s
-        slot = s.x_slot[x]
-        job = s.job_index[slot]
-        edges = self._edges(x)
-        for _, after in reversed(self._to_come.pop(x, ())):
-            self._arrive(slot, job, after, now)
-        end = rules.fail if (s.x_vertex[x], job) in self._failed else rules.complete
-        end(t, s, self._key, x, now)
-        for after, delay in edges:
-            if delay == 0 or (delay < 0 and not self._early):
-                self._arrive(slot, job, after, now)
-            elif delay > 0 and (self._stops or not self._early):
-                self._post(now + delay, slot, job, after)
+def delay_of(t: Tables, s: State, load: Load, x: int, edge: int) -> int:
+    """Return how long after the end of an execution an edge of its vertex comes true."""
+    slot = s.x_slot[x]
+    dag = s.job_dag[slot]
+    return load.delays[load.delay_base[dag] + s.job_index[slot] * load.delay_stride[dag]
+                       + edge - t.first_successor[t.first_vertex[dag]]]
 
-    def arrive(self, now: int) -> None:
-        """Make the edges true whose messages arrive now, in the order in which they were sent."""
-        messages = self._messages
-        while messages and messages[0][0] <= now:
-            _, _, slot, job, vertex = heappop(messages)
-            self._arrive(slot, job, vertex, now)
-        if self._to_come:
-            self._publish(now)
 
-    def _publish(self, now: int) -> None:
-        """Make the edges true that running executions publish now, before their end."""
-        s = self._s
-        for x in s.worker_x:
-            to_come = self._to_come.get(x)
-            if to_come:
+def sends_at_start(
+    t: Tables, s: State, load: Load, d: Deliveries, m: Machine | None, x: int, now: int
+) -> None:
+    """Send what an execution that starts publishes before or after its end, as far as known."""
+    vertex = s.x_vertex[x]
+    first, end = t.first_successor[vertex], t.first_successor[vertex + 1]
+    if s.scalars[PREEMPTIVE] != 0 or first == end:
+        return
+    if m is not None:
+        while len(d.next_vertex) <= x:
+            d.next_vertex.append(-1)
+        d.next_vertex[x] = -1
+        _find_next_place(t, s, load, d, m, x)
+        return
+    finish = now + s.x_left[x]
+    for edge in range(first, end):
+        delay = delay_of(t, s, load, x, edge)
+        if delay != 0:
+            _post(s, d, max(now, finish + delay), x, t.successors[edge])
+
+
+def _find_next_place(
+    t: Tables, s: State, load: Load, d: Deliveries, m: Machine, x: int
+) -> None:
+    """Find what an execution publishes next before its end, and how far it is then."""
+    vertex = s.x_vertex[x]
+    last_place, last = m.publishes_at[x], d.next_vertex[x]
+    place, after = NEVER, -1
+    for edge in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
+        delay = delay_of(t, s, load, x, edge)
+        if delay < 0:
+            at, to = max(0, s.x_cost[x] + delay), t.successors[edge]
+            if ((last < 0 or at > last_place or (at == last_place and to > last))
+                    and (at < place or (at == place and to < after))):
+                place, after = at, to
+    m.publishes_at[x] = place
+    d.next_vertex[x] = after
+
+
+def ends_sending(
+    t: Tables, s: State, key: KeyFunction, load: Load, d: Deliveries, m: Machine | None, x: int,
+    now: int,
+) -> None:
+    """End an execution, and send what it publishes."""
+    slot, vertex = s.x_slot[x], s.x_vertex[x]
+    job = s.job_index[slot]
+    if m is not None:
+        while m.publishes_at[x] < NEVER:
+            _publish_next(t, s, key, load, d, m, x, now)
+    if len(load.fates) > 0 and load.fates[place_of(s, load, x)] == FAILS:
+        rules.fail(t, s, key, x, now)
+    else:
+        rules.complete(t, s, key, x, now)
+    preemptive = s.scalars[PREEMPTIVE] != 0
+    for edge in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
+        delay = delay_of(t, s, load, x, edge)
+        if delay == 0 or (delay < 0 and preemptive):
+            _arrive(t, s, key, slot, job, t.successors[edge], now)
+        elif delay > 0 and (m is not None or preemptive):
+            _post(s, d, now + delay, x, t.successors[edge])
+
+
+def arrive_due(
+    t: Tables, s: State, key: KeyFunction, load: Load, d: Deliveries, m: Machine | None, now: int
+) -> None:
+    """Make the edges true whose messages arrive now, in the order in which they were sent."""
+    while len(d.messages) > 0 and d.messages[0][0] <= now:
+        message = heappop(d.messages)
+        _arrive(t, s, key, message[2], message[3], message[4], now)
+    if m is not None:  # what running executions publish now, before their end
+        for worker in range(len(s.worker_x)):
+            x = s.worker_x[worker]
+            if x >= 0 and m.publishes_at[x] < NEVER:
                 at = rules.progress(s, x, now)
-                while to_come and to_come[-1][0] <= at:
-                    slot = s.x_slot[x]
-                    self._arrive(slot, s.job_index[slot], to_come.pop()[1], now)
+                while m.publishes_at[x] <= at:
+                    _publish_next(t, s, key, load, d, m, x, now)
 
-    def _base(self, dag: int, job: int) -> int:
-        transports = self._transports
-        return transports.base[dag] + job * transports.stride[dag] - self._first_edge[dag]
 
-    def _send(self, x: int, finish: int, now: int) -> None:
-        """Send what an execution publishes and that needs time, or came before its end."""
-        slot = self._s.x_slot[x]
-        for after, delay in self._edges(x):
-            if delay:
-                self._post(max(now, finish + delay), slot, self._s.job_index[slot], after)
+def _publish_next(
+    t: Tables, s: State, key: KeyFunction, load: Load, d: Deliveries, m: Machine, x: int, now: int
+) -> None:
+    slot, after = s.x_slot[x], d.next_vertex[x]
+    _find_next_place(t, s, load, d, m, x)
+    _arrive(t, s, key, slot, s.job_index[slot], after, now)
 
-    def _post(self, time: int, slot: int, job: int, vertex: int) -> None:
-        self._sent += 1
-        heappush(self._messages, (time, self._sent, slot, job, vertex))
 
-    def _arrive(self, slot: int, job: int, vertex: int, now: int) -> None:
-        t, s = self._t, self._s
-        if (s.job_state[slot] == OPEN and s.job_index[slot] == job
-                and s.job_dag[slot] == t.dag_of[vertex]):
-            rules.edge(t, s, self._key, slot, vertex, now)
+def _post(s: State, d: Deliveries, time: int, x: int, vertex: int) -> None:
+    slot = s.x_slot[x]
+    d.sent[0] += 1
+    heappush(d.messages, (time, d.sent[0], slot, s.job_index[slot], vertex))
+
+
+def _arrive(
+    t: Tables, s: State, key: KeyFunction, slot: int, job: int, vertex: int, now: int
+) -> None:
+    if (s.job_state[slot] == OPEN and s.job_index[slot] == job
+            and s.job_dag[slot] == t.dag_of[vertex]):
+        rules.edge(t, s, key, slot, vertex, now)

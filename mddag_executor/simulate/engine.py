@@ -10,17 +10,13 @@ one instant first the completions are told to the core, workers in ascending ord
 releases in DAG order, then the core dispatches until it has nothing left to do (design section 9).
 A completion at the horizon counts; nothing is released or dispatched there any more.
 
-Where messages take time, executions fail or sources skip jobs, ``deliveries`` ends the executions,
-and the messages of an instant arrive between its completions and its releases.  Where CPUs are few
+Where messages take time or executions fail, ``deliveries`` ends the executions, and the messages
+of an instant arrive between its completions and its releases.  Where CPUs are few
 or executions hold the interpreter, ``machine`` tells after each instant when those finish that
 run.
 
 A job's deadlines count from its release, which is the time at which its source becomes ready,
 unless ``releases`` says that it was earlier (a sensor's message that arrived later).
-
-The execution time of vertex v in job k of DAG d is ``costs[cost_base[d] + k * cost_stride[d] +
-local index of v]``: a stride of zero gives every job the same times, the number of vertices of the
-DAG a row for each job.
 
 Like the rules this is plain integer arithmetic on lists, so that it can be compiled as it is;
 what is None then costs nothing.
@@ -29,41 +25,26 @@ what is None then costs nothing.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.state import add_slot, State
 from mddag_executor.core.tables import NEVER, Tables
-
-if TYPE_CHECKING:
-    from mddag_executor.simulate.deliveries import Deliveries
-    from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.deliveries import (
+    arrive_due,
+    Deliveries,
+    ends_sending,
+    next_arrival,
+    sends_at_start,
+)
+from mddag_executor.simulate.load import Load, SKIPPED
+from mddag_executor.simulate.machine import decide, Machine, NEXT_TIME, settle, share, starts
 
 # Kinds of log entries.
 START, END, PREEMPT = range(3)
 
 LogEntry = tuple[int, int, int, int, int, int]
 """(time, kind, worker, DAG, global vertex, job): one change of a worker."""
-
-
-class Load(NamedTuple):
-    """
-    What arrives: releases in order of (time, DAG), with their jobs' indices and execution times.
-
-    Times in ns; the cost columns as in the theory of operation.  ``releases`` is empty where each
-    job's source becomes ready (``times``) at its release.  ``holds`` tells, as ``costs``, which
-    interpreter executions hold (from 1; 0: none); it is empty where none does.
-    """
-
-    times: list[int]
-    dags: list[int]
-    jobs: list[int]
-    costs: list[int]
-    cost_base: list[int]
-    cost_stride: list[int]
-    releases: list[int] = []
-    holds: list[int] = []
 
 
 def run(
@@ -99,9 +80,9 @@ def run(
             if finish_at[w] < instant:
                 instant = finish_at[w]
         if deliveries is not None:
-            instant = min(instant, deliveries.next_time())
+            instant = min(instant, next_arrival(deliveries))
         if machine is not None:
-            instant = min(instant, machine.next_time)
+            instant = min(instant, machine.scalars[NEXT_TIME])
         if instant > horizon:
             return horizon
         now = instant
@@ -109,7 +90,7 @@ def run(
             progress(now)
         seen = len(s.decisions)
         if machine is not None:
-            machine.settle(now)
+            settle(s, machine, now)
         for w in range(n_workers):
             if finish_at[w] == now:
                 finish_at[w] = NEVER
@@ -118,26 +99,25 @@ def run(
                     running[w] = -1
                     _note(t, s, log, now, END, w, x)
                 if deliveries is not None:
-                    deliveries.complete(x, now)
+                    ends_sending(t, s, key, load, deliveries, machine, x, now)
                 else:
                     rules.complete(t, s, key, x, now)
         if now == horizon:
             return horizon
         if deliveries is not None:
-            deliveries.arrive(now)
+            arrive_due(t, s, key, load, deliveries, machine, now)
         while next_release < n_releases and load.times[next_release] == now:
-            release_load(t, s, key, load, next_release, now, deliveries)
+            release_load(t, s, key, load, next_release, now)
             next_release += 1
-        _dispatch(t, s, key, now, finish_at, running, log, deliveries, machine)
+        _dispatch(t, s, key, load, now, finish_at, running, log, deliveries, machine)
         if machine is not None:
-            machine.share(now, finish_at)
+            share(t, s, machine, now, finish_at)
         if stop_at_first_miss and any_missed(s, seen):
             return now
 
 
 def release_load(
-    t: Tables, s: State, key: KeyFunction, load: Load, i: int, now: int,
-    deliveries: Deliveries | None,
+    t: Tables, s: State, key: KeyFunction, load: Load, i: int, now: int
 ) -> None:
     """Release the i-th job of a load, with the execution times that the load gives it."""
     dag = load.dags[i]
@@ -147,27 +127,29 @@ def release_load(
     if slot < 0:
         add_slot(t, s, dag)
         slot = jobs.release_job(t, s, dag, job, release, now)
-    if deliveries is not None:
-        if (dag, job) in deliveries.skipped:
-            jobs.expire_job(t, s, slot, now)
-            return
     base = s.job_base[slot]
     cost = load.cost_base[dag] + job * load.cost_stride[dag]
+    source = t.region_offset[t.source[dag]]
+    if len(load.fates) > 0:
+        if load.fates[cost + source] == SKIPPED:
+            jobs.expire_job(t, s, slot, now)
+            return
     for place in range(t.n_region[dag]):
         s.x_cost[base + place] = load.costs[cost + place]
     if len(load.holds) > 0:
         for place in range(t.n_region[dag]):
             s.x_holds[base + place] = load.holds[cost + place]
-    rules.make_ready(t, s, key, base + t.region_offset[t.source[dag]], now)
+    rules.make_ready(t, s, key, base + source, now)
 
 
 def _dispatch(
-    t: Tables, s: State, key: KeyFunction, now: int, finish_at: list[int], running: list[int],
-    log: list[LogEntry] | None, deliveries: Deliveries | None, machine: Machine | None,
+    t: Tables, s: State, key: KeyFunction, load: Load, now: int, finish_at: list[int],
+    running: list[int], log: list[LogEntry] | None, deliveries: Deliveries | None,
+    machine: Machine | None,
 ) -> None:
     """Dispatch what is to run now; ``running`` is kept for the log, which wants the preempted."""
     if machine is not None:
-        machine.decide(now)
+        decide(t, s, now)
     x = rules.schedule(t, s, key, now)
     while x >= 0:
         worker = s.x_worker[x]
@@ -177,11 +159,12 @@ def _dispatch(
                 _note(t, s, log, now, PREEMPT, worker, running[worker])
             running[worker] = x
             _note(t, s, log, now, START, worker, x)
-        if deliveries is not None:
-            deliveries.started(x, now)
         if machine is not None:
-            machine.started(x)
-            machine.decide(now)
+            starts(s, load, machine, x)
+        if deliveries is not None:
+            sends_at_start(t, s, load, deliveries, machine, x, now)
+        if machine is not None:
+            decide(t, s, now)
         x = rules.schedule(t, s, key, now)
 
 

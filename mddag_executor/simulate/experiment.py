@@ -26,10 +26,9 @@ from typing import NamedTuple, Protocol
 from mddag_executor import defaults
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Tables
-from mddag_executor.core.jobs import finish
+from mddag_executor.core.jobs import is_miss
 from mddag_executor.simulate.acceptance import Bools
 from mddag_executor.simulate.draws import Draws, feasible, Floats, Samples, Times, utilisations
-from mddag_executor.simulate.engine import any_missed, run
 from mddag_executor.simulate.run import check, Settings
 from mddag_executor.simulate.workload import declared_holds, periodic_load
 from msg_graph import TaskSet
@@ -193,12 +192,7 @@ class PlainJudge:
         tables = self._tables
         accepted = np.zeros(len(times), dtype=np.bool_)
         for row in range(len(times)):
-            state, key = settings.start(tables)
             load = self._load._replace(costs=times[row].tolist())
-            ended = run(
-                tables, state, key, load, settings.duration_ns, settings.stop_at_first_miss,
-                machine=settings.machine(tables, state, load))
-            if settings.judges_open(ended):
-                finish(tables, state, ended)
-            accepted[row] = not any_missed(state, 0)
+            decisions = settings.schedule(tables, load).decisions
+            accepted[row] = not any(is_miss(decision[0]) for decision in decisions)
         return accepted

@@ -27,14 +27,13 @@ preempted executions back, knows of none.  All is in whole nanoseconds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from typing import NamedTuple
 
-from mddag_executor.core import NEVER, Tables
 from mddag_executor.core.queues import first_waiting, overtaking_pays
 from mddag_executor.core.rules import progress
-from mddag_executor.core.state import N_HOLDING, PREEMPTIVE, State
-from mddag_executor.simulate.engine import Load
+from mddag_executor.core.state import add_queue, N_HOLDING, PREEMPTIVE, State
+from mddag_executor.core.tables import NEVER, Tables
+from mddag_executor.simulate.load import Load, place_of
 
 SWITCH_NS = 1_000_000
 """Python's switch interval while an executor spins."""
@@ -45,191 +44,246 @@ BRIEF_NS = 100_000
 HARDLY = 8
 """One that holds the interpreter and waits for less than this part of it keeps it meanwhile."""
 
+# What an execution needs.
 _LOCK, _CPU, _NOTHING = range(3)
 
-
-class Places(Protocol):
-    """Knows how far executions are when something of them has to be told."""
-
-    def next_place(self, x: int) -> int:
-        """Return how far a running execution is then."""
-
-
-class _Lock:
-    """The lock of an interpreter: those that want it, first who has it."""
-
-    def __init__(self) -> None:
-        self._queue: list[int] = []
-        self.switch_at = NEVER
-
-    def take_turns(self, now: int, wanted: list[int]) -> list[int]:
-        """Return who has it now, if anybody."""
-        before = self._queue
-        queue = [x for x in before if x in wanted]
-        queue += [x for x in wanted if x not in queue]
-        if len(queue) < 2:
-            self.switch_at = NEVER
-        elif len(before) < 2 or queue[0] != before[0]:
-            self.switch_at = now + SWITCH_NS
-        elif now >= self.switch_at:
-            queue.append(queue.pop(0))
-            self.switch_at = now + SWITCH_NS
-        self._queue = queue
-        return queue[:1]
+# Columns of ``Machine.scalars``: how many CPUs there are; whether executions that do not hold the
+# interpreter need it at their end; up to when time has been taken in; when CPUs change hands, if
+# nothing happens before; when somebody needs something else, or must wait; how often it was found
+# out who goes on.
+CPUS, PYTHON, SETTLED, SLICE_AT, NEXT_TIME, SHARES = range(6)
 
 
-class Machine:
+class Machine(NamedTuple):
+    """Who computes, among those that run; made by ``new_machine``."""
+
+    scalars: list[int]
+    # by execution that was started: up to where it computes with the lock, computes without it,
+    # and waits; where it publishes next before its end (``deliveries``; NEVER: nowhere)
+    locked_until: list[int]
+    computes_until: list[int]
+    waits_until: list[int]
+    publishes_at: list[int]
+    # how far it is, what it needs and up to where; in which of the shares it had a CPU last
+    at: list[int]
+    need: list[int]
+    until: list[int]
+    share: list[int]
+    # those that stand still, and those that compute, first who have a CPU; those that do so anew
+    still: list[int]
+    computing: list[int]
+    anew: list[int]
+    # by interpreter, from 1: those that want its lock, first who has it; who had it while others
+    # waited, or -1; when the next one gets it
+    lock_queue: list[list[int]]
+    lock_had: list[int]
+    switch_at: list[int]
+
+
+def new_machine(t: Tables, s: State, cpus: int | None = None, python: bool = False) -> Machine:
     """
-    Who computes, among those that run.
+    Return a machine on which nothing runs yet.
 
-    :param state: of the core.
-    :param load: of the run; its ``holds`` tell which executions hold the interpreter.
     :param cpus: how many there are; None: as many as are needed.
-    :param computed: CPU time of the executions, as ``load.costs``; -1: it waits, as far as is
-        known.  Empty: all of them compute all the time.
     :param python: whether executions that do not hold the interpreter need it at their end.
-    :param locks: whether they compute with Python's lock, as ``computed``; empty: those do that
-        hold the interpreter.
-    :ivar next_time: when somebody needs something else, or must wait.
     """
+    columns: dict[str, list[int]] = {name: [] for name in Machine._fields}
+    machine = Machine(**columns)    # type: ignore[arg-type]
+    fill_machine(t, s, machine, cpus or NEVER, int(python))
+    return machine
 
-    def __init__(
-        self, tables: Tables, state: State, load: Load, cpus: int | None = None,
-        computed: Sequence[int] = (), python: bool = False, deliveries: Places | None = None,
-        locks: Sequence[bool] = (),
-    ) -> None:
-        self._t = tables
-        self._s = state
-        self._load = load
-        self._cpus = cpus or NEVER
-        self._computed = computed
-        self._locks_of = locks
-        self._python = python
-        self._deliveries = deliveries
-        state.overtaking.extend([1] * (max(tables.process) + 1 - len(state.overtaking)))
-        # by execution that was started: up to where it needs what
-        self._parts: dict[int, tuple[int, int, int]] = {}
-        self._still: list[int] = []
-        self._settled = 0
-        self._locks = [_Lock() for _ in state.overtaking[1:]]
-        # those that compute, first who have a CPU
-        self._cpu: list[int] = []
-        self._slice_at = NEVER
-        self.next_time = NEVER
 
-    def settle(self, now: int) -> None:
-        """Take in that time has passed."""
-        for x in self._still:
-            self._s.x_left[x] += now - self._settled
-        self._settled = now
+def fill_machine(t: Tables, s: State, m: Machine, cpus: int, python: int) -> None:
+    """Fill the columns of a machine that is all empty; see ``new_machine``."""
+    for value in (cpus, python, 0, NEVER, NEVER, 1):
+        m.scalars.append(value)
+    for vertex in range(len(t.process)):
+        while len(s.overtaking) <= t.process[vertex]:
+            s.overtaking.append(1)
+    for _ in range(len(s.overtaking)):
+        add_queue(m.lock_queue)
+        m.lock_had.append(-1)
+        m.switch_at.append(NEVER)
 
-    def decide(self, now: int) -> None:
-        """Decide by process whether what waits first may overtake who began last to hold it."""
-        s = self._s
-        if s.scalars[N_HOLDING] == 0 or not (s.ready or s.held_back):
-            return
-        for process in range(1, len(s.overtaking)):
-            holders = [x for x in s.worker_x if x >= 0 and s.x_holds[x] == process]
-            first = first_waiting(self._t, s, process) if holders else -1
-            s.overtaking[process] = 1
-            if first >= 0 and s.x_holds[first] == process:
-                last = max(holders, key=lambda x: (s.x_started[x], s.x_worker[x]))
-                s.overtaking[process] = int(overtaking_pays(
-                    self._t, s, process, now - s.x_started[last], s.x_cost[last],
-                    s.scalars[PREEMPTIVE] != 0))
 
-    def started(self, x: int) -> None:
-        """Take in that an execution has been dispatched."""
-        s, load = self._s, self._load
-        slot = s.x_slot[x]
-        dag = s.job_dag[slot]
-        place = (load.cost_base[dag] + s.job_index[slot] * load.cost_stride[dag]
-                 + x - s.job_base[slot])
-        cost = s.x_cost[x]
-        self.begins(x, cost, self._computed[place] if self._computed else cost,
-                    bool(self._locks_of and self._locks_of[place]))
+def settle(s: State, m: Machine, now: int) -> None:
+    """Take in that time has passed."""
+    passed = now - m.scalars[SETTLED]
+    for i in range(len(m.still)):
+        s.x_left[m.still[i]] += passed
+    m.scalars[SETTLED] = now
 
-    def begins(self, x: int, cost: int, cpu: int, locks: bool = False) -> None:
-        """Take in what an execution that has been dispatched takes, and what it computes of it."""
-        self._parts[x] = self._ends(cost, min(cpu, cost), locks or self._s.x_holds[x] != 0)
 
-    def _ends(self, cost: int, cpu: int, locks: bool) -> tuple[int, int, int]:
-        """Return where the first three parts of an execution end."""
-        if locks:
-            if (cost - cpu) * HARDLY <= cpu:
-                return cost, cost, cost
-            half = cpu // 2
-            return half, half, cost - cpu + half
-        if cpu < 0:
-            return -NEVER, -NEVER, cost
-        if not self._python:
-            return -NEVER, cpu, cost
-        if 2 * cpu >= cost:
-            brief = min(cpu, BRIEF_NS)
-            return -NEVER, cpu - brief, cost - brief
-        first = cpu // 4
-        return first, first, cost - cpu + first
+def decide(t: Tables, s: State, now: int) -> None:
+    """Decide by process whether what waits first may overtake who began last to hold it."""
+    if s.scalars[N_HOLDING] == 0 or (len(s.ready) == 0 and len(s.held_back) == 0):
+        return
+    for process in range(1, len(s.overtaking)):
+        s.overtaking[process] = 1
+        last = -1
+        for worker in range(len(s.worker_x)):
+            x = s.worker_x[worker]
+            if (x >= 0 and s.x_holds[x] == process
+                    and (last < 0 or s.x_started[x] >= s.x_started[last])):
+                last = x
+        first = first_waiting(t, s, process) if last >= 0 else -1
+        if first >= 0 and s.x_holds[first] == process:
+            s.overtaking[process] = int(overtaking_pays(
+                t, s, process, now - s.x_started[last], s.x_cost[last],
+                s.scalars[PREEMPTIVE] != 0))
 
-    def share(self, now: int, finish_at: list[int]) -> None:
-        """Find out who goes on, and set when they finish."""
-        s = self._s
-        free, steps = [], {}
-        waiting: list[list[int]] = [[] for _ in self._locks]
-        for x in s.worker_x:
-            if x >= 0:
-                at = progress(s, x, now)
-                need, until = self._need(x, at)
-                if need == _LOCK:
-                    waiting[self._interpreter(x) - 1].append(x)
-                elif need == _CPU:
-                    free.append(x)
-                steps[x] = at, until, need
-        for lock, wanted in zip(self._locks, waiting):
-            free += lock.take_turns(now, wanted)
-        self._take_turns_with_cpus(now, free)
-        computes = set(self._cpu[:self._cpus])
-        self._still = []
-        self.next_time = min(self._slice_at, *(lock.switch_at for lock in self._locks))
-        for worker, x in enumerate(s.worker_x):
-            if x < 0:
-                continue
-            at, until, need = steps[x]
-            if need == _NOTHING or x in computes:
-                finish_at[worker] = s.x_started[x] + s.x_left[x]
-                if self._deliveries is not None:
-                    until = min(until, self._deliveries.next_place(x))
-                if until < s.x_cost[x]:
-                    self.next_time = min(self.next_time, now + until - at)
-            else:
-                finish_at[worker] = NEVER
-                self._still.append(x)
 
-    def _need(self, x: int, at: int) -> tuple[int, int]:
-        """Return what an execution needs that is so far, and how far it needs that."""
-        first, second, third = self._parts[x]
-        if at < first:
-            return _LOCK, first
-        if at < second:
-            return _CPU, second
-        if at < third:
-            return _NOTHING, third
-        cost = self._s.x_cost[x]
-        return (_LOCK if third < cost else _NOTHING), cost
+def starts(s: State, load: Load, m: Machine, x: int) -> None:
+    """Take in that an execution has been dispatched."""
+    cost = s.x_cost[x]
+    cpu, locks = cost, False
+    if len(load.computed) > 0:
+        cpu = load.computed[place_of(s, load, x)]
+    if len(load.locks) > 0:
+        locks = load.locks[place_of(s, load, x)] != 0
+    begins(s, m, x, cost, cpu, locks)
 
-    def _interpreter(self, x: int) -> int:
-        """Return which interpreter an execution computes with."""
-        s = self._s
-        return s.x_holds[x] or self._t.process[s.x_vertex[x]]
 
-    def _take_turns_with_cpus(self, now: int, wanted: list[int]) -> None:
-        queue = [x for x in self._cpu if x in wanted]
-        queue = [x for x in wanted if x not in queue] + queue
-        if len(queue) <= self._cpus:
-            self._slice_at = NEVER
-        elif self._slice_at == NEVER:
-            self._slice_at = now + SLICE_NS
-        elif now >= self._slice_at:
-            had = self._cpu[:self._cpus]
-            queue = [x for x in queue if x not in had] + [x for x in queue if x in had]
-            self._slice_at = now + SLICE_NS
-        self._cpu = queue
+def begins(s: State, m: Machine, x: int, cost: int, cpu: int, locks: bool) -> None:
+    """Take in what an execution that has been dispatched takes, and what it computes of it."""
+    while len(m.at) <= x:
+        for column in (m.locked_until, m.computes_until, m.waits_until, m.publishes_at, m.at,
+                       m.need, m.until, m.share):
+            column.append(0)
+    m.publishes_at[x] = NEVER
+    cpu = min(cpu, cost)
+    if locks or s.x_holds[x] != 0:
+        if (cost - cpu) * HARDLY <= cpu:
+            _set_parts(m, x, cost, cost, cost)
+        else:
+            _set_parts(m, x, cpu // 2, cpu // 2, cost - cpu + cpu // 2)
+    elif cpu < 0:
+        _set_parts(m, x, -NEVER, -NEVER, cost)
+    elif m.scalars[PYTHON] == 0:
+        _set_parts(m, x, -NEVER, cpu, cost)
+    elif 2 * cpu >= cost:
+        brief = min(cpu, BRIEF_NS)
+        _set_parts(m, x, -NEVER, cpu - brief, cost - brief)
+    else:
+        _set_parts(m, x, cpu // 4, cpu // 4, cost - cpu + cpu // 4)
+
+
+def _set_parts(m: Machine, x: int, first: int, second: int, third: int) -> None:
+    m.locked_until[x] = first
+    m.computes_until[x] = second
+    m.waits_until[x] = third
+
+
+def share(t: Tables, s: State, m: Machine, now: int, finish_at: list[int]) -> None:
+    """Find out who goes on, and set when they finish."""
+    number = m.scalars[SHARES] = m.scalars[SHARES] + 1
+    m.anew.clear()
+    on = s.worker_x
+    for worker in range(len(on)):
+        x = on[worker]
+        if x >= 0:
+            _find_need(t, s, m, x, progress(s, x, now))
+    for process in range(1, len(m.lock_queue)):
+        if len(m.lock_queue[process]) > 0:
+            _pass_lock(s, m, process, now)
+    _pass_cpus(s, m, now)
+    next_time = m.scalars[SLICE_AT]
+    for process in range(1, len(m.switch_at)):
+        next_time = min(next_time, m.switch_at[process])
+    m.still.clear()
+    for worker in range(len(on)):
+        x = on[worker]
+        if x < 0:
+            continue
+        if m.need[x] == _NOTHING or m.share[x] == number:
+            finish_at[worker] = s.x_started[x] + s.x_left[x]
+            until = m.until[x]
+            if m.publishes_at[x] < until:
+                until = m.publishes_at[x]
+            if until < s.x_cost[x] and now + until - m.at[x] < next_time:
+                next_time = now + until - m.at[x]
+        else:
+            finish_at[worker] = NEVER
+            m.still.append(x)
+    m.scalars[NEXT_TIME] = next_time
+
+
+def _find_need(t: Tables, s: State, m: Machine, x: int, at: int) -> None:
+    """Find what an execution needs that is so far; where that is anew, it queues for it."""
+    need, until = _NOTHING, s.x_cost[x]
+    if at < m.locked_until[x]:
+        need, until = _LOCK, m.locked_until[x]
+    elif at < m.computes_until[x]:
+        need, until = _CPU, m.computes_until[x]
+    elif at < m.waits_until[x]:
+        until = m.waits_until[x]
+    elif m.waits_until[x] < until:
+        need = _LOCK
+    m.at[x], m.need[x], m.until[x] = at, need, until
+    if need == _LOCK:
+        interpreter = s.x_holds[x]
+        if interpreter == 0:
+            interpreter = t.process[s.x_vertex[x]]
+        if x not in m.lock_queue[interpreter]:
+            m.lock_queue[interpreter].append(x)
+    elif need == _CPU and x not in m.computing:
+        m.anew.append(x)
+
+
+def _pass_lock(s: State, m: Machine, process: int, now: int) -> None:
+    """Find out who has the lock of an interpreter now: it needs a CPU."""
+    queue = m.lock_queue[process]
+    kept = 0
+    for i in range(len(queue)):
+        x = queue[i]
+        if s.x_worker[x] >= 0 and m.need[x] == _LOCK:
+            queue[kept] = x
+            kept += 1
+    del queue[kept:]
+    had = m.lock_had[process]
+    m.lock_had[process] = -1
+    if kept < 2:
+        m.switch_at[process] = NEVER
+    else:
+        if queue[0] != had:
+            m.switch_at[process] = now + SWITCH_NS
+        elif now >= m.switch_at[process]:
+            for i in range(1, kept):
+                queue[i - 1] = queue[i]
+            queue[kept - 1] = had
+            m.switch_at[process] = now + SWITCH_NS
+        m.lock_had[process] = queue[0]
+    if kept > 0:
+        first = queue[0]
+        m.need[first] = _CPU
+        if first not in m.computing:
+            m.anew.append(first)
+
+
+def _pass_cpus(s: State, m: Machine, now: int) -> None:
+    """Find out who has a CPU now."""
+    number, cpus = m.scalars[SHARES], m.scalars[CPUS]
+    for i in range(len(m.computing)):
+        x = m.computing[i]
+        if s.x_worker[x] >= 0 and m.need[x] == _CPU:
+            m.anew.append(x)
+    wanted = len(m.anew)
+    turns = False
+    if wanted <= cpus:
+        m.scalars[SLICE_AT] = NEVER
+    else:
+        turns = m.scalars[SLICE_AT] <= now
+        if turns or m.scalars[SLICE_AT] == NEVER:
+            m.scalars[SLICE_AT] = now + SLICE_NS
+    m.computing.clear()
+    for i in range(wanted):
+        x = m.anew[i]
+        if not turns or m.share[x] != number - 1:
+            m.computing.append(x)
+    if turns:
+        for i in range(wanted):
+            x = m.anew[i]
+            if m.share[x] == number - 1:
+                m.computing.append(x)
+    for i in range(min(cpus, wanted)):
+        m.share[m.computing[i]] = number

@@ -25,7 +25,8 @@ from typing import Any
 
 from mddag_executor.core import Scheduler, Tables
 from mddag_executor.core.state import IDLE
-from mddag_executor.simulate.engine import END, Load, LogEntry, run
+from mddag_executor.simulate.engine import END
+from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.run import Settings
 from mddag_executor.simulate.workload import draw_execution_times, periodic_load
 from msg_graph import TaskSet
@@ -48,12 +49,10 @@ def time_core(
     tables = Tables.build(task_set)
     load = periodic_load(task_set, draw_execution_times(task_set, seed), duration_ns)
 
-    def simulate(log: list[LogEntry] | None = None) -> None:
-        state, key = settings.start(tables)
-        run(tables, state, key, load, duration_ns, False, log)
+    def simulate() -> None:
+        settings.schedule(tables, load)
 
-    log: list[LogEntry] = []
-    simulate(log)
+    log = settings.schedule(tables, load, log=True).log
     vertex_jobs = sum(kind == END for _, kind, *_ in log)
     events = len(log) + len(load.times)
     taken = _seconds(simulate, repeat)

@@ -35,7 +35,8 @@ from mddag_executor.core.state import (
     SINK_EXPIRED,
     SINK_IN_TIME,
 )
-from mddag_executor.simulate.engine import END, Load, LogEntry, START
+from mddag_executor.simulate.engine import END, LogEntry, START
+from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.run import Run
 from mddag_executor.trace import TraceFile
 from msg_graph import TaskSet

@@ -11,12 +11,11 @@ from typing import Any
 from mddag_executor import defaults
 from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core import policy as find_policy
-from mddag_executor.core.jobs import finish
-from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.state import Decision, new_state, State
-from mddag_executor.simulate.engine import Load, LogEntry, run
+from mddag_executor.core.state import Decision
+from mddag_executor.simulate.engine import LogEntry
 from mddag_executor.simulate.errors import SimulationError
-from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.load import Load
+from mddag_executor.simulate.schedule import How, schedule, Scheduled
 from msg_graph import TaskSet
 
 JUDGES = ('horizon', 'completions')
@@ -54,29 +53,25 @@ class Settings:
         """
         return find_policy(self.policy).mode(self.preemptive)
 
-    def start(self, tables: Tables) -> tuple[State, KeyFunction]:
+    @property
+    def how(self) -> How:
         """
-        Return the core's state for such a run, and the policy's key.
+        Return how loads are scheduled.
 
         :raises mddag_executor.core.PolicyError: as ``preempts``
         """
-        row = find_policy(self.policy)
-        state = new_state(
-            tables, self.workers, preemptive=self.preempts,
-            dispatch_overhead=self.dispatch_overhead_ns,
-            switch_overhead=self.switch_overhead_ns, polling=row.polling)
-        return state, row.key
+        return How(
+            self.policy, self.workers, self.preempts, self.dispatch_overhead_ns,
+            self.switch_overhead_ns, cpus=self.cpus)
 
-    def machine(self, tables: Tables, state: State, load: Load) -> Machine | None:
-        """Return the machine for a run in which all compute; None: nobody ever stands still."""
-        if self.cpus is None and not load.holds:
-            return None
-        return Machine(tables, state, load, self.cpus)
-
-    def judges_open(self, ended_ns: int) -> bool:
-        """Tell whether what is open at the end is judged: not where the run ended early."""
-        stopped = self.stop_at_first_miss and ended_ns < self.duration_ns
-        return self.judge == 'horizon' and not stopped
+    def schedule(
+        self, tables: Tables, load: Load, log: bool = False,
+        progress: Callable[[int], None] | None = None,
+    ) -> Scheduled:
+        """Run the core over a load (see ``schedule``)."""
+        return schedule(
+            tables, load, self.how, self.duration_ns, log=log, progress=progress,
+            stop_at_first_miss=self.stop_at_first_miss, judge_open=self.judge == 'horizon')
 
 
 @dataclass
@@ -127,20 +122,13 @@ def simulate(
     check(settings)
     tables = Tables.build(
         task_set, max_active_jobs=NEVER if max_active_jobs is None else max_active_jobs)
-    state, key = settings.start(tables)
-    entries: list[LogEntry] = []
-    ended = run(
-        tables, state, key, load, settings.duration_ns, settings.stop_at_first_miss,
-        entries if log else None, progress, machine=settings.machine(tables, state, load))
-    if settings.judges_open(ended):
-        finish(tables, state, ended)
+    ended, entries, decisions = settings.schedule(tables, load, log, progress)
     tally = Tally(task_set, tables)
     for time, dag in zip(load.times, load.dags):
         if time < settings.duration_ns and time <= ended:
             tally.released(dag)
-    tally.add(state.decisions)
-    return Run(
-        settings, tally, ended, utilisation, settings.preempts, entries, state.decisions)
+    tally.add(decisions)
+    return Run(settings, tally, ended, utilisation, settings.preempts, entries, decisions)
 
 
 def check(settings: Settings) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 from mddag_executor.core.policies import Key, POLICIES
 from mddag_executor.core.state import State
 from mddag_executor.core.tables import Tables
-from mddag_executor.simulate.engine import Load
+from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.vectors import at, StructureType, VectorType
 from numba import types
 from numba.extending import overload

@@ -16,8 +16,8 @@ import random
 from typing import Any
 
 from mddag_executor.core import processes_of
-from mddag_executor.simulate.engine import Load
 from mddag_executor.simulate.errors import SimulationError
+from mddag_executor.simulate.load import Load
 from msg_graph import Dag, TaskSet
 from msg_graph.duration import DAY, MICROSECOND
 

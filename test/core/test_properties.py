@@ -11,7 +11,7 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.core import rad_offsets, Tables
+from mddag_executor.core import policy, rad_offsets, Tables
 from mddag_executor.core.state import (
     ABORTED,
     COMPLETED,
@@ -266,9 +266,9 @@ def test_whatever_gets_ready_ends_or_is_dropped_or_is_there(case: Case, horizon:
         case.policy, case.workers, horizon * TICK, case.preemptive,
         dispatch_overhead_ns=case.dispatch_overhead * TICK,
         switch_overhead_ns=case.switch_overhead * TICK)
-    state, key = settings.start(tables)
+    state = settings.how.start(tables)
     log: list[LogEntry] = []
-    run(tables, state, key, case.load(horizon), horizon * TICK, False, log)
+    run(tables, state, policy(case.policy).key, case.load(horizon), horizon * TICK, False, log)
     kinds = Counter(kind for _, kind, *_ in log)
     ready = state.scalars[ORDER] - kinds[PREEMPT]
     dropped = sum(kind == DROP for kind, *_ in state.decisions)

@@ -12,7 +12,8 @@ from typing import Any
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core.state import Decision, SINK_LATE
-from mddag_executor.simulate.engine import END, Load, LogEntry, START
+from mddag_executor.simulate.engine import END, LogEntry, START
+from mddag_executor.simulate.load import Load
 from mddag_executor.trace import TraceFile
 from msg_graph import TaskSet
 

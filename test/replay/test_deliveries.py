@@ -11,8 +11,9 @@ from mddag_executor.core import Tables
 from mddag_executor.core.state import new_state, SINK_COMPLETED
 from mddag_executor.replay import reschedule
 from mddag_executor.simulate import END, Load, LogEntry, PREEMPT, START
-from mddag_executor.simulate.deliveries import Deliveries, edge_numbers, edges_of, Transports
+from mddag_executor.simulate.deliveries import new_deliveries
 from mddag_executor.simulate.engine import busy_times, run
+from mddag_executor.simulate.load import edge_numbers, edges_of
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
 import pytest
@@ -53,12 +54,12 @@ def engine(
     numbers = edge_numbers(tables)
     by_edge = [delay for _, delay in sorted(zip(
         (numbers[edge] for edge in ((0, 1), (0, 2), (1, 2))), delays))]
-    transports = Transports(by_edge * jobs, [0, 0], [3, 0])
+    load = load._replace(
+        delays=by_edge * jobs, delay_base=[0, 0], delay_stride=[3, 0])
     state = new_state(tables, workers, preemptive=preemptive, propagate=2)
     log: list[LogEntry] = []
     key = find_policy('rad').key
-    run(tables, state, key, load, horizon, False, log,
-        deliveries=Deliveries(tables, state, key, transports))
+    run(tables, state, key, load, horizon, False, log, deliveries=new_deliveries())
     starts = [(time // 1000, worker, vertex) for time, kind, worker, _, vertex, _ in log
               if kind == START]
     done = [(d[2], d[5] // 1000) for d in state.decisions if d[0] in SINK_COMPLETED]

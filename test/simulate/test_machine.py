@@ -25,7 +25,7 @@ from mddag_executor.simulate import (
 )
 from mddag_executor.simulate.engine import run
 from mddag_executor.simulate.experiment import Evaluator, Experiment
-from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.machine import new_machine
 from msg_graph import loads
 import pytest
 
@@ -64,14 +64,14 @@ def times(
     order = sorted(range(len(jobs)), key=lambda n: (jobs[n].release, n))
     n = len(jobs)
     load = Load([jobs[i].release for i in order], order, [0] * n, [job.cost for job in jobs],
-                list(range(n)), [0] * n, holds=[job.interpreter * job.holds for job in jobs])
+                list(range(n)), [0] * n, holds=[job.interpreter * job.holds for job in jobs],
+                computed=[job.cost if job.cpu is None else job.cpu for job in jobs])
     state = new_state(tables, workers * (1 + divided), preemptive=preemptive)
     if divided:
         divide(state, [workers, workers])
-    computed = [job.cost if job.cpu is None else job.cpu for job in jobs]
     log: list[LogEntry] = []
     run(tables, state, find_policy('rad').key, load, 10 ** 12, False, log,
-        machine=Machine(tables, state, load, cpus, computed, python))
+        machine=new_machine(tables, state, cpus, python))
     found = [(-1, -1)] * n
     for now, kind, _, dag, _, _ in log:
         if kind == START and found[dag][0] < 0:

@@ -1,0 +1,72 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What arrives in virtual time: releases, with all that is known of what they cause."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from mddag_executor.core.state import State
+from mddag_executor.core.tables import Tables
+
+# What becomes of an execution: it runs, fails at its end, or does not run and its job expires.
+RUNS, FAILS, SKIPPED = range(3)
+
+
+class Load(NamedTuple):
+    """
+    What arrives: releases in order of (time, DAG), with their jobs' indices and execution times.
+
+    Times are in ns.  The execution time of vertex v in job k of DAG d is ``costs[cost_base[d] +
+    k * cost_stride[d] + local index of v]``: a stride of zero gives every job the same times, the
+    number of vertices of the DAG a row for each job.  Columns beside it tell as ``costs`` does,
+    and may be empty:
+
+    * ``releases``: by release, where a source becomes ready later (``times``) than it is released;
+    * ``holds``: which interpreter an execution holds (from 1; 0: none);
+    * ``computed``: its CPU time; -1: it waits, as far as is known.  Empty: it computes all the
+      time;
+    * ``locks``: whether it computes with Python's lock, as those do that hold the interpreter;
+    * ``fates``: what becomes of it (``RUNS``, …; ``SKIPPED`` stands at a source).
+
+    ``delays[delay_base[d] + k * delay_stride[d] + e]`` is how long after a vertex's completion its
+    edge e in job k of DAG d comes true (see ``deliveries``); the edges of a DAG are numbered as in
+    ``Tables.successors``, from its first vertex on.
+    """
+
+    times: list[int]
+    dags: list[int]
+    jobs: list[int]
+    costs: list[int]
+    cost_base: list[int]
+    cost_stride: list[int]
+    releases: list[int] = []
+    holds: list[int] = []
+    computed: list[int] = []
+    locks: list[int] = []
+    fates: list[int] = []
+    delays: list[int] = []
+    delay_base: list[int] = []
+    delay_stride: list[int] = []
+
+
+def place_of(s: State, load: Load, x: int) -> int:
+    """Return the place of an execution in ``load.costs``."""
+    slot = s.x_slot[x]
+    dag = s.job_dag[slot]
+    return (load.cost_base[dag] + s.job_index[slot] * load.cost_stride[dag]
+            + x - s.job_base[slot])
+
+
+def edges_of(tables: Tables) -> list[int]:
+    """Return the number of edges of each declared DAG."""
+    first = [tables.first_successor[v] for v in tables.first_vertex]
+    return [after - before for before, after in zip(first, first[1:])]
+
+
+def edge_numbers(tables: Tables) -> dict[tuple[int, int], int]:
+    """Return the number of each edge in its DAG, by the global vertices that it joins."""
+    first = tables.first_successor
+    return {
+        (vertex, tables.successors[i]): i - first[tables.first_vertex[tables.dag_of[vertex]]]
+        for vertex in range(tables.n_vertices) for i in range(first[vertex], first[vertex + 1])}
