@@ -10,10 +10,10 @@ one callback (or of all) a factor longer.  The greatest factor with every deadli
 bisection, to 1 %.  What dispatch takes does not grow with it.
 
 A run that meets all deadlines takes long, one that misses ends early.  So a miss, once it is
-found, is looked at by itself: the releases of a *window* before it, ``WINDOW`` times the longest
-deadline, are enough to find it again, unless no worker was ever idle meanwhile.  The bisection
-goes over windows only, those that broke before first; the factor that it finds is tried on the
-whole load, which confirms it or finds another window.
+found, is looked at by itself: the releases of a *window* before it, ``WINDOW`` times its deadline
+or twice, four times … as long, are enough to find it again, unless no worker was ever idle
+meanwhile.  The bisection goes over windows only, those that broke before first; the factor that it
+finds is tried on the whole load, which confirms it or finds another window.
 
 Schedules have anomalies: a longer callback may let a deadline be met that a shorter one misses.
 The factor is one below which nothing broke where it was looked.
@@ -57,11 +57,17 @@ NOTHING = -1
 
 
 class Miss(NamedTuple):
-    """A missed deadline: the global vertex of the sink, the deadline, and the job's release."""
+    """
+    A missed deadline.
+
+    :ivar sink: its global vertex.
+    :ivar until: when the job completed or was given up.
+    """
 
     sink: int
     deadline: int
     release: int
+    until: int
 
 
 class Problem(NamedTuple):
@@ -123,10 +129,7 @@ class Search:
         if isinstance(work, RecordedLoad):
             self._dispatches[:len(work.dispatches)] = work.dispatches
         self._of = self._callback_of_cost(load, tables)
-        self._reach = WINDOW * max(
-            [tables.sink_deadline[sink] for sink in tables.sinks], default=0)
-        length = load.times[-1] - load.times[0] if load.times else 0
-        self._is_long = length > LONG * self._reach
+        self._length = load.times[-1] - load.times[0] if load.times else 0
         self._stops = True
         #: Windows in which something broke, the last one first.
         self._windows: list[tuple[int, int]] = []
@@ -164,10 +167,10 @@ class Search:
     def _misses(
         self, scaled: tuple[Load, int], stop: bool, of_any: bool = False
     ) -> Iterator[Miss]:
-        for kind, _, vertex, _, deadline, _ in self._problem.decide(*scaled, stop):
+        for kind, _, vertex, _, deadline, until in self._problem.decide(*scaled, stop):
             if is_miss(kind) and (of_any or vertex not in self.left_out):
                 yield Miss(vertex, deadline,
-                           deadline - self._problem.tables.sink_deadline[vertex])
+                           deadline - self._problem.tables.sink_deadline[vertex], until)
 
     def _scaled(self, callback: int, factor: float) -> tuple[Load, int]:
         """Return the load with a callback that takes longer, and the end of the run."""
@@ -182,10 +185,15 @@ class Search:
         return (self._problem.load._replace(costs=costs.tolist(), computed=computed.tolist()),
                 self._problem.end)
 
-    def first_miss(
-        self, callback: int, factor: float, window: tuple[int, int] | None = None
+    def miss(
+        self, callback: int, factor: float, window: tuple[int, int] | None = None,
+        worst: bool = False,
     ) -> Miss | None:
-        """Return a deadline that is missed with a factor, in a window or anywhere, if any is."""
+        """
+        Return a deadline that is missed with a factor, in a window or anywhere, if any is.
+
+        :param worst: the one that is missed by most; else the first.
+        """
         load, end = self._scaled(callback, factor)
         if window is not None:
             first, last = (bisect_left(load.times, each) for each in window)
@@ -194,30 +202,41 @@ class Search:
                 times=load.times[first:last], dags=load.dags[first:last],
                 jobs=load.jobs[first:last], releases=load.releases[first:last])
         with no_garbage():
-            missed = list(self._misses((load, end), self._stops, True))
-            if self._stops and missed and all(miss.sink in self.left_out for miss in missed):
+            stops = self._stops and not worst
+            missed = list(self._misses((load, end), stops, True))
+            if stops and missed and all(miss.sink in self.left_out for miss in missed):
                 # it stopped where a job of what is left out expired
                 missed = list(self._misses((load, end), False))
             return min((miss for miss in missed if miss.sink not in self.left_out), default=None,
-                       key=lambda miss: miss.deadline)
+                       key=lambda miss: miss.deadline - worst * miss.until)
 
     def factor(self, callback: int) -> Found:
         """Return the greatest factor for a callback, or for ``ALL``."""
         factor, breaks = MOST, NOTHING
         for window in list(self._windows):
-            miss = self.first_miss(callback, factor, window)
+            miss = self.miss(callback, factor, window)
             if miss is not None:
                 factor, breaks = self._bisect(callback, factor, miss.sink, window)
         while factor > 1.0:     # which is known to be met
-            miss = self.first_miss(callback, factor)
+            miss = self.miss(callback, factor, worst=factor < MOST)
             if miss is None:
                 break
-            window = miss.release - self._reach, miss.deadline + 1
-            if not self._is_long or self.first_miss(callback, factor, window) is None:
-                return Found(*self._bisect(callback, factor, miss.sink, None))
-            self._windows = [window, *self._windows][:_MOST_WINDOWS]
-            factor, breaks = self._bisect(callback, factor, miss.sink, window)
+            short = self._window(callback, factor, miss)
+            factor, breaks = self._bisect(callback, factor, miss.sink, short)
+            if short is None:
+                break
+            self._windows = [short, *self._windows][:_MOST_WINDOWS]
         return Found(None if breaks == NOTHING else factor, breaks)
+
+    def _window(self, callback: int, factor: float, miss: Miss) -> tuple[int, int] | None:
+        """Return a window in which a miss is found again, if one is much shorter than the load."""
+        length = WINDOW * (miss.deadline - miss.release)
+        while LONG * length < self._length:
+            window = miss.release - length, miss.deadline + 1
+            if self.miss(callback, factor, window) is not None:
+                return window
+            length *= 2
+        return None
 
     def fewer(self, of: str) -> Fewer | None:
         """Return how few ``workers`` or ``cpus`` meet what is met now; None: it was not said."""
@@ -228,7 +247,7 @@ class Search:
         least, breaks = given, NOTHING
         while least > 1 and breaks == NOTHING:
             self._problem = problem.with_number(of, least - 1)
-            miss = self.first_miss(ALL, 1.0)
+            miss = self.miss(ALL, 1.0)
             if miss is None:
                 least -= 1
             else:
@@ -243,7 +262,7 @@ class Search:
         low = 1.0
         while high > low * EXACT:
             middle = math.sqrt(low * high)
-            miss = self.first_miss(callback, middle, window)
+            miss = self.miss(callback, middle, window)
             if miss is None:
                 low = middle
             else:

@@ -121,4 +121,4 @@ def test_windows_find_what_plain_bisection_finds(
     search = Search(problem)
     for callback, one in found[1].items():
         if one.factor is not None:
-            assert search.first_miss(callback, one.factor) is None
+            assert search.miss(callback, one.factor) is None
