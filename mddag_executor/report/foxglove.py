@@ -170,7 +170,7 @@ class FoxgloveTarget:
 
 def _plot(title: str, topics: list[str], field: str) -> dict[str, Any]:
     return {
-        'foxglovePanelTitle': title, 'lichtblickPanelTitle': title, 'isSynced': True,
-        'xAxisVal': 'timestamp', 'showLegend': True, 'legendDisplay': 'left', 'paths': [
+        'foxglovePanelTitle': title, 'isSynced': True, 'xAxisVal': 'timestamp', 'showLegend': True,
+        'legendDisplay': 'left', 'paths': [
             {'value': f'{topic}.{field}', 'label': topic.removeprefix('/sinks/'), 'enabled': True,
              'timestampMethod': 'receiveTime'} for topic in topics]}

@@ -47,6 +47,9 @@ def _margins(sink: Mapping[str, Any]) -> list[Cell]:
 
 def summary(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the tables."""
+    if len(result['left_out']) == len(result['sinks']):
+        yield 'every sink misses deadlines as things are: nothing is left that could break'
+        return
     free = sum(one['factor'] is None for one in result['callbacks'].values())
     most = result['most']
     if free:

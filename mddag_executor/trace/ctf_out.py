@@ -11,6 +11,8 @@ integer of 8 bits, as LTTng has it.  Process, thread and process name are each e
 Processes are named by `mddag:process` events in a trace; such an event becomes that context.
 
 Times are the trace's, so the session's clock has no offset.  Events come in the order of time.
+
+tracetools_analysis asks for an ``rcl_init``: one stands first where the trace has none.
 """
 
 from __future__ import annotations
@@ -35,6 +37,8 @@ _HEADER = struct.Struct('<IIQQQQQI')
 _EVENT = struct.Struct('<IQii')
 _LENGTH = struct.Struct('<I')
 _LATEST = 2 ** 63 - 1
+_INIT = 'ros2:rcl_init'
+_INIT_FIELDS = {'context_handle': FieldType('uint64'), 'version': FieldType('string')}
 _CODES = {'byte': 'B', 'char': 'B', 'bool': 'B', 'float32': 'f', 'float64': 'd', **{
     f'{sign}int{bits}': code if sign else code.lower()
     for bits, code in ((8, 'B'), (16, 'H'), (32, 'I'), (64, 'Q')) for sign in ('u', '')}}
@@ -78,6 +82,9 @@ def export_ctf(
     reader = TraceReader(path)
     with CtfSession(folder) as session:
         for number, (layout, time, vpid, vtid, *values) in enumerate(reader.layout_events(None)):
+            if number == 0 and not reader.may_have(_INIT):
+                session.add(_INIT, time, vpid, vtid, tuple(_INIT_FIELDS),
+                            tuple(_INIT_FIELDS.values()), (0, ''))
             session.add(layout.name, time, vpid, vtid, layout.fields, layout.types, values)
             if progress is not None and number % 5000 == 0:
                 progress(number)

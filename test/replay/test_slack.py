@@ -122,3 +122,15 @@ def test_windows_find_what_plain_bisection_finds(
     for callback, one in found[1].items():
         if one.factor is not None:
             assert search.miss(callback, one.factor) is None
+
+
+def test_where_every_sink_misses_nothing_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph = tmp_path / 'g.yaml'
+    graph.write_text(BY_HAND.replace('8ms', '2ms').replace(
+        'timer: 100ms, deadline: 100ms', 'timer: 100ms, deadline: 50us'))
+    assert program.main(['slack', str(graph)]) == 0
+    out = capsys.readouterr().out
+    assert 'every sink misses deadlines as things are' in out
+    assert 'times' not in out.splitlines()[-1]
