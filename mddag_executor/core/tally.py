@@ -256,15 +256,17 @@ class Tally:
             elif kind == DROP:
                 self.dropped += 1
             else:
-                self._add_sink(kind, dag, vertex, job, deadline, time)
+                if kind in SINK_COMPLETED:
+                    sink = self.sinks[vertex]
+                    sink.done(time - deadline + sink.relative_deadline_ns, kind == SINK_LATE)
+                if kind != SINK_IN_TIME:
+                    self._add_miss(kind, dag, vertex, job, deadline, time)
 
-    def _add_sink(
+    def _add_miss(
         self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
     ) -> None:
         sink = self.sinks[vertex]
-        if kind in SINK_COMPLETED:
-            sink.done(time - deadline + sink.relative_deadline_ns, kind == SINK_LATE)
-        elif kind == SINK_MISSED:
+        if kind == SINK_MISSED:
             sink.late += 1
             sink.overdue += 1
         elif kind == SINK_EXPIRED:
@@ -273,9 +275,9 @@ class Tally:
             sink.failed += 1
         elif kind == SINK_ABORTED:
             sink.aborted += 1
-        if kind != SINK_IN_TIME and (self.first_miss is None or (
+        if self.first_miss is None or (
                 kind == self._first_kind == SINK_MISSED
-                and deadline < self.first_miss['deadline_ns'])):
+                and deadline < self.first_miss['deadline_ns']):
             self._first_kind = kind
             self.first_miss = {
                 'dag': self._dags[dag].name, 'vertex': self.vertex_name(vertex), 'job': job,

@@ -144,23 +144,23 @@ class Chains:
         self.misses = Misses(
             np.empty((0, N_MISS), dtype=np.int64), np.empty((0, N_LINK), dtype=np.int64))
 
-    def begin_batch(self, batch: Batch) -> tuple[int, int]:
-        """Begin with what completes and starts; return the numbers of the first links of each."""
+    def begin_batch(self, batch: Batch) -> None:
+        """Begin with what completes and starts."""
         completed, started = batch.columns(COMPLETED), batch.columns(STARTED)
-        first = len(self._kept)
-        table = np.zeros((first + len(completed) + len(started), N_LINK), dtype=np.int64)
-        table[:first] = self._kept
-        table[first:first + len(completed), :L_GROUP] = completed[:, (1, 3, 6, 7, 8, 9)]
-        table[first:first + len(completed), L_CPU] = completed[:, 11]
-        running = table[first + len(completed):]
-        running[:, L_VERTEX], running[:, L_READY:L_END] = started[:, 1], started[:, 3:5]
-        running[:, L_LEG], running[:, L_END:L_GROUP], running[:, L_CPU] = -1, NEVER, -1
-        self._table = table
-        vertex, leg, ready, start, end = table[:, :L_BUSY].T.tolist()
-        self.ready, self.first = ready, first
-        self._columns = vertex, leg, ready, start, end
+        first = self.first = len(self._kept)
+        running = self.first_started = first + len(completed)
+        columns = np.zeros((N_LINK, running + len(started)), dtype=np.int64)
+        columns[:, :first] = self._kept.T
+        for link, column in zip((*range(L_GROUP), L_CPU), (1, 3, 6, 7, 8, 9, 11)):
+            columns[link, first:running] = completed[:, column]
+        for link, more in ((L_VERTEX, started[:, 1]), (L_LEG, -1), (L_READY, started[:, 3]),
+                           (L_START, started[:, 4]), (L_END, NEVER), (L_BUSY, NEVER), (L_CPU, -1)):
+            columns[link, running:] = more
+        self._table = columns.T
+        # the few that are looked at become numbers one by one
+        self._columns = tuple(memoryview(column) for column in columns[:L_BUSY])
+        self.ready = self._columns[L_READY]
         self.waited: dict[int, int] = {}
-        return first, first + len(completed)
 
     def begin(self, base: int, dag: int) -> None:
         """Begin a job whose executions have these numbers; the last one there is forgotten."""

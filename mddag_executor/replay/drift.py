@@ -26,6 +26,7 @@ from mddag_executor.replay.happenings import (
     NOW,
     Observer,
     PROCESS,
+    PUBLISHED,
 )
 from mddag_executor.replay.own import OwnRun
 from mddag_executor.trace.census import ADDRESS, Address, Census
@@ -35,8 +36,8 @@ from msg_graph.drift import Drift, drift, Observed, Releases
 import numpy as np
 
 _RELEASE, _DISPATCH, _DROP = 'mddag:job_release', 'mddag:dispatch', 'mddag:drop'
-_THREADS = (
-    'ros2:callback_start', 'ros2:callback_end', 'ros2:rclcpp_publish', 'ros2:rcl_publish')
+_PUBLISH = 'ros2:rclcpp_publish'
+_MIX = 0x9E3779B97F4A7C1
 
 
 class OwnDrift(Observer):
@@ -52,8 +53,6 @@ class OwnDrift(Observer):
         self._executions: Counter[Address] = Counter()
         self._dropped: Counter[Address] = Counter()
         self._first: int | None = None
-        # by process and thread, what runs there: the innermost callback last
-        self._running: dict[tuple[int, int], list[int]] = {}
 
     def handlers(self) -> Handlers:
         """Return the method for what is dropped."""
@@ -82,7 +81,8 @@ class OwnDrift(Observer):
             first += zip(places[:1].tolist(), rows[:1, NOW].tolist())
         if first and self._first is None:
             self._first = min(first)[1]
-        self._publish(batch)
+        if _PUBLISH in batch.events:
+            self._publish(batch)
 
     def _dispatched(self, pid: int, rows: Ints) -> None:
         callbacks, counts = np.unique(rows[:, 0], return_counts=True)
@@ -98,25 +98,14 @@ class OwnDrift(Observer):
             self._key[pid, callback & ADDRESS] = self._keys[of][place]
 
     def _publish(self, batch: Batch) -> None:
-        """Note which callbacks publish what: the innermost that runs in the thread."""
-        none = np.empty(0, dtype=np.int64), np.empty((0, FIELD + 1), dtype=np.int64)
-        places, rows = zip(*(batch.events.get(name, none) for name in _THREADS))
-        kind = np.repeat((0, 1, 2, 2), [len(each) for each in places])
-        order = np.argsort(np.concatenate(places))
-        kind = kind[order]
-        pid, thread, what = np.concatenate(
-            [each[:, PROCESS:FIELD + 1] for each in rows])[order].T
-        found: set[tuple[int, int, int]] = set()
-        for process in different(pid):
-            threads = thread[pid == process]
-            for one in different(threads):
-                mine = np.flatnonzero((pid == process) & (thread == one))
-                stack = self._running.setdefault((process, one), [])
-                found.update((process, *pair) for pair in _published(
-                    kind[mine], what[mine], stack))
-        for process, callback, publisher in found:
-            self._census.published(
-                (process, callback & ADDRESS), (process, publisher & ADDRESS))
+        """Note which callbacks publish what."""
+        pid = batch.events[_PUBLISH][1][:, PROCESS]
+        publisher, callback = batch.columns(PUBLISHED)[:, :2].T
+        pairs = (callback * _MIX + publisher) * _MIX + pid
+        _, first = np.unique(pairs[callback != -1], return_index=True)
+        for row in np.flatnonzero(callback != -1)[first].tolist():
+            self._census.published((int(pid[row]), int(callback[row]) & ADDRESS),
+                                   (int(pid[row]), int(publisher[row]) & ADDRESS))
 
     def drift(self, judge: TaskSet) -> list[Drift]:
         """
@@ -139,40 +128,6 @@ class OwnDrift(Observer):
         observed.nodes = set(self._census.publishers) or None
         observed.undeclared = undeclared(self._census, judge)
         return drift(judge, observed)
-
-
-def _published(kind: Ints, what: Ints, stack: list[int]) -> set[tuple[int, int]]:
-    """
-    Return which callbacks have published with what in a thread.
-
-    :param kind: of its events: start (0), end (1), publication (2); ``what`` the callback's or
-        the publisher's address.
-    :param stack: the callbacks that run there, the innermost last; it is brought up to date.
-    """
-    runs = np.flatnonzero(kind != 2)
-    kept = len(stack)
-    callbacks = np.r_[np.array(stack, dtype=np.int64), what[runs]]
-    ends = np.r_[np.zeros(kept, dtype=np.int64), kind[runs]]
-    pairs = len(ends) // 2 * 2
-    if kept < 2 and not ends[::2].any() and ends[1::2].all() and (
-            callbacks[:pairs:2] == callbacks[1::2]).all():      # one after the other
-        publications = np.flatnonzero(kind == 2)
-        before = np.searchsorted(runs, publications) + kept
-        within = before % 2 == 1
-        stack[:] = callbacks[pairs:].tolist()
-        return set(zip(callbacks[before[within] - 1].tolist(),
-                       what[publications[within]].tolist()))
-    found = set()
-    for each, address in zip(kind.tolist(), what.tolist()):
-        if each == 0:
-            stack.append(address)
-        elif each == 2:
-            if stack:
-                found.add((stack[-1], address))
-        else:
-            while stack and stack.pop() != address:
-                pass
-    return found
 
 
 def declared_keys(census: Census, task_set: TaskSet) -> dict[Address, str]:

@@ -18,7 +18,7 @@ missing in the trace or wrong in this program, and ``differences`` says so.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER, Scheduler, Tables
@@ -41,7 +41,6 @@ from mddag_executor.replay.happenings import (
     COMPLETED,
     ENDED,
     FAILED,
-    Ints,
     MISSED,
     Observer,
     PUBLISHED,
@@ -59,7 +58,7 @@ import numpy as np
 KEEP_RESPONSES = 1_000_000
 """How many response times are kept for each sink: beyond that, quantiles are of the last ones."""
 
-_LARGE = 1 << 40
+_HALF = 1 << 63
 
 
 class Miss(NamedTuple):
@@ -102,8 +101,9 @@ class Judge(Observer):
         self._scheduler.state.scalars[SKIP] = self.skip = skip
         self._scheduler.state.scalars[JUDGE_FROM] = judge_from
         self._key = self._scheduler.policy.key
-        # by job, as one number
-        self._slots: dict[int, int] = {}
+        # by open job, as one number: where its executions begin
+        self._bases: dict[int, int] = {}
+        self._region = np.array(tables.region_offset, dtype=np.int64)
         self._others: dict[int, Any] = {
             RELEASED: self._released, ENDED: self._ended, WITHDRAWN: self._withdrawn,
             FAILED: self._failed, MISSED: self._missed}
@@ -133,51 +133,60 @@ class Judge(Observer):
     def take(self, batch: Batch) -> None:
         """Feed the core what happened."""
         self._keep_waits(batch)
-        order = batch.order
-        places = np.flatnonzero((order != RAN) & (order != PUBLISHED))
-        kinds = order[places].tolist()
-        completed, started = self.chains.begin_batch(batch)
-        n_dags, slots, region = self.tables.n_dags, self._slots, self.tables.region_offset
-        state, links, ready = self._scheduler.state, self.chains.links, self.chains.ready
-        t, key_of = self.tables, self._key
-        x_state, job_base, decided = state.x_state, state.job_base, state.decisions
-        completions = _keyed(batch.columns(COMPLETED), (0, 2), n_dags, (1, 3, 5, 10))
-        starts = _keyed(batch.columns(STARTED), (0, 2), n_dags, (1,))
+        self.chains.begin_batch(batch)
+        links, ready, newest = self.chains.links, self.chains.ready, self._newest
+        t, state, key_of = self.tables, self._scheduler.state, self._key
+        x_state, decided, bases, n_dags = state.x_state, state.decisions, self._bases, t.n_dags
         others = {kind: iter(batch.rows(kind)) for kind in self._others}
-        for place, kind in zip(places.tolist(), kinds):
+        for place, kind, key, head, leg, now, link in self._feed(batch):
             if kind == COMPLETED:
-                key, vertex, leg, end, number = next(completions)
-                slot = slots.get(key, -1)
-                link, completed = completed, completed + 1
-                waited = self._take_waited(batch, link) if number >= 0 and self._waited else 0
-                if slot < 0:
-                    self._not_open(key)
+                base = bases.get(key, -1)
+                waited = self._take_waited(batch, link) if link >= 0 and self._waited else 0
+                if base < 0:
+                    # unless of a job that has ended
+                    self.contradictions += key > newest.get(key % n_dags, -1)
                     continue
-                head = job_base[slot] + region[vertex]
-                x = head + leg
-                if x_state[x] != IDLE:
+                head += base
+                if x_state[head + leg] != IDLE:
                     self.contradictions += 1
                     continue
-                if record(t, state, key_of, x, end) and number >= 0:
+                if record(t, state, key_of, head + leg, now) and link >= 0:
                     links[head] = link
                     if waited:
                         self.chains.waited[link] = waited
             elif kind == STARTED:
-                key, vertex = next(starts)
-                slot = slots.get(key, -1)
-                if slot >= 0:
-                    head = job_base[slot] + region[vertex]
-                    before = links[head]
-                    if before < 0 or ready[before] != ready[started]:
-                        links[head] = started
-                started += 1
+                base = bases.get(key, -1)
+                if base >= 0:
+                    before = links[base + head]
+                    if before < 0 or ready[before] != ready[link]:
+                        links[base + head] = link
                 continue
             else:
-                slot = self._others[kind](*next(others[kind]))
+                base = self._others[kind](*next(others[kind]))
             if decided:
-                self._decided(batch, place, slot)
+                self._decided(batch, place, base)
         self.chains.end_batch()
         self.tally.add(batch.decisions)
+
+    def _feed(self, batch: Batch) -> Iterator[tuple[int, ...]]:
+        """
+        Yield the place and the kind of what concerns the core.
+
+        Of what completed and started also the job as one number, the place of its vertex among
+        the executions of a job, the leg, the time, and its link; -1 without one.
+        """
+        places = np.flatnonzero((batch.order != RAN) & (batch.order != PUBLISHED))
+        kinds = batch.order[places]
+        table = np.zeros((5, len(places)), dtype=np.int64)
+        for kind, link in ((COMPLETED, self.chains.first), (STARTED, self.chains.first_started)):
+            mine, rows = np.flatnonzero(kinds == kind), batch.columns(kind)
+            table[0, mine] = rows[:, 2] * self.tables.n_dags + rows[:, 0]
+            table[1, mine] = self._region[rows[:, 1]]
+            table[4, mine] = np.arange(link, link + len(rows))
+            if kind == COMPLETED:
+                table[2:4, mine] = rows[:, (3, 5)].T
+                table[4, mine[rows[:, 10] < 0]] = -1
+        return zip(places.tolist(), kinds.tolist(), *table.tolist())
 
     def _keep_waits(self, batch: Batch) -> None:
         """Keep what pieces waited for their groups."""
@@ -194,27 +203,29 @@ class Judge(Observer):
         dag, vertex, job, _, _, _, ready, *_ = batch.rows(COMPLETED)[link - self.chains.first]
         return self._waited.pop((dag, vertex, job, ready), 0)
 
-    def _not_open(self, key: int) -> None:
-        """Count what completes in a job that has not been released."""
-        if key > self._newest.get(key % self.tables.n_dags, -1):
-            self.contradictions += 1
-
     def _key_of_job(self, dag: int, job: int) -> int:
-        return job * self.tables.n_dags + dag
+        key = job * self.tables.n_dags + dag
+        return (key + _HALF) % (2 * _HALF) - _HALF      # as numpy has it: job may be damaged
 
     def _released(self, dag: int, job: int, release: int, now: int) -> int:
         """Open the job."""
+        state = self._scheduler.state
         slot = self._scheduler.release(dag, job, release, now)
         key = self._newest[dag] = self._key_of_job(dag, job)
-        self._slots[key] = slot
-        if is_judged(self._scheduler.state, slot):
+        base = self._bases[key] = state.job_base[slot]
+        if is_judged(state, slot):
             self.tally.released(dag)
-        self.chains.begin(self._scheduler.state.job_base[slot], dag)
-        return slot
+        self.chains.begin(base, dag)
+        return base
+
+    def _base_and_slot(self, dag: int, job: int) -> tuple[int, int]:
+        """Return where the executions of an open job begin, and its slot; -1 where it is not."""
+        base = self._bases.get(self._key_of_job(dag, job), -1)
+        return base, -1 if base < 0 else self._scheduler.state.x_slot[base]
 
     def _ended(self, dag: int, job: int, aborted: bool, now: int) -> int:
         """End an open job as it was recorded."""
-        slot = self._slots.get(self._key_of_job(dag, job), -1)
+        base, slot = self._base_and_slot(dag, job)
         self._now = now
         if slot < 0:
             # under another declaration it may have completed before
@@ -223,22 +234,23 @@ class Judge(Observer):
             self._scheduler.abort(slot, now)
         else:
             self._scheduler.expire(slot, now)
-        return slot
+        return base
 
     def _withdrawn(self, dag: int, job: int) -> int:
         """Close a job that is open without a verdict."""
-        slot = self._slots.pop(self._key_of_job(dag, job), -1)
+        _, slot = self._base_and_slot(dag, job)
         if slot >= 0:
+            del self._bases[self._key_of_job(dag, job)]
             self._scheduler.withdraw(slot)
         return -1
 
     def _failed(self, dag: int, vertex: int, job: int, now: int) -> int:
         """Fail an open job."""
-        slot = self._slots.get(self._key_of_job(dag, job), -1)
+        base, slot = self._base_and_slot(dag, job)
         self._now = now
         if slot >= 0:
             self._scheduler.fail_open(slot, now)
-        return slot
+        return base
 
     def _missed(self, dag: int, vertex: int, job: int, deadline: int, completed: int) -> int:
         """Compare a recorded miss."""
@@ -255,28 +267,27 @@ class Judge(Observer):
             self.chains.begin_batch(batch)
             self._decided(batch, 0, -1)
 
-    def _decided(self, batch: Batch, place: int, slot: int) -> None:
-        """Keep what the core has decided (about the job in a slot, except at the end)."""
-        state = self._scheduler.state
-        for decision in state.decisions:
-            kind, dag, vertex, job, deadline, time = decision
-            batch.decisions.append(decision)
-            batch.decided_at.append(place)
+    def _decided(self, batch: Batch, place: int, base: int) -> None:
+        """Keep what the core has decided (about a job's executions, except at the end)."""
+        decisions, deadlines, chains = (
+            self._scheduler.state.decisions, self.tables.sink_deadline, self.chains)
+        batch.decisions += decisions
+        batch.decided_at += [place] * len(decisions)
+        for kind, dag, vertex, job, deadline, time in decisions:
             if kind == JOB_END:
-                del self._slots[job * self.tables.n_dags + dag]
+                del self._bases[self._key_of_job(dag, job)]
                 continue
             assert kind != DROP, 'nothing waits in this core, so nothing can be dropped'
-            release = deadline - self.tables.sink_deadline[vertex]
+            release = deadline - deadlines[vertex]
             if kind in SINK_COMPLETED:
-                self.chains.sink(state.job_base[slot], vertex, job, release, time)
+                chains.sink(base, vertex, job, release, time)
             if kind != SINK_IN_TIME:
-                of = slot if slot >= 0 else self._slots[self._key_of_job(dag, job)]
-                self.chains.missed(
-                    kind, state.job_base[of], vertex, job, release,
-                    time if kind == SINK_LATE else self._now)
+                of = base if base >= 0 else self._bases[self._key_of_job(dag, job)]
+                chains.missed(kind, of, vertex, job, release,
+                              time if kind == SINK_LATE else self._now)
                 if self.compare:
                     self.differ(Miss(dag, vertex, job, deadline, time), 1)
-        state.decisions.clear()
+        decisions.clear()
 
     def differ(self, miss: Miss, side: int) -> None:
         """Count a miss that was found here (side 1) or recorded (-1) against the other side."""
@@ -303,15 +314,3 @@ class Judge(Observer):
         recorded_misses = counted(self.n_recorded, 'recorded miss', 'recorded misses')
         return (f'the replay does not find {len(recorded)} of {recorded_misses}, and it finds '
                 f'{len(found)} that were not recorded: the first is job {example.job} at {name}')
-
-
-def _keyed(
-    columns: Ints, of: tuple[int, int], n_dags: int, others: Sequence[int]
-) -> Iterator[tuple[int, ...]]:
-    """Yield rows of a job's number, of which two columns tell DAG and job, and other columns."""
-    dag, job = (columns[:, column] for column in of)
-    if len(job) and max(-int(job.min()), int(job.max())) >= _LARGE:     # damage
-        keys = [j * n_dags + d for d, j in zip(dag.tolist(), job.tolist())]
-    else:
-        keys = (job * n_dags + dag).tolist()
-    return zip(keys, *(columns[:, column].tolist() for column in others))

@@ -63,7 +63,7 @@ _RELEASE, _DISPATCH, _COMPLETE = 'mddag:job_release', 'mddag:dispatch', 'mddag:c
 _START, _END, _PUBLISH = 'ros2:callback_start', 'ros2:callback_end', 'ros2:rclcpp_publish'
 _DEADLINE, _FAIL, _EXPIRE, _ABORT, _LOST, STOP = (
     f'mddag:{name}' for name in ('deadline', 'fail', 'expire', 'abort', 'lost', 'stop'))
-_NUMBERS = (_START, _END, _PUBLISH, 'ros2:rcl_publish', _RELEASE, _DISPATCH, _COMPLETE, _DEADLINE,
+_NUMBERS = (_START, _END, _PUBLISH, _RELEASE, _DISPATCH, _COMPLETE, _DEADLINE,
             _FAIL, _EXPIRE, _ABORT, _LOST, STOP)
 _DROP, _HOSTED, _SHUTDOWN = 'mddag:drop', 'mddag:hosted', 'mddag:shutdown'
 _JUDGE_FROM = 'mddag:judge_from'
@@ -73,6 +73,8 @@ X_DAG, X_VERTEX, X_JOB, X_READY, X_START, X_END, X_BUSY, X_NUMBER, _N_EXECUTION 
 # What is sorted by thread.
 _OF_THREAD = (_DISPATCH, _START, _END, _COMPLETE, _PUBLISH)
 _IS_DISPATCH, _IS_START, _IS_END, _IS_COMPLETE, _IS_PUBLISH = range(5)
+
+_OF_LINE = (THREAD, NOW, FIELD)
 
 Add = Callable[..., None]
 
@@ -215,10 +217,10 @@ class OwnRun:
         others: list[tuple[int, Event]] = []
         for (name,), rows, places in events.tables():
             if name in _NUMBERS:
-                columns = np.empty((len(rows), len(rows.dtype.names)), dtype=np.int64)
+                columns = np.empty((len(rows.dtype.names), len(rows)), dtype=np.int64)
                 for i, field in enumerate(rows.dtype.names):
-                    columns[:, i] = rows[field]
-                found.setdefault(name, []).append((places, columns))
+                    columns[i] = rows[field]
+                found.setdefault(name, []).append((places, columns.T))
             else:
                 others += [(place, (name, *row))
                            for place, row in zip(places.tolist(), rows.tolist())]
@@ -458,7 +460,7 @@ class _Threads:
         told[:n_running] = False
         add(STARTED, where[_IS_DISPATCH][told[n_running:]], dag[told], vertex[told],
             dispatch[told, FIELD + 3], ready[told], dispatch[told, NOW], dispatch[told, FIELD])
-        line = _Line(length, self._last[:, 0], self._running[:, THREAD], where, of)
+        line = _Line(length, self._last[:, 0], self._running, where, of)
 
         # dispatches and ends change what a thread runs
         is_dispatch, is_end = line.kind == _IS_DISPATCH, line.kind == _IS_END
@@ -466,22 +468,20 @@ class _Threads:
         runs = (before >= 0) & is_dispatch[before]
         runs[runs] = good[line.row[before[runs]]]
         same = np.zeros(len(runs), dtype=np.bool_)
-        callback = line.gather(dispatch, of, FIELD)
-        same[runs] = callback[runs] == callback[before[runs]]
+        same[runs] = line.callback[runs] == line.callback[before[runs]]
         started = line.latest((line.kind == _IS_START) & same)
-        now = line.gather(dispatch, of, NOW)
 
         def begun(events: Ints, dispatches: Ints) -> Ints:
             """Return since when what was dispatched runs, as of some events."""
             start = started[events]
-            return np.where(start > dispatches, now[start], since[line.row[dispatches]])
+            return np.where(start > dispatches, line.now[start], since[line.row[dispatches]])
 
         ended = np.flatnonzero(is_end & same)
         ended = ended[np.argsort(line.place[ended])]
         by = line.row[before[ended]]
         executions = np.column_stack((
             dag[by], vertex[by], dispatch[by, FIELD + 3], ready[by],
-            begun(ended, before[ended]), now[ended], np.zeros((len(ended), 2), dtype=np.int64)))
+            begun(ended, before[ended]), line.now[ended], np.zeros((len(ended), 2), dtype=np.int64)))
         executions[:, X_BUSY] = executions[:, X_END] - executions[:, X_START]
         executions[:, X_NUMBER] = np.arange(self._number, self._number + len(ended))
         self._number += len(ended)
@@ -498,7 +498,7 @@ class _Threads:
             line, where, of, is_end, execution, executions, line.place[ended], add)
         self._first_undeclared(first, executions, dispatch[by, FIELD])
         add(RAN, line.place[ended], dispatch[by, FIELD], dag[by], vertex[by],
-            dispatch[by, FIELD + 3], dispatch[by, FIELD + 4], ready[by], start, now[ended], first)
+            dispatch[by, FIELD + 3], dispatch[by, FIELD + 4], ready[by], start, line.now[ended], first)
         self._publish(line, of, before, runs, dispatch, (dag, vertex), add)
 
         at_end = line.at_end
@@ -631,7 +631,8 @@ class _Line:
     Events of threads, thread by thread and in order.
 
     :ivar kind: of each, an index of ``_OF_THREAD``; ``row`` its number among those of its kind,
-        ``place`` its place in the batch (below 0: kept from before), ``thread`` its thread.
+        ``place`` its place in the batch (below 0: kept from before), ``thread`` its thread,
+        ``now`` its time, ``callback`` its first field.
     :ivar at_end: the last event of each thread.
     """
 
@@ -641,20 +642,22 @@ class _Line:
         n_last, kept = len(last), len(last) + len(running)
         kind = np.full(kept + length, -1, dtype=np.int8)
         row = np.zeros(kept + length, dtype=np.int64)
-        thread = np.zeros(kept + length, dtype=np.int64)
+        columns = np.zeros((3, kept + length), dtype=np.int64)
         kind[:n_last], kind[n_last:kept] = _IS_END, _IS_DISPATCH
         row[:n_last], row[n_last:kept] = np.arange(n_last), np.arange(len(running))
-        thread[:n_last], thread[n_last:kept] = last, running
+        columns[0, :n_last] = last
+        columns[:, n_last:kept] = running[:, _OF_LINE].T
         before = {_IS_END: n_last, _IS_DISPATCH: len(running)}
-        for number, (places, columns) in enumerate(zip(where, of)):
-            kind[places + kept] = number
-            row[places + kept] = np.arange(len(places)) + before.get(number, 0)
-            thread[places + kept] = columns[:, THREAD]
+        for number, (places, rows) in enumerate(zip(where, of)):
+            at = places + kept
+            kind[at] = number
+            row[at] = np.arange(len(places)) + before.get(number, 0)
+            for column, field in zip(columns, _OF_LINE):
+                column[at] = rows[:, field]
         at = np.flatnonzero(kind >= 0)
-        order = at[_by_thread(thread[at])]
-        self.kind, self.row, self.thread = kind[order], row[order], thread[order]
-        self.place = order - kept
-        self._before = before
+        order = at[_by_thread(columns[0, at])]
+        self.kind, self.row, self.place = kind[order], row[order], order - kept
+        self.thread, self.now, self.callback = columns[:, order]
         self._numbers = np.arange(len(order))
         begins = np.r_[True, self.thread[1:] != self.thread[:-1]]
         self._begin = np.maximum.accumulate(np.where(begins, self._numbers, 0))
@@ -669,16 +672,6 @@ class _Line:
         """Return the same of those before the event."""
         found = np.r_[-1, np.maximum.accumulate(np.where(which, self._numbers, -1))[:-1]]
         return np.where(found >= self._begin, found, -1)
-
-    def gather(self, dispatch: Ints, of: Sequence[Ints], column: int) -> Ints:
-        """Return a column of dispatches, starts and ends by event; 0 of others."""
-        found = np.zeros(len(self.kind), dtype=np.int64)
-        for number, rows, less in (
-                (_IS_DISPATCH, dispatch, 0), (_IS_START, of[_IS_START], 0),
-                (_IS_END, of[_IS_END], self._before[_IS_END])):
-            which = (self.kind == number) & ((self.place >= 0) | (number == _IS_DISPATCH))
-            found[which] = rows[self.row[which] - less, column]
-        return found
 
 
 def _by_thread(threads: Ints) -> Ints:

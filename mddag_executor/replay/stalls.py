@@ -47,7 +47,7 @@ class Seen:
         self, times: Ints, timers: Ints, started: Ints, ran: Ints, stops: Ints,
         noticed: int,
     ) -> None:
-        self.times = np.unique(times)
+        self.times = np.sort(times)
         self.timers = timers[timers[:, 1] - timers[:, 0] >= _UNNOTICED_NS]
         self.started = started[started[:, 1] - started[:, 0] >= LEAST_NS]
         self.ran, self.stops, self.noticed = ran, stops, noticed

@@ -26,7 +26,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from mddag_executor.core import Tables, Tally
-from mddag_executor.core.state import SINK_IN_TIME
 from mddag_executor.core.tally import counts, total
 from mddag_executor.text import counted
 from msg_graph import TaskSet
@@ -73,12 +72,11 @@ class MissTally(Tally):
         #: By global vertex of each sink: the jobs that missed.
         self.missed_jobs = {vertex: Runs() for vertex in self.sinks}
 
-    def _add_sink(
+    def _add_miss(
         self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
     ) -> None:
-        super()._add_sink(kind, dag, vertex, job, deadline, time)
-        if kind != SINK_IN_TIME:
-            self.missed_jobs[vertex].add(job)
+        super()._add_miss(kind, dag, vertex, job, deadline, time)
+        self.missed_jobs[vertex].add(job)
 
     def add_bursts(self, dags: Mapping[str, Any]) -> None:
         """Add to each sink of a result its longest burst of misses, as `longest_burst`."""

@@ -101,4 +101,6 @@ def _with_fields(rows: Any, missing: dict[str, int]) -> Any:
 def rows_at(data: bytes, kind: Any, positions: Ints) -> Any:
     """Return the structures of a type that stand in data at positions, which are checked."""
     room = len(data) - kind.itemsize + 1
-    return np.ndarray(max(room, 0), kind, data, strides=(1,))[positions]
+    # as plain bytes: numpy copies structures field by field
+    found = np.ndarray(max(room, 0), f'V{kind.itemsize}', data, strides=(1,))[positions]
+    return found.view(kind)

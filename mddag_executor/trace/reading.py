@@ -50,6 +50,7 @@ _CONTENT = records.RECORD.size
 _FIELDS = _CONTENT + records.MESSAGE_HEAD.size + 4      # 4: the encapsulation header
 _LITTLE_ENDIAN = 0x0100         # plain CDR, little endian, as _HEAD reads it
 _CHANNEL = np.dtype({'names': ['channel'], 'formats': ['<u2'], 'offsets': [9], 'itemsize': 11})
+_INDEX_ROOM = 1 << 16           # an index takes a third of its messages, and a head a channel
 _INDEX_ENTRY = np.dtype([('time', '<u8'), ('offset', '<u8')])
 
 
@@ -239,17 +240,15 @@ class Reading:
             return None
         parts = []
         stream.seek(block.end)
-        while True:
-            head = stream.read(_CONTENT)
-            if len(head) < _CONTENT or head[0] != Opcode.MESSAGE_INDEX:
-                break
-            length = records.RECORD.unpack(head)[1]
-            if length % _INDEX_ENTRY.itemsize != 6 or length > 16 * end:
+        content = stream.read(end // 3 + _INDEX_ROOM)
+        at = 0
+        while at + _CONTENT <= len(content) and content[at] == Opcode.MESSAGE_INDEX:
+            length = records.RECORD.unpack_from(content, at)[1]
+            first, at = at + _CONTENT + 6, at + _CONTENT + length
+            if length % _INDEX_ENTRY.itemsize != 6 or at > len(content):
                 return None
-            content = stream.read(length)
-            if len(content) < length:
-                return None
-            parts.append(np.frombuffer(content, _INDEX_ENTRY, offset=6)['offset'])
+            parts.append(np.frombuffer(
+                content, _INDEX_ENTRY, length // _INDEX_ENTRY.itemsize, first)['offset'])
         if not parts:
             return None
         starts = np.sort(np.concatenate(parts).astype(np.int64))
