@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.memory import no_garbage
+from mddag_executor.replay.beside import pays, play_beside
 from mddag_executor.replay.drift import OwnDrift
 from mddag_executor.replay.explain import Explainer
 from mddag_executor.replay.happenings import Observer
@@ -55,19 +56,24 @@ class Replay:
         self._seen: Communications | None = None
         self._paths: ImportedPaths | OwnPaths | None = None
         self._drift: ImportedDrift | OwnDrift | None = None
-        if not isinstance(run, OwnRun):
-            from mddag_executor.replay.imported_figures import observers_of
-            self._seen, self._paths, self._drift = observers_of(run, paths)
-        elif paths:
-            self._paths, self._drift = OwnPaths(run), OwnDrift(run)
         self.explainer = Explainer(run, self.judge, jobs) if paths else None
-        observers = [waits, self.judge, self.usage, self._paths, self._drift, self._seen,
-                     self.explainer,
-                     *(more(self) if more is not None else ())]
         with no_garbage():
-            run.play([each for each in observers if each is not None], progress)
+            if paths and not jobs and more is None and isinstance(run, OwnRun) and pays(run):
+                self.run, self._paths, self._drift = play_beside(
+                    run, waits, [self.judge, self.usage, *filter(None, [self.explainer])],
+                    progress)
+            else:
+                if not isinstance(run, OwnRun):
+                    from mddag_executor.replay.imported_figures import observers_of
+                    self._seen, self._paths, self._drift = observers_of(run, paths)
+                elif paths:
+                    self._paths, self._drift = OwnPaths(run), OwnDrift(run)
+                observers = [waits, self.judge, self.usage, self._paths, self._drift, self._seen,
+                             self.explainer, *(more(self) if more is not None else ())]
+                run.play([each for each in observers if each is not None], progress)
             if self.explainer is not None:
                 self.explainer.finish()
+        run = self.run
         self.warnings = run.warnings
         if self.judge.contradictions:
             self.warnings.append(

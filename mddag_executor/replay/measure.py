@@ -9,8 +9,8 @@ The file to read is a simulated run of a declaration, written over and over with
 each time later and with the next jobs' numbers; messages are recorded as the executor records
 them.  So it has the mixture of events of a live run, as long as is wanted.
 
-Each reader is measured in a process of its own: its CPU time, because the machine may be doing
-other things, and its greatest memory.
+Each reader is measured in a process of its own, with those that it starts itself: how long it
+takes, its CPU time, and its greatest memory.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 import multiprocessing
 import os
+import resource
 import time
 from typing import Any, NamedTuple
 
@@ -48,16 +49,17 @@ Event = tuple[Any, ...]
 
 
 class Speed(NamedTuple):
-    """What reading took: events in the file (as far as read), CPU seconds, greatest memory."""
+    """What reading took: events in the file (as far as read), seconds, greatest memory."""
 
     events: int
+    elapsed_s: float
     cpu_s: float
     peak_mb: float
 
     @property
     def per_s(self) -> float:
         """Return events a second."""
-        return self.events / self.cpu_s if self.cpu_s else 0.0
+        return self.events / self.elapsed_s if self.elapsed_s else 0.0
 
 
 def write_long_trace(
@@ -237,14 +239,16 @@ OTHERS = ('mcap, undecoded', 'rosbags, undecoded')
 
 
 def _in_child(name: str, path: str, limit: int, pipe: Any) -> None:
-    begin = time.process_time()
+    begin, cpu = time.monotonic(), time.process_time()
     try:
         count = READERS[name](path, limit)
     except MddagError as error:
         pipe.send(str(error))
         return
-    cpu = time.process_time() - begin
-    pipe.send(Speed(count, cpu, peak_memory_mb()))
+    took, cpu = time.monotonic() - begin, time.process_time() - cpu
+    beside = resource.getrusage(resource.RUSAGE_CHILDREN)
+    pipe.send(Speed(count, took, cpu + beside.ru_utime + beside.ru_stime,
+                    peak_memory_mb() + beside.ru_maxrss / 1024))
 
 
 def measure(name: str, path: str, limit: int) -> Speed:

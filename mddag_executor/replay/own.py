@@ -97,6 +97,8 @@ class OwnRun:
     ) -> None:
         self._reader = reader
         self.name, self.head = name, head
+        #: What ``open_run`` is to be given to open it again.
+        self.recording = reader.path, task_set, name
         #: Who is who in it.
         self.who = Census(keep_times=0)
         #: The DAG tasks that it was recorded with; its events refer to them by index.
@@ -117,7 +119,7 @@ class OwnRun:
         #: The greatest time of an event, ns.
         self.last = 0
         #: Called when it has been played.
-        self.when_played: Callable[[], object] = lambda: None
+        self.when_played: Callable[[], object] | None = None
         #: What is to be said of it beside: of the traces that it was joined from.
         self.notes: list[str] = []
         #: What its workers are called, where that is more than a number.
@@ -153,7 +155,9 @@ class OwnRun:
             if self.end == 0:
                 self.end = min(max(0, self.head.time), NEVER - 1)
             self._finish(self.end)
-        self.when_played()
+        self._observers = ()
+        if self.when_played is not None:
+            self.when_played()
 
     def _finish(self, judged: int) -> None:
         """Have deadlines judged up to a time."""
@@ -161,6 +165,11 @@ class OwnRun:
         for observer in self._observers:
             observer.finished(judged, batch)
             observer.take(batch)
+
+    @property
+    def events(self) -> int:
+        """Return how many events are in it, 0 where that is not known before it is played."""
+        return self._reader.message_count or 0
 
     @property
     def warnings(self) -> list[str]:
@@ -481,7 +490,8 @@ class _Threads:
         by = line.row[before[ended]]
         executions = np.column_stack((
             dag[by], vertex[by], dispatch[by, FIELD + 3], ready[by],
-            begun(ended, before[ended]), line.now[ended], np.zeros((len(ended), 2), dtype=np.int64)))
+            begun(ended, before[ended]), line.now[ended],
+            np.zeros((len(ended), 2), dtype=np.int64)))
         executions[:, X_BUSY] = executions[:, X_END] - executions[:, X_START]
         executions[:, X_NUMBER] = np.arange(self._number, self._number + len(ended))
         self._number += len(ended)
@@ -498,7 +508,8 @@ class _Threads:
             line, where, of, is_end, execution, executions, line.place[ended], add)
         self._first_undeclared(first, executions, dispatch[by, FIELD])
         add(RAN, line.place[ended], dispatch[by, FIELD], dag[by], vertex[by],
-            dispatch[by, FIELD + 3], dispatch[by, FIELD + 4], ready[by], start, line.now[ended], first)
+            dispatch[by, FIELD + 3], dispatch[by, FIELD + 4], ready[by], start, line.now[ended],
+            first)
         self._publish(line, of, before, runs, dispatch, (dag, vertex), add)
 
         at_end = line.at_end
