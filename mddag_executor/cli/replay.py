@@ -89,7 +89,6 @@ def _check_arguments(args: argparse.Namespace) -> None:
 
 
 def _show(args: argparse.Namespace, result: dict[str, Any]) -> None:
-    from mddag_executor.report.drift import drift_lines
     from mddag_executor.report.replays import (
         callbacks_table,
         comparison_table,
@@ -97,7 +96,7 @@ def _show(args: argparse.Namespace, result: dict[str, Any]) -> None:
         summary,
         times_table,
     )
-    from mddag_executor.report.tables import sink_table
+    from mddag_executor.report.tables import drift_lines, sink_table
     if result['rescheduled'] and result['recorded'] is None:
         print(sink_table(result['dags']))
         for note in result['notes']:

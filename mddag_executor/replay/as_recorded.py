@@ -15,7 +15,6 @@ from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.own import OwnRun
 from mddag_executor.replay.own_paths import OwnPaths
-from mddag_executor.replay.path_results import path_results
 from mddag_executor.replay.run import open_run, Recording, Run
 from mddag_executor.replay.usage import share, Usage
 from mddag_executor.replay.waits import GroupWaits
@@ -118,7 +117,7 @@ class Replay:
             'worker_use': self.usage.workers(head.workers, duration),
             'dropped': dict(sorted(self.run.dropped.items())),
             'misses': None if self.explainer is None else self.explainer.summary(),
-            'paths': {} if self._paths is None else path_results(self._paths.book),
+            'paths': {} if self._paths is None else self._paths.book.results(),
             **({} if self._seen is None else {
                 'recorded_callbacks': self._seen.callbacks(),
                 'communications': self._seen.communications()}),

@@ -132,7 +132,7 @@ def serve() -> None:
             paths, drift = OwnPaths(run), OwnDrift(run)
             run.play([waits, _Sender(send, waits), paths, drift],
                      lambda events: send('progress', events))
-            paths.book.figures()
+            paths.book.results()
             send('over', (run, paths, drift))
         except MddagError as error:
             send('error', error)

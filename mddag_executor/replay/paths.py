@@ -118,7 +118,7 @@ class PathBook:
         self._waiting = 0
         self._steps = np.empty((1024, _N_STEP), dtype=np.int64)
         self._n = 0
-        self._results: list[dict[str, Any]] | None = None
+        self._results: dict[str, Any] | None = None
 
     def __bool__(self) -> bool:
         """Tell whether there is any path."""
@@ -310,12 +310,24 @@ class PathBook:
             place.messages[:, 1] = 0
             place.messages[:, 2] = numbers[place.messages[:, 2]]
 
-    def figures(self) -> list[dict[str, Any]]:
-        """Return the figures of each path, once all input is there."""
+    def results(self) -> dict[str, Any]:
+        """
+        Return by path its figures, all times in ns, once all input is there.
+
+        ``flows`` counts the inputs and ``arrived`` those whose flow reached the last callback.
+        ``response_time`` has CARET's cases (see ``path_stream``) from the first publication to the
+        start of the last callback, ``whole`` those from the start of the first to the end of the
+        last.  ``reaction_time`` is the worst case with external latency, ``data_age`` that of
+        every output.  Median and p99 are exact up to 32,768 response times; where there are more,
+        ``quantiles_within`` tells how exact they are, as a share.
+        """
         if self._results is None:
             self._round()
             self._settle(True)
-            self._results = [figures.result() for figures in self._figures]
+            self._results = {
+                path.name: {'callbacks': list(path.callbacks), 'hops': [hop.kind for hop in hops],
+                            **figures.result()}
+                for path, hops, figures in zip(self.paths, self.hops, self._figures)}
         return self._results
 
 

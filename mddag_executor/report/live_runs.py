@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mddag_executor.core.tally import total
-from mddag_executor.report.drift import drift_lines
-from mddag_executor.report.tables import never_due_lines, percent, verdicts_line
+from mddag_executor.report.tables import drift_lines, never_due_lines, percent, verdicts_line
 from mddag_executor.report.text import listed, printable
 from mddag_executor.text import counted
 

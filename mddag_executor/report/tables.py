@@ -11,13 +11,14 @@ sink job that got a verdict, and *in time* what completed by its deadline.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from mddag_executor.core.tally import Counts, counts, never_due, total
-from mddag_executor.report.text import Cell, format_ns, listed, table
+from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
 
+MOST_LINES = 12     # of drift
 HEADER = ('DAG', 'sink', 'due', 'in time', 'share', 'late', 'expired', 'median', 'p99', 'max',
           'deadline')
 
@@ -114,3 +115,18 @@ def never_due_lines(dags: Mapping[str, Any]) -> Iterator[str]:
     never = never_due(dags)
     if never:
         yield f'never due, so not judged: {counted(len(never), "sink")}: {listed(never)}'
+
+
+def drift_lines(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """
+    Yield a line for each disagreement of a run and its declaration, and none where there is none.
+
+    :param found: what ``drift`` holds in a result for machines.
+    """
+    if not found:
+        return
+    yield f'{counted(len(found), "difference")} between the run and the declaration:'
+    for each in found[:MOST_LINES]:
+        yield f'  {printable(each["text"])}'
+    if len(found) > MOST_LINES:
+        yield f'  … ({len(found) - MOST_LINES} more)'

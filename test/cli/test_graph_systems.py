@@ -10,7 +10,7 @@ from pathlib import Path
 import re
 import subprocess
 
-from mddag_executor.report.drift import drift_lines, MOST_LINES
+from mddag_executor.report.tables import drift_lines, MOST_LINES
 import msg_graph
 import pytest
 
