@@ -116,11 +116,15 @@ def recording_and_graph(args: argparse.Namespace) -> None:
     Tell TRACE… from GRAPH, which `options.add_recording` leaves together.
 
     The last is a trace, too, if that is what it looks like.
+
+    :raises mddag_executor.errors.UsageError: where they cannot be taken together
     """
     traces = args.trace
     if len(traces) > 1 and not _is_trace(traces[-1]):
         *traces, args.graph = traces
     args.trace = one_run(traces, args.offset)
+    if args.trace == '-' and args.graph == '-':
+        raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
 
 
 def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | Traces:

@@ -9,7 +9,7 @@ The run is judged as `replay` does it; `mddag_executor.replay.causes` says what 
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded
 from mddag_executor.cli.text import printable, warn
@@ -17,6 +17,7 @@ from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
     from mddag_executor.replay import Replay
+    from mddag_executor.replay.explain import Explainer
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -42,8 +43,6 @@ def main(args: argparse.Namespace) -> int:
     """Explain the misses of a trace."""
     common.recording_and_graph(args)
     common.check_output(args.json)
-    if args.trace == '-' and args.graph == '-':
-        raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
     task_set = None if args.graph is None else common.load_graph(args.graph)
     with common.input_recording(args.trace) as (path, name):
         if task_set is None or recorded.is_bag(path):
@@ -59,9 +58,9 @@ def main(args: argparse.Namespace) -> int:
         common.write_json(args.json, explainer.result(sink, args.job))
     if common.wants_tables(args):
         if sink is None and args.job is None:
-            _show(outcome)
+            _show(outcome, explainer)
         else:
-            _show_jobs(outcome, sink, args.job)
+            _show_jobs(explainer.result(sink, args.job)['jobs'])
     return 0
 
 
@@ -75,7 +74,7 @@ def _sink(name: str, task_set: TaskSet) -> int:
     return sinks[name]
 
 
-def _show(outcome: Replay) -> None:
+def _show(outcome: Replay, explainer: Explainer) -> None:
     from mddag_executor.report.explained import (
         causes_line,
         causes_table,
@@ -84,8 +83,6 @@ def _show(outcome: Replay) -> None:
         stalls_table,
     )
     from mddag_executor.report.tables import verdicts_line
-    explainer = outcome.explainer
-    assert explainer is not None
     summary = explainer.summary()
     if summary['missed']:
         print(causes_table(summary))
@@ -102,11 +99,8 @@ def _show(outcome: Replay) -> None:
         print(line)
 
 
-def _show_jobs(outcome: Replay, sink: int | None, job: int | None) -> None:
+def _show_jobs(jobs: list[dict[str, Any]]) -> None:
     from mddag_executor.report.explained import job_lines
-    explainer = outcome.explainer
-    assert explainer is not None
-    jobs = explainer.result(sink, job)['jobs']
     for each in jobs[:MOST_SHOWN]:
         for line in job_lines(each):
             print(line)

@@ -121,8 +121,6 @@ def _export_session(args: argparse.Namespace) -> int:
 
 def _form(args: argparse.Namespace) -> str:
     """Return what is to be written."""
-    if args.trace == '-' and args.graph == '-':
-        raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
     if args.output.endswith('/'):
         return _FOLDER
     if args.caret:

@@ -17,7 +17,6 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded, verdicts
 from mddag_executor.cli.text import printable, warn
-from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
     from mddag_executor.replay import Replay, Reschedule
@@ -53,7 +52,7 @@ def main(args: argparse.Namespace) -> int:
     common.check_output(args.json)
     common.check_report(args.report)
     verdicts.check(args)
-    _check_arguments(args)
+    recorded.check(args, args.trace, args.graph)
     task_set = None if args.graph is None else common.load_graph(args.graph)
     with common.input_recording(args.trace) as (path, name):
         watch = common.report_watch(args.report)
@@ -80,12 +79,6 @@ def main(args: argparse.Namespace) -> int:
         _show(args, result)
         verdicts.show(args, result)
     return status
-
-
-def _check_arguments(args: argparse.Namespace) -> None:
-    if args.trace == '-' and args.graph == '-':
-        raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
-    recorded.check(args, args.trace, args.graph)
 
 
 def _show(args: argparse.Namespace, result: dict[str, Any]) -> None:
