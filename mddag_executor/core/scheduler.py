@@ -12,6 +12,7 @@ from mddag_executor.core.policies import policy
 from mddag_executor.core.state import (
     add_group,
     add_slot,
+    as_object,
     Decision,
     EXPIRED,
     N_IDLE,
@@ -55,12 +56,12 @@ class Scheduler:
         dispatch_overhead: int = 0,
         switch_overhead: int = 0,
     ) -> None:
-        self.tables = tables
+        self.tables = as_object(tables)
         self.policy = policy(policy_name)
-        self.state = new_state(
+        self.state = as_object(new_state(
             tables, n_workers, preemptive=self.policy.mode(preemptive), propagate=propagate,
             dispatch_overhead=dispatch_overhead, switch_overhead=switch_overhead,
-            polling=self.policy.polling)
+            polling=self.policy.polling))
         self._free_groups: list[int] = []
         # bound here: a method of its own would be one more call for each execution
         rule = self.tables, self.state

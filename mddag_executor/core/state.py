@@ -7,11 +7,12 @@ A *slot* holds one open job of one DAG and owns a region of *executions* ``x``: 
 (or leg) of that DAG.  Slots of a DAG are recycled through a free list; open jobs of a DAG form a
 list in order of release.  Columns are plain lists for live use; a compiled driver makes them
 arrays.  ``scalars`` holds what would be plain integers, because a named tuple's cannot change.
+Plain Python reads the attributes of an object in half the time of a tuple's: see ``as_object``.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from mddag_executor.core.tables import NEVER, Tables
 
@@ -97,6 +98,20 @@ class State(NamedTuple):
     x_cost: list[int]
     # what was decided, for the driver to take away
     decisions: list[Decision]
+
+
+Columns = TypeVar('Columns', State, Tables)
+
+_OBJECTS: dict[type, Any] = {
+    kind: type(kind.__name__, (), {'__slots__': kind._fields}) for kind in (State, Tables)}
+
+
+def as_object(columns: Columns) -> Columns:
+    """Return the same columns as an object with these attributes, and no others."""
+    result: Columns = _OBJECTS[type(columns)]()
+    for name in columns._fields:
+        setattr(result, name, getattr(columns, name))
+    return result
 
 
 def new_state(

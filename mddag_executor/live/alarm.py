@@ -1,15 +1,35 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""A thread's alarm that others set and call off without waking it."""
+"""What a thread waits for: a bell, and an alarm that others set without waking it."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import threading
 import time
 
 _CLOEXEC = os.O_CLOEXEC  # TFD_CLOEXEC of timerfd_create(2)
 _ENDING_NS = 1
+
+
+class Bell:
+    """One thread waits until others ring; who rings while nobody waits ends the next wait."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._lock.acquire()
+
+    def ring(self) -> None:
+        """End the present wait, or the next one; from any thread."""
+        try:
+            self._lock.release()
+        except RuntimeError:
+            pass  # it rings already
+
+    def wait(self, seconds: float = -1) -> bool:
+        """Wait until it rings, for so long at most unless that is -1; return whether it rang."""
+        return self._lock.acquire(True, seconds)
 
 
 class Alarm:

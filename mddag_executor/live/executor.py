@@ -29,6 +29,7 @@ from mddag_executor.clocks import TraceClock
 from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE_JOBS
 from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.live import hooks
+from mddag_executor.live.alarm import Bell
 from mddag_executor.live.announcements import Announcements
 from mddag_executor.live.compat import (
     BareExecutor,
@@ -176,7 +177,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._errors: deque[BaseException] = deque()
         self._process = process
         self._unclaimed = Unclaimed(self._fail)
-        self._attention = threading.Event()
+        self._attention = Bell()
         self._spinning = threading.Lock()
         self._finished = False
         self._freeze_gc = freeze_gc
@@ -303,7 +304,7 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _ring(self) -> None:
         """End the wait of whoever spins."""
-        self._attention.set()
+        self._attention.ring()
         self.ring()
 
     def _hand_over(self) -> None:
@@ -355,7 +356,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self, future: Future, timeout_sec: float | None = None
     ) -> None:
         """Run callbacks on the pool until a future is done or the time is over."""
-        future.add_done_callback(QuickCallback(self._attention.set))
+        future.add_done_callback(QuickCallback(self._attention.ring))
         try:
             with short_switch_interval():
                 self._spin(lambda: future.done() or future.cancelled(), timeout_sec)
@@ -396,7 +397,6 @@ class MultiDeadlineExecutor(BareExecutor):
                     if left <= 0:
                         return
                 self._stop_watch.wait(left)
-                self._attention.clear()
             self._raise_error()
         except RCL_ERRORS:
             self._check_context()
@@ -446,11 +446,11 @@ class MultiDeadlineExecutor(BareExecutor):
         intake: EventsIntake | WaitSetIntake
         if kind == 'events':
             intake = EventsIntake(
-                self.context, self._receiver, on_shutdown=self._attention.set,
+                self.context, self._receiver, on_shutdown=self._attention.ring,
                 serve_here=self._pool.serve_here)
         else:
             intake = WaitSetIntake(
-                self.context, self._receiver, self.guards(), on_shutdown=self._attention.set)
+                self.context, self._receiver, self.guards(), on_shutdown=self._attention.ring)
         self._intake = intake
         self._upkeep.add_intake(intake)
         self._upkeep.refresh()

@@ -86,6 +86,8 @@ class Interpreter:
         self._closed = False
         # whom to look at, when that was done last, and what he had computed then
         self._seen: tuple[Work | None, int, int] = (None, 0, 0)
+        # who has never waited yet, and for whom the alarm is set late enough
+        self._trusted: Work | None = None
         self._idle = 0
 
     # --- measuring -------------------------------------------------------------------------------
@@ -122,6 +124,7 @@ class Interpreter:
         holder = engine.interpreter_holder() if engine.held_back or pauses else None
         if holder is None:
             self._seen = None, 0, 0
+            self._trusted = None
             if self.rings_at:
                 self.rings_at = 0
                 self._alarm.start(0)
@@ -132,6 +135,8 @@ class Interpreter:
             if (seat is not None and seat.cpu_clock is not None
                     and seat.thread is not threading.current_thread()):
                 habit.was_released(self._computes_now(seat.cpu_clock))
+        if holder is self._trusted and self.rings_at and not pauses:
+            return
         is_trusted = habit.is_trusted and not pauses
         if holder is self._seen[0]:
             if not self.rings_at:
@@ -142,8 +147,10 @@ class Interpreter:
             self._idle = 0
             self._note(holder)
             self._watch(LOOK_NS)
-        elif not self.rings_at:
-            self._watch(PATIENCE_NS)
+        else:
+            self._trusted = holder
+            if self.rings_at - monotonic_ns() < PATIENCE_NS // 2:
+                self._watch(PATIENCE_NS)
 
     def _watch(self, ns: int) -> None:
         """Set the alarm for the next look."""

@@ -25,8 +25,9 @@ interpreter's lock, no thread runs either: that looks the same.
 from __future__ import annotations
 
 from collections.abc import Callable
-import threading
 import time
+
+from mddag_executor.live.alarm import Bell
 
 SLICE_NS = 20_000_000
 SHORT_NS = 5_000_000
@@ -34,7 +35,7 @@ SHORT_NS = 5_000_000
 
 class StopWatch:
     """
-    Waits for an event, and tells of the stops meanwhile.
+    Waits for a bell, and tells of the stops meanwhile.
 
     :param stopped: gets begin and end of each stop, as ``clock`` has them.
     :param clock: ns.
@@ -43,12 +44,12 @@ class StopWatch:
     """
 
     def __init__(
-        self, event: threading.Event, stopped: Callable[[int, int], None],
+        self, bell: Bell, stopped: Callable[[int, int], None],
         clock: Callable[[], int] = time.monotonic_ns,
         cpu: Callable[[], int] = time.process_time_ns,
         look: Callable[[], None] = lambda: None,
     ) -> None:
-        self._event = event
+        self._wait = bell.wait
         self._stopped = stopped
         self._look = look
         self._clock = clock
@@ -64,13 +65,13 @@ class StopWatch:
         self._last, self._used = self._clock(), self._cpu()
 
     def wait(self, seconds: float) -> None:
-        """Wait until the event is set, or the time is over."""
+        """Wait until it rings, or the time is over."""
         now = self._clock()
         end = now + int(seconds * 1e9)
-        is_set = False
-        while not is_set and now < end:
+        rang = False
+        while not rang and now < end:
             slice_ns = min(end - now, SLICE_NS)
-            is_set = self._event.wait(slice_ns / 1e9)
+            rang = self._wait(slice_ns / 1e9)
             last, used = self._last, self._used
             self._look_at_clocks()
             now = self._last

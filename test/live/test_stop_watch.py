@@ -16,7 +16,7 @@ MS = 1_000_000
 
 
 class Machine:
-    """A virtual clock, and an event whose waits end late as they are told to: (wall, CPU)."""
+    """A virtual clock, and a bell whose waits end late as they are told to: (wall, CPU)."""
 
     def __init__(self, *late: tuple[int, int], set_after: int = 0) -> None:
         self.now, self.cpu = 1000 * MS, 5 * MS
@@ -35,8 +35,8 @@ class Machine:
         """Return the stops while it waited, from its begin."""
         found: list[tuple[int, int]] = []
         begin = self.now
-        event: Any = self
-        StopWatch(event, lambda *stop: found.append(stop), lambda: self.now,
+        bell: Any = self
+        StopWatch(bell, lambda *stop: found.append(stop), lambda: self.now,
                   lambda: self.cpu).wait(seconds)
         return [(first - begin, last - begin) for first, last in found]
 
@@ -59,8 +59,8 @@ def test_a_stop_beyond_the_end_is_one_stop() -> None:
 def test_a_stop_between_two_waits_is_one() -> None:
     found: list[tuple[int, int]] = []
     machine = Machine()
-    event: Any = machine
-    watch = StopWatch(event, lambda *stop: found.append(stop), lambda: machine.now,
+    bell: Any = machine
+    watch = StopWatch(bell, lambda *stop: found.append(stop), lambda: machine.now,
                       lambda: machine.cpu)
     machine.now += 500 * MS
     watch.start()  # what was before does not count
@@ -70,7 +70,7 @@ def test_a_stop_between_two_waits_is_one() -> None:
     assert found == [(1500 * MS, 1500 * MS), (1520 * MS + 10 * MS, 1820 * MS)]
 
 
-def test_it_waits_no_longer_than_until_the_event() -> None:
+def test_it_waits_no_longer_than_until_it_rings() -> None:
     machine = Machine(set_after=2)
     machine.stops(0.1)
     assert machine.waits == [SLICE_NS, SLICE_NS]

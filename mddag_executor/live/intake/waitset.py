@@ -33,6 +33,7 @@ from collections.abc import Callable, Iterable
 import threading
 import time
 
+from mddag_executor.live.alarm import Bell
 from mddag_executor.live.compat import RCLError
 from mddag_executor.live.compat.wait_set import RefilledSet
 from mddag_executor.live.intake.arrivals import Receiver
@@ -112,9 +113,8 @@ class WaitSetIntake:
         self._changed = False
         self._rebuild_at = 0
         self._filled: RefilledSet | None = None
-        # Whoever sleeps, sleeps on this lock or on this guard condition; a wake rings both.
-        self._bell = threading.Lock()
-        self._bell.acquire()
+        # Whoever sleeps, sleeps on this bell or on this guard condition; a wake rings both.
+        self._bell = Bell()
         self._guard: GuardCondition | None = None
         if self._guards or self._kinds != {'timers'}:
             self._guard = GuardCondition(None, None, context)
@@ -143,10 +143,7 @@ class WaitSetIntake:
 
     def wake(self) -> None:
         """End the present wait, or the next one, early; from any thread."""
-        try:
-            self._bell.release()
-        except RuntimeError:
-            pass  # it rings already
+        self._bell.ring()
         if self._guard is not None:
             try:
                 self._guard.trigger()
@@ -214,7 +211,7 @@ class WaitSetIntake:
         """Wait for all but timers, for ever if the time is negative (see ``_turn``)."""
         filled = self._filled
         if filled is None or not (filled.size or self._guards):
-            return 0, self._bell.acquire(True, timeout_ns / 1e9 if timeout_ns >= 0 else -1)
+            return 0, self._bell.wait(timeout_ns / 1e9 if timeout_ns >= 0 else -1)
         try:
             filled.wait(timeout_ns)
         except InvalidHandle:
@@ -308,7 +305,7 @@ class WaitSetIntake:
                         self._receiver.on_intake_error(error)
                 if self._failures > PATIENCE and not ended:
                     # Something fails again and again without being used up: no busy loop.
-                    self._bell.acquire(True, min(0.1, 0.001 * self._failures))
+                    self._bell.wait(min(0.1, 0.001 * self._failures))
         finally:
             self._timers.watch_clocks(False)
             self._timers.update(())
