@@ -5,120 +5,167 @@ What recorded executions would have taken alone, without others that compute bes
 
 Theory of operation
 -------------------
-An execution that computed for ``cpu`` of its ``took`` waited for the rest: for something of its
-own, for Python's lock, or for a CPU.
+An execution takes the time from when it could have started to its end: dispatch and callback.  In
+that it stood still while it waited for Python's lock, or for a CPU.  How long, the model of the
+machine tells (``simulate.machine``) that predictions are made with: executions that are started
+when the recorded ones could have, and take what these would have alone, must end when these did.
+So the times are sought with which they do: first each takes what was recorded; what it then ends
+too late is taken off, and of what is still wrong a half, ``TURNS`` times in all.  What the model
+does not explain stays in the time, so that a schedule like the recorded one gives the recorded
+response times.
 
-* A callback *computes* if its executions that wait least wait for less than it computes.  It can
-  have waited for the lock only while at least two ran that compute with it, and for a CPU only
-  while as many computed as there are CPUs: the executor's own threads need one, too.
-* One that *waits* needs the lock and a CPU when it goes on, and publishes.  If others computed
-  then, it had to wait for a switch interval at most.
-* What a callback waits for itself is told by its executions that nobody can have disturbed: their
-  median; where there are none, by those that waited least beyond what others explain.  What an
-  execution waited for more than that is taken back, as far as others explain it.
+That is right where as many run beside one another as in the recording.  Where fewer do, what the
+model leaves over has to be told apart:  a callback *computes* if its executions that wait least
+wait for less than they compute; what such a callback waits for itself is told by its executions
+that hardly any other ran beside: the median; where there are too few, by those that waited least
+beyond what others explain.  What one waited for more than that, while others ran, is *theirs*.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
+from mddag_executor.core import Tables
 from mddag_executor.replay.happenings import Ints
-from mddag_executor.simulate.machine import BRIEF_NS, SWITCH_NS
+from mddag_executor.simulate import END, How, Load, schedule
 import numpy as np
 import numpy.typing as npt
 
 LEAST = 0.05
 """So many of a callback's executions are those that wait least."""
+HARDLY = 0.1
+"""Others hardly ran beside one if they did for no more than this part of its time."""
+ENOUGH = 5
+"""So many executions that hardly any other ran beside are enough to tell."""
+TURNS = 5
 
 Flags = npt.NDArray[np.bool_]
 
 
-def computing(callback: Ints, took: Ints, cpu: Ints) -> Flags:
+class Recorded(NamedTuple):
     """
-    Return by execution whether its callback computes.
+    Recorded executions, by columns, ns.
 
-    :param callback: a number by execution; ``cpu`` is -1 where it is not known.
+    ``could`` tells when they could have started, and ``took`` what they took from then on;
+    ``cpu`` is -1 where it is not known; ``locks`` tells whether they compute with Python's lock,
+    ``interpreter`` which one that is, from 1; ``callback`` is a number.
     """
+
+    could: Ints
+    took: Ints
+    cpu: Ints
+    locks: Flags
+    interpreter: Ints
+    callback: Ints
+
+    def of(self, which: Flags) -> Recorded:
+        """Return some of them."""
+        return Recorded(
+            self.could[which], self.took[which], self.cpu[which], self.locks[which],
+            self.interpreter[which], self.callback[which])
+
+
+def alone(ran: Recorded, cpus: int = 0, beside: float = 1.0) -> Ints:
+    """
+    Return what executions would have taken alone.
+
+    :param cpus: of the machine; 0: not known.
+    :param beside: how many are to run beside one, of those that did in the recording.
+    """
+    took = ran.took.copy()
+    some = _beside(ran.could, ran.could + ran.took) > 0
+    took[some] = _explained(ran.of(some), cpus)
+    if beside < 1.0:
+        took -= np.rint((1.0 - beside) * _theirs(ran, took)).astype(np.int64)
+    return took
+
+
+def computing(callback: Ints, took: Ints, cpu: Ints) -> Flags:
+    """Return by execution whether its callback computes; ``cpu`` is -1 where it is not known."""
     computes = np.zeros(len(took), dtype=np.bool_)
-    for which in _by_callback(callback, cpu):
+    for which in _by_callback(callback, cpu >= 0):
         waited = np.quantile(np.maximum(0, took[which] - cpu[which]), LEAST)
         computes[which] = waited <= np.median(cpu[which])
     return computes
 
 
-def _by_callback(callback: Ints, cpu: Ints) -> Iterator[Ints]:
-    """Yield the executions of each callback of which the CPU time is known."""
-    known = np.flatnonzero(cpu >= 0)
-    known = known[np.argsort(callback[known], kind='stable')]
-    for which in np.split(known, np.flatnonzero(np.diff(callback[known])) + 1):
+def _by_callback(callback: Ints, those: Flags) -> Iterator[Ints]:
+    """Yield some executions of each callback."""
+    places = np.flatnonzero(those)
+    places = places[np.argsort(callback[places], kind='stable')]
+    for which in np.split(places, np.flatnonzero(np.diff(callback[places])) + 1):
         if len(which):
             yield which
 
 
-def alone(
-    start: Ints, took: Ints, cpu: Ints, callback: Ints, locks: Flags, interpreter: Ints, cpus: int
-) -> Ints:
-    """
-    Return what executions would have taken alone, ns.
-
-    :param took: how long they took, all in all.
-    :param cpu: their CPU time, -1 where it is not known: they took what they would have.
-    :param callback: the number of their callback.
-    :param locks: whether they compute with Python's lock, and ``interpreter``: which one.
-    :param cpus: of the machine; 0: not known.
-    """
-    computes = computing(callback, took, cpu)
-    computed = np.minimum(cpu, took)
-    waited = np.where(cpu >= 0, took - computed, 0)
-    for_others = np.minimum(
-        waited, _for_others(start, took, computed, computes, locks, interpreter, cpus))
-    result = took.copy()
-    for which in _by_callback(callback, cpu):
-        own = waited[which] - for_others[which]
-        undisturbed = own[for_others[which] == 0]
-        usual = int(np.median(undisturbed) if len(undisturbed) else np.quantile(own, LEAST))
-        result[which] -= np.minimum(np.maximum(0, waited[which] - usual), for_others[which])
-    return result
+def _explained(ran: Recorded, cpus: int) -> Ints:
+    """Return the times with which the model ends executions when they ended."""
+    least = np.minimum(np.maximum(0, ran.cpu), ran.took) // 2
+    took = ran.took.copy()
+    for turn in range(TURNS):
+        wrong = ran.could + ran.took - _ends(ran, took, cpus)
+        if not wrong.any():
+            break
+        took = np.clip(took + (wrong // 2 if turn else wrong), least, ran.took)
+    return took
 
 
-def _for_others(
-    start: Ints, took: Ints, computed: Ints, computes: Flags, locks: Flags, interpreter: Ints,
-    cpus: int,
-) -> Ints:
-    """Return for how long executions can have waited for others, at most."""
-    end = start + took
-    after = np.where(
-        2 * computed >= took, np.minimum(computed, BRIEF_NS), computed - computed // 4)
-    last = np.maximum(start, end - after - SWITCH_NS)   # of one that waits
-    waits = (computed >= 0) & ~computes
-    found = np.zeros(len(took), dtype=np.int64)
-    if cpus > 0:
-        for which, begin, most in (
-                (computes, start, max(1, cpus - 1)), (waits, last, cpus - 1)):
-            busy = time_of(start[computes], end[computes], most)
-            found[which] += (busy(end) - busy(begin))[which]
-    for number in np.unique(interpreter[locks]).tolist():
-        mine = locks & (interpreter == number)
-        here = waits & ~mine & (interpreter == number)
-        for which, begin, most in ((mine, start, 1), (here, last, 0)):
-            held = time_of(start[mine], end[mine], most)
-            found[which] += (held(end) - held(begin))[which]
-    return found
+def _ends(ran: Recorded, took: Ints, cpus: int) -> Ints:
+    """Return when the model ends executions that take so long alone."""
+    order = np.argsort(ran.could, kind='stable')
+    times = ran.could[order]
+    ended = np.searchsorted(np.sort(ran.could + took), times, 'right')
+    most = int((np.arange(1, len(times) + 1) - ended).max(initial=1))
+    n = int(ran.interpreter.max(initial=1))
+    load = Load(
+        times.tolist(), (ran.interpreter[order] - 1).tolist(), list(range(len(times))),
+        took[order].tolist(), [0] * n, [1] * n, holds=[0] * len(times) if ran.locks.any() else [],
+        computed=ran.cpu[order].tolist(), locks=ran.locks[order].astype(np.int64).tolist())
+    # those that stand still are more than those that ran
+    how = How('fifo', 2 * most + 2, cpus=cpus or len(times) + 1)
+    horizon = int(times.max(initial=0) + took.sum() + 1)
+    ends = np.zeros(len(times), dtype=np.int64)
+    for now, kind, _, _, _, job in schedule(_interpreters(n), load, how, horizon, log=True).log:
+        if kind == END:
+            ends[order[job]] = now
+    return ends
 
 
-def time_of(begins: Ints, ends: Ints, more_than: int) -> Callable[[Ints], Ints]:
-    """Return a function of a time: how long, until then, more than so many ran at once."""
+def _interpreters(n: int) -> Tables:
+    """Return tables with a DAG of one vertex, of which nothing is declared, in each process."""
+    one = Tables.build(None)
+    columns: dict[str, Any] = {
+        name: value * n for name, value in one._asdict().items() if isinstance(value, list)}
+    numbers = list(range(n))
+    return one._replace(**columns)._replace(
+        n_dags=n - 1, n_vertices=n - 1, dag_of=numbers, source=numbers, first_vertex=numbers,
+        process=[number + 1 for number in numbers],
+        first_sink=[0] * (n + 1), first_successor=[0] * (n + 1))
+
+
+def _theirs(ran: Recorded, took: Ints) -> Ints:
+    """Return what executions that take so long waited for others that ran beside them."""
+    beside = _beside(ran.could, ran.could + ran.took)
+    least = np.minimum(np.maximum(0, ran.cpu), ran.took)
+    waited = took - least
+    theirs = np.minimum(waited, 0)
+    for which in _by_callback(ran.callback, computing(ran.callback, ran.took, ran.cpu)):
+        by_itself = which[beside[which] <= HARDLY * ran.took[which]]
+        usual = (np.median(waited[by_itself]) if len(by_itself) >= ENOUGH
+                 else np.quantile(np.maximum(0, waited - beside)[which], LEAST))
+        more = waited[which] - max(0, int(usual))
+        theirs[which] += np.minimum(np.maximum(0, more), beside[which])
+    return theirs
+
+
+def _beside(begins: Ints, ends: Ints) -> Ints:
+    """Return by interval for how long there was at least one other."""
     times = np.concatenate([begins, ends])
     order = np.argsort(times, kind='stable')
-    times = times[order]
+    times = times[order] - begins.min(initial=0)
     count = np.cumsum(np.repeat([1, -1], len(begins))[order])
-    total = np.concatenate([[0], np.cumsum(np.diff(times) * (count[:-1] > more_than))])
-
-    def until(when: Ints) -> Ints:
-        if not len(times):
-            return np.zeros(len(when), dtype=np.int64)
-        passed: Ints = np.rint(np.interp(when - times[0], times - times[0], total)).astype(
-            np.int64)
-        return passed
-
-    return until
+    total = np.concatenate([[0], np.cumsum(np.diff(times) * (count[:-1] > 1))])
+    until = (np.interp(each - begins.min(initial=0), times, total) for each in (ends, begins))
+    passed: Ints = np.rint(next(until) - next(until)).astype(np.int64)
+    return passed

@@ -15,9 +15,7 @@ it could have started at once.  (It may still have waited: a worker that is abou
 to take what it has started itself.)  Else it had to wait for the worker that took it, until that
 had ended what it did before.
 
-What passed while another execution of its process computed is not the executor's, beyond what is
-usual: one that computes had to wait for its turn, and a thread that begins for the interpreter or
-a CPU.
+One that holds the interpreter had to wait for its turn: for the end of the last one that held it.
 """
 
 from __future__ import annotations
@@ -67,13 +65,12 @@ class Dispatches:
         self._process.append(process)
         return len(self._start) - 1
 
-    def late(self, computing: Any = ()) -> Any:
+    def late(self, holding: Any = ()) -> Any:
         """
         Return by number how late it was dispatched, ns, as an array.
 
-        :param computing: the numbers of those that compute.
+        :param holding: the numbers of those that hold their interpreter.
         """
-        from mddag_executor.replay.alone import time_of
         import numpy as np
         free, start, end, worker = (
             np.array(column, dtype=np.int64) for column in (
@@ -85,15 +82,10 @@ class Dispatches:
             n_free, n_ended = (
                 np.searchsorted(np.sort(times[here]), free, 'right') for times in (free, end))
             could = np.where(here & (n_free - n_ended <= self._n_workers), free, could)
-        computing = np.array(computing, dtype=np.int64)
-        beside = np.zeros(len(start), dtype=np.int64)
-        for number in np.unique(process[computing]).tolist():
-            mine, here = computing[process[computing] == number], process == number
+        holding = np.array(holding, dtype=np.int64)
+        for number in np.unique(process[holding]).tolist():
+            mine = holding[process[holding] == number]
             ended = np.sort(end[mine])
             place = np.searchsorted(ended, start[mine], 'right') - 1
             could[mine] = np.maximum(could[mine], np.where(place >= 0, ended[place], 0))
-            until = time_of(start[mine], end[mine], 0)
-            beside[here] = (until(start) - until(np.minimum(could, start)))[here]
-        late = np.maximum(0, start - could)
-        usual = np.median(late[beside == 0]) if (beside == 0).any() else 0
-        return np.maximum(np.minimum(late, usual), late - beside).astype(np.int64)
+        return np.maximum(0, start - could)

@@ -90,8 +90,8 @@ class _Jobs:
         self.release = array('q')
         self.noticed = array('q')
         self.round = array('q')
-        self.took, self.start, self.end, self.dispatch, self.cpu, self.held = (
-            array('q') for _ in range(6))
+        self.took, self.start, self.end, self.dispatch, self.cpu, self.held, self.late = (
+            array('q') for _ in range(7))
         self.arrived = array('q')
         self._new = array('q', [_UNKNOWN]) * self.size
         self._new_edges = array('q', [_UNKNOWN]) * n_edges
@@ -250,19 +250,20 @@ class LoadBuilder(Observer):
                 for dag in self._task_set.dags]
 
     def build(
-        self, overheads: bool = True, process: Sequence[int] | None = None
+        self, overheads: bool = True, process: Sequence[int] | None = None, beside: float = 1.0,
     ) -> RecordedLoad:
         """
         Return what was collected.
 
         :param process: by vertex the process that it is to run in; None: as recorded.
+        :param beside: how many executions are to run beside one, of those that did.
         """
         import numpy as np
         if self._leg is not None:
             self._others.append(self._leg[1])
             self._leg = None
         locks = self._locks()
-        computing = self._take_back(locks)
+        every, usual = self._alone(locks, beside)
         process = process or self._process
         typical = self._typical()
         unknown: dict[str, None] = {}
@@ -272,11 +273,6 @@ class LoadBuilder(Observer):
         holds: list[int] = []
         bases: list[int] = []
         dispatches: list[int] = []
-        measured = self._all('dispatch')
-        late = self._dispatches.late(measured[(measured >= 0) & computing])
-        measured = measured[measured >= 0]
-        usual = quantile(np.sort(late[measured]).tolist(), 0.5) if len(measured) else 0
-        late = np.append(late, usual)  # number -1
         demand = 0
         for dag, jobs in zip(self._task_set.dags, self._jobs):
             bases.append(len(costs))
@@ -293,14 +289,13 @@ class LoadBuilder(Observer):
             demand += int(took.sum())
             self._computing(dag, jobs, took, missing, computed, holds, process)
             if overheads:
-                added = late[np.array(jobs.dispatch, dtype=np.int64).reshape(-1, jobs.size)]
-                took += added
-                dispatches.extend(added.ravel().tolist())
+                took += np.array(jobs.late, dtype=np.int64).reshape(-1, jobs.size)
+                dispatches.extend(jobs.late)
             costs.extend(took.ravel().tolist())
         executions = len(costs)
         bases.append(len(costs))
         others = sorted(self._others)
-        costs.extend(max(0, took) + (int(late[number]) if number >= 0 else 0)
+        costs.extend(max(0, took) + (int(every[number]) if number >= 0 else 0)
                      for _, took, number in others)
         computed += [_UNKNOWN] * len(others)
         holds += [0] * len(others)
@@ -313,7 +308,7 @@ class LoadBuilder(Observer):
             delay_base=[0, *accumulate(len(jobs.arrived) for jobs in self._jobs[:-1])])
         return RecordedLoad(
             load, [jobs.numbers for jobs in self._jobs], demand, executions, estimated,
-            list(unknown), usual if len(measured) else None, transport, dispatches)
+            list(unknown), usual, transport, dispatches)
 
     def _fates(self, bases: list[int], executions: int) -> list[int]:
         """Return which executions failed, or were skipped; empty: none."""
@@ -352,29 +347,37 @@ class LoadBuilder(Observer):
             np.tile(by_vertex[first:first + jobs.size], len(jobs.numbers))
             for first, jobs in zip(self._first, self._jobs)])
 
-    def _take_back(self, locks: Any) -> Any:
+    def _alone(self, locks: Any, beside: float) -> tuple[Any, int | None]:
         """
-        Make the execution times those that the executions would have taken alone.
+        Make times those that executions would have taken alone (see ``alone``).
 
-        :return: which of them compute, all in all.
+        ``took`` becomes what their callbacks take, ``late`` what the executor does.
+
+        :return: how late executions were, by number, the last one what is usual; and that.
         """
-        from mddag_executor.replay.alone import alone, computing
-        took, start, cpu = (self._all(name) for name in ('took', 'start', 'cpu'))
-        interpreter, callback = (
-            self._by_execution(self._process), self._by_execution(self._callbacks))
-        cpu[took < 0] = _UNKNOWN
-        computes = computing(callback, took, cpu)
-        if not (cpu >= 0).any():
-            return computes
-        ran = took >= 0
-        took[ran] = alone(start[ran], took[ran], cpu[ran], callback[ran], locks[ran],
-                          interpreter[ran], self._cpus)
-        first = 0
-        for jobs in self._jobs:
-            n = len(jobs.took)
-            jobs.took = array('q', took[first:first + n].tobytes())
-            first += n
-        return computes
+        from mddag_executor.replay.alone import alone, Recorded
+        import numpy as np
+        number, took, start, cpu = (
+            self._all(name) for name in ('dispatch', 'took', 'start', 'cpu'))
+        every = self._dispatches.late(number[locks & (number >= 0)])
+        known = number[number >= 0]
+        usual = quantile(np.sort(every[known]).tolist(), 0.5) if len(known) else 0
+        every = np.append(every, usual)     # number -1
+        late = every[number]
+        ran = np.flatnonzero((took >= 0) & (start >= 0))
+        if (cpu[ran] >= 0).any():
+            recorded = Recorded(
+                start[ran] - late[ran], took[ran] + late[ran], cpu[ran], locks[ran],
+                self._by_execution(self._process)[ran], self._by_execution(self._callbacks)[ran])
+            cost = alone(recorded, self._cpus, beside)
+            # what is less than recorded: it began late, or it stood still later
+            began = np.minimum(recorded.took - cost, np.maximum(0, late[ran] - usual))
+            took[ran] = np.maximum(0, cost - late[ran] + began)
+            late[ran] = cost - took[ran]
+        ends = np.cumsum([len(jobs.took) for jobs in self._jobs])[:-1]
+        for jobs, *columns in zip(self._jobs, np.split(took, ends), np.split(late, ends)):
+            jobs.took, jobs.late = (array('q', column.tobytes()) for column in columns)
+        return every, usual if len(known) else None
 
     def _computing(
         self, dag: Dag, jobs: _Jobs, took: Any, missing: Any, computed: list[int],

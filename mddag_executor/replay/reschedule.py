@@ -230,7 +230,7 @@ def reschedule(
     tables = tables._replace(process=[*_processes(run, placed), 1])
     find_policy(policy).mode(preemptive, len(placed))
     with no_garbage():
-        work = builder.build(overheads, tables.process)
+        work = builder.build(overheads, tables.process, _beside(workers, each))
     if work.unknown:
         raise ReplayError(
             run.name, f'{counted(len(work.unknown), "callback")} did not complete in it, '
@@ -242,6 +242,11 @@ def reschedule(
         return Reschedule(
             recorded, work, tables, policy, workers, preemptive, overheads, dispatch_overhead,
             recorded.judge.judge_from, skip, cpus, placed)
+
+
+def _beside(workers: int, recorded: int) -> float:
+    """Return how many executions can run beside one in a process, of those that could."""
+    return min(1.0, (workers - 1) / (recorded - 1)) if recorded > 1 else 1.0
 
 
 def _processes(run: Run, placed: Sequence[Process]) -> list[int]:
