@@ -29,7 +29,7 @@ from mddag_executor.core import policy as find_policy
 from mddag_executor.core.tally import total
 from mddag_executor.simulate.deliveries import DELAY_NS
 from mddag_executor.simulate.load import edge_numbers, edges_of, Load
-from mddag_executor.simulate.schedule import How, schedule
+from mddag_executor.simulate.schedule import How, prepare, schedule
 from mddag_executor.simulate.workload import periodic_load
 from msg_graph import Process, TaskSet
 
@@ -58,6 +58,7 @@ class Predictor:
         self._cpus = cpus
         self._policy = find_policy(policy)
         self._duration = duration_ns
+        self._compiled: bool | None = None  # not known yet
 
     def predict(
         self, processes: Sequence[Process], execution_ns: Sequence[Sequence[int]]
@@ -73,7 +74,10 @@ class Predictor:
             holds=holds, delays=delays, delay_base=bases, delay_stride=[0] * len(bases)))
         how = How(
             self._policy.name, self._workers, cpus=self._cpus, processes=max(1, len(processes)))
-        decisions = schedule(tables, load, how, self._duration).decisions
+        if self._compiled is None:
+            self._compiled = prepare(tables, load, how, MOST_TRIES)
+        decisions = schedule(
+            tables, load, how, self._duration, compiled=self._compiled).decisions
         tally = Tally(task_set, tables)
         for time, dag in zip(load.times, load.dags):
             if time < self._duration:

@@ -43,6 +43,7 @@ QueueEntry = tuple[int, int, int, int, int]
 """What the ready queue holds: the four integers of a key, then the execution."""
 
 Decision = tuple[int, int, int, int, int, int]
+Kind = TypeVar('Kind')
 
 
 class State(NamedTuple):
@@ -114,6 +115,11 @@ def as_object(columns: Columns) -> Columns:
     return result
 
 
+def empty(kind: type[Kind]) -> Kind:
+    """Return a named tuple of columns that are all empty."""
+    return kind(*([] for _ in kind._fields))    # type: ignore[attr-defined]
+
+
 def new_state(
     tables: Tables,
     n_workers: int,
@@ -136,8 +142,7 @@ def new_state(
     :param switch_overhead: added to an execution each time it is preempted, ns.
     :param polling: what becomes ready waits for a poll (see ``queues``); never with preemption.
     """
-    columns: dict[str, list[int]] = {name: [] for name in State._fields}
-    state = State(**columns)  # type: ignore[arg-type]
+    state = empty(State)
     fill_state(
         tables, state, n_workers, int(preemptive), int(propagate), dispatch_overhead,
         switch_overhead, int(polling))

@@ -25,7 +25,9 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from copy import copy
+from functools import partial
 import math
 import multiprocessing
 import signal
@@ -34,11 +36,12 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core.jobs import is_miss
-from mddag_executor.core.state import Decision
 from mddag_executor.memory import no_garbage
 from mddag_executor.replay.as_recorded import slack as margin
 from mddag_executor.replay.load import RecordedLoad
 from mddag_executor.simulate import How, Load, schedule
+from mddag_executor.simulate.load import as_arrays
+from mddag_executor.simulate.schedule import prepare
 from msg_graph import TaskSet
 import numpy as np
 
@@ -49,6 +52,8 @@ LONG = 4
 """How many windows a load must be long for them to be worth it."""
 _MOST_WINDOWS = 8
 _FEW_S = 3.0
+_RUNS = 5
+"""About so many runs of the whole load it takes to find the factor of a callback."""
 _NO_DEADLINE = NEVER // 2
 ALL = -1
 """Stands for all callbacks."""
@@ -96,9 +101,10 @@ class Problem(NamedTuple):
         """Return the load."""
         return self.work if isinstance(self.work, Load) else self.work.load
 
-    def decide(self, load: Load, end: int, stop: bool) -> list[Decision]:
-        """Schedule a load up to a time, or its first miss; return what was decided."""
-        return schedule(self.tables, load, self.how, end, stop_at_first_miss=stop).decisions
+    def prepare(self, waiting: Callable[[], None]) -> bool:
+        """Tell whether to search compiled; if so, compile, and call ``waiting`` meanwhile."""
+        runs = _RUNS * len(set(self.callback_of))
+        return prepare(self.tables, self.load, self.how, runs, waiting)
 
 
 class Found(NamedTuple):
@@ -117,19 +123,25 @@ class Fewer(NamedTuple):
 
 
 class Search:
-    """Looks for the greatest factors of a problem."""
+    """
+    Looks for the greatest factors of a problem.
 
-    def __init__(self, problem: Problem) -> None:
+    :param compiled: whether the core runs compiled (see ``Problem.prepare``).
+    """
+
+    def __init__(self, problem: Problem, compiled: bool = False) -> None:
         self._problem = problem
-        load, tables = problem.load, problem.tables
-        self._costs = np.array(load.costs, dtype=np.int64)
+        self._compiled = compiled
+        load, tables = as_arrays(problem.load), problem.tables
+        self._load = load
+        self._costs: Any = load.costs
         self._dispatches = np.zeros_like(self._costs)
-        self._computed = np.array(load.computed, dtype=np.int64)
+        self._computed: Any = load.computed
         work = problem.work
         if isinstance(work, RecordedLoad):
             self._dispatches[:len(work.dispatches)] = work.dispatches
         self._of = self._callback_of_cost(load, tables)
-        self._length = load.times[-1] - load.times[0] if load.times else 0
+        self._length = int(load.times[-1] - load.times[0]) if len(load.times) else 0
         self._stops = True
         #: Windows in which something broke, the last one first.
         self._windows: list[tuple[int, int]] = []
@@ -167,10 +179,14 @@ class Search:
     def _misses(
         self, scaled: tuple[Load, int], stop: bool, of_any: bool = False
     ) -> Iterator[Miss]:
-        for kind, _, vertex, _, deadline, until in self._problem.decide(*scaled, stop):
+        problem, (load, end) = self._problem, scaled
+        decisions = schedule(
+            problem.tables, load, problem.how, end, stop_at_first_miss=stop,
+            compiled=self._compiled).decisions
+        for kind, _, vertex, _, deadline, until in decisions:
             if is_miss(kind) and (of_any or vertex not in self.left_out):
-                yield Miss(vertex, deadline,
-                           deadline - self._problem.tables.sink_deadline[vertex], until)
+                release = deadline - problem.tables.sink_deadline[vertex]
+                yield Miss(vertex, deadline, release, until)
 
     def _scaled(self, callback: int, factor: float) -> tuple[Load, int]:
         """Return the load with a callback that takes longer, and the end of the run."""
@@ -182,8 +198,7 @@ class Search:
         if len(computed):
             which &= computed >= 0
             computed[which] = np.minimum(computed[which] * factor, NEVER >> 8).astype(np.int64)
-        return (self._problem.load._replace(costs=costs.tolist(), computed=computed.tolist()),
-                self._problem.end)
+        return self._load._replace(costs=costs, computed=computed), self._problem.end
 
     def miss(
         self, callback: int, factor: float, window: tuple[int, int] | None = None,
@@ -293,19 +308,22 @@ def find_slack(
     :param progress: called with the number of callbacks that are done.
     :param jobs: how many processes search, where it is not quick.
     """
-    search = Search(problem)
+    compiled = problem.prepare(lambda: progress(0))
+    search = Search(problem, compiled)
     rest = sorted(set(problem.callback_of))
     found = {ALL: search.factor(ALL)}
     begin, quick = time.monotonic(), True
     while rest and (quick or jobs == 1):
         callback = rest.pop(0)
-        found[callback] = search.factor(callback)
+        found[callback] = _factor(search, callback)
         progress(len(found) - 1)
         quick = (time.monotonic() - begin) * len(rest) < _FEW_S * (len(found) - 1)
     if rest:
+        number = min(len(rest), jobs)
         spawn = multiprocessing.get_context('spawn')
-        with ProcessPoolExecutor(min(len(rest), jobs), spawn, _start, (problem,)) as pool:
-            for callback, one in zip(rest, pool.map(_factor, rest)):
+        with ThreadPoolExecutor(number) if compiled else \
+                ProcessPoolExecutor(number, spawn, _start) as pool:
+            for callback, one in zip(rest, pool.map(partial(_factor, search), rest)):
                 found[callback] = one
                 progress(len(found) - 1)
     return Slack(found, search.left_out, {of: search.fewer(of) for of in ('workers', 'cpus')})
@@ -343,15 +361,10 @@ def slack_result(
                   for dag in dags.values() for name, sink in dag['sinks'].items()}}
 
 
-_search: Search | None = None   # of this process, if it is a worker
-
-
-def _start(problem: Problem) -> None:
-    global _search
+def _start() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the first process's to handle
-    _search = Search(problem)
 
 
-def _factor(callback: int) -> Found:
-    assert _search is not None
-    return _search.factor(callback)
+def _factor(search: Search, callback: int) -> Found:
+    """Return a callback's factor, the same in whatever order and by whomever it is looked for."""
+    return copy(search).factor(callback)    # whose windows go to no other

@@ -23,8 +23,7 @@ from typing import Protocol
 
 from mddag_executor.core import quantile, Tables
 from mddag_executor.replay.load import RecordedLoad
-from mddag_executor.simulate.load import edge_numbers
-from mddag_executor.simulate.schedule import needs_python
+from mddag_executor.simulate.load import edge_numbers, needs_python
 
 
 class Times(Protocol):

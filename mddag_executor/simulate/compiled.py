@@ -6,47 +6,73 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core.policies import POLICIES
 from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.core.state import Decision, State
 from mddag_executor.core.tables import Tables
 from mddag_executor.simulate.compiling import (
+    available,
     cached_entries,
     compile_elsewhere,
     entries_of,
     keeps_entries,
 )
+from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.draws import Times
-from mddag_executor.simulate.engine import LogEntry
+from mddag_executor.simulate.engine import LogEntry, Orders
 from mddag_executor.simulate.lending import EmptyMemory, LentTuple
 from mddag_executor.simulate.load import Load
-from mddag_executor.simulate.run import Settings
+from mddag_executor.simulate.machine import Machine
 from mddag_executor.simulate.workload import periodic_load
 from msg_graph import TaskSet
 import numpy as np
 import numpy.typing as npt
 
-_ENTRIES = ('accept_runs', 'run_once', 'free_run')
+if TYPE_CHECKING:
+    from mddag_executor.simulate.run import Settings
+
+ACCEPT_RUNS, RUN_ONCE = 'accept_runs', 'run_once'
+"""What is compiled: for ``evaluate``, and for all else."""
 _WORD = 8
 
+# Roughly, to choose what is sooner done: how long compiling takes.
+_COMPILE_S = {ACCEPT_RUNS: 15.0, RUN_ONCE: 40.0}
 
-def cached() -> bool:
-    """Tell whether what ``evaluate`` needs has been compiled before (for any processor)."""
-    return cached_entries('accept_runs')
+_ready: set[str] = set()    # what this process has loaded
+
+
+def pays(name: str, plain_s: float) -> bool:
+    """Tell whether to compile, or load what was, for work that takes plain Python that long."""
+    return name in _ready or (
+        available() and (plain_s > _COMPILE_S[name] or cached_entries(name)))
+
+
+def prepare(name: str, waiting: Callable[[], None] = lambda: None) -> None:
+    """Compile, and call ``waiting`` now and then, or load what was compiled before."""
+    if name in _ready:
+        return
+    if keeps_entries() and not cached_entries(name):
+        compile_elsewhere(f'{__name__}.compile_here({name!r})', waiting)
+    compile_here(name)
+    _ready.add(name)
 
 
 @cache
 def _entries() -> dict[str, Callable[..., Any]]:
     from mddag_executor.simulate import kernel
-    return entries_of(kernel, _ENTRIES)
+    return entries_of(kernel, (ACCEPT_RUNS, RUN_ONCE, 'free_run'))
 
 
-def compile_here() -> None:
-    """Compile what ``evaluate`` needs, by evaluating no run of nothing."""
+def compile_here(name: str) -> None:
+    """Compile, or load, by running nothing."""
+    if name == RUN_ONCE:
+        run_once(Tables.build(None), Load([], [], [], [], [], []), 'rad',
+                 Orders(*[0] * len(Orders._fields)), False)
+        return
     nothing = EmptyMemory(max(len(Tables._fields) + 1, len(State._fields)))
-    _entries()['accept_runs'](
+    _entries()[ACCEPT_RUNS](
         nothing.address, nothing.address, nothing.address, 0, 0, 1, 0, 0, 0, 0, 1, False,
         np.zeros(0, dtype=np.bool_))
 
@@ -70,10 +96,7 @@ class CompiledJudge:
 
     def warm_up(self, waiting: Callable[[], None] = lambda: None) -> None:
         """Compile, and call ``waiting`` now and then, or load what was compiled before."""
-        if keeps_entries() and not cached():
-            compile_elsewhere(__name__, waiting)
-        none = np.ones((0, self._columns), dtype=np.int64)
-        self(Settings(preemptive=False, judge='completions'), none)
+        prepare(ACCEPT_RUNS, waiting)
 
     def __call__(self, settings: Settings, times: Times) -> npt.NDArray[np.bool_]:
         """Tell which of the runs met every deadline."""
@@ -82,7 +105,7 @@ class CompiledJudge:
         working = EmptyMemory(len(State._fields))
         times = np.ascontiguousarray(times, dtype=np.int64)
         accepted = np.zeros(len(times), dtype=np.bool_)
-        _entries()['accept_runs'](
+        _entries()[ACCEPT_RUNS](
             self._tables[list(POLICIES).index(settings.policy)].address, load.address,
             working.address, times.ctypes.data, self._columns * _WORD, settings.workers,
             int(settings.preempts), int(row.polling), settings.dispatch_overhead_ns,
@@ -90,29 +113,19 @@ class CompiledJudge:
         return accepted
 
 
-def run_compiled(
-    built: Tables, load: Load, settings: Settings
+def run_once(
+    tables: Tables, load: Load, policy: str, orders: Orders, keep_log: bool
 ) -> tuple[int, list[LogEntry], list[Decision]]:
-    """
-    Run the compiled core over a load, as ``engine.run`` does with the plain one.
-
-    It is there to be compared with that one, start by start (see ``test_compiled``).
-
-    :return: when the run ended (ns), the log of every worker, and the core's decisions.
-    """
-    row = find_policy(settings.policy)
-    lent = LentTuple(built, list(POLICIES).index(settings.policy))
-    lent_load = LentTuple(load)
-    working = EmptyMemory(len(State._fields))
-    log = EmptyMemory()
-    entries = _entries()
-    ended = entries['run_once'](
-        lent.address, lent_load.address, working.address, settings.workers,
-        int(settings.preempts), int(row.polling), settings.dispatch_overhead_ns,
-        settings.switch_overhead_ns, settings.duration_ns, settings.stop_at_first_miss,
-        settings.judge == 'horizon', log.address)
+    """Do what ``engine.run_load`` does: return the end, the log of every worker, the decisions."""
+    lent = [LentTuple(tables, list(POLICIES).index(policy)), LentTuple(load), LentTuple(orders)]
+    state, deliveries, machine, log = working = [
+        EmptyMemory(len(fields)) for fields in (
+            State._fields, Deliveries._fields, Machine._fields, ('log',))]
+    addresses = [each.address for each in working]
+    ended = _entries()[RUN_ONCE](*(each.address for each in lent), *addresses)
     try:
         place = State._fields.index('decisions')
-        return int(ended), log.rows(0, 6), working.rows(place, 6)  # type: ignore[return-value]
+        return (int(ended), log.rows(0, 6) if keep_log else [],  # type: ignore[return-value]
+                state.rows(place, 6))
     finally:
-        entries['free_run'](working.address, log.address)
+        _entries()['free_run'](*addresses)

@@ -46,13 +46,15 @@ from typing import Any
 
 from mddag_executor.core import jobs, policies, queues, rules, state, tables
 from mddag_executor.core.policies import POLICIES
-from mddag_executor.simulate import engine
+from mddag_executor.simulate import deliveries, engine, load, machine
 import numpy as np
 
-_MODULES = (tables, state, queues, jobs, policies, rules, engine)
+_MODULES = (
+    tables, state, queues, jobs, policies, rules, load, machine, deliveries, engine)
 _NOT_COMPILED = frozenset({
-    'new_state', 'add_queue', 'rad_offsets', 'latest_starts', 'policy',
-    'busy_times'})  # for plain lists
+    # for plain lists
+    'empty', 'as_object', 'new_state', 'add_queue', 'rad_offsets', 'latest_starts', 'policy',
+    'new_machine', 'new_deliveries', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers', 'busy_times'})
 _OWN = ('compiling', 'kernel', 'lending', 'structures', 'vectors')
 _REPLACED = ('add_queue', 'heapify', 'heappop', 'heappush')
 _KEEP_S = 90 * 86400
@@ -184,14 +186,14 @@ def _bound(function: Any, space: dict[str, Any], file: str | None = None) -> Fun
     return FunctionType(code, space, function.__name__, function.__defaults__)
 
 
-def compile_elsewhere(module: str, waiting: Callable[[], None] = lambda: None) -> None:
+def compile_elsewhere(call: str, waiting: Callable[[], None] = lambda: None) -> None:
     """
-    Have a process compile what a module needs; if it fails, this one does when it needs it.
+    Have a process compile what this one needs; if it fails, this one does when it needs it.
 
-    :param module: has ``compile_here``.
+    :param call: of a function of a module, ``MODULE.FUNCTION(ARGUMENTS)``, that compiles.
     :param waiting: called now and then meanwhile.
     """
-    program = f'from {module} import compile_here; compile_here()'
+    program = f'import {call.split("(")[0].rpartition(".")[0]}; {call}'
     path = os.pathsep.join(each or os.getcwd() for each in sys.path)
     try:
         process = subprocess.Popen(

@@ -25,10 +25,11 @@ what is None then costs nothing.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.state import add_slot, State
+from mddag_executor.core.state import add_slot, divide, fill_state, JUDGE_FROM, State
 from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.simulate.deliveries import (
     arrive_due,
@@ -37,14 +38,69 @@ from mddag_executor.simulate.deliveries import (
     next_arrival,
     sends_at_start,
 )
-from mddag_executor.simulate.load import Load, SKIPPED
-from mddag_executor.simulate.machine import decide, Machine, NEXT_TIME, settle, share, starts
+from mddag_executor.simulate.load import Load, needs_python, SKIPPED
+from mddag_executor.simulate.machine import (
+    decide,
+    fill_machine,
+    Machine,
+    NEXT_TIME,
+    settle,
+    share,
+    starts,
+)
 
 # Kinds of log entries.
 START, END, PREEMPT = range(3)
 
 LogEntry = tuple[int, int, int, int, int, int]
 """(time, kind, worker, DAG, global vertex, job): one change of a worker."""
+
+
+class Orders(NamedTuple):
+    """How to run a load, as integers: see ``schedule.How``."""
+
+    workers: int
+    processes: int
+    preemptive: int
+    polling: int
+    dispatch_overhead: int
+    switch_overhead: int
+    judge_from: int
+    cpus: int
+    horizon: int
+    stop_at_first_miss: int
+    judge_open: int
+
+
+def run_load(
+    t: Tables, s: State, d: Deliveries, m: Machine, key: KeyFunction, load: Load, o: Orders,
+    log: list[LogEntry] | None, progress: Callable[[int], None] | None,
+) -> int:
+    """Run the core over a load (see ``run``) with a state and so on that are all empty."""
+    sends = len(load.delay_base) > 0
+    stops = len(load.holds) > 0 or o.cpus < NEVER
+    fill_state(
+        t, s, o.workers * o.processes, o.preemptive, 2 if sends else 1, o.dispatch_overhead,
+        o.switch_overhead, o.polling)
+    if o.processes > 1:
+        divide(s, [o.workers] * o.processes)
+    s.scalars[JUDGE_FROM] = o.judge_from
+    stop = o.stop_at_first_miss != 0
+    if stops:
+        fill_machine(t, s, m, o.cpus, int(needs_python(load)))
+    if sends:
+        d.sent.append(0)
+        if stops:
+            ended = run(t, s, key, load, o.horizon, stop, log, progress, d, m)
+        else:
+            ended = run(t, s, key, load, o.horizon, stop, log, progress, d, None)
+    elif stops:
+        ended = run(t, s, key, load, o.horizon, stop, log, progress, None, m)
+    else:
+        ended = run(t, s, key, load, o.horizon, stop, log, progress, None, None)
+    if o.judge_open != 0 and ended == o.horizon:
+        jobs.finish(t, s, ended)
+    return ended
 
 
 def run(

@@ -24,6 +24,7 @@ from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.evaluation import Evaluation
 from mddag_executor.simulate.experiment import Chunk, Evaluator, Experiment, STRIDE
 from mddag_executor.simulate.pools import Pool, ProcessPool, ThreadPool
+from mddag_executor.simulate.schedule import SOON_S
 import numpy as np
 
 if TYPE_CHECKING:
@@ -38,9 +39,8 @@ _MOST_RUNS = 10 ** 8
 _KEEP_S = 5.0
 """So often what is done is kept."""
 
-# Roughly, to choose the core that is sooner done: plain Python's time for each vertex job, and the
-# compiled core's to be loaded and to be compiled.
-_PLAIN_S, _LOAD_S, _COMPILE_S = 6e-6, 1.0, 15.0
+# Roughly, to choose the core that is sooner done: plain Python's time for each vertex job.
+_PLAIN_S = 6e-6
 
 
 def evaluate(
@@ -78,7 +78,7 @@ def evaluate(
     evaluator = Evaluator(experiments, runs, compiled)
     evaluator.check()
     if core == 'auto' and not compiled and cluster is None and (
-            _plain_s(experiments, outcome.asked - outcome.runs) < _LOAD_S):
+            _plain_s(experiments, outcome.asked - outcome.runs) < SOON_S):
         jobs = 1  # it is done before other processes have started
     outcome.compiled, outcome.jobs = compiled, jobs
     begin = time.monotonic()
@@ -128,7 +128,7 @@ def uses_compiled(core: str, experiments: Sequence[Experiment], runs: int, jobs:
             f"core '{core}': there is no such core: choose one of {', '.join(CORES)}")
     if core == 'plain':
         return False
-    from mddag_executor.simulate.compiled import cached
+    from mddag_executor.simulate.compiled import ACCEPT_RUNS, pays
     from mddag_executor.simulate.compiling import available
     if core == 'compiled' and not available():
         raise SimulationError(
@@ -137,7 +137,7 @@ def uses_compiled(core: str, experiments: Sequence[Experiment], runs: int, jobs:
     if core == 'compiled' or not available():
         return core == 'compiled'
     plain_s = _plain_s(experiments, runs) / jobs
-    return plain_s > _LOAD_S and (plain_s > _COMPILE_S or cached())
+    return plain_s > SOON_S and pays(ACCEPT_RUNS, plain_s)
 
 
 def _plain_s(experiments: Sequence[Experiment], runs: int) -> float:

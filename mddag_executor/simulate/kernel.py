@@ -13,10 +13,15 @@ from typing import Any
 
 from mddag_executor.core.jobs import finish
 from mddag_executor.core.state import fill_state, State
-from mddag_executor.simulate.engine import any_missed, run
+from mddag_executor.simulate.deliveries import Deliveries
+from mddag_executor.simulate.engine import any_missed, run, run_load
+from mddag_executor.simulate.machine import Machine
 from mddag_executor.simulate.structures import (
+    as_deliveries,
     as_load,
     as_log,
+    as_machine,
+    as_orders,
     as_state,
     as_tables,
     as_vector,
@@ -25,6 +30,8 @@ from mddag_executor.simulate.structures import (
 from mddag_executor.simulate.vectors import free, set_address
 
 STATE_FIELDS = len(State._fields)
+DELIVERIES_FIELDS = len(Deliveries._fields)
+MACHINE_FIELDS = len(Machine._fields)
 
 
 def clear_state(state: int) -> None:
@@ -41,8 +48,13 @@ def clear_state(state: int) -> None:
 def free_state(state: int) -> None:
     """Free the memory of a state."""
     clear_state(state)
-    for field in range(STATE_FIELDS):
-        free(as_vector(state + 24 * field))
+    free_fields(state, STATE_FIELDS)
+
+
+def free_fields(structure: int, fields: int) -> None:
+    """Free the memory of a structure of vectors in which nothing is nested any more."""
+    for field in range(fields):
+        free(as_vector(structure + 24 * field))
 
 
 def accept_runs(
@@ -73,26 +85,20 @@ def accept_runs(
 
 
 def run_once(
-    tables: int, load: int, state: int, n_workers: int, preemptive: int, polling: int,
-    dispatch_overhead: int, switch_overhead: int, horizon: int, stop_at_first_miss: bool,
-    judge_open: bool, log: int,
+    tables: int, load: int, orders: int, state: int, deliveries: int, machine: int, log: int
 ) -> int:
-    """
-    Simulate one run and return when it ended; log and state are the caller's to free.
-
-    As in ``simulate``, what is open is judged unless the run stopped before its horizon.
-    """
-    t = as_tables(tables)
-    s = as_state(state)
-    fill_state(t, s, n_workers, preemptive, 1, dispatch_overhead, switch_overhead, polling)
-    ended = run(
-        t, s, key_of_policy, as_load(load), horizon, stop_at_first_miss, as_log(log), None)
-    if judge_open and not (stop_at_first_miss and ended < horizon):
-        finish(t, s, ended)
-    return ended
+    """Run a load and return when it ended; what it leaves is the caller's to free."""
+    return run_load(
+        as_tables(tables), as_state(state), as_deliveries(deliveries), as_machine(machine),
+        key_of_policy, as_load(load), as_orders(orders), as_log(log), None)
 
 
-def free_run(state: int, log: int) -> None:
+def free_run(state: int, deliveries: int, machine: int, log: int) -> None:
     """Free what ``run_once`` left."""
     free_state(state)
+    queues = as_machine(machine).lock_queue
+    for process in range(len(queues)):
+        free(queues[process])
+    free_fields(deliveries, DELIVERIES_FIELDS)
+    free_fields(machine, MACHINE_FIELDS)
     free(as_log(log))

@@ -27,7 +27,7 @@ class LentTuple:
             if isinstance(value, int):
                 words += [value, 0, 0]
                 continue
-            column = np.array(value, dtype=np.int64)
+            column = np.ascontiguousarray(value, dtype=np.int64)
             self._columns.append(column)
             words += [column.ctypes.data, len(column), len(column)]
         self._words = np.array(words, dtype=np.int64)
@@ -61,5 +61,4 @@ class EmptyMemory:
         if length == 0:
             return []
         data = (ctypes.c_int64 * (length * width)).from_address(address)
-        rows = np.ctypeslib.as_array(data).reshape(length, width).tolist()
-        return [tuple(row) for row in rows]
+        return list(zip(*np.ctypeslib.as_array(data).reshape(length, width).T.tolist()))

@@ -50,6 +50,22 @@ class Load(NamedTuple):
     delay_stride: list[int] = []
 
 
+def as_lists(load: Load) -> Load:
+    """Return a load whose columns are lists, also where some were arrays."""
+    return Load(*(column if isinstance(column, list) else column.tolist() for column in load))
+
+
+def as_arrays(load: Load) -> Load:
+    """Return a load whose columns are arrays: these are sooner changed, and lent."""
+    import numpy as np
+    return Load(*(np.array(column, dtype=np.int64) for column in load))  # type: ignore[arg-type]
+
+
+def needs_python(load: Load) -> bool:
+    """Tell whether it is known what needs the interpreter, so that all else does at its end."""
+    return len(load.computed) > 0 and len(load.holds) > 0
+
+
 def place_of(s: State, load: Load, x: int) -> int:
     """Return the place of an execution in ``load.costs``."""
     slot = s.x_slot[x]

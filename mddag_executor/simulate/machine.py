@@ -31,7 +31,7 @@ from typing import NamedTuple
 
 from mddag_executor.core.queues import first_waiting, overtaking_pays
 from mddag_executor.core.rules import progress
-from mddag_executor.core.state import add_queue, N_HOLDING, PREEMPTIVE, State
+from mddag_executor.core.state import add_queue, empty, N_HOLDING, PREEMPTIVE, State
 from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.simulate.load import Load, place_of
 
@@ -87,8 +87,7 @@ def new_machine(t: Tables, s: State, cpus: int | None = None, python: bool = Fal
     :param cpus: how many there are; None: as many as are needed.
     :param python: whether executions that do not hold the interpreter need it at their end.
     """
-    columns: dict[str, list[int]] = {name: [] for name in Machine._fields}
-    machine = Machine(**columns)    # type: ignore[arg-type]
+    machine = empty(Machine)
     fill_machine(t, s, machine, cpus or NEVER, int(python))
     return machine
 

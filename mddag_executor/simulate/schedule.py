@@ -9,12 +9,17 @@ from typing import NamedTuple
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core import policy as find_policy
-from mddag_executor.core.jobs import finish
-from mddag_executor.core.state import Decision, divide, JUDGE_FROM, new_state, State
-from mddag_executor.simulate.deliveries import new_deliveries
-from mddag_executor.simulate.engine import LogEntry, run
-from mddag_executor.simulate.load import Load
-from mddag_executor.simulate.machine import new_machine
+from mddag_executor.core.state import as_object, Decision, empty, State
+from mddag_executor.simulate.deliveries import Deliveries
+from mddag_executor.simulate.engine import LogEntry, Orders, run_load
+from mddag_executor.simulate.load import as_lists, Load
+from mddag_executor.simulate.machine import Machine
+
+# Roughly, to choose what is sooner done: plain Python's time for each execution, and for each
+# where those that run may stand still.
+_PLAIN_S, _STOPS_S = 10e-6, 50e-6
+SOON_S = 1.0
+"""What plain Python has done so soon is not worth loading what is compiled."""
 
 
 class How(NamedTuple):
@@ -38,22 +43,17 @@ class How(NamedTuple):
     cpus: int | None = None
     processes: int = 1
 
-    def start(self, tables: Tables, propagate: int = 1) -> State:
+    def orders(self, horizon: int, stop_at_first_miss: bool, judge_open: bool) -> Orders:
         """
-        Return the core's state for such a run.
+        Return how to run a load, as integers.
 
         :raises mddag_executor.core.PolicyError: there is no such policy, or it cannot do that.
         """
         policy = find_policy(self.policy)
-        state = new_state(
-            tables, self.workers * self.processes, propagate=propagate,
-            preemptive=policy.mode(self.preemptive, self.processes),
-            dispatch_overhead=self.dispatch_overhead, switch_overhead=self.switch_overhead,
-            polling=policy.polling)
-        if self.processes > 1:
-            divide(state, [self.workers] * self.processes)
-        state.scalars[JUDGE_FROM] = self.judge_from
-        return state
+        return Orders(
+            self.workers, self.processes, int(policy.mode(self.preemptive, self.processes)),
+            int(policy.polling), self.dispatch_overhead, self.switch_overhead, self.judge_from,
+            self.cpus or NEVER, horizon, int(stop_at_first_miss), int(judge_open))
 
 
 class Scheduled(NamedTuple):
@@ -66,29 +66,48 @@ class Scheduled(NamedTuple):
 
 def schedule(
     tables: Tables, load: Load, how: How, horizon: int, *, stop_at_first_miss: bool = False,
-    log: bool = False, judge_open: bool = True, progress: Callable[[int], None] | None = None,
+    log: bool = False, judge_open: bool = True,
+    progress: Callable[[int], None] | None = None, compiled: bool | None = None,
 ) -> Scheduled:
     """
     Run the core over a load up to the horizon, or its first miss.
 
     :param log: keep the log of every worker.
     :param judge_open: judge what is open at the horizon.
-    :param progress: told the virtual time (ns) now and then.
-    :raises mddag_executor.core.PolicyError: as ``How.start``.
+    :param progress: told the virtual time (ns) now and then, by plain Python.
+    :param compiled: whether compiled, which gives the same; None: what is sooner done.
+    :raises mddag_executor.core.PolicyError: as ``How.orders``.
     """
-    sends = len(load.delay_base) > 0
-    state = how.start(tables, 2 if sends else 1)
+    orders = how.orders(horizon, stop_at_first_miss, judge_open)
+    if compiled is None:
+        compiled = prepare(tables, load, how)
+    if compiled:
+        from mddag_executor.simulate.compiled import run_once
+        return Scheduled(*run_once(tables, load, how.policy, orders, log))
+    state = as_object(empty(State))
     entries: list[LogEntry] = []
-    stops = len(load.holds) > 0 or how.cpus is not None
-    machine = new_machine(tables, state, how.cpus, needs_python(load)) if stops else None
-    ended = run(
-        tables, state, find_policy(how.policy).key, load, horizon, stop_at_first_miss,
-        entries if log else None, progress, new_deliveries() if sends else None, machine)
-    if judge_open and ended == horizon:
-        finish(tables, state, ended)
+    ended = run_load(
+        as_object(tables), state, empty(Deliveries), empty(Machine), find_policy(how.policy).key,
+        as_lists(load), orders, entries if log else None, progress)
     return Scheduled(ended, entries, state.decisions)
 
 
-def needs_python(load: Load) -> bool:
-    """Tell whether it is known what needs the interpreter, so that all else does at its end."""
-    return len(load.computed) > 0 and len(load.holds) > 0
+def prepare(
+    tables: Tables, load: Load, how: How, runs: int = 1,
+    waiting: Callable[[], None] = lambda: None,
+) -> bool:
+    """
+    Tell whether so many runs are sooner done compiled; if so, compile, or load what was.
+
+    :param waiting: called now and then meanwhile.
+    """
+    executions = runs * len(load.times) * tables.n_vertices // max(1, tables.n_dags)
+    stops = len(load.holds) > 0 or how.cpus is not None
+    plain_s = executions * (_STOPS_S if stops else _PLAIN_S)
+    if plain_s < SOON_S:
+        return False
+    from mddag_executor.simulate import compiled
+    if not compiled.pays(compiled.RUN_ONCE, plain_s):
+        return False
+    compiled.prepare(compiled.RUN_ONCE, waiting)
+    return True

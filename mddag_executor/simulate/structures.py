@@ -13,7 +13,10 @@ from typing import Any
 from mddag_executor.core.policies import Key, POLICIES
 from mddag_executor.core.state import State
 from mddag_executor.core.tables import Tables
+from mddag_executor.simulate.deliveries import Deliveries
+from mddag_executor.simulate.engine import Orders
 from mddag_executor.simulate.load import Load
+from mddag_executor.simulate.machine import Machine
 from mddag_executor.simulate.vectors import at, StructureType, VectorType
 from numba import types
 from numba.extending import overload
@@ -22,6 +25,7 @@ _KINDS = {
     'int': types.int64,
     'list[int]': VectorType(),
     'list[QueueEntry]': VectorType(5),
+    'list[list[int]]': VectorType(nested=True),
     'list[list[QueueEntry]]': VectorType(5, nested=True),
     'list[Decision]': VectorType(6),
 }
@@ -39,6 +43,9 @@ def _structure(row: Any, **more: Any) -> Any:
 as_tables = at(_structure(Tables, policy=types.int64))
 as_state = at(_structure(State))
 as_load = at(_structure(Load))
+as_deliveries = at(_structure(Deliveries))
+as_machine = at(_structure(Machine))
+as_orders = at(_structure(Orders))
 as_log = at(VectorType(6))
 as_vector = at(VectorType())
 

@@ -250,6 +250,20 @@ def _overload_bool(vector: Any) -> Any:
     return None
 
 
+@overload(operator.contains, strict=False)
+def _overload_contains(vector: Any, value: Any) -> Any:
+    if not isinstance(vector, VectorType) or vector.width or vector.nested:
+        return None
+
+    def contains(vector, value):
+        for place in range(len(vector)):
+            if vector[place] == value:
+                return True
+        return False
+
+    return contains
+
+
 @overload_method(VectorType, 'append', strict=False)
 def _overload_append(vector: Any, value: Any) -> Any:
     words = vector.words

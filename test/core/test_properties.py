@@ -16,6 +16,7 @@ from mddag_executor.core.state import (
     ABORTED,
     COMPLETED,
     DROP,
+    empty,
     EXPIRED,
     JOB_END,
     LATE,
@@ -25,10 +26,13 @@ from mddag_executor.core.state import (
     SINK_COMPLETED,
     SINK_EXPIRED,
     SINK_LATE,
+    State,
     WAITING,
 )
 from mddag_executor.simulate import END, LogEntry, PREEMPT, Settings
-from mddag_executor.simulate.engine import run
+from mddag_executor.simulate.deliveries import Deliveries
+from mddag_executor.simulate.engine import run_load
+from mddag_executor.simulate.machine import Machine
 from msg_graph import Dag
 
 from .dag_paths import least_laxity
@@ -266,9 +270,11 @@ def test_whatever_gets_ready_ends_or_is_dropped_or_is_there(case: Case, horizon:
         case.policy, case.workers, horizon * TICK, case.preemptive,
         dispatch_overhead_ns=case.dispatch_overhead * TICK,
         switch_overhead_ns=case.switch_overhead * TICK)
-    state = settings.how.start(tables)
+    state = empty(State)
     log: list[LogEntry] = []
-    run(tables, state, policy(case.policy).key, case.load(horizon), horizon * TICK, False, log)
+    run_load(
+        tables, state, empty(Deliveries), empty(Machine), policy(case.policy).key,
+        case.load(horizon), settings.how.orders(horizon * TICK, False, False), log, None)
     kinds = Counter(kind for _, kind, *_ in log)
     ready = state.scalars[ORDER] - kinds[PREEMPT]
     dropped = sum(kind == DROP for kind, *_ in state.decisions)

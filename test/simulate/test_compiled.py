@@ -8,17 +8,20 @@ Both are the same source; what this finds is where compiled arithmetic, lists or
 
 from __future__ import annotations
 
+from itertools import accumulate
 import os
 from pathlib import Path
+import random
 import subprocess
 import sys
 
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import POLICIES, Tables
-from mddag_executor.simulate import compiled, compiling
+from mddag_executor.simulate import compiled, compiling, Load, schedule
 from mddag_executor.simulate.draws import Draws
 from mddag_executor.simulate.experiment import PlainJudge
+from mddag_executor.simulate.load import as_arrays, FAILS, RUNS, SKIPPED
 from mddag_executor.simulate.run import Settings, simulate
 from msg_graph import load, loads
 import numpy as np
@@ -46,11 +49,13 @@ def compare(case: Case, horizon: int, judge: str = 'horizon', stop: bool = False
     settings = settings_of(case, horizon, judge, stop)
     load_ = case.load(horizon)
     plain = simulate(case.task_set, load_, settings, log=True)
-    ended, log, decisions = compiled.run_compiled(Tables.build(case.task_set), load_, settings)
-    assert log == plain.log
-    assert decisions == plain.decisions
-    assert ended == plain.ended_ns
-    return len(decisions)
+    found = schedule(
+        Tables.build(case.task_set), load_, settings.how, settings.duration_ns,
+        stop_at_first_miss=stop, log=True, judge_open=judge == 'horizon', compiled=True)
+    assert found.log == plain.log
+    assert found.decisions == plain.decisions
+    assert found.ended == plain.ended_ns
+    return len(found.decisions)
 
 
 @pytest.mark.parametrize('policy', POLICIES)
@@ -66,6 +71,72 @@ def test_the_paper_s_model(policy: str, data: st.DataObject, horizon: int) -> No
 def test_everything_at_once(case: Case, horizon: int, judge: str, stop: bool) -> None:
     """Groups, bounds, aborts and overheads too."""
     compare(case, horizon, judge, stop)
+
+
+SLOW = 400
+"""Times so many times as long are some switch intervals and slices of a machine."""
+
+
+def slowed(tables: Tables, processes: int, chances: random.Random) -> Tables:
+    """Return tables with longer times, and vertices in any of the processes."""
+    columns = {name: [time * SLOW if time >= 0 else time for time in getattr(tables, name)]
+               for name in ('period', 'dag_deadline', 'rad_offset', 'sink_deadline')}
+    return tables._replace(
+        **columns, process=[chances.randint(1, processes) for _ in tables.process])
+
+
+def with_everything(load_: Load, tables: Tables, chances: random.Random) -> Load:
+    """Return a load, slowed, that is different for each job, with all that it may tell."""
+    jobs = [load_.dags.count(dag) for dag in range(tables.n_dags)]
+    sizes = [tables.n_region[dag] for dag in range(tables.n_dags)]
+    first = [tables.first_successor[v] for v in tables.first_vertex]
+    edges = [after - before for before, after in zip(first, first[1:])]
+    vertices = [v for dag, size in enumerate(sizes) for _ in range(jobs[dag])
+                for v in range(tables.first_vertex[dag], tables.first_vertex[dag] + size)]
+    costs = [chances.randint(0, 9) * TICK * SLOW + chances.randint(0, 3) for _ in vertices]
+    computes, sends, stops = (chances.random() < 0.7 for _ in range(3))
+
+    def some(values: list[int], weights: list[int]) -> list[int]:
+        return chances.choices(values, weights, k=len(costs))
+
+    load_ = load_._replace(
+        times=[time * SLOW for time in load_.times], costs=costs, cost_stride=sizes,
+        cost_base=[0, *accumulate(a * b for a, b in zip(jobs, sizes))][:-1],
+        fates=some([RUNS, FAILS, SKIPPED], [9, 1, 1]) if sends else [],
+        releases=[max(0, time - chances.randint(0, 3) * TICK) * SLOW for time in load_.times])
+    if stops:
+        load_ = load_._replace(holds=[
+            tables.process[v] * each for v, each in zip(vertices, some([0, 1], [1, 1]))])
+    if stops and computes:
+        load_ = load_._replace(
+            locks=some([0, 1], [3, 1]),
+            computed=[chances.choice([cost, cost // 2, cost // 9, -1]) for cost in costs])
+    if sends:
+        delays = [chances.choice([0, 0, 1, 7, -1, -3, -8]) * TICK * SLOW
+                  for dag, number in enumerate(edges) for _ in range(jobs[dag] * number)]
+        load_ = load_._replace(
+            delays=delays, delay_stride=edges,
+            delay_base=[0, *accumulate(a * b for a, b in zip(jobs, edges))][:-1])
+    return load_
+
+
+@examples(800)
+@given(cases(overheads=True), st.integers(5, 60), st.booleans(), st.integers(0, 2 ** 32))
+def test_machine_messages_and_processes(
+    case: Case, horizon: int, stop: bool, seed: int
+) -> None:
+    chances = random.Random(seed)
+    one = case.preemptive or POLICIES[case.policy].polling
+    how = settings_of(case, horizon, 'horizon', stop).how._replace(
+        processes=1 if one else chances.randint(1, 3), cpus=chances.choice([None, 1, 2, 3]))
+    tables = slowed(Tables.build(case.task_set), how.processes, chances)
+    load_ = with_everything(case.load(horizon), tables, chances)
+    plain, found = (
+        schedule(tables, load_, how, horizon * TICK * SLOW, stop_at_first_miss=stop, log=True,
+                 compiled=compiled) for compiled in (False, True))
+    assert found == plain
+    assert schedule(tables, as_arrays(load_), how, horizon * TICK * SLOW, log=True,
+                    stop_at_first_miss=stop) == plain
 
 
 @examples(15)
@@ -174,7 +245,8 @@ def test_a_second_process_does_not_compile(tmp_path: Path) -> None:
         peaks.append(int(peak))
     assert max(peaks) < 200_000
     assert python(
-        'from mddag_executor.simulate import compiled', 'print(compiled.cached())',
+        'from mddag_executor.simulate.compiling import cached_entries',
+        'print(cached_entries("accept_runs"))',
         XDG_CACHE_HOME=str(tmp_path)) == 'True'
     assert [path.name for path in (tmp_path / 'mddag_executor').iterdir()] == [
         compiling._fingerprint()]
@@ -207,7 +279,7 @@ def test_without_a_place_for_the_cache(
     for place in ('relative', '/proc/nowhere'):
         monkeypatch.setenv('XDG_CACHE_HOME', place)
         assert compiling._stamp() is None
-        assert not compiled.cached()
+        assert not compiling.cached_entries('accept_runs')
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     stamp = compiling._stamp()
     assert stamp is not None and stamp.is_file()

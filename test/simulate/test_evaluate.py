@@ -251,9 +251,10 @@ def test_without_numba(small: TaskSet, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_choice_of_the_core(autoware: TaskSet, monkeypatch: pytest.MonkeyPatch) -> None:
     """A cold cache costs seconds: few runs are done in plain Python."""
     def chosen(runs: int, warm: bool) -> bool:
-        monkeypatch.setattr(compiled, 'cached', lambda: warm)
+        monkeypatch.setattr(compiled, 'cached_entries', lambda name: warm)
         return module.uses_compiled('auto', [Experiment(autoware)], runs, 2)
 
     monkeypatch.setattr(compiling, 'available', lambda: True)
+    monkeypatch.setattr(compiled, '_ready', set())
     assert [chosen(runs, False) for runs in (1, 100, 5000)] == [False, False, True]
     assert [chosen(runs, True) for runs in (1, 100, 5000)] == [False, True, True]
