@@ -334,7 +334,8 @@ def _given_up(
     found[skips] = skipped[which[skips]]
     before = never.waiting(at, until)
     waits = skips & (before >= 0) & (found != MACHINE)
-    of = dict(zip(zip(*rows[:, [M_SINK, M_JOB]].T.tolist()), causes.tolist()))
+    raised = rows[:, M_KIND] == SINK_FAILED     # which does not say why something waited
+    of = dict(zip(zip(*rows[~raised][:, [M_SINK, M_JOB]].T.tolist()), causes[~raised].tolist()))
     found[waits] = [of.get(key, WAITED) for key in zip(
         rows[which[waits], M_SINK].tolist(), before[waits].tolist())]
     return found
