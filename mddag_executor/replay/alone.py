@@ -10,9 +10,9 @@ that it stood still while it waited for Python's lock, or for a CPU.  How long, 
 machine tells (``simulate.machine``) that predictions are made with: executions that are started
 when the recorded ones could have, and take what these would have alone, must end when these did.
 So the times are sought with which they do: first each takes what was recorded; what it then ends
-too late is taken off, and of what is still wrong a half, ``TURNS`` times in all.  What the model
-does not explain stays in the time, so that a schedule like the recorded one gives the recorded
-response times.
+too late is taken off, down to its CPU time, and so on.  Of ``TURNS`` tries the best one counts.
+What the model does not explain stays in the time, so that a schedule like the recorded one gives
+the recorded response times.
 
 That is right where as many run beside one another as in the recording.  Where fewer do, what the
 model leaves over has to be told apart:  a callback *computes* if its executions that wait least
@@ -38,7 +38,7 @@ HARDLY = 0.1
 """Others hardly ran beside one if they did for no more than this part of its time."""
 ENOUGH = 5
 """So many executions that hardly any other ran beside are enough to tell."""
-TURNS = 5
+TURNS = 8
 
 Flags = npt.NDArray[np.bool_]
 
@@ -101,14 +101,17 @@ def _by_callback(callback: Ints, those: Flags) -> Iterator[Ints]:
 
 def _explained(ran: Recorded, cpus: int) -> Ints:
     """Return the times with which the model ends executions when they ended."""
-    least = np.minimum(np.maximum(0, ran.cpu), ran.took) // 2
-    took = ran.took.copy()
-    for turn in range(TURNS):
+    least = np.minimum(np.maximum(0, ran.cpu), ran.took)
+    found, took, least_wrong = ran.took, ran.took, -1
+    for _ in range(TURNS):
         wrong = ran.could + ran.took - _ends(ran, took, cpus)
-        if not wrong.any():
+        total = int(np.abs(wrong).sum())
+        if least_wrong < 0 or total < least_wrong:
+            found, least_wrong = took, total
+        if not total:
             break
-        took = np.clip(took + (wrong // 2 if turn else wrong), least, ran.took)
-    return took
+        took = np.clip(took + wrong, least, ran.took)
+    return found
 
 
 def _ends(ran: Recorded, took: Ints, cpus: int) -> Ints:

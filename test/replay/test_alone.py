@@ -47,7 +47,7 @@ def test_what_the_machine_does_not_explain_is_its_own() -> None:
 def test_one_that_waits_got_the_lock_late() -> None:
     # it needs the lock for 0.3 ms when it goes on
     waits = (0, 6, 0.4, 0)
-    assert of(waits, (4, 20, 20, 1)) == [5, 19.7]
+    assert of(waits, (4, 20, 19.7, 1)) == [5, 19.7]
     assert of(waits, (7, 20, 20, 1)) == [6, 20]
     assert of(waits, (4, 20, 20, 1), here=[1, 2]) == [6, 20]
 
