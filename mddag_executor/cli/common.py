@@ -153,8 +153,9 @@ def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | T
 def _traces_in(path: str) -> Sequence[str]:
     if os.path.isdir(path):
         from mddag_executor.replay.bags import is_ordinary
-        found = sorted(name for name in os.listdir(path) if name.endswith('.mcap'))
-        if len(found) > 1 and 'metadata.yaml' not in os.listdir(path) and not is_ordinary(path):
+        names = os.listdir(path)
+        found = sorted(name for name in names if name.endswith('.mcap'))
+        if len(found) > 1 and 'metadata.yaml' not in names and not is_ordinary(path):
             return [os.path.join(path, name) for name in found]
     return [path]
 

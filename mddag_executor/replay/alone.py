@@ -59,6 +59,12 @@ class Recorded(NamedTuple):
     interpreter: Ints
     callback: Ints
 
+    @property
+    def least(self) -> Ints:
+        """Return what they took at least, alone, too: their CPU time."""
+        least: Ints = np.minimum(np.maximum(0, self.cpu), self.took)
+        return least
+
     def of(self, which: Flags) -> Recorded:
         """Return some of them."""
         return Recorded(
@@ -101,7 +107,6 @@ def _by_callback(callback: Ints, those: Flags) -> Iterator[Ints]:
 
 def _explained(ran: Recorded, cpus: int) -> Ints:
     """Return the times with which the model ends executions when they ended."""
-    least = np.minimum(np.maximum(0, ran.cpu), ran.took)
     found, took, least_wrong = ran.took, ran.took, -1
     for _ in range(TURNS):
         wrong = ran.could + ran.took - _ends(ran, took, cpus)
@@ -110,7 +115,7 @@ def _explained(ran: Recorded, cpus: int) -> Ints:
             found, least_wrong = took, total
         if not total:
             break
-        took = np.clip(took + wrong, least, ran.took)
+        took = np.clip(took + wrong, ran.least, ran.took)
     return found
 
 
@@ -150,9 +155,8 @@ def _interpreters(n: int) -> Tables:
 def _theirs(ran: Recorded, took: Ints) -> Ints:
     """Return what executions that take so long waited for others that ran beside them."""
     beside = _beside(ran.could, ran.could + ran.took)
-    least = np.minimum(np.maximum(0, ran.cpu), ran.took)
-    waited = took - least
-    theirs = np.minimum(waited, 0)
+    waited = took - ran.least
+    theirs: Ints = np.minimum(waited, 0)
     for which in _by_callback(ran.callback, computing(ran.callback, ran.took, ran.cpu)):
         by_itself = which[beside[which] <= HARDLY * ran.took[which]]
         usual = (np.median(waited[by_itself]) if len(by_itself) >= ENOUGH
@@ -166,9 +170,11 @@ def _beside(begins: Ints, ends: Ints) -> Ints:
     """Return by interval for how long there was at least one other."""
     times = np.concatenate([begins, ends])
     order = np.argsort(times, kind='stable')
-    times = times[order] - begins.min(initial=0)
+    first = begins.min(initial=0)
+    times = times[order] - first
     count = np.cumsum(np.repeat([1, -1], len(begins))[order])
     total = np.concatenate([[0], np.cumsum(np.diff(times) * (count[:-1] > 1))])
-    until = (np.interp(each - begins.min(initial=0), times, total) for each in (ends, begins))
-    passed: Ints = np.rint(next(until) - next(until)).astype(np.int64)
+    passed: Ints = np.rint(
+        np.interp(ends - first, times, total) - np.interp(begins - first, times, total)
+    ).astype(np.int64)
     return passed

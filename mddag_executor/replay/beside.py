@@ -28,6 +28,7 @@ from mddag_executor.replay.own import OwnRun, STOP
 from mddag_executor.replay.own_paths import OwnPaths
 from mddag_executor.replay.run import open_run
 from mddag_executor.replay.waits import GroupWaits
+from mddag_executor.resources import import_environment
 
 LEAST_EVENTS = 1_000_000
 Played = tuple[OwnRun, OwnPaths, OwnDrift]
@@ -50,9 +51,8 @@ def play_beside(
     :raises mddag_executor.errors.MddagError: as ``OwnRun.play``, and where that
         process ends early.
     """
-    path = os.pathsep.join(each or os.getcwd() for each in sys.path)
     with subprocess.Popen(
-            [sys.executable, '-c', _PROGRAM], env={**os.environ, 'PYTHONPATH': path},
+            [sys.executable, '-c', _PROGRAM], env=import_environment(),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdin is not None and process.stdout is not None
         try:

@@ -46,6 +46,7 @@ from typing import Any
 
 from mddag_executor.core import jobs, policies, queues, rules, state, tables
 from mddag_executor.core.policies import POLICIES
+from mddag_executor.resources import import_environment
 from mddag_executor.simulate import deliveries, engine, load, machine
 import numpy as np
 
@@ -54,7 +55,7 @@ _MODULES = (
 _NOT_COMPILED = frozenset({
     # for plain lists
     'empty', 'as_object', 'new_state', 'add_queue', 'rad_offsets', 'latest_starts', 'policy',
-    'new_machine', 'new_deliveries', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers',
+    'new_machine', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers',
     'busy_times'})
 _OWN = ('compiling', 'kernel', 'lending', 'structures', 'vectors')
 _REPLACED = ('add_queue', 'heapify', 'heappop', 'heappush')
@@ -195,10 +196,9 @@ def compile_elsewhere(call: str, waiting: Callable[[], None] = lambda: None) -> 
     :param waiting: called now and then meanwhile.
     """
     program = f'import {call.split("(")[0].rpartition(".")[0]}; {call}'
-    path = os.pathsep.join(each or os.getcwd() for each in sys.path)
     try:
         process = subprocess.Popen(
-            [sys.executable, '-c', program], env={**os.environ, 'PYTHONPATH': path},
+            [sys.executable, '-c', program], env=import_environment(),
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     except OSError:
         return

@@ -45,11 +45,6 @@ class Deliveries(NamedTuple):
     next_vertex: list[int]
 
 
-def new_deliveries() -> Deliveries:
-    """Return the messages of a run that begins."""
-    return Deliveries([], [0], [])
-
-
 def next_arrival(d: Deliveries) -> int:
     """Return when the next message arrives, ns."""
     return d.messages[0][0] if len(d.messages) > 0 else NEVER

@@ -115,6 +115,8 @@ def test_synthetic_nodes_in_two_processes_are_measured_as_one_run(
     # what waited 0.1 s for its announcement, as on a busy machine, is of no job
     assert measured['attribution']['wrong'] == 0
     assert measured['attribution']['none'] < measured['sink_jobs_due'] / 2
+    assert result['undeclared'] == sum(
+        each['unattributed'] for each in result['callbacks'].values())
     assert result['never_ran'] == result['drift'] == []
     for name in ('p1', 'p2'):
         assert f'trace: {world / f"out.{name}.mcap"}' in run.stdout

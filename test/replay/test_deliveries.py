@@ -11,7 +11,7 @@ from mddag_executor.core import Tables
 from mddag_executor.core.state import new_state, SINK_COMPLETED
 from mddag_executor.replay import reschedule
 from mddag_executor.simulate import END, Load, LogEntry, PREEMPT, START
-from mddag_executor.simulate.deliveries import new_deliveries
+from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.engine import busy_times, run
 from mddag_executor.simulate.load import edge_numbers, edges_of
 from mddag_executor.trace import TraceFile
@@ -59,7 +59,7 @@ def engine(
     state = new_state(tables, workers, preemptive=preemptive, propagate=2)
     log: list[LogEntry] = []
     key = find_policy('rad').key
-    run(tables, state, key, load, horizon, False, log, deliveries=new_deliveries())
+    run(tables, state, key, load, horizon, False, log, deliveries=Deliveries([], [0], []))
     starts = [(time // 1000, worker, vertex) for time, kind, worker, _, vertex, _ in log
               if kind == START]
     done = [(d[2], d[5] // 1000) for d in state.decisions if d[0] in SINK_COMPLETED]
