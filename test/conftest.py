@@ -133,15 +133,18 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 ALONE = (
     'live', 'bench', 'launch', 'examples', 'hardening/test_misuse.py', 'cli/test_run.py',
     'cli/test_demo.py', 'cli/test_top.py', 'cli/test_bench_replay.py', 'cli/test_graph_systems.py',
-    'replay/test_live_replay.py', 'test_docs.py', 'test_readme.py')
-# These only count how often they fail.
-NOT_ALONE = ('live/mutations',)
+    'replay/test_live_replay.py', 'test_docs.py', 'test_readme.py', 'endurance/test_soak.py')
+# One fixture runs all of these, once; they only count how often they fail.
+MUTATIONS = 'live/mutations'
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=_rank)
     if 'PYTEST_XDIST_WORKER' in os.environ:
-        items.sort(key=lambda item: not _is_alone(item.nodeid))  # the longest group first
+        # The longest first, so that no process has to wait for the other at the end.
+        items.sort(key=lambda item: (
+            not _is_alone(item.nodeid), not _is_in(item.nodeid, MUTATIONS),
+            item.get_closest_marker('slow') is None))
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -151,15 +154,20 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     class Scheduling(LoadScopeScheduling):
 
         def _split_scope(self, nodeid: str) -> str:
+            if _is_in(nodeid, MUTATIONS):
+                return MUTATIONS
             return 'alone' if _is_alone(nodeid) else nodeid
 
     return Scheduling(config, log)
 
 
 def _is_alone(nodeid: str) -> bool:
-    path = PurePosixPath(nodeid.partition('::')[0])
-    return (any(path.is_relative_to(PurePosixPath(HERE.name, each)) for each in ALONE)
-            and not any(path.is_relative_to(PurePosixPath(HERE.name, each)) for each in NOT_ALONE))
+    return (any(_is_in(nodeid, each) for each in ALONE)
+            and not _is_in(nodeid, MUTATIONS))
+
+
+def _is_in(nodeid: str, path: str) -> bool:
+    return PurePosixPath(nodeid.partition('::')[0]).is_relative_to(PurePosixPath(HERE.name, path))
 
 
 def _rank(item: pytest.Item) -> tuple[bool, int]:

@@ -265,7 +265,9 @@ def test_an_interrupted_compilation_is_not_begun_anew(
 ) -> None:
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     interrupted = tmp_path / 'python'
-    interrupted.write_text('#!/bin/sh\nkill -INT $$\n')
+    interrupted.write_text(  # by a signal that may be ignored here
+        f'#!{sys.executable}\nimport os, signal\nsignal.signal(signal.SIGINT, signal.SIG_DFL)\n'
+        'os.kill(os.getpid(), signal.SIGINT)\n')
     interrupted.chmod(0o755)
     monkeypatch.setattr(sys, 'executable', str(interrupted))
     judge = compiled.CompiledJudge(load(CONFIG / 'autoware.yaml'), 10 ** 9)
