@@ -11,7 +11,7 @@ from mddag_executor.cli.options import add_verb
 
 EXAMPLE = 'mddag bench live --load autoware --executors rad-events,multi --utilisation 0.6'
 
-SUBJECTS = ('live', 'core', 'replay', 'rerun', 'evaluate')
+SUBJECTS = ('live', 'core', 'replay', 'evaluate')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

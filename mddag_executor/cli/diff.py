@@ -55,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser, 'compare with what the scheduler would have done in B with the recorded releases '
         'and execution times (in an ordinary bag A, too)')
     recorded.add_skip(parser)
+    options.add_offset(parser)
     add('--callbacks', action='store_true', help='show a table of all callbacks, too')
     add('--fail-on-worse', action='store_true',
         help='exit with status 1 if a sink missed a larger share of its deadlines in B, or its '
@@ -70,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
     from mddag_executor.report import diff
     _check_arguments(args)
     task_set = None if args.graph is None else common.load_graph(args.graph)
-    runs = [common.one_run([given], ()) for given in (args.first, args.second)]
+    runs = common.two_runs(args.first, args.second, args.offset)
     with ExitStack() as files:
         first, second = (files.enter_context(common.input_recording(run)) for run in runs)
         before, after = _results(args, first, second, task_set)

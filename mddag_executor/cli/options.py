@@ -128,9 +128,9 @@ def add_offset(parser: argparse.ArgumentParser) -> None:
     """Declare `--offset`."""
     parser.add_argument(
         '--offset', metavar='NAME=TIME', type=_offset, action='append', default=[],
-        help='of several machines: how far the clock of process NAME (of RUN.NAME.mcap) is ahead '
-        "of the first trace's, as 2.5ms, or -2.5ms where it is behind (default: as messages both "
-        'ways tell)')
+        help='of several machines: how far the clock of process NAME (of RUN.NAME.mcap; or that '
+        "trace itself) is ahead of the first trace's, as 2.5ms, or -2.5ms where it is behind "
+        '(default: as messages both ways tell)')
 
 
 def _offset(text: str) -> tuple[str, int]:

@@ -323,20 +323,20 @@ def _run_synthetic(
     seconds: float | None, progress: Progress,
 ) -> Books | None:
     from mddag_executor.live import current_job
-    from mddag_executor.live.session import run_and_note
+    from mddag_executor.live.session import run_and_note, Session
     from mddag_executor.live.synthetic import SyntheticWorkload
-    meet = None
+    begin = Session.wait_until_matched
     if args.part is not None:
         from mddag_executor.live.parts import Part
-        meet = partial(Part.read(args.part).meet, args.process,
-                       [process.name for process in task_set.processes])
+        begin = partial(Part.read(args.part).start_together, args.process,
+                        [process.name for process in task_set.processes])
     workload = SyntheticWorkload(
         task_set, plan, current_job=current_job, process=args.process)
     for node in workload.nodes:
         session.executor.add_node(node)
     try:
         with session:
-            return run_and_note(session, workload, seconds, progress.update, meet=meet)
+            return run_and_note(session, workload, seconds, progress.update, begin=begin)
     finally:
         workload.destroy()
 

@@ -60,7 +60,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     from mddag_executor.live.execution import ExecutionPlan
     from mddag_executor.live.loading import ros_arguments
     from mddag_executor.live.parts import left, Part, together
-    from mddag_executor.live.supervisor import Supervisor
+    from mddag_executor.live.supervisor import Run, Supervisor
     plan = None
     if args.synthetic is not None:
         workers = defaults.workers(args.workers, task_set)
@@ -78,14 +78,19 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
             warn_of(plan, args.ros_args, len(names))
 
         def command(name: str, nth: int, since: float) -> list[str]:
+            Part.starts(folder, name)
             trace = traces.of(name, nth)
             return [*_command(args, folder, specs.get(name, ()), since), '--process', name,
                     *(() if trace is None else ('--trace', trace)), *ros_arguments(args.ros_args)]
 
         out = sys.stdout if common.wants_tables(args) else sys.stderr
-        supervisor = Supervisor(
-            command, args.on_exit, out, sys.stderr,
-            lambda run: warn(f'process {run.name} {run.how}: {run.said}'))
+
+        def ended(run: Run) -> None:
+            Part.ended(folder, run.name)
+            if run.died:
+                warn(f'process {run.name} {run.how}: {run.said}')
+
+        supervisor = Supervisor(command, args.on_exit, out, sys.stderr, ended)
         signals.end_of(supervisor)
         supervisor.run(names, None if args.duration is None else args.duration / 1e9)
         parts = [left(folder, run.process.pid) for run in supervisor.runs]

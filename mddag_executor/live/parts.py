@@ -11,13 +11,16 @@ verdicts are put together by the core (``core.tally.of_processes``); callbacks a
 they are; rules that need all of them (drift, what the synthetic nodes measured) get the sum of
 what was observed.
 
-Synthetic nodes start together in all processes, as they do in one: each process notes in the
-folder when it is ready, and starts ``LEAD_NS`` after the last of these times.
+Synthetic nodes start together in all processes, as they do in one.  So each process notes in the
+folder that its nodes are *made*; when those of all are, it waits until publishers and
+subscriptions have met; then it notes when it is *ready*, and starts ``LEAD_NS`` after the last of
+these times.  However long another process takes for that, it is waited for; but not if it has
+*ended*, which the run notes: then nobody is waited for any more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 import json
 import os
@@ -29,7 +32,7 @@ from mddag_executor.core.tally import of_processes
 from mddag_executor.live.entity import COUNTS
 from mddag_executor.live.execution import ExecutionPlan
 from mddag_executor.live.measure import Books
-from mddag_executor.live.session import MATCH_TIMEOUT_S, measured, Session
+from mddag_executor.live.session import measured, Session
 from msg_graph import TaskSet
 from msg_graph.binding import Entity
 from msg_graph.drift import drift, Observed, Releases
@@ -70,19 +73,44 @@ class Part:
         part.write_text(json.dumps(result))
         part.replace(path)
 
-    def meet(self, name: str, names: Sequence[str], session: Session) -> None:
-        """Wait for the instant at which all processes start; not for ever, nor if the run ends."""
-        own = self.folder / f'{name}.ready'
+    @staticmethod
+    def starts(folder: str, name: str) -> None:
+        """Note, in the run, that a process is going to be started, perhaps again."""
+        Path(folder, f'{name}.ended').unlink(missing_ok=True)
+
+    @staticmethod
+    def ended(folder: str, name: str) -> None:
+        """Note, in the run, that a process has ended."""
+        Path(folder, f'{name}.ended').touch()
+
+    def start_together(
+        self, name: str, names: Sequence[str], session: Session, unmatched: Callable[[], list[str]]
+    ) -> None:
+        """
+        Wait for the instant at which all processes start; not if the run is to end.
+
+        :param unmatched: returns the topics where publishers and subscriptions have not met yet.
+        :raises mddag_executor.live.session.SessionError: when they do not meet.
+        """
+        self._come_to('made', name, names, session)
+        session.wait_until_matched(lambda: [] if self._is_left_alone() else unmatched())
+        at = self._come_to('ready', name, names, session) + LEAD_NS
+        session.wait(max(0, at - time.monotonic_ns()) / 1e9)
+
+    def _is_left_alone(self) -> bool:
+        return any(self.folder.glob('*.ended'))
+
+    def _come_to(self, step: str, name: str, names: Sequence[str], session: Session) -> int:
+        """Wait until all processes have come to a step; return when the last one did."""
+        own = self.folder / f'{name}.{step}'
         part = own.with_suffix('.part')
         part.write_text(str(time.monotonic_ns()))
         part.replace(own)
-        paths = [self.folder / f'{each}.ready' for each in names]
-        end = time.monotonic() + MATCH_TIMEOUT_S
-        while not all(path.exists() for path in paths) and time.monotonic() < end:
+        paths = [self.folder / f'{each}.{step}' for each in names]
+        while not (all(path.exists() for path in paths) or self._is_left_alone()):
             if session.wait(0.01):
-                return
-        at = max(int(path.read_text()) for path in paths if path.exists()) + LEAD_NS
-        session.wait(max(0, at - time.monotonic_ns()) / 1e9)
+                break
+        return max(int(path.read_text()) for path in paths if path.exists())
 
 
 def left(folder: str, pid: int) -> Any:

@@ -21,6 +21,7 @@ them again, stop the sensors, and shut the executor down.  Only then the figures
 from __future__ import annotations
 
 from collections.abc import Callable
+import math
 import threading
 import time
 from typing import Any
@@ -126,10 +127,13 @@ class Session:
         Wait until publishers and subscriptions have met, or the run is to end.
 
         :param unmatched: returns the topics where they have not yet.
-        :raises SessionError: when they do not in time.
+        :raises SessionError: when for ``MATCH_TIMEOUT_S`` no more of them do.
         """
-        end = time.monotonic() + MATCH_TIMEOUT_S
+        fewest = math.inf
+        end = 0.0
         while topics := unmatched():
+            if len(topics) < fewest:
+                fewest, end = len(topics), time.monotonic() + MATCH_TIMEOUT_S
             if self.wait(0.02):
                 return
             if time.monotonic() > end:
@@ -188,23 +192,21 @@ def measured(books: Books, plan: ExecutionPlan, warm_up_s: float = WARM_UP_S) ->
 def run_and_note(
     session: Session, workload: SyntheticWorkload, duration_s: float | None,
     tick: Tick | None = None, warm_up_s: float = WARM_UP_S,
-    meet: Callable[[Session], None] | None = None,
+    begin: Callable[[Session, Callable[[], list[str]]], None] = Session.wait_until_matched,
 ) -> Books | None:
     """
     Run a synthetic workload as ``run_synthetic`` does.
 
     :param duration_s: length of the measured window, which begins ``warm_up_s`` after the timers;
         None: until the session is stopped.
-    :param meet: waits for the instant at which other processes start, too.
+    :param begin: waits until publishers and subscriptions have met, and for other processes.
     :return: the books about it; None when the run was stopped before the window began.
     :raises SessionError: when publishers and subscriptions do not find each other.
     """
     window: tuple[Reading, Reading] | None = None
     try:
         executors: Callable[[], list[str]] = getattr(session.executor, 'unmatched', list)
-        session.wait_until_matched(lambda: workload.unmatched() + executors())
-        if meet is not None:
-            meet(session)
+        begin(session, lambda: workload.unmatched() + executors())
         if not session.stopped:
             workload.start(session.executor.wake)
             if not session.wait(warm_up_s):

@@ -106,7 +106,7 @@ class Supervisor:
         since the run's begin.
     :param on_exit: ``end``, ``continue`` or ``restart``.
     :param out: where standard output goes; ``err``: standard error.
-    :param tell: told of each that dies.
+    :param tell: told of each that has ended.
     """
 
     def __init__(
@@ -202,8 +202,7 @@ class Supervisor:
         self._reap(run)
         if run.status == _BAD_INPUT and not run.asked:
             raise ProcessError(f'process {run.name}: {run.said.removeprefix("error: ")}')
-        if run.died:
-            self._tell(run)
+        self._tell(run)
         if self._stop or (is_over and not run.died):
             return
         if self._on_exit == 'restart':

@@ -21,12 +21,14 @@ The joined trace has the events of all in the order of time, and is replayed lik
 4. Of a DAG that several run, those vertices are expected that are in any of the processes.  Jobs
    are judged from the time on from which all processes have judged.
 5. A process whose end is not recorded was killed.  Its open jobs are said, and the run goes on.
+6. *One run.*  Traces are of one run if their times, from the first event to the last, overlap, or
+   others' bridge them; but a vertex runs in one process at a time.  All else is refused.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import heapq
 import os
 from typing import Any
@@ -62,6 +64,17 @@ _NO_ADDRESSES = {'queue_depth', 'message_timestamp'}
 Event = tuple[Any, ...]
 
 
+def label_of(path: str) -> str:
+    """Return the name of a trace's process: `up` of `run.up.mcap`, `up.2` of `run.up.2.mcap`."""
+    rest, _, word = os.path.basename(path).removesuffix('.mcap').rpartition('.')
+    return f'{rest.rpartition(".")[2]}.{word}' if rest and word.isdecimal() else word
+
+
+def names_of(paths: Iterable[str]) -> set[str]:
+    """Return what an offset may call traces: by their paths, or their processes."""
+    return {name for path in paths for name in (path, label_of(path))}
+
+
 class _Part:
     """One of the traces: where its times, workers and addresses are in the whole."""
 
@@ -89,8 +102,9 @@ class _Part:
                 else:
                     self.judges_from = event[4]
         self.shift = 0
-        self.label = os.path.basename(name).removesuffix('.mcap').rpartition('.')[2]
-        self.nodes: dict[str, None] = {}
+        self.label = label_of(name)
+        # by DAG and vertex: when it ran first, and last
+        self.ran: dict[tuple[int, int], tuple[int, int]] = {}
         self.first_worker = 0
         self.first_spare = 0
         self.last = 0
@@ -98,6 +112,11 @@ class _Part:
         self.hosted: dict[int, set[int]] = {}
         self.open: dict[tuple[int, int], int] = {}
         self.numbers: dict[tuple[int, int], int] = {}
+
+    @property
+    def first(self) -> int:
+        """Return when it begins, by the clock of the whole."""
+        return self.head.time + self.shift
 
     def events(self) -> Iterator[tuple[_Part, Event]]:
         """Yield itself with each event, by the clock and with the addresses of the whole."""
@@ -142,7 +161,7 @@ class Joined:
 
     :param files: path of each, and what messages call it.
     :param offsets: how far clocks of other machines are ahead of the first trace's, ns, by the
-        last word of a trace's name.
+        last word of a trace's name, or its path.
     :ivar warnings: what is to be said of them beside what the joined trace says, once written.
     :raises mddag_executor.trace.TraceError: when one is no trace.
     :raises ReplayError: when they are not of one run.
@@ -188,7 +207,8 @@ class Joined:
         found: dict[int, int] = {}
         for label, ahead in offsets.items():
             machine = next(
-                (m for m, part in zip(self._machines, self._parts) if part.label == label), None)
+                (m for m, part in zip(self._machines, self._parts) if label in names_of(
+                    [part.name])), None)
             if machine is None:
                 raise UsageError(f'--offset: there is no trace of {label}: name one of '
                                  + listed([part.label for part in self._parts]))
@@ -227,9 +247,10 @@ class Joined:
         Write the joined trace.
 
         :raises mddag_executor.trace.TraceError: when that cannot be, or one cannot be read.
+        :raises ReplayError: when they are of several runs.
         """
         head = self.head
-        begin = min(part.head.time + part.shift for part in self._parts)
+        begin = min(part.first for part in self._parts)
         judges_from = max(part.judges_from + part.shift * (part.judges_from > 0)
                           for part in self._parts)
         end = judged = 0
@@ -250,13 +271,41 @@ class Joined:
                         file.add(*told)
             if any(part.end is not None for part in self._parts):
                 file.add(_SHUTDOWN, max(end, judged), 0, 0, judged)
+        self._check_run()
         self._say(max(end, judged))
+
+    def _check_run(self) -> None:
+        """Refuse what several runs have left (rule 6)."""
+        runs: list[list[_Part]] = []
+        for part in sorted(self._parts, key=lambda part: part.first):
+            if not runs or part.first > max(each.last for each in runs[-1]):
+                runs.append([])
+            for other in runs[-1]:
+                for (dag, vertex), (first, last) in part.ran.items():
+                    began, ended = other.ran.get((dag, vertex), (0, -1))
+                    if max(first, began) <= min(last, ended):
+                        key = self.task_set.dags[dag].vertices[vertex].callback.key
+                        raise ReplayError(
+                            part.name, f'{key} ran in it and, at the same time, in {other.name}: '
+                            'these are of two runs', 'give the traces of one')
+            runs[-1].append(part)
+        if len(runs) > 1:
+            several = len(set(self._machines)) > 1
+            raise ReplayError(
+                runs[1][0].name, f'it is of another run than {runs[0][0].name}: no trace goes on '
+                'from one to the other', 'give the traces of one run: ' + ', or '.join(
+                    ' '.join(part.name for part in run) for run in runs)
+                + several * ' (or --offset, if clocks of machines differed)')
 
     def placed(self) -> list[Process]:
         """Return which nodes ran in which process, once the joined trace is written."""
         if self.task_set.processes:
             return list(self.task_set.processes)
-        return [Process(part.label, tuple(part.nodes)) for part in self._parts]
+        return [
+            Process(part.label, tuple(dict.fromkeys(
+                self.task_set.dags[dag].vertices[vertex].callback.node
+                for dag, vertex in part.ran)))
+            for part in self._parts]
 
     def _told(self, part: _Part, event: Event) -> Event | None:
         """Return an event as it is in the joined trace, None where it is not."""
@@ -274,8 +323,8 @@ class Joined:
             return event if event[at_dag] < 0 else None
         job = event[at_dag], number
         if name == _DISPATCH and 0 <= event[at_dag + 1] < len(self._legs[event[at_dag]]):
-            vertex = self.task_set.dags[event[at_dag]].vertices[event[at_dag + 1]]
-            part.nodes[vertex.callback.node] = None
+            what = event[at_dag], event[at_dag + 1]
+            part.ran[what] = part.ran.get(what, (event[1],))[0], event[1]
         if name == _COMPLETE and job in part.open:
             part.open[job] -= 1
             if part.open[job] <= 0:

@@ -29,12 +29,9 @@ from mddag_executor.live.entity import Entity
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.loop import Loop
 from mddag_executor.rerun.replacing import instead, Replacements
-from mddag_executor.rerun.services import Call
+from mddag_executor.rerun.services import Header
 
 _KINDS = ('goal', 'cancel', 'result')
-
-Header = tuple[Any, int]
-"""What a request's header is to a server: the client that has sent it, and its number."""
 
 
 class Actions:
@@ -119,7 +116,7 @@ class Actions:
             else:
                 self._take(server, {kind: ((client, number), asked)})
 
-        self._loop.send(Call(leave))
+        self._loop.later(leave)
         return number
 
     # --- what servers send -----------------------------------------------------------------------
@@ -127,7 +124,7 @@ class Actions:
     def _answer(self, kind: str, handle: Any, header: Header, response: Any) -> None:
         client, number = header
         answered = copy.deepcopy(response)
-        self._loop.send(Call(lambda: self._take(client, {kind: (number, answered)})))
+        self._loop.later(lambda: self._take(client, {kind: (number, answered)}))
 
     def _clients_of(self, handle: Any) -> list[Any]:
         name, _ = self._servers[id(handle)]
@@ -142,7 +139,7 @@ class Actions:
                 if callback is not None:
                     self._ready(client, callback, copy.deepcopy(sent))
 
-        self._loop.send(Call(leave))
+        self._loop.later(leave)
 
     def _status(self, handle: Any) -> None:
         from action_msgs.msg import GoalStatus, GoalStatusArray
@@ -154,7 +151,7 @@ class Actions:
             for client in self._clients_of(handle):
                 self._take(client, {'status': message})
 
-        self._loop.send(Call(leave))
+        self._loop.later(leave)
 
     # --- what arrives ----------------------------------------------------------------------------
 

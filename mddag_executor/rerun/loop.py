@@ -27,11 +27,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from heapq import heappop, heappush
 import itertools
 import math
-from typing import Any, Protocol
+from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.live.compat import UNKNOWN
@@ -59,17 +60,21 @@ _LENT = 1 << 20
 ENDED, ARRIVED, RECORDED, TIMER = range(4)
 
 
-class Held(Protocol):
-    """Something that an execution has sent."""
+@dataclass
+class Held:
+    """
+    Something that an execution has sent.
 
-    def record(self, thread: int) -> None:
-        """Be recorded, as sent by a thread of the trace."""
+    :ivar leave: sends it, given the execution's job and release, and when that ends (or begins to
+        wait).
+    :ivar record: records it, as sent by a thread of the trace.
+    :ivar early: returns how long before the end of its execution it leaves, ns, as a negative
+        number, given its job and release.
+    """
 
-    def early(self, origin: Origin, release: int) -> int:
-        """Return how long before the end of its execution it leaves, ns, as a negative number."""
-
-    def leave(self, origin: Origin | None, release: int, end: int) -> None:
-        """Be sent: now; the execution ends (or begins to wait) at ``end``."""
+    leave: Callable[[Origin | None, int, int], None]
+    record: Callable[[int], None] = lambda thread: None
+    early: Callable[[Origin, int], int] = lambda origin, release: 0
 
 
 class Execution:
@@ -337,6 +342,10 @@ class Loop:
             execution.held.append(held)
         else:
             self.soon(partial(held.leave, None, 0, self.now))
+
+    def later(self, function: Callable[[], None]) -> None:
+        """Do something when the callback that runs ends, or else at once."""
+        self.send(Held(lambda *_: function()))
 
     # --- waiting ---------------------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 from mddag_executor.live.compat import callback_type, WITH_INFO
@@ -29,7 +30,7 @@ from mddag_executor.live.jobs import header_stamp, Origin
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.errors import RerunError
-from mddag_executor.rerun.loop import ARRIVED, Loop
+from mddag_executor.rerun.loop import ARRIVED, Held, Loop
 from mddag_executor.rerun.outputs import Outputs
 from mddag_executor.rerun.times import Times
 from mddag_executor.rerun.types import canonical, type_name
@@ -83,29 +84,6 @@ class Outlet:
         found, _ = qos_check_compatible(
             self.publisher.qos_profile, inlet.entity.rclpy.qos_profile)
         return bool(found != QoSCompatibility.ERROR) and inlet.kind is self.kind
-
-
-class Sent:
-    """A message that was published."""
-
-    __slots__ = ('outlet', 'data', '_messages')
-
-    def __init__(self, messages: Messages, outlet: Outlet, data: bytes) -> None:
-        self.outlet = outlet
-        self.data = data
-        self._messages = messages
-
-    def record(self, thread: int) -> None:
-        """Be recorded."""
-        self._messages.record(self, thread)
-
-    def early(self, origin: Origin, release: int) -> int:
-        """Return how long before the end of its execution it leaves: the earliest of its ways."""
-        return self._messages.earliest(self.outlet, origin, release)
-
-    def leave(self, origin: Origin | None, release: int, end: int) -> None:
-        """Go to the outputs and to the subscriptions."""
-        self._messages.leave(self, origin, release, end)
 
 
 class Messages:
@@ -211,7 +189,9 @@ class Messages:
         current = self._loop.current
         if current is not None:
             current.work.entity.publishes.add(outlet.topic)
-        self._loop.send(Sent(self, outlet, data))
+        self._loop.send(Held(
+            partial(self._leave, outlet, data), partial(self._record, outlet),
+            partial(self._earliest, outlet)))
 
     def subscription_count(self, publisher: Publisher) -> int:
         """Return how many subscribe to a publisher's topic: nodes, and the rerun itself."""
@@ -228,14 +208,14 @@ class Messages:
         """Return how many publishers nodes of the run have on a topic."""
         return self._publishers.get(topic, 0)
 
-    def record(self, sent: Sent, thread: int) -> None:
+    def _record(self, outlet: Outlet, thread: int) -> None:
         """Record a publication."""
         if self._engine.record is not None:
             self._sequence += 1
             self._engine.record(
-                PUBLICATION, self._loop.now, thread, id(sent.outlet.publisher), self._sequence)
+                PUBLICATION, self._loop.now, thread, id(outlet.publisher), self._sequence)
 
-    def earliest(self, outlet: Outlet, origin: Origin, release: int) -> int:
+    def _earliest(self, outlet: Outlet, origin: Origin, release: int) -> int:
         """Return when the first subscription gets a message, after its execution's end."""
         if self._times.at_once:
             return 0
@@ -248,20 +228,22 @@ class Messages:
             return 0
         return self._times.transport(origin.dag, origin.vertex, target[0], release)
 
-    def leave(self, sent: Sent, origin: Origin | None, release: int, end: int) -> None:
+    def _leave(
+        self, outlet: Outlet, data: bytes, origin: Origin | None, release: int, end: int
+    ) -> None:
         """Send a message to the outputs and to the subscriptions."""
-        outlet, now = sent.outlet, self._loop.now
-        self._outputs.add(now, outlet.topic, outlet.kind, sent.data, outlet.publisher)
+        now = self._loop.now
+        self._outputs.add(now, outlet.topic, outlet.kind, data, outlet.publisher)
         outlet.count += 1
         if outlet.kept.maxlen:
-            outlet.kept.append((now, sent.data))
+            outlet.kept.append((now, data))
         for inlet in self._inlets_of(outlet):
             time = end + self._delay(inlet, origin, release)
             if time <= now:
-                self._arrive(inlet, sent.data, now, origin, outlet.count)
+                self._arrive(inlet, data, now, origin, outlet.count)
             else:
                 self._loop.at(
-                    time, ARRIVED, self._arrive, inlet, sent.data, now, origin, outlet.count)
+                    time, ARRIVED, self._arrive, inlet, data, now, origin, outlet.count)
 
     # --- what arrives ----------------------------------------------------------------------------
 

@@ -19,7 +19,6 @@ from typing import Any
 from mddag_executor.live.compat import complete_request, service_name
 from mddag_executor.live.compat.in_process import new_request
 from mddag_executor.live.entity import Entity, SERVICE
-from mddag_executor.live.jobs import Origin
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.loop import Loop
 from mddag_executor.rerun.replacing import instead, Replacements
@@ -28,35 +27,8 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.service import Service
 from rclpy.task import Future
 
-
-class Call:
-    """Something that is sent, and does something when it leaves."""
-
-    __slots__ = ('_function',)
-
-    def __init__(self, function: Callable[[], None]) -> None:
-        self._function = function
-
-    def record(self, thread: int) -> None:
-        """Be recorded: there is no event for it."""
-
-    def early(self, origin: Origin, release: int) -> int:
-        """Return that it leaves at the end of its execution."""
-        return 0
-
-    def leave(self, origin: Origin | None, release: int, end: int) -> None:
-        """Do it."""
-        self._function()
-
-
-class _Header:
-    """What a request's header is to a service: who has sent it."""
-
-    __slots__ = ('client', 'number')
-
-    def __init__(self, client: Client, number: int) -> None:
-        self.client = client
-        self.number = number
+Header = tuple[Any, int]
+"""What a request's header is to a server: the client that has sent it, and its number."""
 
 
 class Services:
@@ -105,7 +77,7 @@ class Services:
             pass
         number = next(self._numbers)
         future = new_request(client, number)
-        self._loop.send(Call(partial(self._ask, client, number, copy.deepcopy(request))))
+        self._loop.later(partial(self._ask, client, number, copy.deepcopy(request)))
         return future
 
     def call(
@@ -131,23 +103,23 @@ class Services:
         service = entity.rclpy
         work = Work(
             service, service.callback, (request, service.srv_type.Response()),
-            partial(service.send_response, header=_Header(client, number)), entity=entity)
+            partial(service.send_response, header=(client, number)), entity=entity)
         engine, now = self._loop.engine, self._loop.now
         if entity.source >= 0:
             engine.arrived(work, None, now, -1, now)
         else:
             engine.ready(work, now)
 
-    def send_response(self, service: Any, response: Any, header: _Header) -> None:
+    def send_response(self, service: Any, response: Any, header: Header) -> None:
         """Send a response."""
         if not isinstance(response, service.srv_type.Response):
             raise TypeError()
-        self._loop.send(Call(partial(self._answer, header, copy.deepcopy(response))))
+        self._loop.later(partial(self._answer, *header, copy.deepcopy(response)))
 
-    def _answer(self, header: _Header, response: Any) -> None:
+    def _answer(self, client: Client, number: int, response: Any) -> None:
         try:
-            with header.client.handle:
+            with client.handle:
                 pass
         except InvalidHandle:
             return  # destroyed meanwhile
-        complete_request(header.client, header.number, response, self._executor)
+        complete_request(client, number, response, self._executor)

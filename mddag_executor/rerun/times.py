@@ -19,40 +19,18 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from typing import Protocol
 
 from mddag_executor.core import quantile, Tables
 from mddag_executor.replay.load import RecordedLoad
 from mddag_executor.simulate.load import edge_numbers, needs_python
 
 
-class Times(Protocol):
-    """
-    How long everything takes, ns; vertices are global.
-
-    :ivar at_once: whether messages take no time.
-    """
-
-    at_once: bool
-
-    def execution(self, dag: int, vertex: int, release: int) -> int:
-        """Return how long a vertex of the job with that release executes."""
-
-    def transport(self, dag: int, before: int, after: int, release: int) -> int:
-        """Return how long after the end of a vertex its message to another one arrives."""
-
-    def computed(self, dag: int, vertex: int, release: int) -> int:
-        """Return how much of its execution a vertex computes; -1: it only waits."""
-
-    def holds(self, vertex: int) -> bool:
-        """Return whether a vertex holds the interpreter, where that is recorded."""
-
-
 class SameInEachJob:
     """
-    The same time in every job.
+    The same time in every job; all times are in ns, vertices are global.
 
     :param times: the execution time of each vertex, by DAG and local index.
+    :ivar at_once: whether messages take no time.
     """
 
     at_once = True
@@ -158,3 +136,6 @@ class AsRecorded:
             return -1
         at, job = min(near, key=lambda row: abs(row[0] - release))
         return job if abs(at - release) * 2 <= self._tables.period[dag] else -1
+
+
+Times = SameInEachJob | AsRecorded

@@ -127,32 +127,58 @@ def test_synthetic_nodes_in_two_processes_are_measured_as_one_run(
     assert 'measured by the nodes, ' in run.stdout and '1 declared callback' not in run.stdout
 
 
+class Beside:
+    """A session in which, at each wait, the next thing happens in the other process."""
+
+    def __init__(self, *happens: Callable[[], None]) -> None:
+        self.happens = list(happens)
+        self.waited = 0.0
+
+    def wait(self, seconds: float) -> bool:
+        if self.happens:
+            self.happens.pop(0)()
+        else:
+            self.waited = seconds
+        return False
+
+    def wait_until_matched(self, unmatched: Callable[[], list[str]]) -> None:
+        while unmatched():
+            self.wait(0.02)
+
+
 def test_processes_start_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The one that is ready first waits for the other, and both until the same instant."""
+    """However late another process is: it is waited for until its nodes are made, and ready."""
     parts.Part.make(str(tmp_path), CHAIN)
-    clock = {'first': 5 * 10 ** 9, 'second': 7 * 10 ** 9}
-    until = {}
+    monkeypatch.setattr(parts.time, 'monotonic_ns', lambda: 5 * 10 ** 9)
+    unmatched = ['/half']
+    seen = []
 
-    class Waiting:
+    def note(step: str, at: int) -> Callable[[], None]:
+        def write() -> None:
+            seen.append([path.name for path in tmp_path.glob('first.*')])
+            (tmp_path / f'second.{step}').write_text(str(at))
+        return write
 
-        def __init__(self, name: str) -> None:
-            self.name = name
+    session: Any = Beside(note('made', 6 * 10 ** 9), unmatched.clear, note('ready', 7 * 10 ** 9))
+    parts.Part.read(str(tmp_path)).start_together(
+        'first', ['first', 'second'], session, lambda: unmatched)
+    assert sorted(seen[0]) == ['first.made'] and 'first.ready' in seen[1]
+    assert session.waited == 2 + parts.LEAD_NS / 1e9
 
-        def wait(self, seconds: float) -> bool:
-            if not (tmp_path / 'second.ready').exists():
-                meet('second')
-                monkeypatch.setattr(parts.time, 'monotonic_ns', lambda: clock[self.name])
-                return False
-            until[self.name] = clock[self.name] + round(seconds * 1e9)
-            return False
 
-    def meet(name: str) -> None:
-        monkeypatch.setattr(parts.time, 'monotonic_ns', lambda: clock[name])
-        waiting: Any = Waiting(name)
-        parts.Part.read(str(tmp_path)).meet(name, ['first', 'second'], waiting)
-
-    meet('first')
-    assert until == dict.fromkeys(('second', 'first'), clock['second'] + parts.LEAD_NS)
+def test_who_has_ended_is_not_waited_for(tmp_path: Path) -> None:
+    """As a process that is started again in the last second, when the others end."""
+    parts.Part.make(str(tmp_path), CHAIN)
+    for step in ('made', 'ready'):
+        (tmp_path / f'second.{step}').write_text('1')
+    session: Any = Beside(lambda: parts.Part.ended(str(tmp_path), 'second'))
+    part = parts.Part.read(str(tmp_path))
+    part.start_together('first', ['first', 'second', 'third'], session, lambda: ['/half'])
+    assert not session.happens and session.waited <= parts.LEAD_NS / 1e9
+    parts.Part.starts(str(tmp_path), 'second')  # again: from now on it is
+    session = Beside(lambda: (tmp_path / 'third.made').write_text('1'), lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        part.start_together('first', ['first', 'second', 'third'], session, lambda: ['/half'])
 
 
 def test_programs_run_in_the_process_of_their_nodes(world: Path) -> None:

@@ -35,7 +35,11 @@ class Case:
         self.died: list[Run] = []
         self.since: list[tuple[str, float]] = []
         self.programs = {n: p if isinstance(p, list) else [p] for n, p in programs.items()}
-        self.supervisor = Supervisor(self.command, on_exit, self.out, self.err, self.died.append)
+        self.supervisor = Supervisor(self.command, on_exit, self.out, self.err, self.ended)
+
+    def ended(self, run: Run) -> None:
+        if run.died:
+            self.died.append(run)
 
     def command(self, name: str, nth: int, since: float) -> list[str]:
         self.since.append((name, since))

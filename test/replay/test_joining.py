@@ -11,6 +11,7 @@ from typing import Any
 from mddag_executor.core.tally import counts
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.clocks import offsets
+from mddag_executor.replay.joining import label_of
 from mddag_executor.trace import TraceFile
 import pytest
 
@@ -31,18 +32,18 @@ class Trace:
     """The trace of a process that runs one vertex; its clock is late by some ns."""
 
     def __init__(self, folder: Path, name: str, vertex: int, late: int = 0, graph: str = GRAPH,
-                 judges_from: int = 0, dag: int = 0, boot: str = '') -> None:
+                 judges_from: int = 0, dag: int = 0, boot: str = '', begin: int = 0) -> None:
         self.path = str(folder / f'run.{name}.mcap')
         self.file = TraceFile(self.path)
         self.vertex, self.late, self.pid, self.job = vertex, late, 100 + vertex + dag, 0
         self.dag = dag
-        self.add('task_set', 0, graph, 'graph.yaml', 'rad', 2, 100 * MS, 64, False, 2)
-        self.add('caret_init', 0, BASE - late, 'jazzy')
+        self.add('task_set', begin, graph, 'graph.yaml', 'rad', 2, 100 * MS, 64, False, 2)
+        self.add('caret_init', begin, BASE - late, 'jazzy')
         if boot:
-            self.add('host', 0, f'computer of {name}', boot)
-        self.add('rclcpp_callback_register', 0, ADDRESS, f'callback of {name}')
-        self.add('hosted', 0, dag, str(vertex))
-        self.add('judge_from', 0, BASE + judges_from - late)
+            self.add('host', begin, f'computer of {name}', boot)
+        self.add('rclcpp_callback_register', begin, ADDRESS, f'callback of {name}')
+        self.add('hosted', begin, dag, str(vertex))
+        self.add('judge_from', begin, BASE + judges_from - late)
 
     def add(self, name: str, at: int, *fields: Any) -> None:
         self.file.add(name, BASE + at - self.late, self.pid, self.pid, *fields)
@@ -358,6 +359,60 @@ def test_traces_of_different_runs_are_refused(tmp_path: Path) -> None:
         file.add('callback_start', 5, 1, 1, 7, False)
     with pytest.raises(ReplayError, match='not recorded by this executor'):
         replay([up, empty])
+
+
+def test_traces_of_two_runs_of_one_declaration_are_refused(tmp_path: Path, mddag: Any) -> None:
+    paths = {}
+    for run, begin in (('one', 0), ('two', 200 * MS)):
+        for vertex, name in enumerate(('up', 'down')):
+            trace = Trace(tmp_path, f'{run}.{name}', vertex, begin=begin)
+            trace.runs(begin + vertex * 5, begin + (1 + 2 * vertex) * MS)
+            paths[run, name] = trace.end(begin + 90 * MS)
+    for order in (['down', 'up'], ['up', 'down']):
+        given = [paths[run, name] for run in ('one', 'two') for name in order]
+        run = mddag('replay', *given) if order[0] == 'up' else mddag('replay', tmp_path)
+        assert (run.returncode, run.stdout, run.stderr.count('\n')) == (2, '', 1)
+        assert run.stderr == (
+            f'error: {given[2]}: it is of another run than {given[0]}: no trace goes on from one '
+            'to the other: give the traces of one run: {} {}, or {} {}\n'.format(*given))
+    one = mddag('replay', paths['one', 'up'], paths['one', 'down'])
+    assert '1 in time' in one.stdout and not one.stderr
+
+    # one that was started again was not there at the same time as the first one
+    long = Trace(tmp_path, 'long', 1)
+    long.runs(5, 3 * MS)
+    whole = replay([paths['one', 'up'], paths['two', 'up'], long.end(300 * MS)])
+    assert whole.result()['dags']['chain']['jobs'] == 2
+    # but what runs in two at once is of two runs
+    twin = Trace(tmp_path, 'twin', 1)
+    for release in (0, 10 * MS):
+        twin.runs(release, release + 2 * MS)
+    with pytest.raises(ReplayError, match='/b:take ran in it and, at the same time, in '):
+        replay([twin.end(50 * MS), paths['one', 'up'], long.path])
+
+
+def test_a_process_that_was_started_again_has_its_name(tmp_path: Path) -> None:
+    assert [label_of(f'/x.y/{name}.mcap') for name in (
+        'up', 'run.up', 'run.up.2', 'up.2', '2', 'drive')] == [
+            'up', 'up', 'up.2', 'up.2', '2', 'drive']
+
+
+def test_diff_takes_offsets(tmp_path: Path, mddag: Any) -> None:
+    folders = tmp_path / 'before', tmp_path / 'after'
+    for folder in folders:
+        folder.mkdir()
+        two_machines(folder, 2 * MS)
+    for name, longest in (
+            ('up', [10 * MS, 10 * MS]), (f'{folders[1]}/run.up.mcap', [9_900_000, 10 * MS])):
+        run = mddag('diff', *folders, '--offset', f'{name}=2ms', '--json', '-')
+        assert run.returncode == 0, run.stderr
+        sides = json.loads(run.stdout)['dags']['chain']['sinks']['/b:take']
+        assert [sides[side]['response_ns']['max'] for side in 'ab'] == longest
+    for arguments in ((*folders, '--offset', 'left=2ms'),
+                      (*folders[0].iterdir(), '--offset', 'up=2ms')):
+        run = mddag('diff', *arguments)
+        assert (run.returncode, run.stderr.count('\n')) == (2, 1)
+        assert '--offset: neither run has several traces and one of ' in run.stderr
 
 
 def test_the_command_takes_several_traces(tmp_path: Path, mddag: Any) -> None:
