@@ -29,7 +29,7 @@ from mddag_executor.core import policy as find_policy
 from mddag_executor.core.tally import total
 from mddag_executor.simulate.deliveries import DELAY_NS
 from mddag_executor.simulate.load import edge_numbers, edges_of, Load
-from mddag_executor.simulate.schedule import How, prepare, schedule
+from mddag_executor.simulate.schedule import prepare, schedule, Settings
 from mddag_executor.simulate.workload import periodic_load
 from msg_graph import Process, TaskSet
 
@@ -72,12 +72,12 @@ class Predictor:
         bases = list(accumulate(edges_of(tables), initial=0))[:-1]
         load = _apart(periodic_load(task_set, times, self._duration)._replace(
             holds=holds, delays=delays, delay_base=bases, delay_stride=[0] * len(bases)))
-        how = How(
-            self._policy.name, self._workers, cpus=self._cpus, processes=max(1, len(processes)))
+        settings = Settings(
+            self._policy.name, self._workers, self._duration, cpus=self._cpus,
+            processes=max(1, len(processes)))
         if self._compiled is None:
-            self._compiled = prepare(tables, load, how, MOST_TRIES)
-        decisions = schedule(
-            tables, load, how, self._duration, compiled=self._compiled).decisions
+            self._compiled = prepare(tables, load, settings, MOST_TRIES)
+        decisions = schedule(tables, load, settings, compiled=self._compiled).decisions
         tally = Tally(task_set, tables)
         for time, dag in zip(load.times, load.dags):
             if time < self._duration:

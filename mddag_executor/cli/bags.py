@@ -12,7 +12,7 @@ from mddag_executor.cli.text import Progress
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
-    from mddag_executor.replay.bags_reschedule import BagReschedule
+    from mddag_executor.replay import Reschedule
     from msg_graph import TaskSet
 
 RECORDED = -1
@@ -63,7 +63,7 @@ def no_graph(name: str) -> UsageError:
 
 def reschedule_bag(
     args: argparse.Namespace, path: str, name: str, task_set: TaskSet | None
-) -> BagReschedule:
+) -> Reschedule:
     """
     Run the scheduler over a bag.
 

@@ -26,7 +26,6 @@ from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
     from mddag_executor.replay import Replay, Reschedule
-    from mddag_executor.replay.bags_reschedule import BagReschedule
     from mddag_executor.replay.run import Recording
     from msg_graph import TaskSet
 
@@ -127,7 +126,7 @@ def _result(
 ) -> tuple[dict[str, Any], TaskSet]:
     """Return the result of a run, and the declaration that judged it."""
     path, name = trace
-    outcome: Replay | Reschedule | BagReschedule
+    outcome: Replay | Reschedule
     if reschedule or recorded.is_bag(path):
         outcome = recorded.rescheduled(args, path, name, task_set)
     else:

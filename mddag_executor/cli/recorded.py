@@ -22,7 +22,6 @@ from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
     from mddag_executor.replay import Replay, Reschedule
-    from mddag_executor.replay.bags_reschedule import BagReschedule
     from mddag_executor.replay.happenings import Observer
     from mddag_executor.replay.run import Recording
     from msg_graph import Process, TaskSet
@@ -124,7 +123,7 @@ def as_recorded(
 
 def rescheduled(
     args: argparse.Namespace, path: Recording, name: str, task_set: TaskSet | None
-) -> Reschedule | BagReschedule:
+) -> Reschedule:
     """
     Run the scheduler over a recording of any kind.
 

@@ -20,7 +20,6 @@ from mddag_executor.cli.text import printable, warn
 
 if TYPE_CHECKING:
     from mddag_executor.replay import Replay, Reschedule
-    from mddag_executor.replay.bags_reschedule import BagReschedule
     from msg_graph.drift import Drift
 
 EXAMPLE = """\
@@ -57,7 +56,7 @@ def main(args: argparse.Namespace) -> int:
     with common.input_recording(args.trace) as (path, name):
         watch = common.report_watch(args.report)
         drift: list[Drift] = []
-        outcome: Replay | Reschedule | BagReschedule
+        outcome: Replay | Reschedule
         if args.reschedule or recorded.is_bag(path):
             outcome = recorded.rescheduled(args, path, name, task_set)
         else:

@@ -74,7 +74,7 @@ def main(args: argparse.Namespace) -> int:
     run = _simulate(task_set, load, settings, utilisation(task_set, times, workers),
                     log=args.trace is not None or args.report is not None)
     if args.trace is not None:
-        from mddag_executor.simulate.recording import write_trace
+        from mddag_executor.replay.run_writer import write_trace
         with common.output_trace(args.trace) as path:
             write_trace(path, task_set, load, run)
     if args.report is not None:

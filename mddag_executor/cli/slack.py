@@ -74,7 +74,7 @@ def main(args: argparse.Namespace) -> int:
     callbacks = len(set(problem.callback_of))
     with Progress('looking for slack', callbacks) as line:
         slack = find_slack(problem, line.update, args.jobs or defaults.processors())
-    result = slack_result(slack, task_set, dags, problem.how.processes)
+    result = slack_result(slack, task_set, dags, problem.settings.processes)
     if args.report is not None:
         from mddag_executor.report.slack import page
         common.write_text(args.report, ''.join(page(result, str(args.trace))))
@@ -106,7 +106,7 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
             name=name, progress=line.events, skip=args.skip, cpus=args.cpus)
     for warning in outcome.warnings:
         warn(warning)
-    problem = Problem(outcome.work, outcome.how, outcome.tables, outcome.end_ns,
+    problem = Problem(outcome.work, outcome.settings, outcome.tables,
                       outcome.task_set.places_of_vertices())
     return problem, outcome.task_set, outcome.result()['dags']
 
@@ -132,8 +132,7 @@ def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
         cpus=args.cpus)
     load = periodic_load(task_set, times, settings.duration_ns)
     run = simulated(task_set, load, settings)
-    problem = Problem(load, settings.how, Tables.build(task_set), settings.duration_ns,
-                      task_set.places_of_vertices())
+    problem = Problem(load, settings, Tables.build(task_set), task_set.places_of_vertices())
     return problem, task_set, run.result()['dags']
 
 

@@ -58,8 +58,7 @@ def check_slack(
     load = periodic_load(fixed, draw_execution_times(fixed, 0), settings.duration_ns)
     with Progress('recording', 2 * args.callbacks) as line:
         slack = find_slack(Problem(
-            load, settings.how, Tables.build(fixed), settings.duration_ns,
-            fixed.places_of_vertices()), jobs=processors())
+            load, settings, Tables.build(fixed), fixed.places_of_vertices()), jobs=processors())
         found = sorted((one.factor, task_set.callbacks[i].key, one.breaks)
                        for i, one in slack.factors.items()
                        if i >= 0 and one.factor is not None and LEAST <= one.factor <= MOST)

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core import Tables
 from mddag_executor.replay.happenings import Ints
-from mddag_executor.simulate import END, How, Load, schedule
+from mddag_executor.simulate import END, Load, schedule, Settings
 import numpy as np
 import numpy.typing as npt
 
@@ -131,10 +131,11 @@ def _ends(ran: Recorded, took: Ints, cpus: int) -> Ints:
         took[order].tolist(), [0] * n, [1] * n, holds=[0] * len(times) if ran.locks.any() else [],
         computed=ran.cpu[order].tolist(), locks=ran.locks[order].astype(np.int64).tolist())
     # those that stand still are more than those that ran
-    how = How('fifo', 2 * most + 2, cpus=cpus or len(times) + 1)
-    horizon = int(times.max(initial=0) + took.sum() + 1)
+    settings = Settings(
+        'fifo', 2 * most + 2, int(times.max(initial=0) + took.sum() + 1),
+        cpus=cpus or len(times) + 1)
     ends = np.zeros(len(times), dtype=np.int64)
-    for now, kind, _, _, _, job in schedule(_interpreters(n), load, how, horizon, log=True).log:
+    for now, kind, _, _, _, job in schedule(_interpreters(n), load, settings, log=True).log:
         if kind == END:
             ends[order[job]] = now
     return ends

@@ -21,17 +21,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 import os
 import random
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core import policy as find_policy
-from mddag_executor.core.state import Decision
 from mddag_executor.replay.bags import Bag, BagError, UNKNOWN
-from mddag_executor.replay.computed import ComputedRun
-from mddag_executor.replay.tolerances import MissTally
-from mddag_executor.replay.usage import share
-from mddag_executor.simulate import How, Load, LogEntry, schedule, SimulationError
-from mddag_executor.simulate.engine import busy_times
+from mddag_executor.replay.load import RecordedLoad
+from mddag_executor.replay.reschedule import Reschedule
+from mddag_executor.simulate import Load, Settings, SimulationError
 from mddag_executor.simulate.workload import declared_holds
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.times import credible
@@ -50,50 +47,33 @@ class Source(NamedTuple):
     note: str
 
 
-class BagReschedule:
+class _Builder:
     """
-    What the core makes of a bag.
+    Makes a load of the messages of a bag.
 
-    :ivar log: every start, end and preemption, on the bag's clock.
     :ivar notes: what was assumed, one line each; ``warnings``: what is missing or doubtful.
     """
 
-    def __init__(
-        self, bag: Bag, task_set: TaskSet, *, policy: str, workers: int, preemptive: bool,
-        times: Sequence[Sequence[int]] | None, seed: int, dispatch_overhead: int,
-        skip: int = 0, cpus: int | None = None,
-    ) -> None:
-        self._bag = bag
-        self.cpus = cpus
-        self.task_set = task_set
-        self.policy = policy
-        self.workers = workers
-        self.preemptive = preemptive
-        self.dispatch_overhead = dispatch_overhead
-        self.start, self.end = bag.start or 0, (bag.end or 0) + 1
-        self.skip = skip
-        self.judge_from = self.start + skip if skip else -NEVER
+    def __init__(self, bag: Bag, task_set: TaskSet) -> None:
+        self._bag, self._task_set = bag, task_set
+        self._start = bag.start or 0
         self.warnings = bag.warnings
         self.notes: list[str] = []
-        self.tables = Tables.build(task_set, max_active_jobs=NEVER)
-        self.tally = MissTally(task_set, self.tables)
-        self.load = load = self._load(times, seed)
-        self.demand = sum(load.costs)
-        self.executions = len(load.costs)
-        self.decisions: list[Decision]
-        self.log: list[LogEntry] = self._run(load)
 
-    def _load(self, times: Sequence[Sequence[int]] | None, seed: int) -> Load:
+    def build(self, times: Sequence[Sequence[int]] | None, seed: int) -> RecordedLoad:
+        """Return the load; ``times`` and ``seed``: see ``reschedule_bag``."""
         generator = random.Random(seed)
         releases: list[tuple[int, int, int, int]] = []
         costs: list[int] = []
         holds: list[int] = []
         bases: list[int] = []
-        declared = declared_holds(self.task_set)
-        for dag in self.task_set.dags:
+        jobs: list[Sequence[int]] = []
+        declared = declared_holds(self._task_set)
+        for dag in self._task_set.dags:
             source = self._source(dag)
             self.notes.append(f'{dag.name}: {source.note}')
             bases.append(len(costs))
+            jobs.append(range(len(source.jobs)))
             if len(releases) + len(source.jobs) > _MOST_JOBS:
                 raise self._too_many()
             for job, (ready, release) in enumerate(source.jobs):
@@ -103,14 +83,15 @@ class BagReschedule:
         bases.append(len(costs))
         if not releases:
             raise BagError(
-                self._bag.name, f'none of the sources of {self.task_set.file} is in it: it has '
+                self._bag.name, f'none of the sources of {self._task_set.file} is in it: it has '
                 + (listed(sorted(self._bag.topics)) or 'no topics'),
                 'give the graph of the nodes that were recorded')
         releases.sort()
-        return Load(
+        load = Load(
             [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases], costs,
-            bases, [*(len(dag.vertices) for dag in self.task_set.dags), 1],
+            bases, [*(len(dag.vertices) for dag in self._task_set.dags), 1],
             [r[3] for r in releases], holds)
+        return RecordedLoad(load, jobs, sum(costs), len(costs), 0, [])
 
     def _source(self, dag: Dag) -> Source:
         callback = dag.vertices[dag.source].callback
@@ -159,7 +140,7 @@ class BagReschedule:
         """Return the jobs of a timer: at its period, while messages came."""
         found: list[tuple[int, int]] = []
         for start, end in self._bag.stretches:
-            first = self.start - (self.start - start) // period * period
+            first = self._start - (self._start - start) // period * period
             if (end - first) // period + len(found) >= _MOST_JOBS:
                 raise self._too_many()
             found.extend((t, t) for t in range(first, end + 1, period))
@@ -168,53 +149,6 @@ class BagReschedule:
     def _too_many(self) -> BagError:
         return BagError(
             self._bag.name, f'there are more than {_MOST_JOBS} jobs in it', 'give a shorter bag')
-
-    def _run(self, load: Load) -> list[LogEntry]:
-        how = How(
-            self.policy, self.workers, find_policy(self.policy).mode(self.preemptive),
-            self.dispatch_overhead, judge_from=self.judge_from, cpus=self.cpus)
-        _, log, self.decisions = schedule(self.tables, load, how, self.end, log=True)
-        for dag, release in zip(load.dags, load.releases):
-            if release >= self.judge_from:
-                self.tally.released(dag)
-        self.tally.add(self.decisions)
-        return log
-
-    @property
-    def duration_ns(self) -> int:
-        """Return the time from the first to the last message of the bag."""
-        return self.end - self.start
-
-    def computed(self) -> ComputedRun:
-        """Return the schedule, to be played to observers."""
-        return ComputedRun(self.task_set, self.load, self.log, self.decisions, self.end, self.end,
-                           judge_from=self.judge_from)
-
-    def worker_busy(self) -> list[int]:
-        """Return for each worker how long it was busy, ns."""
-        return busy_times(self.log, self.workers, self.end)
-
-    def result(self) -> dict[str, Any]:
-        """Return the result format of ``replay --json``."""
-        busy = self.worker_busy()
-        return {
-            'policy': self.policy, 'workers': self.workers, 'preemptive': self.preemptive,
-            **({} if self.cpus is None else {'cpus': self.cpus}),
-            'duration_ns': self.duration_ns,
-            'utilisation': share(self.demand, self.workers, self.duration_ns),
-            **self.tally.result(), 'rescheduled': True, 'skip_ns': self.skip,
-            'executions': self.executions, 'estimated_executions': 0,
-            'overheads': {
-                'included': False, 'added_ns': self.dispatch_overhead,
-                'dispatch_median_ns': None, 'transport_median_ns': None},
-            'worker_use': {
-                'busy_ns': {str(w): took for w, took in enumerate(busy)},
-                'use': share(sum(busy), self.workers, self.duration_ns)},
-            'recorded': None,
-            'recording': {
-                'trace': self._bag.name, 'declaration': self.task_set.file,
-                'start_ns': self.start, 'end_ns': self.end, 'messages': self._bag.count},
-            'notes': self.notes, 'warnings': self.warnings}
 
 
 def _costs(
@@ -243,7 +177,7 @@ def reschedule_bag(
     skip: int = 0,
     name: str | None = None,
     cpus: int | None = None,
-) -> BagReschedule:
+) -> Reschedule:
     """
     Run the core over the messages of an ordinary bag.
 
@@ -273,7 +207,14 @@ def reschedule_bag(
     if bag.start is None:
         what = '; '.join(bag.warnings) or 'there are no messages in it'
         raise BagError(bag.name, what.removeprefix(f'{bag.name}: '), 'record one anew')
-    return BagReschedule(
-        bag, task_set, policy=policy, workers=workers or task_set.workers or DEFAULT_WORKERS,
-        preemptive=preemptive, times=times, seed=seed, dispatch_overhead=dispatch_overhead,
-        skip=skip, cpus=cpus)
+    builder = _Builder(bag, task_set)
+    work = builder.build(times, seed)
+    end = (bag.end or 0) + 1
+    settings = Settings(
+        policy, workers or task_set.workers or DEFAULT_WORKERS, end, preemptive,
+        dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
+        judge_from=bag.start + skip if skip else -NEVER)
+    return Reschedule(
+        task_set, work, Tables.build(task_set, max_active_jobs=NEVER), settings, bag.start,
+        {'trace': bag.name, 'declaration': task_set.file, 'start_ns': bag.start, 'end_ns': end,
+         'messages': bag.count}, builder.warnings, skip=skip, notes=builder.notes)

@@ -32,7 +32,7 @@ from mddag_executor.replay.happenings import (
     RELEASED,
     STARTED,
 )
-from mddag_executor.simulate import END, Load, LogEntry, START
+from mddag_executor.simulate import END, Load, LogEntry, Run, START
 from mddag_executor.simulate.load import FAILS
 from msg_graph import TaskSet
 
@@ -61,9 +61,17 @@ class ComputedRun(NamedTuple):
     horizon: int
     end: int
     judged: bool = True
-    numbers: list[list[int]] | None = None
+    numbers: Sequence[Sequence[int]] | None = None
     delay: Delay | None = None
     judge_from: int = -NEVER
+
+    @classmethod
+    def of_run(cls, task_set: TaskSet, load: Load, run: Run) -> ComputedRun:
+        """Return a run that was simulated with its log."""
+        horizon = run.settings.duration_ns
+        stopped = run.settings.stop_at_first_miss and run.ended_ns < horizon
+        judged = run.settings.judge == 'horizon' and not stopped
+        return cls(task_set, load, run.log, run.decisions, horizon, run.ended_ns, judged)
 
     def play(self, observers: Sequence[Observer]) -> None:
         """Tell the observers everything."""
@@ -162,7 +170,7 @@ class _Teller:
                 before = _Running(now, ready, now, 0)
             self._running[what] = before._replace(since=now)
             if declared:
-                self._tell(STARTED, dag, v, number, before.ready, now, self._callback[v])
+                self._tell(STARTED, dag, v, number, before.ready, now, self._callback[v], worker)
             return
         assert before is not None, 'what ends has begun'
         busy = before.busy + now - before.since

@@ -43,7 +43,7 @@ NOW, PROCESS, THREAD, FIELD = range(4)
 KINDS = ('released', 'started', 'ran', 'completed', 'ended', 'withdrawn', 'failed', 'missed',
          'published')
 RELEASED, STARTED, RAN, COMPLETED, ENDED, WITHDRAWN, FAILED, MISSED, PUBLISHED = range(len(KINDS))
-_WIDTHS = (4, 6, 9, 13, 4, 2, 4, 5, 7)
+_WIDTHS = (4, 7, 9, 13, 4, 2, 4, 5, 7)
 
 
 class Piece(NamedTuple):
@@ -163,9 +163,9 @@ class Observer:
         """Note that a job was released; `now` is when the executor noticed it."""
 
     def started(
-        self, dag: int, vertex: int, job: int, ready: int, start: int, callback: int
+        self, dag: int, vertex: int, job: int, ready: int, start: int, callback: int, worker: int
     ) -> None:
-        """Note that an execution of a vertex was dispatched (or a coroutine went on)."""
+        """Note that an execution was dispatched (or a coroutine went on); worker -1: not known."""
 
     def ran(
         self, callback: int, dag: int, vertex: int, job: int, worker: int, ready: int, start: int,

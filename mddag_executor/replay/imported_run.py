@@ -215,7 +215,7 @@ class ImportedRun(LinkObserver):
         if target is not None and run.of is not None:
             dag, vertex, job = run.of
             self._active[(dag, job)] += 1
-            self._tell(STARTED, dag, vertex, job, run.ready, run.start, run.callback.number)
+            self._tell(STARTED, dag, vertex, job, run.ready, run.start, run.callback.number, -1)
 
     def _ready(self, run: Execution, message: Publication | None) -> int:
         if run.callback.kind == 'timer':

@@ -68,7 +68,7 @@ class RecordedLoad(NamedTuple):
     """
 
     load: Load
-    jobs: list[list[int]]
+    jobs: Sequence[Sequence[int]]
     demand: int
     executions: int
     estimated: int

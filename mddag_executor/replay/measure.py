@@ -22,29 +22,26 @@ import resource
 import time
 from typing import Any, NamedTuple
 
-from mddag_executor.core import legs_of, Tables
-from mddag_executor.core import policy as find_policy
-from mddag_executor.core.state import new_state
 from mddag_executor.errors import MddagError
 from mddag_executor.memory import peak_memory_mb
+from mddag_executor.replay.run_writer import write_events
 from mddag_executor.simulate import (
     draw_execution_times,
-    END,
     Load,
-    LogEntry,
     periodic_load,
     scale_execution_times,
-    START,
+    Settings,
+    simulate,
 )
-from mddag_executor.simulate.engine import run
 from mddag_executor.trace import TraceFile, TraceReader
-from msg_graph import Dag, TaskSet
+from msg_graph import TaskSet
 
 _TILE = 10_000_000_000      # ns simulated
 _PAUSE = 1_000_000_000      # ns after it, in which everything completes
 _BEGIN = 1_732_166_766_000_000_000
 _PROCESS = 1
-_BATCH = 8192
+_ADDRESS = 1024     # times the place of a callback, so that its handles have others
+_KINDS = ('job_release', 'dispatch', 'callback_start', 'callback_end', 'complete')
 Event = tuple[Any, ...]
 
 
@@ -74,12 +71,8 @@ def write_long_trace(
     times = scale_execution_times(
         task_set, draw_execution_times(task_set, 0), workers, utilisation)
     load = periodic_load(task_set, times, _TILE)
-    tables = Tables.build(task_set)
-    state = new_state(tables, workers)
-    log: list[LogEntry] = []
-    run(tables, state, find_policy('rad').key, load, _TILE + _PAUSE, False, log)
-    tile = list(_Tile(task_set, tables, load, log).events())
-    jobs = [0] * tables.n_dags
+    tile = _tile(task_set, load, workers)
+    jobs = [0] * len(task_set.dags)
     for dag in load.dags:
         jobs[dag] += 1
     written = 0
@@ -120,54 +113,30 @@ def _shifted(tile: list[Event], number: int, jobs: list[int]) -> Iterator[Event]
         yield (name, when + later, thread, *fields)
 
 
-class _Tile:
-    """The events of a simulated run, in the order in which an executor records them."""
+def _tile(task_set: TaskSet, load: Load, workers: int) -> list[Event]:
+    """Return the events of a simulated run, with those of its messages, in the order of time."""
+    run = simulate(task_set, load, Settings(
+        workers=workers, duration_ns=_TILE + _PAUSE, judge='completions'), log=True)
+    found: list[Event] = []
+    publishes: dict[int, bool] = {}     # by thread
 
-    def __init__(
-        self, task_set: TaskSet, tables: Tables, load: Load, log: list[LogEntry]
-    ) -> None:
-        self._dags = task_set.dags
-        self._tables = tables
-        self._load = load
-        self._log = log
-        self._ready: dict[tuple[int, int], int] = {}
+    def add(name: str, when: int, thread: int, *fields: Any) -> None:
+        if name not in _KINDS:
+            return
+        address = _ADDRESS * fields[0]
+        if name == 'dispatch':
+            vertex = task_set.dags[fields[1]].vertices[fields[2]]
+            publishes[thread] = bool(vertex.successors)
+            if vertex.predecessors:
+                ready = fields[5]
+                found.append(('rmw_take', ready, 0, address + 1, address + 2, ready, True))
+        elif name == 'callback_end' and publishes[thread]:
+            found.append(('rclcpp_publish', when, thread, address + 3, address + 4, when))
+            found.append(('rcl_publish', when, thread, address + 3, address + 4))
+        found.append((name, when, thread, *fields))
 
-    def events(self) -> Iterator[Event]:
-        """Yield them in order of time."""
-        events: list[Event] = []
-        for when, dag, job in zip(self._load.times, self._load.dags, self._load.jobs):
-            events.append(('job_release', when, 99, dag, job, when))
-            self._ready[self._tables.source[dag], job] = when
-        started: dict[int, int] = {}
-        for when, kind, worker, dag, vertex, job in self._log:
-            if kind == START:
-                started[worker] = when
-            elif kind == END:
-                events.extend(self._execution(
-                    self._dags[dag], vertex, job, worker, started[worker], when))
-        return iter(sorted(events, key=lambda event: event[1]))
-
-    def _execution(
-        self, dag: Dag, vertex: int, job: int, worker: int, start: int, end: int
-    ) -> Iterator[Event]:
-        t = self._tables
-        thread, address = 100 + worker, 1000 + 16 * vertex
-        local = t.index_in_dag[vertex]
-        ready = self._ready.pop((vertex, job))
-        if dag.vertices[local].predecessors:
-            yield ('rmw_take', ready, 99, address + 1, address + 2, ready, True)
-        yield ('dispatch', start, thread, address, dag.index, local, job, worker, ready, end)
-        yield ('callback_start', start, thread, address, False)
-        if dag.vertices[local].successors:
-            yield ('rclcpp_publish', end, thread, address + 3, address + 4, end)
-            yield ('rcl_publish', end, thread, address + 3, address + 4)
-        yield ('callback_end', end, thread, address)
-        here = dag.vertices[local]
-        last = max(1, len(legs_of(here, dag.vertices))) - 1
-        for leg in range(last + 1):
-            yield ('complete', end, thread, address, dag.index, local, job, leg == last, end, leg)
-        for after in dag.vertices[local].successors:
-            self._ready[t.first_vertex[dag.index] + after, job] = end
+    write_events(task_set, load, run, add)
+    return sorted(found, key=lambda event: event[1])
 
 
 # --- readers -------------------------------------------------------------------------------------

@@ -468,7 +468,8 @@ class _Threads:
         told = good & (dag >= 0)
         told[:n_running] = False
         add(STARTED, where[_IS_DISPATCH][told[n_running:]], dag[told], vertex[told],
-            dispatch[told, FIELD + 3], ready[told], dispatch[told, NOW], dispatch[told, FIELD])
+            dispatch[told, FIELD + 3], ready[told], dispatch[told, NOW],
+            *dispatch[told][:, [FIELD, FIELD + 4]].T)
         line = _Line(length, self._last[:, 0], self._running, where, of)
 
         # dispatches and ends change what a thread runs

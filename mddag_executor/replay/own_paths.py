@@ -60,7 +60,7 @@ class OwnPaths(Observer):
             return
         started, ran = batch.columns(STARTED), batch.columns(RAN)
         chosen = np.flatnonzero(self._callback[started[:, 1]] != NONE)
-        dag, vertex, job, ready, start, address = started[chosen].T
+        dag, vertex, job, ready, start, address, _ = started[chosen].T
         topics = np.where(self._takes_topics[vertex], self._number_of(address), NONE)
         begun = np.column_stack((
             batch.places(STARTED)[chosen], self._callback[vertex],

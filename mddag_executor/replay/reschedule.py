@@ -16,7 +16,6 @@ from typing import Any
 
 from mddag_executor.core import NEVER, POLICIES, processes_of, Tables
 from mddag_executor.core import policy as find_policy
-from mddag_executor.core.state import Decision
 from mddag_executor.errors import UsageError
 from mddag_executor.memory import no_garbage
 from mddag_executor.replay.as_recorded import Progress, recording_result, Replay
@@ -28,7 +27,7 @@ from mddag_executor.replay.recording import Head, ReplayError
 from mddag_executor.replay.run import open_run, Recording, Run
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
-from mddag_executor.simulate import How, LogEntry, schedule
+from mddag_executor.simulate import schedule, Settings
 from mddag_executor.simulate.engine import busy_times
 from mddag_executor.simulate.load import edge_numbers
 from mddag_executor.text import counted, listed
@@ -39,101 +38,75 @@ MAX_WORKERS = 4096
 
 class Reschedule:
     """
-    What the core makes of a recorded load.
+    What the core makes of a load that was recorded.
 
-    :ivar recorded: the same recording as it was.
+    :param work: the load, made from a run or from a bag.
+    :param start: when the recording began, ns.
+    :param about: what the result tells of the recording.
+    :param recorded: the same run as it was; None: it was a bag.
+    :param notes: what was assumed, one line each.
     :ivar processes: which nodes run in which process; empty: all in one.
     :ivar workers: of all processes.
-    :ivar log: every start, end and preemption, on the trace's clock.
+    :ivar log: every start, end and preemption, on the recording's clock.
     :ivar decisions: what the core decided.
     :ivar warnings: what is missing or doubtful, one line each.
     """
 
     def __init__(
-        self, recorded: Replay, work: RecordedLoad, tables: Tables, policy: str, workers: int,
-        preemptive: bool, overheads: bool, dispatch_overhead: int = 0,
-        judge_from: int = -NEVER, skip: int = 0, cpus: int | None = None,
-        processes: Sequence[Process] = (),
+        self, task_set: TaskSet, work: RecordedLoad, tables: Tables, settings: Settings,
+        start: int, about: dict[str, Any], warnings: list[str], *, skip: int = 0,
+        overheads: bool = False, processes: Sequence[Process] = (),
+        recorded: Replay | None = None, notes: Sequence[str] = (),
     ) -> None:
-        self._work = work
-        self.cpus = cpus
-        self.recorded = recorded
-        self.task_set = recorded.task_set
-        self.tables = tables
-        self.policy = policy
-        self.processes = processes
-        self.workers = workers * max(1, len(processes))
-        self.preemptive = preemptive
-        self.overheads = overheads
-        self.dispatch_overhead = dispatch_overhead
-        self.judge_from = judge_from
-        self.skip = skip
-        self.warnings = recorded.warnings
-        if cpus is not None and recorded.run.declared and not work.load.computed:
-            self.warnings.append(
-                f'{recorded.run.name}: CPU times are not recorded in it, so with --cpus each '
-                'execution computes all the time')
-        self.log: list[LogEntry]
-        self.decisions: list[Decision]
-        self.tally = MissTally(self.task_set, tables)
-        self._run()
-
-    def _run(self) -> None:
-        load, end = self._work.load, self.recorded.run.end
-        _, self.log, self.decisions = schedule(self.tables, load, self.how, end, log=True)
+        self.task_set, self.work, self.tables, self.settings = task_set, work, tables, settings
+        self.recorded, self.processes, self.notes = recorded, processes, notes
+        self.workers = settings.workers * settings.processes
+        self.warnings = warnings
+        self._skip, self._overheads, self._about = skip, overheads, about
+        self._start = start
+        self.tally = MissTally(task_set, tables)
+        load, end = work.load, settings.duration_ns
+        _, self.log, self.decisions = schedule(tables, load, settings, log=True)
         for time, dag, release in zip(load.times, load.dags, load.releases or load.times):
-            if time < end and release >= self.judge_from:
+            if time < end and release >= settings.judge_from:
                 self.tally.released(dag)
         self.tally.add(self.decisions)
 
     @property
-    def how(self) -> How:
-        """Return how the load is scheduled."""
-        processes = max(1, len(self.processes))
-        return How(self.policy, self.workers // processes, self.preemptive,
-                   self.dispatch_overhead, judge_from=self.judge_from, cpus=self.cpus,
-                   processes=processes)
-
-    @property
     def worker_names(self) -> list[str]:
         """Return what workers are called, where that is more than a number."""
-        each = self.workers // max(1, len(self.processes))
-        return [f'{process.name} {w}' for process in self.processes for w in range(each)]
+        return [f'{process.name} {w}' for process in self.processes
+                for w in range(self.settings.workers)]
 
     @property
-    def work(self) -> RecordedLoad:
-        """Return the load that was scheduled."""
-        return self._work
-
-    @property
-    def end_ns(self) -> int:
-        """Return when the run ended, on the trace's clock."""
-        return self.recorded.run.end
+    def duration_ns(self) -> int:
+        """Return how long the recording is."""
+        return max(0, self.settings.duration_ns - self._start)
 
     def computed(self) -> ComputedRun:
         """Return the schedule, to be played to observers."""
-        load, edges = self._work.load, edge_numbers(self.tables)
+        load, edges = self.work.load, edge_numbers(self.tables)
+        end = self.settings.duration_ns
 
         def delay(dag: int, job: int, before: int, after: int) -> int:
             return load.delays[
                 load.delay_base[dag] + job * load.delay_stride[dag] + edges[before, after]]
 
-        end = self.end_ns
         return ComputedRun(
-            self.task_set, load, self.log, self.decisions, end, end, True, self._work.jobs, delay,
-            self.judge_from)
+            self.task_set, load, self.log, self.decisions, end, end, True, self.work.jobs,
+            delay if load.delay_base else None, self.settings.judge_from)
 
     def recorded_job(self, dag: int, job: int) -> int:
         """Return the recorded index of a job of the log or tally."""
-        return self._work.jobs[dag][job]
+        return self.work.jobs[dag][job]
 
     def worker_busy(self) -> list[int]:
         """Return for each worker how long it was busy, ns."""
-        return busy_times(self.log, self.workers, self.recorded.run.end)
+        return busy_times(self.log, self.workers, self.settings.duration_ns)
 
     def result(self) -> dict[str, Any]:
         """Return the result format of ``replay --json``, with the recorded run beside it."""
-        duration = self.recorded.duration_ns
+        duration, settings, work = self.duration_ns, self.settings, self.work
         busy = self.worker_busy()
         verdicts = self.tally.result()
         miss = verdicts['first_miss']
@@ -141,24 +114,26 @@ class Reschedule:
             dag = self.task_set.dag(miss['dag']).index
             miss = {**miss, 'job': self.recorded_job(dag, miss['job'])}
         return {
-            'policy': self.policy, 'workers': self.workers, 'preemptive': self.preemptive,
-            **({} if self.cpus is None else {'cpus': self.cpus}), 'duration_ns': duration,
+            'policy': settings.policy, 'workers': self.workers,
+            'preemptive': settings.preemptive,
+            **({} if settings.cpus is None else {'cpus': settings.cpus}),
+            'duration_ns': duration,
             **({'processes': [asdict(each) for each in self.processes]}
                if self.processes else {}),
-            'utilisation': share(self._work.demand, self.workers, duration),
-            **verdicts, 'first_miss': miss, 'rescheduled': True, 'skip_ns': self.skip,
-            'executions': self._work.executions, 'estimated_executions': self._work.estimated,
+            'utilisation': share(work.demand, self.workers, duration),
+            **verdicts, 'first_miss': miss, 'rescheduled': True, 'skip_ns': self._skip,
+            'executions': work.executions, 'estimated_executions': work.estimated,
             'overheads': {
-                'included': self.overheads, 'added_ns': self.dispatch_overhead,
-                'dispatch_median_ns': self._work.dispatch_ns,
-                'transport_median_ns': self._work.transport_ns},
+                'included': self._overheads, 'added_ns': settings.dispatch_overhead_ns,
+                'dispatch_median_ns': work.dispatch_ns,
+                'transport_median_ns': work.transport_ns},
             'worker_use': {
                 'busy_ns': {str(w): took for w, took in enumerate(busy)},
                 'use': share(sum(busy), self.workers, duration)},
-            'recorded': {
+            'recorded': None if self.recorded is None else {
                 'policy': self.recorded.run.head.policy, 'workers': self.recorded.run.head.workers,
                 **self.recorded.tally.result()},
-            'recording': recording_result(self.recorded.run),
+            'recording': self._about, **({'notes': self.notes} if self.notes else {}),
             'warnings': self.warnings}
 
 
@@ -238,10 +213,19 @@ def reschedule(
             'give a GRAPH that declares it')
     tables = with_groups(
         tables, builder.callback_of, run.who.groups(), declared_first=not run.same)
+    warnings = recorded.warnings
+    if cpus is not None and run.declared and not work.load.computed:
+        warnings.append(
+            f'{run.name}: CPU times are not recorded in it, so with --cpus each '
+            'execution computes all the time')
+    settings = Settings(
+        policy, workers, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
+        judge_from=recorded.judge.judge_from, processes=max(1, len(placed)))
+    start = run.end if run.start is None else run.start
     with no_garbage():
         return Reschedule(
-            recorded, work, tables, policy, workers, preemptive, overheads, dispatch_overhead,
-            recorded.judge.judge_from, skip, cpus, placed)
+            run.task_set, work, tables, settings, start, recording_result(run), warnings,
+            skip=skip, overheads=overheads, processes=placed, recorded=recorded)
 
 
 def _beside(workers: int, recorded: int) -> float:

@@ -27,6 +27,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from copy import copy
+from dataclasses import replace
 from functools import partial
 import math
 import multiprocessing
@@ -39,7 +40,7 @@ from mddag_executor.core.jobs import is_miss
 from mddag_executor.memory import no_garbage
 from mddag_executor.replay.as_recorded import slack as margin
 from mddag_executor.replay.load import RecordedLoad
-from mddag_executor.simulate import How, Load, schedule
+from mddag_executor.simulate import Load, schedule, Settings
 from mddag_executor.simulate.load import as_arrays
 from mddag_executor.simulate.schedule import prepare
 from msg_graph import TaskSet
@@ -80,21 +81,19 @@ class Problem(NamedTuple):
     A load, and how it is scheduled.
 
     :ivar work: a recorded load, or a periodic one.
-    :ivar how: how it is scheduled.
-    :ivar end: of the run, ns.
+    :ivar settings: how it is scheduled.
     :ivar callback_of: by global vertex the number of its callback.
     """
 
     work: RecordedLoad | Load
-    how: How
+    settings: Settings
     tables: Tables
-    end: int
     callback_of: list[int]
 
     def with_number(self, of: str, number: int) -> Problem:
         """Return the same problem for another number of ``workers`` or ``cpus``."""
         return self._replace(
-            how=self.how._replace(**{of: number}))      # type: ignore[arg-type]
+            settings=replace(self.settings, **{of: number}))    # type: ignore[arg-type]
 
     @property
     def load(self) -> Load:
@@ -104,7 +103,7 @@ class Problem(NamedTuple):
     def prepare(self, waiting: Callable[[], None]) -> bool:
         """Tell whether to search compiled; if so, compile, and call ``waiting`` meanwhile."""
         runs = _RUNS * len(set(self.callback_of))
-        return prepare(self.tables, self.load, self.how, runs, waiting)
+        return prepare(self.tables, self.load, self.settings, runs, waiting)
 
 
 class Found(NamedTuple):
@@ -180,9 +179,9 @@ class Search:
         self, scaled: tuple[Load, int], stop: bool, of_any: bool = False
     ) -> Iterator[Miss]:
         problem, (load, end) = self._problem, scaled
+        settings = replace(problem.settings, duration_ns=end, stop_at_first_miss=stop)
         decisions = schedule(
-            problem.tables, load, problem.how, end, stop_at_first_miss=stop,
-            compiled=self._compiled).decisions
+            problem.tables, load, settings, compiled=self._compiled).decisions
         for kind, _, vertex, _, deadline, until in decisions:
             if is_miss(kind) and (of_any or vertex not in self.left_out):
                 release = deadline - problem.tables.sink_deadline[vertex]
@@ -198,7 +197,8 @@ class Search:
         if len(computed):
             which &= computed >= 0
             computed[which] = np.minimum(computed[which] * factor, NEVER >> 8).astype(np.int64)
-        return self._load._replace(costs=costs, computed=computed), self._problem.end
+        load = self._load._replace(costs=costs, computed=computed)
+        return load, self._problem.settings.duration_ns
 
     def miss(
         self, callback: int, factor: float, window: tuple[int, int] | None = None,
@@ -256,7 +256,7 @@ class Search:
     def fewer(self, of: str) -> Fewer | None:
         """Return how few ``workers`` or ``cpus`` meet what is met now; None: it was not said."""
         problem = self._problem
-        given = getattr(problem.how, of)
+        given = getattr(problem.settings, of)
         if given is None:
             return None
         least, breaks = given, NOTHING

@@ -19,7 +19,6 @@ from mddag_executor.core import Tally
 from mddag_executor.core.tally import total
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import Replay, Reschedule
-from mddag_executor.replay.bags_reschedule import BagReschedule
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.judge import Judge
@@ -104,13 +103,11 @@ def check_available() -> None:
 
 
 def of_outcome(
-    outcome: Replay | Reschedule | BagReschedule, watch: Watch | None
+    outcome: Replay | Reschedule, watch: Watch | None
 ) -> ReportData:
     """Return the data of a report about a recorded run; ``watch`` was there if as recorded."""
     if isinstance(outcome, Reschedule):
         return of_reschedule(outcome)
-    if isinstance(outcome, BagReschedule):
-        return of_bag(outcome)
     assert watch is not None
     return of_replay(outcome, watch)
 
@@ -127,31 +124,20 @@ def of_replay(outcome: Replay, watch: Watch) -> ReportData:
 
 
 def of_reschedule(outcome: Reschedule) -> ReportData:
-    """Return the data of a report about a recorded run that was rescheduled."""
+    """Return the data of a report about a recorded run, or a bag, that was rescheduled."""
     watch = Watch().of_computed(outcome.computed())
     result = outcome.result()
-    facts = [('recording', result['recording']['trace']), *_facts(result)]
-    return watch.data(
-        'Replay, rescheduled', facts, outcome.task_set, outcome.workers, result['duration_ns'],
-        outcome.warnings)._replace(worker_names=outcome.worker_names)
-
-
-def of_bag(outcome: BagReschedule) -> ReportData:
-    """Return the data of a report about an ordinary bag that was rescheduled."""
-    watch = Watch().of_computed(outcome.computed())
-    result = outcome.result()
-    facts = [('bag', result['recording']['trace']), *_facts(result),
+    what, title = ('bag', 'Bag') if outcome.recorded is None else ('recording', 'Replay')
+    facts = [(what, result['recording']['trace']), *_facts(result),
              *(('assumed', note) for note in outcome.notes)]
-    return watch.data('Bag, rescheduled', facts, outcome.task_set, outcome.workers,
-                      outcome.duration_ns, outcome.warnings)
+    return watch.data(
+        f'{title}, rescheduled', facts, outcome.task_set, outcome.workers, outcome.duration_ns,
+        outcome.warnings)._replace(worker_names=outcome.worker_names)
 
 
 def of_run(task_set: TaskSet, load: Load, run: Run) -> ReportData:
     """Return the data of a report about a run that was simulated with its log."""
-    stopped = run.settings.stop_at_first_miss and run.ended_ns < run.settings.duration_ns
-    judged = run.settings.judge == 'horizon' and not stopped
-    watch = Watch().of_computed(ComputedRun(
-        task_set, load, run.log, run.decisions, run.settings.duration_ns, run.ended_ns, judged))
+    watch = Watch().of_computed(ComputedRun.of_run(task_set, load, run))
     facts = [('declaration', task_set.file), *_facts(run.result())]
     return watch.data(
         'Simulation', facts, task_set, run.settings.workers, run.ended_ns, [], run.tally)

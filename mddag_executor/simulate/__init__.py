@@ -5,8 +5,8 @@
 from mddag_executor.simulate.engine import END, LogEntry, PREEMPT, START
 from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.load import Load
-from mddag_executor.simulate.run import JUDGES, Run, Settings, simulate
-from mddag_executor.simulate.schedule import How, schedule, Scheduled
+from mddag_executor.simulate.run import JUDGES, Run, simulate
+from mddag_executor.simulate.schedule import schedule, Scheduled, Settings
 from mddag_executor.simulate.workload import (
     draw_execution_times,
     periodic_load,
@@ -16,7 +16,7 @@ from mddag_executor.simulate.workload import (
 )
 
 __all__ = [
-    'END', 'How', 'JUDGES', 'Load', 'LogEntry', 'PREEMPT', 'Run', 'START', 'Scheduled', 'Settings',
+    'END', 'JUDGES', 'Load', 'LogEntry', 'PREEMPT', 'Run', 'START', 'Scheduled', 'Settings',
     'SimulationError', 'draw_execution_times', 'periodic_load', 'read_execution_times',
     'scale_execution_times', 'schedule', 'simulate', 'utilisation',
 ]

@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from mddag_executor.simulate.run import Settings
+    from mddag_executor.simulate.schedule import Settings
 
 ACCEPT_RUNS, RUN_ONCE = 'accept_runs', 'run_once'
 """What is compiled: for ``evaluate``, and for all else."""

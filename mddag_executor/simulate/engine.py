@@ -57,7 +57,7 @@ LogEntry = tuple[int, int, int, int, int, int]
 
 
 class Orders(NamedTuple):
-    """How to run a load, as integers: see ``schedule.How``."""
+    """How to run a load, as integers: see ``schedule.Settings``."""
 
     workers: int
     processes: int

@@ -29,7 +29,8 @@ from mddag_executor.core import Tables
 from mddag_executor.core.jobs import is_miss
 from mddag_executor.simulate.acceptance import Bools
 from mddag_executor.simulate.draws import Draws, feasible, Floats, Samples, Times, utilisations
-from mddag_executor.simulate.run import check, Settings
+from mddag_executor.simulate.run import check
+from mddag_executor.simulate.schedule import schedule, Settings
 from mddag_executor.simulate.workload import declared_holds, periodic_load
 from msg_graph import TaskSet
 import numpy as np
@@ -193,6 +194,6 @@ class PlainJudge:
         accepted = np.zeros(len(times), dtype=np.bool_)
         for row in range(len(times)):
             load = self._load._replace(costs=times[row].tolist())
-            decisions = settings.schedule(tables, load).decisions
+            decisions = schedule(tables, load, settings).decisions
             accepted[row] = not any(is_miss(decision[0]) for decision in decisions)
         return accepted

@@ -15,7 +15,7 @@ from mddag_executor.simulate.compiled import CompiledJudge
 from mddag_executor.simulate.draws import Draws
 from mddag_executor.simulate.evaluate import evaluate
 from mddag_executor.simulate.experiment import Experiment, Judge, PlainJudge
-from mddag_executor.simulate.run import Settings
+from mddag_executor.simulate.schedule import Settings
 from msg_graph import loads, TaskSet
 import numpy as np
 

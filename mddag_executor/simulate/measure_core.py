@@ -27,7 +27,7 @@ from mddag_executor.core import Scheduler, Tables
 from mddag_executor.core.state import IDLE
 from mddag_executor.simulate.engine import END
 from mddag_executor.simulate.load import Load
-from mddag_executor.simulate.run import Settings
+from mddag_executor.simulate.schedule import schedule, Settings
 from mddag_executor.simulate.workload import draw_execution_times, periodic_load
 from msg_graph import TaskSet
 
@@ -50,9 +50,9 @@ def time_core(
     load = periodic_load(task_set, draw_execution_times(task_set, seed), duration_ns)
 
     def simulate() -> None:
-        settings.schedule(tables, load)
+        schedule(tables, load, settings)
 
-    log = settings.schedule(tables, load, log=True).log
+    log = schedule(tables, load, settings, log=True).log
     vertex_jobs = sum(kind == END for _, kind, *_ in log)
     events = len(log) + len(load.times)
     taken = _seconds(simulate, repeat)

@@ -8,70 +8,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from mddag_executor import defaults
 from mddag_executor.core import NEVER, Tables, Tally
-from mddag_executor.core import policy as find_policy
 from mddag_executor.core.state import Decision
 from mddag_executor.simulate.engine import LogEntry
 from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.load import Load
-from mddag_executor.simulate.schedule import How, schedule, Scheduled
+from mddag_executor.simulate.schedule import schedule, Settings
 from msg_graph import TaskSet
 
 JUDGES = ('horizon', 'completions')
-
-
-@dataclass(frozen=True)
-class Settings:
-    """
-    How to run.
-
-    :param preemptive: None takes the policy's own mode of the paper's experiment.
-    :param judge: ``horizon`` judges what is open at the end, ``completions`` (the paper's way)
-        only what completed.
-    :param dispatch_overhead_ns: added to an execution at each dispatch.
-    :param switch_overhead_ns: added to an execution at each preemption.
-    :param cpus: that those who compute share; None: enough for all.
-    """
-
-    policy: str = 'rad'
-    workers: int = defaults.WORKERS
-    duration_ns: int = defaults.DURATION_NS
-    preemptive: bool | None = False
-    judge: str = 'horizon'
-    stop_at_first_miss: bool = False
-    dispatch_overhead_ns: int = 0
-    switch_overhead_ns: int = 0
-    cpus: int | None = None
-
-    @property
-    def preempts(self) -> bool:
-        """
-        Tell whether what is more urgent takes the worker of what runs.
-
-        :raises mddag_executor.core.PolicyError: there is no such policy, or it never preempts
-        """
-        return find_policy(self.policy).mode(self.preemptive)
-
-    @property
-    def how(self) -> How:
-        """
-        Return how loads are scheduled.
-
-        :raises mddag_executor.core.PolicyError: as ``preempts``
-        """
-        return How(
-            self.policy, self.workers, self.preempts, self.dispatch_overhead_ns,
-            self.switch_overhead_ns, cpus=self.cpus)
-
-    def schedule(
-        self, tables: Tables, load: Load, log: bool = False,
-        progress: Callable[[int], None] | None = None,
-    ) -> Scheduled:
-        """Run the core over a load (see ``schedule``)."""
-        return schedule(
-            tables, load, self.how, self.duration_ns, log=log, progress=progress,
-            stop_at_first_miss=self.stop_at_first_miss, judge_open=self.judge == 'horizon')
 
 
 @dataclass
@@ -122,7 +67,7 @@ def simulate(
     check(settings)
     tables = Tables.build(
         task_set, max_active_jobs=NEVER if max_active_jobs is None else max_active_jobs)
-    ended, entries, decisions = settings.schedule(tables, load, log, progress)
+    ended, entries, decisions = schedule(tables, load, settings, log=log, progress=progress)
     tally = Tally(task_set, tables)
     for time, dag in zip(load.times, load.dags):
         if time < settings.duration_ns and time <= ended:

@@ -5,8 +5,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
+from mddag_executor import defaults
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core.state import as_object, Decision, empty, State
@@ -22,38 +24,52 @@ SOON_S = 1.0
 """What plain Python has done so soon is not worth loading what is compiled."""
 
 
-class How(NamedTuple):
+@dataclass(frozen=True)
+class Settings:
     """
     How a load is scheduled.
 
     :ivar workers: of each process.
-    :ivar dispatch_overhead: added to an execution at each dispatch, ns; ``switch_overhead``: at
+    :ivar duration_ns: when the run ends, on the load's clock.
+    :ivar preemptive: None takes the policy's own mode of the paper's experiment.
+    :ivar judge: ``horizon`` judges what is open at the end, ``completions`` (the paper's way)
+        only what completed.
+    :ivar dispatch_overhead_ns: added to an execution at each dispatch; ``switch_overhead_ns``: at
         each preemption.
-    :ivar judge_from: jobs released before are not judged.
     :ivar cpus: that those who compute share; None: enough for all.
+    :ivar judge_from: jobs released before are not judged.
     :ivar processes: how many there are, each with an interpreter of its own.
     """
 
-    policy: str
-    workers: int
-    preemptive: bool = False
-    dispatch_overhead: int = 0
-    switch_overhead: int = 0
-    judge_from: int = -NEVER
+    policy: str = 'rad'
+    workers: int = defaults.WORKERS
+    duration_ns: int = defaults.DURATION_NS
+    preemptive: bool | None = False
+    judge: str = 'horizon'
+    stop_at_first_miss: bool = False
+    dispatch_overhead_ns: int = 0
+    switch_overhead_ns: int = 0
     cpus: int | None = None
+    judge_from: int = -NEVER
     processes: int = 1
 
-    def orders(self, horizon: int, stop_at_first_miss: bool, judge_open: bool) -> Orders:
+    @property
+    def preempts(self) -> bool:
         """
-        Return how to run a load, as integers.
+        Tell whether what is more urgent takes the worker of what runs.
 
         :raises mddag_executor.core.PolicyError: there is no such policy, or it cannot do that.
         """
-        policy = find_policy(self.policy)
+        return find_policy(self.policy).mode(self.preemptive, self.processes)
+
+    @property
+    def orders(self) -> Orders:
+        """Return the same as integers, for the engine; raise as ``preempts``."""
         return Orders(
-            self.workers, self.processes, int(policy.mode(self.preemptive, self.processes)),
-            int(policy.polling), self.dispatch_overhead, self.switch_overhead, self.judge_from,
-            self.cpus or NEVER, horizon, int(stop_at_first_miss), int(judge_open))
+            self.workers, self.processes, int(self.preempts),
+            int(find_policy(self.policy).polling), self.dispatch_overhead_ns,
+            self.switch_overhead_ns, self.judge_from, self.cpus or NEVER, self.duration_ns,
+            int(self.stop_at_first_miss), int(self.judge == 'horizon'))
 
 
 class Scheduled(NamedTuple):
@@ -65,35 +81,34 @@ class Scheduled(NamedTuple):
 
 
 def schedule(
-    tables: Tables, load: Load, how: How, horizon: int, *, stop_at_first_miss: bool = False,
-    log: bool = False, judge_open: bool = True,
+    tables: Tables, load: Load, settings: Settings, *, log: bool = False,
     progress: Callable[[int], None] | None = None, compiled: bool | None = None,
 ) -> Scheduled:
     """
-    Run the core over a load up to the horizon, or its first miss.
+    Run the core over a load.
 
     :param log: keep the log of every worker.
-    :param judge_open: judge what is open at the horizon.
     :param progress: told the virtual time (ns) now and then, by plain Python.
     :param compiled: whether compiled, which gives the same; None: what is sooner done.
-    :raises mddag_executor.core.PolicyError: as ``How.orders``.
+    :raises mddag_executor.core.PolicyError: as ``Settings.preempts``.
     """
-    orders = how.orders(horizon, stop_at_first_miss, judge_open)
+    orders = settings.orders
     if compiled is None:
-        compiled = prepare(tables, load, how)
+        compiled = prepare(tables, load, settings)
     if compiled:
         from mddag_executor.simulate.compiled import run_once
-        return Scheduled(*run_once(tables, load, how.policy, orders, log))
+        return Scheduled(*run_once(tables, load, settings.policy, orders, log))
     state = as_object(empty(State))
     entries: list[LogEntry] = []
     ended = run_load(
-        as_object(tables), state, empty(Deliveries), empty(Machine), find_policy(how.policy).key,
-        as_lists(load), orders, entries if log else None, progress)
+        as_object(tables), state, empty(Deliveries), empty(Machine),
+        find_policy(settings.policy).key, as_lists(load), orders, entries if log else None,
+        progress)
     return Scheduled(ended, entries, state.decisions)
 
 
 def prepare(
-    tables: Tables, load: Load, how: How, runs: int = 1,
+    tables: Tables, load: Load, settings: Settings, runs: int = 1,
     waiting: Callable[[], None] = lambda: None,
 ) -> bool:
     """
@@ -102,7 +117,7 @@ def prepare(
     :param waiting: called now and then meanwhile.
     """
     executions = runs * len(load.times) * tables.n_vertices // max(1, tables.n_dags)
-    stops = len(load.holds) > 0 or how.cpus is not None
+    stops = len(load.holds) > 0 or settings.cpus is not None
     plain_s = executions * (_STOPS_S if stops else _PLAIN_S)
     if plain_s < SOON_S:
         return False

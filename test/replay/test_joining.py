@@ -266,7 +266,7 @@ def test_each_process_has_its_workers_and_interpreter_again(
         two: list[str], tmp_path: Path, mddag: Any) -> None:
     outcome = reschedule(two)
     assert [(p.name, p.nodes) for p in outcome.processes] == [('up', ('/a',)), ('down', ('/b',))]
-    assert (outcome.workers, outcome.how.workers) == (4, 2) and not outcome.tally.missed
+    assert (outcome.workers, outcome.settings.workers) == (4, 2) and not outcome.tally.missed
     assert outcome.worker_names == ['up 0', 'up 1', 'down 0', 'down 1']
     assert reschedule(two, cpus=1).tally.missed
 

@@ -14,9 +14,9 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from mddag_executor.cli import main as program
 from mddag_executor.errors import MddagError
-from mddag_executor.replay import bags
+from mddag_executor.replay import bags, Reschedule
 from mddag_executor.replay.bags import Bag, BagError, is_ordinary, UNKNOWN
-from mddag_executor.replay.bags_reschedule import BagReschedule, reschedule_bag
+from mddag_executor.replay.bags_reschedule import reschedule_bag
 from mddag_executor.simulate import SimulationError, START
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
@@ -85,7 +85,7 @@ def write_bag(
     return path
 
 
-def responses(outcome: BagReschedule, dag: str, sink: str) -> dict[str, int]:
+def responses(outcome: Reschedule, dag: str, sink: str) -> dict[str, int]:
     found: dict[str, int] = outcome.result()['dags'][dag]['sinks'][sink]['response_ns']
     return found
 

@@ -16,10 +16,10 @@ from mddag_executor.core import PolicyError, Tables, Tally
 from mddag_executor.core.state import Decision, new_state
 from mddag_executor.errors import UsageError
 from mddag_executor.replay import replay, ReplayError, reschedule
+from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import periodic_load, Settings, simulate
 from mddag_executor.simulate.engine import END, LogEntry, PREEMPT, run, START
 from mddag_executor.simulate.load import Load
-from mddag_executor.simulate.recording import write_trace
 from mddag_executor.trace import TraceFile
 from msg_graph import loads, TaskSet
 import pytest

@@ -106,7 +106,7 @@ def test_windows_find_what_plain_bisection_finds(
                chances=Chances(0, 0, 0, 0, 0, 0, 0))
     run = reschedule(path)
     problem = Problem(
-        run.work, run.how, run.tables, run.end_ns, run.task_set.places_of_vertices())
+        run.work, run.settings, run.tables, run.task_set.places_of_vertices())
     found = []
     for long in (10 ** 9, 1):
         monkeypatch.setattr(module, 'LONG', long)

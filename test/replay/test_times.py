@@ -17,8 +17,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.errors import MddagError
-from mddag_executor.replay import replay, reschedule
-from mddag_executor.replay.bags_reschedule import BagReschedule, reschedule_bag
+from mddag_executor.replay import replay, Reschedule, reschedule
+from mddag_executor.replay.bags_reschedule import reschedule_bag
 from mddag_executor.trace import times, TraceFile, TraceReader
 from msg_graph import loads
 import pytest
@@ -51,7 +51,7 @@ def arrivals() -> list[int]:
     return [BEGIN + k * 25 * MS for k in range(N)]
 
 
-def rescheduled(path: Path, graph: str = GRAPH) -> BagReschedule:
+def rescheduled(path: Path, graph: str = GRAPH) -> Reschedule:
     """Reschedule a bag; there may not be more than each message warrants."""
     outcome = reschedule_bag(path, loads(graph, 'g.yaml'))
     jobs = [dag['jobs'] for dag in outcome.result()['dags'].values()]

@@ -12,9 +12,9 @@ from typing import Any
 
 from mddag_executor.replay import replay
 from mddag_executor.replay.judge import Judge
+from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.report import export
 from mddag_executor.report.export import Exporter, KEEP_ENDED, MOST_HELD, target
-from mddag_executor.simulate.recording import write_trace
 import pytest
 
 from . import runs

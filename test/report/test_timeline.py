@@ -12,6 +12,7 @@ from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.bags_reschedule import reschedule_bag
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.happenings import Batch, Observer, Piece, RAN, RELEASED
+from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.report import html
 from mddag_executor.report.timeline import (
     END,
@@ -23,7 +24,6 @@ from mddag_executor.report.timeline import (
     Timeline,
 )
 from mddag_executor.simulate import periodic_load, Settings, simulate
-from mddag_executor.simulate.recording import write_trace
 import msg_graph
 import numpy as np
 import pytest

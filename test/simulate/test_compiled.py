@@ -8,6 +8,7 @@ Both are the same source; what this finds is where compiled arithmetic, lists or
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import accumulate
 import os
 from pathlib import Path
@@ -18,11 +19,10 @@ import sys
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import POLICIES, Tables
-from mddag_executor.simulate import compiled, compiling, Load, schedule
+from mddag_executor.simulate import compiled, compiling, Load, schedule, Settings, simulate
 from mddag_executor.simulate.draws import Draws
 from mddag_executor.simulate.experiment import PlainJudge
 from mddag_executor.simulate.load import as_arrays, FAILS, RUNS, SKIPPED
-from mddag_executor.simulate.run import Settings, simulate
 from msg_graph import load, loads
 import numpy as np
 import pytest
@@ -50,8 +50,7 @@ def compare(case: Case, horizon: int, judge: str = 'horizon', stop: bool = False
     load_ = case.load(horizon)
     plain = simulate(case.task_set, load_, settings, log=True)
     found = schedule(
-        Tables.build(case.task_set), load_, settings.how, settings.duration_ns,
-        stop_at_first_miss=stop, log=True, judge_open=judge == 'horizon', compiled=True)
+        Tables.build(case.task_set), load_, settings, log=True, compiled=True)
     assert found.log == plain.log
     assert found.decisions == plain.decisions
     assert found.ended == plain.ended_ns
@@ -127,16 +126,16 @@ def test_machine_messages_and_processes(
 ) -> None:
     chances = random.Random(seed)
     one = case.preemptive or POLICIES[case.policy].polling
-    how = settings_of(case, horizon, 'horizon', stop).how._replace(
+    settings = replace(
+        settings_of(case, horizon * SLOW, 'horizon', stop),
         processes=1 if one else chances.randint(1, 3), cpus=chances.choice([None, 1, 2, 3]))
-    tables = slowed(Tables.build(case.task_set), how.processes, chances)
+    tables = slowed(Tables.build(case.task_set), settings.processes, chances)
     load_ = with_everything(case.load(horizon), tables, chances)
     plain, found = (
-        schedule(tables, load_, how, horizon * TICK * SLOW, stop_at_first_miss=stop, log=True,
-                 compiled=compiled) for compiled in (False, True))
+        schedule(tables, load_, settings, log=True, compiled=compiled)
+        for compiled in (False, True))
     assert found == plain
-    assert schedule(tables, as_arrays(load_), how, horizon * TICK * SLOW, log=True,
-                    stop_at_first_miss=stop) == plain
+    assert schedule(tables, as_arrays(load_), settings, log=True) == plain
 
 
 @examples(15)

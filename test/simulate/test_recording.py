@@ -13,6 +13,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.replay import replay, reschedule
+from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import (
     draw_execution_times,
     END,
@@ -23,7 +24,6 @@ from mddag_executor.simulate import (
     simulate,
     START,
 )
-from mddag_executor.simulate.recording import write_trace
 from mddag_executor.trace import read_events
 from msg_graph import load, loads
 import pytest
