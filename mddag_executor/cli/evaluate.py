@@ -172,9 +172,6 @@ class _Clock:
         self._begin: tuple[float, int] | None = None
 
     def __call__(self, done: int) -> None:
-        if done < 0:
-            self._line.update(0, 'the core is being compiled, once')
-            return
         now = time.monotonic()
         if self._begin is None:  # what is done by then may come from a file
             self._begin = (now, done)

@@ -10,6 +10,7 @@ import time
 from types import TracebackType
 from typing import TextIO
 
+from mddag_executor import progress
 from mddag_executor.report.text import Cell, format_ns, printable, table
 
 __all__ = ['Cell', 'Progress', 'format_ns', 'one_line', 'printable', 'table', 'warn']
@@ -55,10 +56,12 @@ class Progress:
         self._shown = 0
 
     def __enter__(self) -> Progress:
+        progress.LISTENERS.append(self._note)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
+        progress.LISTENERS.remove(self._note)
         if self._shown:
             self._stream.write('\r' + ' ' * self._shown + '\r')
             self._stream.flush()
@@ -70,17 +73,21 @@ class Progress:
         :param done: in the unit of the total
         :param note: something to add to the line
         """
-        if self._next == float('inf'):
+        if self._next == float('inf') or self._clock() < self._next:
             return
-        now = self._clock()
-        if now < self._next:
-            return
-        self._next = now + self.INTERVAL_S
         if self._total:
             part = f'{100 * min(done / self._total, 1.0):.0f} %'
         else:
             part = f'{done:g}'
-        line = f'{self._what}: {part} {one_line(note)}'.rstrip()[:79]
+        self._show(f'{part} {one_line(note)}'.rstrip())
+
+    def _note(self, what: str) -> None:
+        if self._clock() >= self._next:
+            self._show(what)
+
+    def _show(self, text: str) -> None:
+        self._next = self._clock() + self.INTERVAL_S
+        line = f'{self._what}: {text}'[:79]
         self._stream.write('\r' + line.ljust(self._shown))
         self._stream.flush()
         self._shown = max(self._shown, len(line))

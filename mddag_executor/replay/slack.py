@@ -100,10 +100,10 @@ class Problem(NamedTuple):
         """Return the load."""
         return self.work if isinstance(self.work, Load) else self.work.load
 
-    def prepare(self, waiting: Callable[[], None]) -> bool:
-        """Tell whether to search compiled; if so, compile, and call ``waiting`` meanwhile."""
+    def prepare(self) -> bool:
+        """Tell whether to search compiled; if so, compile."""
         runs = _RUNS * len(set(self.callback_of))
-        return prepare(self.tables, self.load, self.settings, runs, waiting)
+        return prepare(self.tables, self.load, self.settings, runs)
 
 
 class Found(NamedTuple):
@@ -308,7 +308,7 @@ def find_slack(
     :param progress: called with the number of callbacks that are done.
     :param jobs: how many processes search, where it is not quick.
     """
-    compiled = problem.prepare(lambda: progress(0))
+    compiled = problem.prepare()
     search = Search(problem, compiled)
     rest = sorted(set(problem.callback_of))
     found = {ALL: search.factor(ALL)}

@@ -17,7 +17,7 @@ concerns the user becomes one error.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import CancelledError, Future
 from importlib.util import find_spec
 import logging
@@ -171,9 +171,6 @@ class _ClusterPool(Pool):
         except Exception:  # noqa: B902 - the cluster is gone, or its last worker is
             pass
 
-    def start(self, compiling: Callable[[], None]) -> None:
-        """Do nothing: workers compile with their first chunk."""
-
     def submit(self, first: int, count: int) -> Future[Chunk]:
         """Let a worker do runs."""
         future: Future[Chunk] = self._executor.submit(_work, self._plugin.name, first, count)
@@ -239,7 +236,6 @@ class _Doer:
         self._version = version
         self._is_local = is_local
         self._evaluator: Evaluator | None = None
-        self._is_ready = False
 
     def set_up(self) -> None:
         """Do what a worker does when it gets this."""
@@ -251,19 +247,17 @@ class _Doer:
             # The terminal's Ctrl-C is the first process's to handle.
             import signal
             signal.signal(signal.SIGINT, signal.SIG_IGN)
-        compiled = self._compiled
-        if compiled:
-            from mddag_executor.simulate.compiling import available
-            compiled = available()
-        self._evaluator = Evaluator(self._experiments, self._runs, compiled)
+        from mddag_executor.simulate.compiling import available
+        self._compiled = self._compiled and available()
+        self._evaluator = Evaluator(self._experiments, self._runs, self._compiled)
         self._prepare = threading.Lock()
 
     def __call__(self, first: int, count: int) -> Chunk:
         assert self._evaluator is not None
-        with self._prepare:  # the first one compiles, not the worker's event loop
-            if not self._is_ready:
-                self._evaluator.prepare()
-                self._is_ready = True
+        if self._compiled:
+            from mddag_executor.simulate.compiled import ACCEPT_RUNS, prepare
+            with self._prepare:  # the first one compiles, not the worker's event loop
+                prepare(ACCEPT_RUNS)
         return self._evaluator(first, count)
 
 

@@ -49,12 +49,12 @@ def pays(name: str, plain_s: float) -> bool:
         available() and (plain_s > _COMPILE_S[name] or cached_entries(name)))
 
 
-def prepare(name: str, waiting: Callable[[], None] = lambda: None) -> None:
-    """Compile, and call ``waiting`` now and then, or load what was compiled before."""
+def prepare(name: str) -> None:
+    """Compile, or load what was compiled before."""
     if name in _ready:
         return
     if keeps_entries() and not cached_entries(name):
-        compile_elsewhere(f'{__name__}.compile_here({name!r})', waiting)
+        compile_elsewhere(f'{__name__}.compile_here({name!r})')
     compile_here(name)
     _ready.add(name)
 
@@ -93,10 +93,6 @@ class CompiledJudge:
         self._tables = [LentTuple(built, number) for number in range(len(POLICIES))]
         self._load = LentTuple(load._replace(
             cost_base=[built.first_vertex[dag.index] for dag in task_set.dags]))
-
-    def warm_up(self, waiting: Callable[[], None] = lambda: None) -> None:
-        """Compile, and call ``waiting`` now and then, or load what was compiled before."""
-        prepare(ACCEPT_RUNS, waiting)
 
     def __call__(self, settings: Settings, times: Times) -> npt.NDArray[np.bool_]:
         """Tell which of the runs met every deadline."""

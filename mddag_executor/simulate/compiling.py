@@ -44,6 +44,7 @@ import time
 from types import FunctionType, ModuleType
 from typing import Any
 
+from mddag_executor import progress
 from mddag_executor.core import jobs, policies, queues, rules, state, tables
 from mddag_executor.core.policies import POLICIES
 from mddag_executor.resources import import_environment
@@ -188,12 +189,11 @@ def _bound(function: Any, space: dict[str, Any], file: str | None = None) -> Fun
     return FunctionType(code, space, function.__name__, function.__defaults__)
 
 
-def compile_elsewhere(call: str, waiting: Callable[[], None] = lambda: None) -> None:
+def compile_elsewhere(call: str) -> None:
     """
     Have a process compile what this one needs; if it fails, this one does when it needs it.
 
     :param call: of a function of a module, ``MODULE.FUNCTION(ARGUMENTS)``, that compiles.
-    :param waiting: called now and then meanwhile.
     """
     program = f'import {call.split("(")[0].rpartition(".")[0]}; {call}'
     try:
@@ -204,7 +204,7 @@ def compile_elsewhere(call: str, waiting: Callable[[], None] = lambda: None) -> 
         return
     try:
         while process.poll() is None:
-            waiting()
+            progress.tell('the core is being compiled, once')
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(0.2)
     finally:  # after Ctrl-C, too

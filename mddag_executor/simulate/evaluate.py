@@ -23,7 +23,7 @@ from mddag_executor.simulate.checkpoint import Checkpoint
 from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.evaluation import Evaluation
 from mddag_executor.simulate.experiment import Chunk, Evaluator, Experiment, STRIDE
-from mddag_executor.simulate.pools import Pool, ProcessPool, ThreadPool
+from mddag_executor.simulate.pools import Pool, processes, threads
 from mddag_executor.simulate.schedule import SOON_S
 import numpy as np
 
@@ -61,7 +61,7 @@ def evaluate(
     :param core: ``compiled``, ``plain``, or ``auto`` for the one that is sooner done.
     :param cluster: who does the runs instead of this machine's processors.
     :param checkpoint: goes on from what it holds, and keeps there what is done.
-    :param progress: told now and then how many runs are done, -1 while the core is compiled.
+    :param progress: told now and then how many runs are done.
     :return: the outcome; after a KeyboardInterrupt that of the runs that were done.
     :raises SimulationError: on settings that make no sense.
     :raises mddag_executor.core.PolicyError: when there is no such policy.
@@ -86,13 +86,14 @@ def evaluate(
     if cluster is not None:
         pool = cluster.pool(experiments, runs, compiled)
     elif compiled or jobs == 1:
-        pool = ThreadPool(evaluator, jobs)
+        pool = threads(evaluator, jobs)
     else:
-        pool = ProcessPool(experiments, runs, jobs)
+        pool = processes(experiments, runs, jobs)
     try:
+        if compiled and cluster is None:
+            from mddag_executor.simulate.compiled import ACCEPT_RUNS, prepare
+            prepare(ACCEPT_RUNS)
         with pool:
-            if compiled:
-                pool.start(lambda: progress(-1) if progress is not None else None)
             _collect(pool, outcome, checkpoint, progress)
     except KeyboardInterrupt:
         outcome.interrupted = True

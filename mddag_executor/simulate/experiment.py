@@ -17,7 +17,7 @@ however many there are of them, in whichever process it is done, and whatever wa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 import time
@@ -92,9 +92,6 @@ class Chunk(NamedTuple):
 class Judge(Protocol):
     """Simulates runs of a task set."""
 
-    def warm_up(self, waiting: Callable[[], None] = lambda: None) -> None:
-        """Do what has to be done once."""
-
     def __call__(self, settings: Settings, times: Times) -> Bools:
         """Tell which of the runs with these execution times met every deadline."""
 
@@ -129,10 +126,6 @@ class Evaluator:
             for name in experiment.policies:
                 check(experiment.settings(name))
             Draws(experiment.task_set, experiment.seed, experiment.samples)
-
-    def prepare(self, waiting: Callable[[], None] = lambda: None) -> None:
-        """Do what has to be done once, before the first run; call ``waiting`` now and then."""
-        self._one(0).judge.warm_up(waiting)
 
     def __call__(self, first: int, count: int) -> Chunk:
         """Evaluate ``count`` runs from the place ``first`` on."""
@@ -184,9 +177,6 @@ class PlainJudge:
             task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
         self._load = load._replace(
             cost_base=[self._tables.first_vertex[dag.index] for dag in task_set.dags])
-
-    def warm_up(self, waiting: Callable[[], None] = lambda: None) -> None:
-        """Do nothing."""
 
     def __call__(self, settings: Settings, times: Times) -> Bools:
         """Tell which of the runs met every deadline."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from mddag_executor import defaults
 from mddag_executor.generate import generate, Options
-from mddag_executor.simulate.compiled import CompiledJudge
+from mddag_executor.simulate.compiled import ACCEPT_RUNS, CompiledJudge, prepare
 from mddag_executor.simulate.draws import Draws
 from mddag_executor.simulate.evaluate import evaluate
 from mddag_executor.simulate.experiment import Experiment, Judge, PlainJudge
@@ -72,12 +72,10 @@ def time_vertex_jobs(
     task_set = random_task_set(n_vertices)
     rate = sum(len(dag.vertices) / dag.period_ns for dag in task_set.dags)
     duration_ns = max(max(_PERIODS_NS), round(vertex_jobs / rate))
-    judge: Judge
+    judge: Judge = PlainJudge(task_set, duration_ns)
     if core == 'compiled':
+        prepare(ACCEPT_RUNS)
         judge = CompiledJudge(task_set, duration_ns)
-    else:
-        judge = PlainJudge(task_set, duration_ns)
-    judge.warm_up()
     settings = Settings('rad', WORKERS, duration_ns, True, 'completions', True)
     done = sum(-(-duration_ns // dag.period_ns) * len(dag.vertices) for dag in task_set.dags)
     times = Draws(task_set, 0).times(0, 1)

@@ -42,9 +42,6 @@ class Pool:
                  trace: TracebackType | None) -> None:
         pass
 
-    def start(self, compiling: Callable[[], None]) -> None:
-        """Do what has to be done once; ``compiling`` is called now and then meanwhile."""
-
     def failure(self, error: BaseException) -> MddagError | None:
         """Return the error that tells the user what an exception of a chunk means, if any."""
         return None
@@ -58,6 +55,7 @@ class Pool:
 
 
 class _LocalPool(Pool):
+    """Threads or processes of this machine."""
 
     def __init__(
         self, executor: Executor, jobs: int, work: Callable[[int, int], Chunk]
@@ -74,33 +72,24 @@ class _LocalPool(Pool):
                  trace: TracebackType | None) -> None:
         self._executor.shutdown()
 
-
-class ThreadPool(_LocalPool):
-    """Threads of this process."""
-
-    def __init__(self, evaluator: Evaluator, jobs: int) -> None:
-        super().__init__(ThreadPoolExecutor(jobs), jobs, evaluator)
-        self._evaluator = evaluator
-
-    def start(self, compiling: Callable[[], None]) -> None:
-        """Compile the core, if that is what the evaluator uses."""
-        self._evaluator.prepare(compiling)
-
-
-class ProcessPool(_LocalPool):
-    """Processes of this machine, with the plain core."""
-
-    def __init__(self, experiments: Sequence[Experiment], runs: int, jobs: int) -> None:
-        executor = ProcessPoolExecutor(
-            jobs, multiprocessing.get_context('spawn'), _start_worker, (experiments, runs))
-        super().__init__(executor, jobs, _work)
-
     def failure(self, error: BaseException) -> MddagError | None:
         """Tell of a worker process that is gone."""
         if not isinstance(error, BrokenProcessPool):
             return None
         return SimulationError(
             'jobs: a worker process was killed: free some memory, or give fewer --jobs')
+
+
+def threads(evaluator: Evaluator, jobs: int) -> Pool:
+    """Return a pool of threads of this process."""
+    return _LocalPool(ThreadPoolExecutor(jobs), jobs, evaluator)
+
+
+def processes(experiments: Sequence[Experiment], runs: int, jobs: int) -> Pool:
+    """Return a pool of processes of this machine, with the plain core."""
+    return _LocalPool(ProcessPoolExecutor(
+        jobs, multiprocessing.get_context('spawn'), _start_worker, (experiments, runs)),
+        jobs, _work)
 
 
 _evaluator: Evaluator | None = None  # of this process, if it is a worker

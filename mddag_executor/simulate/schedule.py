@@ -107,15 +107,8 @@ def schedule(
     return Scheduled(ended, entries, state.decisions)
 
 
-def prepare(
-    tables: Tables, load: Load, settings: Settings, runs: int = 1,
-    waiting: Callable[[], None] = lambda: None,
-) -> bool:
-    """
-    Tell whether so many runs are sooner done compiled; if so, compile, or load what was.
-
-    :param waiting: called now and then meanwhile.
-    """
+def prepare(tables: Tables, load: Load, settings: Settings, runs: int = 1) -> bool:
+    """Tell whether so many runs are sooner done compiled; if so, compile, or load what was."""
     executions = runs * len(load.times) * tables.n_vertices // max(1, tables.n_dags)
     stops = len(load.holds) > 0 or settings.cpus is not None
     plain_s = executions * (_STOPS_S if stops else _PLAIN_S)
@@ -124,5 +117,5 @@ def prepare(
     from mddag_executor.simulate import compiled
     if not compiled.pays(compiled.RUN_ONCE, plain_s):
         return False
-    compiled.prepare(compiled.RUN_ONCE, waiting)
+    compiled.prepare(compiled.RUN_ONCE)
     return True

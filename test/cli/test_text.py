@@ -8,6 +8,7 @@ import io
 
 from hypothesis import given, strategies
 from mddag_executor.cli.text import format_ns, one_line, printable, Progress, table, warn
+from mddag_executor.progress import tell
 from msg_graph import errors
 import pytest
 
@@ -115,6 +116,20 @@ def test_progress_is_quiet_where_nobody_looks() -> None:
         clock.now += 10
         progress.update(3)
     assert stream.getvalue() == ''
+
+
+def test_progress_of_what_nobody_asked_for() -> None:
+    stream, clock = Terminal(), Clock()
+    with Progress('replaying', stream=stream, clock=clock) as progress:
+        tell('the core is being compiled, once')
+        assert stream.getvalue() == ''
+        clock.now += 3
+        tell('the core is being compiled, once')
+        assert '\rreplaying: the core is being compiled, once' in stream.getvalue()
+        clock.now += 3
+        progress.update(1500)
+    tell('nobody hears it')
+    assert 'nobody' not in stream.getvalue()
 
 
 def test_progress_of_unknown_length() -> None:

@@ -18,6 +18,7 @@ import sys
 
 from hypothesis import given
 from hypothesis import strategies as st
+from mddag_executor import progress
 from mddag_executor.core import POLICIES, Tables
 from mddag_executor.simulate import compiled, compiling, Load, schedule, Settings, simulate
 from mddag_executor.simulate.draws import Draws
@@ -220,9 +221,7 @@ def test_nothing_is_compiled_at_import() -> None:
 
 WARM_UP = (
     'from mddag_executor.simulate import compiled',
-    'from msg_graph import load',
-    f'judge = compiled.CompiledJudge(load({str(CONFIG / "autoware.yaml")!r}), 10 ** 9)',
-    'judge.warm_up()',
+    'compiled.prepare(compiled.ACCEPT_RUNS)',
     'statistics = compiled._entries()["accept_runs"].stats',
     'print(sum(statistics.cache_hits.values()), sum(statistics.cache_misses.values()))')
 
@@ -269,9 +268,16 @@ def test_an_interrupted_compilation_is_not_begun_anew(
         'os.kill(os.getpid(), signal.SIGINT)\n')
     interrupted.chmod(0o755)
     monkeypatch.setattr(sys, 'executable', str(interrupted))
-    judge = compiled.CompiledJudge(load(CONFIG / 'autoware.yaml'), 10 ** 9)
+    monkeypatch.setattr(compiled, '_ready', set())
     with pytest.raises(KeyboardInterrupt):
-        judge.warm_up()
+        compiled.prepare(compiled.ACCEPT_RUNS)
+
+
+def test_whoever_shows_progress_is_told_of_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(progress, 'LISTENERS', [told.append])
+    compiling.compile_elsewhere('time.sleep(0)')
+    assert set(told) == {'the core is being compiled, once'}
 
 
 def test_without_a_place_for_the_cache(
