@@ -318,8 +318,10 @@ def write_json(path: str, value: Any) -> None:
 
     :raises ValueError: when it holds a number that JSON lacks (infinity, not a number)
     """
-    text = json.dumps(value, indent=2, ensure_ascii=True, allow_nan=False, default=_plain)
-    write_text(path, text + '\n')
+    encoder = json.JSONEncoder(indent=2, allow_nan=False, default=_plain)
+    with output_file(path) as file:
+        file.writelines(part.encode() for part in encoder.iterencode(value))
+        file.write(b'\n')
 
 
 def _plain(value: Any) -> Any:
