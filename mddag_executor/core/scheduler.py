@@ -101,6 +101,17 @@ class Scheduler:
             slot = jobs.open_undeclared(self.state, self.tables.n_dags, job, now)
         return self.state.job_base[slot]
 
+    def start(self, x: int, worker: int, now: int) -> None:
+        """Start what began on an idle worker before all that waits, and is told of only now."""
+        state = self.state
+        waiting = [(queue, queue[:]) for queue in (state.ready, state.held_back)]
+        for queue, _ in waiting:
+            queue.clear()
+        self.ready(x, now)
+        self.take(worker, now)
+        for queue, entries in waiting:
+            queue.extend(entries)
+
     def fail_open(self, slot: int, now: int) -> None:
         """Fail the job in a slot unless it has ended already."""
         if self.state.job_state[slot] == OPEN:

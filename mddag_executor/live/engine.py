@@ -22,6 +22,9 @@ lock, so that times never decrease.  Nobody but the engine and its parts (``jobs
     ``suspended``, ``refused``, …) is the core's decision, see ``core.rules``.
 4.  *What the core decides beside* (verdicts, ends of jobs, what an abort drops) is counted,
     recorded and told to the user (``verdicts``).
+5.  *What no DAG declares and ends at once runs past the core* (``begins_alone``) where an idle worker
+    would take it anyway.  Only if something is to be dispatched meanwhile the core is told of it
+    (``tell_of_alone``).
 """
 
 from __future__ import annotations
@@ -102,6 +105,8 @@ class Engine:
         # whether who is overtaken pauses
         self.preempts = False
         self._holds_since = 0
+        # what runs past the core
+        self.alone: Work | None = None
 
     # --- what became ready -----------------------------------------------------------------------
 
@@ -170,6 +175,39 @@ class Engine:
         """Take in anything that no DAG declares: requests, guard conditions, waitables, tasks."""
         if not work.entity.removed and not self._finished:
             self._start_undeclared(work, now)
+
+    def begins_alone(self, work: Work) -> bool:
+        """
+        Let an undeclared callback run past the core, if that would dispatch it now.
+
+        :return: False where it would not, or where what runs is recorded.
+        """
+        entity, state = work.entity, self._state
+        if (self.alone is not None or self.record is not None or state.ready or state.held_back
+                or state.unpolled or not state.scalars[N_IDLE]
+                or entity.removed or entity.gate is not None or self._finished
+                or entity.group >= 0 and state.group_owner[entity.group] >= 0
+                or entity.habit.holds and state.scalars[N_HOLDING]):
+            return False
+        entity.ready += 1
+        self.undeclared += 1
+        work.worker = state.worker_x.index(-1)
+        self.alone = work
+        return True
+
+    def tell_of_alone(self, now: int) -> None:
+        """Tell the core of what runs past it, if anything does."""
+        work, self.alone = self.alone, None
+        if work is None:
+            return
+        entity, state = work.entity, self._state
+        x = self.scheduler.undeclared(entity.ready, now)
+        state.x_group[x] = entity.group
+        state.x_holds[x] = entity.habit.holds
+        work.x = x
+        self.scheduler.start(x, work.worker, now)
+        if entity.habit.holds:
+            self._begins_to_hold(work, now)
 
     def ran_at_once(self, entity: Entity) -> None:
         """Count an undeclared callback that ran where it was taken."""
@@ -342,6 +380,8 @@ class Engine:
         if not (state.ready or state.held_back or state.unpolled):
             self.has_more = False
             return None
+        if self.alone is not None:
+            self.tell_of_alone(now)
         self.has_more = True
         if worker < 0:
             if not state.scalars[N_IDLE]:
@@ -359,10 +399,7 @@ class Engine:
         work.entity.waiting.pop(x, None)
         work.worker = worker
         if state.x_holds[x]:
-            self._holders = [w for w in self._holders if self._holds(w)]
-            self._holders.append(work)
-            self.is_shared = len(self._holders) > 1
-            self._holds_since = now
+            self._begins_to_hold(work, now)
             self.has_more = bool(state.ready or state.unpolled)  # what is held back stays there
         else:
             self.has_more = bool(state.ready or state.held_back or state.unpolled)
@@ -373,6 +410,12 @@ class Engine:
     def _holds(self, work: Work) -> bool:
         state, x = self._state, work.x
         return x >= 0 and state.x_worker[x] >= 0 and state.x_holds[x] != 0
+
+    def _begins_to_hold(self, work: Work, now: int) -> None:
+        self._holders = [w for w in self._holders if self._holds(w)]
+        self._holders.append(work)
+        self.is_shared = len(self._holders) > 1
+        self._holds_since = now
 
     def _may_be_overtaken(self, now: int) -> bool:
         """Return whether what comes first may overtake who began last to hold the interpreter."""
@@ -463,12 +506,15 @@ class Engine:
         :param vtid: the thread that it ran in; ``worker`` is -1 where that has lent its worker.
         :param failed: whether its callback has let an exception out.
         """
-        x, work.x = work.x, -1
-        if work in self._holders:
-            self._holders.remove(work)
         entity = work.entity
         entity.ran += 1
         entity.failed += failed
+        if work is self.alone:
+            self.alone = None
+            return
+        x, work.x = work.x, -1
+        if work in self._holders:
+            self._holders.remove(work)
         end_it = self.scheduler.fail if failed else self.scheduler.complete
         if self.record is None:
             end_it(x, end)

@@ -25,6 +25,8 @@ BRIEF_NS = 50_000
 SOON_RUNS, BRIEF_RUNS = 8, 32
 DOUBT = 4
 MOST_DEBT = 4096
+SELDOM, FORGIVEN_NS = 32, 2_000_000
+"""One in so many may be so long: the machine stalls, too."""
 
 COUNTS = ('ready', 'ran', 'failed', 'dropped', 'skipped', 'unattributed', 'busy_ns')
 _HAVE_HANDLES = (TIMER, SUBSCRIPTION, SERVICE)
@@ -35,26 +37,28 @@ class Guess:
     Whether something is expected to be short, because it was so the last times.
 
     What takes longer is a debt, which as many short ones pay off as it was too long: so a wrong
-    guess costs no more than ``limit_ns`` for each time, on average, and a stall of the machine is
-    forgotten soon.
+    guess costs no more than ``limit_ns`` for each time, on average.  One in ``SELDOM`` is none.
 
     :param limit_ns: what is short.
     :param first: how many times it must have been short before it is expected.
     :ivar debt: it is expected to be short where there is none.
     """
 
-    __slots__ = ('limit_ns', 'debt')
+    __slots__ = ('limit_ns', 'debt', '_last_long')
 
     def __init__(self, limit_ns: int, first: int) -> None:
         self.limit_ns = limit_ns
         self.debt = first
+        self._last_long = 0
 
-    def took(self, ns: int) -> None:
-        """Learn how long it was."""
-        if ns > self.limit_ns:
+    def took(self, ns: int, run: int) -> None:
+        """Learn how long it was in the run of this number."""
+        if ns <= self.limit_ns:
+            self.debt -= self.debt > 0
+            return
+        if ns > FORGIVEN_NS or run - self._last_long < SELDOM:
             self.debt = min(MOST_DEBT, self.debt + DOUBT * ns // self.limit_ns)
-        elif self.debt > 0:
-            self.debt -= 1
+        self._last_long = run
 
 
 class Entity:

@@ -299,7 +299,7 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def wake(self) -> None:
         """Take note of entities that were created or destroyed, or of a change of state."""
-        self._upkeep.changed = True
+        self._upkeep.change()
         self._ring()
 
     def _ring(self) -> None:
@@ -429,7 +429,7 @@ class MultiDeadlineExecutor(BareExecutor):
         """Do what is to be done now and then while somebody spins."""
         self._submit_tasks()
         if self._rates.look() and self._registry.is_stale():
-            self._upkeep.changed = True
+            self._upkeep.change()
         if self._announcements is not None:
             self._announcements.look()
         if self._diagnostics is not None:

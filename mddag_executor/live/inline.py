@@ -138,7 +138,9 @@ class Delivery:
         try:
             for direct in self._directs:
                 missed |= not direct.take(begin, arrivals)
-            if arrivals:
+            if len(arrivals) == 1:
+                self._receiver.take(arrivals[0])
+            elif arrivals:
                 self._receiver.take_in(arrivals)
         except Exception as error:
             self._receiver.on_intake_error(error)

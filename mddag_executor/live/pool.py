@@ -78,6 +78,8 @@ class Pool:
         # when it began to start nothing more; 0: it has not
         self.stopped_at = 0
         self.lent = 0
+        # whether the registry knows of all entities that were made or destroyed
+        self.is_settled = False
         # called to have another thread do what the intake's does not (True), and no longer
         self.relieve_intake: Callable[[bool], None] = lambda relieved: None
         # entered while a callback that runs in the calling thread of spin_once waits
@@ -121,10 +123,28 @@ class Pool:
                       and running.work is not None and not running.work.entity.ends_soon.debt):
                 self._hand_out(now)  # else who has published goes on with it soon
         if own is not None:
-            self._execute(own)
-            if own.relieved:
-                own.relieved = False
-                self.relieve_intake(False)
+            self._run_here(own)
+
+    def runs_alone(self, work: Work) -> bool:
+        """Run an undeclared callback in the calling thread, an intake's, if it may at once."""
+        seat = current.intake
+        if seat is None or seat.work is not None:
+            return False
+        with self.lock:
+            if not self.running or self._batches or not self.engine.begins_alone(work):
+                return False
+            seat.worker = work.worker
+            seat.work = work
+            work.is_fresh = self.is_settled
+        self._run_here(seat)
+        return True
+
+    def _run_here(self, seat: Seat) -> None:
+        """Run what is in the seat of an intake's thread, in that."""
+        self._execute(seat)
+        if seat.relieved:
+            seat.relieved = False
+            self.relieve_intake(False)
 
     @contextmanager
     def batch(self) -> Iterator[None]:
@@ -312,7 +332,9 @@ class Pool:
                 seat = self._new_seat(work.worker)
                 seat.work = work
             seat.vtid = threading.get_native_id()
+            before = current.running    # a callback that steps the executor itself
             ran = self._execute(seat)
+            current.running = before
         return True
 
     def _execute(self, seat: Seat) -> bool:
@@ -324,15 +346,16 @@ class Pool:
         work, engine, offset = seat.work, self.engine, self.clock.offset_ns
         assert work is not None
         entity = work.entity
-        before, current.running = current.running, seat
         waits_for: Any = None
         raised: BaseException | None = None
+        current.running = seat
         seat.began_ns = start = monotonic_ns() + offset
-        if self.cpu_order is not None and seat.thread is not None:
-            self.cpu_order.starts(seat, start)
-        seat.reading = None
-        if seat.cpu_clock is not None and entity.habit.is_to_be_measured():
-            self._interpreter.begins(seat, entity.habit)
+        if seat.cpu_clock is not None:
+            if self.cpu_order is not None:
+                self.cpu_order.starts(seat, start)
+            seat.reading = None
+            if entity.habit.is_to_be_measured():
+                self._interpreter.begins(seat, entity.habit)
         traced = engine.record is not None
         if traced:
             work.cpu_ns -= thread_time_ns()
@@ -343,14 +366,14 @@ class Pool:
         if traced:
             work.cpu_ns += thread_time_ns()
         end = monotonic_ns() + offset
-        current.running = before
+        current.running = None
         if seat.published:
             after = end - offset - seat.published
             if entity.ends_soon.debt or after > SOON_NS:
-                entity.ends_soon.took(after)
+                entity.ends_soon.took(after, entity.ran)
             seat.published = 0
         if entity.is_brief.debt or end - start > BRIEF_NS:
-            entity.is_brief.took(end - start)
+            entity.is_brief.took(end - start, entity.ran)
         if seat.reading is not None:
             self._interpreter.ended(seat, entity.habit, end - start)
         with self.lock:
@@ -364,7 +387,8 @@ class Pool:
                 engine.ask_again()
             seat.work = None
             if seat.thread is None:
-                self._hand_out(now)
+                if engine.has_waiting or engine.is_shared or self._interpreter.rings_at:
+                    self._hand_out(now)
             elif self._closed or not self.running or seat.worker < 0:
                 self._leave(seat, now)
             else:
@@ -393,6 +417,7 @@ class Pool:
         if isinstance(raised, Refused):
             engine.refused(work, now)
             return
+        engine.tell_of_alone(now)
         work.entity.busy_ns += end - start
         if waits_for is not None:
             engine.suspended(work, start, end, seat.vtid, seat.worker)
@@ -424,7 +449,7 @@ class Pool:
 
     def is_idle(self) -> bool:
         """Return whether nothing runs and nothing is ready."""
-        return not self.engine.has_waiting and (
+        return not self.engine.has_waiting and self.engine.alone is None and (
             self.engine.idle_workers >= self.engine.n_workers)
 
     def look_around(self) -> float:
@@ -479,6 +504,7 @@ class Pool:
     def _lend(self, seat: Seat) -> Iterator[None]:
         """Lend the worker of a running callback to a spare thread."""
         with self.lock:
+            self.engine.tell_of_alone(self.tick())
             if seat.worker >= 0:  # else it has lent its place before, and goes on without
                 self._give_place(seat)
                 assert seat.work is not None

@@ -9,6 +9,7 @@ from typing import Any
 
 from mddag_executor.live.announcements import Announcements
 from mddag_executor.live.compat import ends_sleep
+from mddag_executor.live.entity import Entity
 from mddag_executor.live.jobs import Announced, header_stamp, Origin, steady_time
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
@@ -42,43 +43,58 @@ class Receiver:
 
     def take_in(self, arrivals: Sequence[Work]) -> None:
         """Take in what became ready at one instant."""
-        if len(arrivals) > 1:
-            with self._pool.batch():
-                for each in arrivals:
-                    self.take_in((each,))
+        if len(arrivals) == 1:
+            self.take(arrivals[0])
             return
-        work = arrivals[0]
+        with self._pool.batch():
+            for each in arrivals:
+                self.take(each)
+
+    def take(self, work: Work) -> None:
+        """Take in what became ready."""
         entity = self._registry.by_id.get(id(work.rclpy_entity))
         if entity is None:
             return
         work.entity = entity
-        pool, engine, info = self._pool, self._engine, work.info
+        info = work.info
+        if info is None or entity.is_own:
+            self._take_other(work, entity)
+            return
+        if entity.at_once and self._pool.running:
+            self._run(work)
+            return
+        if self._recorder is not None:
+            self._recorder.taken(entity, work.args[0], info['source_timestamp'])
+        if entity.awaits and self.announcements is not None:
+            self.announcements.take(work)
+            return
+        engine = self._engine
+        origin: Origin | Announced | None = None
+        release = stamp = -1
+        if entity.source >= 0:
+            release, stamp = engine.jobs.release(
+                engine.tables.dag_of[entity.source], work.args[0],
+                info['source_timestamp'], self._clock.now())
+        elif entity.targets:
+            origin = engine.jobs.find(
+                entity.topic, info['source_timestamp'],
+                info.get('publication_sequence_number'))
+            if origin is None and entity.remote_publishers:
+                release, stamp = self._stamp(work)
+        elif entity.callback is None and not entity.is_brief.debt and self._pool.runs_alone(work):
+            return
+        self._pool.tell(engine.arrived, work, origin, release, stamp)
+
+    def _take_other(self, work: Work, entity: Entity) -> None:
+        """Take in what is no message, or one of the executor's own."""
+        pool, engine = self._pool, self._engine
         if entity.is_own:
             work.function(*work.args)
-        elif entity.callback is None and pool.running and (
-                entity.at_once or work.due is not None and ends_sleep(work.function)):
-            self._run(work)
         elif work.due is not None:
-            self._timer_due(work)
-        elif info is not None:
-            if self._recorder is not None:
-                self._recorder.taken(entity, work.args[0], info['source_timestamp'])
-            if entity.awaits and self.announcements is not None:
-                self.announcements.take(work)
-                return
-            origin: Origin | Announced | None = None
-            release = stamp = -1
-            if entity.source >= 0:
-                release, stamp = engine.jobs.release(
-                    engine.tables.dag_of[entity.source], work.args[0],
-                    info['source_timestamp'], self._clock.now())
-            elif entity.targets:
-                origin = engine.jobs.find(
-                    entity.topic, info['source_timestamp'],
-                    info.get('publication_sequence_number'))
-                if origin is None and entity.remote_publishers:
-                    release, stamp = self._stamp(work)
-            pool.tell(engine.arrived, work, origin, release, stamp)
+            if entity.callback is None and pool.running and ends_sleep(work.function):
+                self._run(work)
+            else:
+                self._timer_due(work)
         elif entity.source >= 0:
             pool.tell(engine.arrived, work, None, self._clock.now(), -1)
         else:

@@ -41,7 +41,7 @@ class Upkeep:
     Keeps registry, intakes and trace up to date.
 
     :param nodes: returns the nodes with what the executor is to run of them.
-    :ivar changed: whether there may be something new.
+    :ivar changed: whether there may be something new (see ``change``).
     :ivar entities: what there was when it was looked at last.
     """
 
@@ -58,6 +58,11 @@ class Upkeep:
         self._intakes: list[Intake] = []
         self._lock = threading.Lock()
         self._refresh_at = 0.0
+
+    def change(self) -> None:
+        """Take note that entities may have come or gone."""
+        self.changed = True
+        self._pool.is_settled = False
 
     def add_intake(self, intake: Intake) -> None:
         """Keep an intake up to date, too; it learns what there is with the next ``refresh``."""
@@ -82,6 +87,9 @@ class Upkeep:
             self.changed = False
             nodes = self._nodes()
             self._register(nodes)
+            self._pool.is_settled = True
+            if self.changed:  # meanwhile
+                self._pool.is_settled = False
             self._inform_intakes(nodes)
             end = time.monotonic()
             self._refresh_at = end + REFRESH_REST * (end - start)

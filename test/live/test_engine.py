@@ -118,3 +118,44 @@ def test_it_needs_no_rclpy_and_no_thread() -> None:
         'import mddag_executor.live.engine as engine\n'
         'engine.Engine(None, 7, "rad", default_deadline=1, max_active_jobs=1, expire_after=1)\n')
     assert subprocess.run([sys.executable, '-c', program], check=False).returncode == 0
+
+
+def entity_without_job(engine: Engine, group: int = -1) -> Entity:
+    return Entity('waitable', None, '/n', None, group, 10, '/t')
+
+
+def test_what_runs_past_the_core_keeps_its_worker_and_its_group() -> None:
+    engine = Engine(None, 2, 'rad', default_deadline=100, max_active_jobs=64, expire_after=NEVER)
+    entity, other = entity_without_job(engine, engine.new_group()), entity_without_job(engine)
+    alone = Work(None, print, entity=entity)
+    assert engine.begins_alone(alone)
+    works = [Work(None, print, entity=each) for each in (entity, other, other)]
+    for now, work in enumerate(works):
+        engine.arrived(work, None, -1, -1, now)
+    assert engine.dispatch(5) is works[1]   # there is one worker more, and the group is busy
+    assert engine.dispatch(5) is None
+    engine.finished(alone, 0, 6, 6, 0, alone.worker)
+    assert engine.dispatch(6) is works[0]
+    assert engine.dispatch(6) is None
+    engine.finished(works[1], 5, 7, 7, 0, works[1].worker)
+    assert engine.dispatch(7) is works[2]
+    assert (entity.ran, entity.ready, other.ready, engine.undeclared) == (1, 2, 2, 4)
+
+
+def test_nothing_runs_past_the_core_that_this_would_not_dispatch() -> None:
+    engine = Engine(None, 1, 'rad', default_deadline=100, max_active_jobs=64, expire_after=NEVER)
+    entity = entity_without_job(engine, engine.new_group())
+    works = [Work(None, print, entity=entity) for _ in range(3)]
+    engine.arrived(works[0], None, -1, -1, 0)
+    assert not engine.begins_alone(works[1])    # one waits
+    assert engine.dispatch(0) is works[0]
+    assert not engine.begins_alone(works[1])    # it runs, on the only worker
+    engine.suspended(works[0], 0, 1, 0, works[0].worker)
+    assert not engine.begins_alone(works[1])    # its group is busy
+    engine.resume(works[0])
+    assert engine.dispatch(2) is works[0]
+    engine.finished(works[0], 2, 3, 3, 0, works[0].worker)
+    assert engine.begins_alone(works[1])
+    assert not engine.begins_alone(works[2])    # one at a time
+    engine.finished(works[1], 3, 4, 4, 0, works[1].worker)
+    assert engine.dispatch(4) is None and engine.idle_workers == 1

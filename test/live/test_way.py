@@ -99,7 +99,7 @@ def ways() -> list[tuple[Way, Way]]:
     found = []
     for place in [i for i, name in enumerate(names) if name == 'middle']:
         try:
-            taken_in = last(names, 'Receiver.take_in', place)
+            taken_in = last(names, 'Receiver.take', place)
             waits = names.index('key_rad', taken_in, place)
             taken = last(names, 'Engine.dispatch', place)
             published = names.index('key_rad', place)

@@ -21,6 +21,9 @@ class Receiver(Protocol):
 
     executor: Any
 
+    def take(self, work: Work) -> None:
+        """Take in what became ready."""
+
     def take_in(self, arrivals: Sequence[Work]) -> None:
         """Take in what became ready at one instant: it is to be chosen among all of it."""
 

@@ -92,7 +92,7 @@ class SubscriptionSource(Source):
 
     def arrived(self, taken: tuple[Any, dict[str, Any]]) -> None:
         """Hand over a message that has been taken."""
-        self._receiver.take_in((self.arrival(taken),))
+        self._receiver.take(self.arrival(taken))
 
     def arrival(self, taken: tuple[Any, dict[str, Any]]) -> Work:
         """Return what a message that has been taken is handed over as."""
@@ -123,9 +123,9 @@ class ServiceSource(Source):
     def arrived(self, request: Any, header: Any) -> None:
         """Hand over a request that has been taken."""
         service = self.entity
-        self._receiver.take_in((Work(
+        self._receiver.take(Work(
             service, service.callback, (request, service.srv_type.Response()),
-            partial(service.send_response, header=header)),))
+            partial(service.send_response, header=header)))
 
 
 class ClientSource(Source):
@@ -168,7 +168,7 @@ class GuardSource(Source):
         """Hand it over."""
         guard = self.entity
         if guard.callback is not None:
-            self._receiver.take_in((Work(guard, guard.callback),))
+            self._receiver.take(Work(guard, guard.callback))
         return True
 
 

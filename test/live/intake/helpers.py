@@ -59,6 +59,9 @@ class Recorder:
         if reaction is not None:
             reaction(*what)
 
+    def take(self, work: Work) -> None:
+        self.take_in((work,))
+
     def take_in(self, arrivals: Sequence[Work]) -> None:
         self.rounds.append(len(arrivals))
         for arrival in arrivals:
