@@ -22,9 +22,9 @@ lock, so that times never decrease.  Nobody but the engine and its parts (``jobs
     ``suspended``, ``refused``, …) is the core's decision, see ``core.rules``.
 4.  *What the core decides beside* (verdicts, ends of jobs, what an abort drops) is counted,
     recorded and told to the user (``verdicts``).
-5.  *What no DAG declares and ends at once runs past the core* (``begins_alone``) where an idle worker
-    would take it anyway.  Only if something is to be dispatched meanwhile the core is told of it
-    (``tell_of_alone``).
+5.  *What no DAG declares and ends at once runs past the core* (``begins_alone``) where an idle
+    worker would take it anyway.  Only if something is to be dispatched meanwhile the core is told
+    of it (``tell_of_alone``).
 """
 
 from __future__ import annotations
