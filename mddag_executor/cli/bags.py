@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--overheads', type=_overheads, metavar='WHICH',
         help='with --reschedule: what noticing, dispatch and transport take: recorded (default), '
         'none, or a time for each dispatch (50us); of a bag: none (default) or a time')
-    add('--execution-times', metavar='FILE',
+    add('--execution-times', metavar='FILE', type=options.Input,
         help="with --reschedule of an ordinary bag: JSON with fixed execution times ('-': "
         'standard input; default: drawn from the declared ones)')
     add('--seed', type=int, metavar='N',
@@ -38,15 +38,12 @@ def _overheads(text: str) -> int:
     return 0 if text == 'none' else options.duration(text)
 
 
-def check(args: argparse.Namespace, *files: str | None) -> None:
+def check(args: argparse.Namespace) -> None:
     """
     Check the arguments.
 
-    :param files: what else may be standard input.
     :raises mddag_executor.errors.UsageError: where they do not go together
     """
-    if args.execution_times == '-' and '-' in files:
-        raise UsageError('-: standard input can be only one file: name the others')
     if args.execution_times is not None and args.seed is not None:
         raise UsageError(
             '--seed: nothing is drawn where --execution-times are given: leave one out')

@@ -29,19 +29,15 @@ _LONGEST_NS = 60_000_000_000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    options.add_workload(parser)
+    options.add(parser, '--graph', '--workers', '--duration', '--json')
     parser.add_argument(
         '--policies', default=','.join(POLICIES), metavar='P,P…', help='(default: all)')
-    options.add_workers(parser)
-    options.add_virtual_time(parser)
     options.add_seed(parser, 'of the execution times')
     options.add_repeat(parser, 5)
-    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     """Measure and print."""
-    common.check_output(args.json)
     policies = options.policies(args.policies)
     if args.duration > _LONGEST_NS:
         raise UsageError('--duration: that is too long: give at most 60s')

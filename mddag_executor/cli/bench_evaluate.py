@@ -36,7 +36,7 @@ _VERTEX_JOBS = {'compiled': 200_000, 'plain': 20_000}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    options.add_workload(parser)
+    options.add(parser, '--graph', '--json')
     add('--runs', type=options.positive_int, default=2000, metavar='N',
         help=f'for each measurement; one in {_PLAIN_SHARE} in plain Python (default: %(default)s)')
     add('--policies', default='rad,rm,wc', metavar='P,P…', help='(default: %(default)s)')
@@ -45,13 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--vertices', type=options.list_of(options.positive_int), default=SIZES, metavar='N,N…',
         help='sizes of the random task sets (default: 10,100,1000,10000)')
     options.add_repeat(parser, 3)
-    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     """Measure and print."""
     from mddag_executor.simulate.compiling import available
-    common.check_output(args.json)
     policies = options.policies(args.policies)
     if max(args.vertices) > 100_000:
         raise UsageError('--vertices: that is too many: give at most 100000')

@@ -75,8 +75,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--utilisation', type=options.list_of(options.positive_float), metavar='U[,U…]',
         help='scale the execution times to these normalised utilisations, sum(C/T)/workers '
         '(default: 0.3,0.6,0.8 for autoware, as declared for reference-system)')
-    add('--graph', metavar='FILE', help='a declaration to take instead of the one that ships '
-        "with the package ('-': standard input)")
     add('--bodies', choices=('sleep', 'spin', 'native', 'mixed'),
         help='how the synthetic callbacks execute: they sleep, compute in Python, compute without '
         'the interpreter lock, or, drawn for each, do one of the three (default: sleep)')
@@ -103,8 +101,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'which every deadline of the Autoware workload can be kept', int,
         default=defaults.LIVE_SEED)
     options.add_repeat(parser, 1, 'measure everything R times in turn, and take the medians')
-    add('--plot', metavar='OUT', help='draw a figure (.png, .svg or .pdf)')
-    options.add_json(parser)
+    add('--plot', metavar='OUT', type=options.Output, help='draw a figure (.png, .svg or .pdf)')
+    options.add(parser, '--graph', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -121,13 +119,11 @@ def main(args: argparse.Namespace) -> int:
     for result in results:
         if graph is not None:
             result['graph'] = args.graph or graph
-    if args.json is not None:
-        common.write_json(args.json, results)
     if args.plot is not None:
         from mddag_executor.live.bench.plot import draw
         with common.output_file(args.plot) as file:
             draw(results, file, args.plot)
-    if common.wants_tables(args):
+    if common.write_result(args, results):
         print(result_table(results))
         for line in notes(results):
             print(line)
@@ -140,10 +136,6 @@ def _check(args: argparse.Namespace) -> None:
             raise UsageError(
                 f'--{option}: it means nothing to --load {args.load}: leave it out, or take '
                 f'--load {" or ".join(loads)}')
-    if args.json == '-' and args.plot == '-':
-        raise UsageError('-: standard output can take only one of --json and --plot: name a file')
-    for path in (args.json, args.plot):
-        common.check_output(path)
     if args.plot is not None:
         from mddag_executor.simulate.plot import check_plot
         check_plot(args.plot)

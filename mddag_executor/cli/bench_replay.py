@@ -80,13 +80,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--workers', type=options.list_of(options.positive_int), metavar='M[,M…]',
         help='with --accuracy: of the live runs; the runs with further numbers are predicted '
         'from the recording with the first (default: 7 for callbacks that sleep, else 7,1,2)')
-    options.add_workload(parser)
-    options.add_json(parser)
+    options.add(parser, '--graph', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Measure and print."""
-    common.check_output(args.json)
     if args.accuracy and args.slack:
         raise UsageError('--slack: it is another measurement: leave it or --accuracy out')
     if (args.accuracy or args.slack) and args.trace:

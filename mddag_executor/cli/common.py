@@ -23,6 +23,7 @@ import sys
 import tempfile
 from typing import Any, BinaryIO, cast, TYPE_CHECKING
 
+from mddag_executor.cli.options import Input, NamedFile, Output, Report
 from mddag_executor.errors import InputError, UsageError
 from mddag_executor.resources import find
 
@@ -113,9 +114,9 @@ def input_file(path: str) -> Iterator[Path]:
 
 def recording_and_graph(args: argparse.Namespace) -> None:
     """
-    Tell TRACE… from GRAPH, which `options.add_recording` leaves together.
+    Separate TRACE… from GRAPH, which `options.add_recording` leaves together.
 
-    The last is a trace, too, if that is what it looks like.
+    The last one is a trace, too, if it looks like one.
 
     :raises mddag_executor.errors.UsageError: where they cannot be taken together
     """
@@ -123,8 +124,6 @@ def recording_and_graph(args: argparse.Namespace) -> None:
     if len(traces) > 1 and not _is_trace(traces[-1]):
         *traces, args.graph = traces
     args.trace = one_run(traces, args.offset)
-    if args.trace == '-' and args.graph == '-':
-        raise UsageError('-: standard input can be only one of TRACE and GRAPH: name the other')
 
 
 def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | Traces:
@@ -221,9 +220,36 @@ def _claim_stdin() -> BinaryIO:
     return cast(BinaryIO, getattr(sys.stdin, 'buffer', sys.stdin))
 
 
+def check_files(args: argparse.Namespace) -> None:
+    """
+    Find out whether the files of a command line can be written, before the work starts.
+
+    :raises mddag_executor.errors.MddagError: when one cannot, or two are the same stream
+    """
+    for kind, stream in ((Input, 'input'), (Output, 'output')):
+        same = [name for name, each in _files(args) if isinstance(each, kind) and each == '-']
+        if len(same) > 1:
+            raise UsageError(f'-: standard {stream} can be only one of {" and ".join(same)}: '
+                             'name a file for each other one')
+    for name, each in _files(args):
+        if isinstance(each, NamedFile) and each == '-':
+            raise UsageError(f'--{name} -: it is not written to standard output: name a file')
+        if isinstance(each, Output):
+            check_output(each)
+        if isinstance(each, Report):
+            _check_report(each)
+
+
+def _files(args: argparse.Namespace) -> Iterator[tuple[str, Input | Output]]:
+    for name, value in vars(args).items():
+        for each in value if isinstance(value, list) else (value,):
+            if isinstance(each, (Input, Output)):
+                yield name.replace('_', ' '), each
+
+
 def check_output(path: str | None) -> None:
     """
-    Find out whether a result can be written, before the work starts.
+    Find out whether a file can be written.
 
     :param path: as given on the command line; None and `-` are always fine
     :raises mddag_executor.errors.InputError: when it cannot be written
@@ -332,19 +358,11 @@ def _plain(value: Any) -> Any:
     raise TypeError(f'{type(value).__name__} has no JSON form')
 
 
-def check_report(path: str | None) -> None:
-    """
-    Find out whether a report can be made and written, before the work starts.
-
-    :raises mddag_executor.errors.MddagError: when it cannot
-    """
-    check_output(path)
-    if path is not None:
-        if os.path.splitext(path)[1].lower() not in ('', '.html', '.htm'):
-            raise UsageError(
-                f'--report {path}: a report is an HTML file: let its name end in .html')
-        from mddag_executor.report.html import check_available
-        check_available()
+def _check_report(path: Report) -> None:
+    if os.path.splitext(path)[1].lower() not in ('', '.html', '.htm'):
+        raise UsageError(f'--report {path}: a report is an HTML file: let its name end in .html')
+    from mddag_executor.report.html import check_available
+    check_available()
 
 
 def report_watch(path: str | None) -> Watch | None:
@@ -370,12 +388,12 @@ def write_report(path: str, data: Callable[[], ReportData]) -> None:
 
 
 def write_result(args: argparse.Namespace, result: Any) -> bool:
-    """Write a result where `--json` says; tell whether tables are to be shown as well."""
+    """Write a result where `--json` says; return whether tables are to be shown as well."""
     if args.json is not None:
         write_json(args.json, result)
     return wants_tables(args)
 
 
 def wants_tables(args: argparse.Namespace) -> bool:
-    """Tell whether standard output is for people, and not taken by a result."""
-    return '-' not in (getattr(args, 'json', None), getattr(args, 'report', None))
+    """Return whether standard output is for people, and not taken by a result."""
+    return not any(isinstance(each, Output) and each == '-' for _, each in _files(args))

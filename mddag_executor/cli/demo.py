@@ -70,12 +70,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_seed(parser, 'what the execution times are drawn with', int, DEFAULT_SEED)
     add('--output', default='build/demo', metavar='DIR',
         help='where trace and results are written (default: build/demo)')
-    options.add_json(parser)
+    options.add(parser, '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Run the steps and print what each found."""
-    common.check_output(args.json)
     output = Path(args.output)
     output.mkdir(parents=True, exist_ok=True)
     graph = find('config/autoware.yaml')
@@ -83,8 +82,7 @@ def main(args: argparse.Namespace) -> int:
     if args.processes is not None:
         from mddag_executor.cli.demo_processes import run_demo
         result = run_demo(args, graph, output, say)
-        if args.json is not None:
-            common.write_json(args.json, result)
+        common.write_result(args, result)
         return 0
     args.utilisation = args.utilisation or UTILISATION
     for line in _introduction(args, graph):
@@ -103,10 +101,9 @@ def main(args: argparse.Namespace) -> int:
         f'{args.baseline_seconds:g} s ==')
     baseline = run_baseline(args, graph)
     say(side_by_side(live['measured'], baseline))
-    if args.json is not None:
-        common.write_json(args.json, {
-            'live': live, 'recorded': recorded, 'rescheduled': rescheduled,
-            'baseline': baseline, 'trace': str((output / 'demo.mcap').absolute())})
+    common.write_result(args, {
+        'live': live, 'recorded': recorded, 'rescheduled': rescheduled, 'baseline': baseline,
+        'trace': str((output / 'demo.mcap').absolute())})
     return 0
 
 

@@ -22,7 +22,6 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded, verdicts
 from mddag_executor.cli.text import warn
-from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
     from mddag_executor.replay import Replay, Reschedule
@@ -43,18 +42,17 @@ exit status: 0 compared; 1 with --fail-on-worse when a sink got worse; 2 bad inp
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('first', metavar='A.mcap',
+    add('first', metavar='A.mcap', type=options.Input,
         help="the run to compare with: a trace, also an imported one ('-': standard input), or a "
         'folder with the traces of all its processes; with --reschedule also an ordinary bag')
-    add('second', metavar='B.mcap', help="the run to compare, likewise ('-': standard input)")
-    add('graph', metavar='GRAPH', nargs='?',
+    add('second', metavar='B.mcap', type=options.Input,
+        help="the run to compare, likewise ('-': standard input)")
+    add('graph', metavar='GRAPH', nargs='?', type=options.Input,
         help="the declaration that judges both ('-': standard input; default: each by the one "
         "that it was recorded with, an imported one by the other's)")
     recorded.add_arguments(
         parser, 'compare with what the scheduler would have done in B with the recorded releases '
         'and execution times (in an ordinary bag A, too)')
-    recorded.add_skip(parser)
-    options.add_offset(parser)
     add('--callbacks', action='store_true', help='show a table of all callbacks, too')
     add('--fail-on-worse', action='store_true',
         help='exit with status 1 if a sink missed a larger share of its deadlines in B, or its '
@@ -62,22 +60,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--tolerance', type=_share, metavar='P%',
         help='with --fail-on-worse and in the tables: how much the p99 response time of a sink '
         'may grow, as 10%% (default: by any amount)')
-    options.add_json(parser)
+    options.add(parser, '--skip', '--offset', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Compare two runs."""
     from mddag_executor.report import diff
-    _check_arguments(args)
+    recorded.check(args)
     task_set = None if args.graph is None else common.load_graph(args.graph)
     runs = common.two_runs(args.first, args.second, args.offset)
     with ExitStack() as files:
         first, second = (files.enter_context(common.input_recording(run)) for run in runs)
         before, after = _results(args, first, second, task_set)
     difference = diff.compare(before, after, args.tolerance)
-    if args.json is not None:
-        common.write_json(args.json, difference)
-    if common.wants_tables(args):
+    if common.write_result(args, difference):
         print(diff.sinks_table(difference))
         if args.callbacks:
             print(diff.callbacks_table(difference))
@@ -89,13 +85,6 @@ def main(args: argparse.Namespace) -> int:
         return verdicts.unproven(
             f'{first[1]} and {second[1]}', 'no sink was due in both, so nothing was compared')
     return int(difference['worse'])
-
-
-def _check_arguments(args: argparse.Namespace) -> None:
-    if (args.first, args.second, args.graph).count('-') > 1:
-        raise UsageError('-: standard input can be only one of A, B and GRAPH: name the others')
-    common.check_output(args.json)
-    recorded.check(args, args.first, args.second, args.graph)
 
 
 def _results(
@@ -132,8 +121,7 @@ def _result(
     else:
         outcome = recorded.as_recorded(
             path, name, task_set, doing=f'replaying {name}', skip=args.skip)
-    for warning in outcome.warnings:
-        warn(warning)
+    warn(*outcome.warnings)
     return outcome.result(), outcome.task_set
 
 

@@ -23,7 +23,7 @@ from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, Progress, table, warn
 from mddag_executor.core import POLICIES
-from mddag_executor.errors import InputError, UsageError
+from mddag_executor.errors import InputError
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
@@ -45,45 +45,45 @@ _EXIT_INTERRUPTED = 130
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('graph', metavar='GRAPH', nargs='+',
+    add('graph', metavar='GRAPH', nargs='+', type=options.Input,
         help="declaration ('-': standard input), or several, or a folder of them (*.yaml)")
     add('--runs', type=options.positive_int, metavar='N',
         help='runs of each GRAPH, each with execution times of its own (default: '
         f'{_RUNS}; {_RUNS_OF_EACH} if there are several)')
     add('--policies', default=','.join(defaults.POLICIES), metavar='P,P…',
         help=f'any of {", ".join(POLICIES)} (default: %(default)s)')
-    options.add_workers(parser)
-    options.add_virtual_time(parser)
     options.add_seed(parser, 'of the draws')
-    add('--samples', metavar='FILE.npz',
+    add('--samples', metavar='FILE.npz', type=options.Input,
         help="measured execution times, an array of ns for each 'node:callback' (default: the "
         'quantile tables of the declaration)')
     add('--non-preemptive', action='store_true',
         help='run all policies as an executor of callbacks can; else '
         f'{", ".join(name for name, row in POLICIES.items() if row.preemptive)} preempt')
-    options.add_overhead(parser)
     add('--judge', choices=('completions', 'horizon'), default='completions',
         help="which deadlines count: those of sinks that completed (the paper's way), or also "
         'those that passed before the end (default: %(default)s)')
-    options.add_jobs(parser)
     add('--dask', metavar='ADDRESS',
         help="let the workers of a Dask cluster do the runs; ADDRESS is its scheduler's, as "
         "tcp://host:8786, or 'local' for --jobs processes of this machine (extra 'dask')")
-    add('--resume', metavar='FILE',
+    add('--resume', metavar='FILE', type=options.NamedFile,
         help='keep what is done in FILE, and go on from what it holds; the result is that of an '
         'uninterrupted evaluation')
     add('--core', choices=('auto', 'compiled', 'plain'), default='auto',
         help="the scheduler core, compiled (by numba, the extra 'batch') or in plain Python: the "
         'results are the same (default: the one that is sooner done)')
-    add('--plot', metavar='OUT', help="draw the paper's figure (.png, .svg or .pdf)")
-    add('--csv', metavar='FILE', help="write the table as CSV ('-': to standard output)")
-    options.add_json(parser)
+    add('--plot', metavar='OUT', type=options.NamedFile,
+        help="draw the paper's figure (.png, .svg or .pdf)")
+    add('--csv', metavar='FILE', type=options.Output,
+        help="write the table as CSV ('-': to standard output)")
+    options.add(parser, '--workers', '--duration', '--overhead', '--jobs', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Evaluate a declaration and print the acceptance ratios."""
     policies = options.policies(args.policies)
-    _check_outputs(args)
+    if args.plot is not None:
+        from mddag_executor.simulate.plot import check_plot
+        check_plot(args.plot)
     task_sets = _load(_graphs(args.graph))
     outcome = _evaluate(args, task_sets, policies)
     if outcome.interrupted:
@@ -92,22 +92,6 @@ def main(args: argparse.Namespace) -> int:
     if outcome.runs > 0:
         _write(args, outcome)
     return _EXIT_INTERRUPTED if outcome.interrupted else 0
-
-
-def _check_outputs(args: argparse.Namespace) -> None:
-    if args.graph.count('-') > 1:
-        raise UsageError('-: standard input can be only one GRAPH: name files')
-    if '-' in args.graph and args.samples == '-':
-        raise UsageError('-: standard input can be only one of GRAPH and --samples: name a file')
-    if args.json == '-' and args.csv == '-':
-        raise UsageError('-: standard output can take only one of --json and --csv: name a file')
-    if args.resume == '-':
-        raise UsageError('--resume: standard input and output keep nothing: name a file')
-    for path in (args.json, args.csv, args.plot, args.resume):
-        common.check_output(path)
-    if args.plot is not None:
-        from mddag_executor.simulate.plot import check_plot
-        check_plot(args.plot)
 
 
 def _graphs(names: Sequence[str]) -> list[str]:
@@ -195,15 +179,13 @@ def _clock(seconds: float) -> str:
 
 
 def _write(args: argparse.Namespace, outcome: Evaluation) -> None:
-    if args.json is not None:
-        common.write_json(args.json, outcome.result())
     if args.csv is not None:
         common.write_text(args.csv, csv_text(outcome))
     if args.plot is not None:
         from mddag_executor.simulate.plot import draw
         with common.output_file(args.plot) as file:
             draw(outcome, file, args.plot)
-    if common.wants_tables(args) and args.csv != '-':
+    if common.write_result(args, outcome.result()):
         print(table(*ratio_table(outcome)))
         print(_summary(outcome))
 

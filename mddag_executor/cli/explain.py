@@ -35,32 +35,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--sink', metavar='S', help='only jobs of this sink, as /node:callback')
     add('--job', type=options.or_zero(options.positive_int), metavar='K',
         help='only the job of this number')
-    recorded.add_skip(parser)
-    options.add_json(parser)
+    options.add(parser, '--skip', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Explain the misses of a trace."""
     common.recording_and_graph(args)
-    common.check_output(args.json)
-    task_set = None if args.graph is None else common.load_graph(args.graph)
-    with common.input_recording(args.trace) as (path, name):
+    with recorded.opened(args) as (path, name, task_set):
         if task_set is None or recorded.is_bag(path):
             recorded.check_declared(path, name)
         outcome = recorded.as_recorded(
             path, name, task_set, doing='explaining', skip=args.skip, jobs=True)
     sink = None if args.sink is None else _sink(args.sink, outcome.task_set)
-    for warning in outcome.warnings:
-        warn(warning)
+    warn(*outcome.warnings)
     explainer = outcome.explainer
     assert explainer is not None
-    if args.json is not None:
-        common.write_json(args.json, explainer.result(sink, args.job))
-    if common.wants_tables(args):
+    result = explainer.result(sink, args.job)
+    if common.write_result(args, result):
         if sink is None and args.job is None:
             _show(outcome, explainer)
         else:
-            _show_jobs(explainer.result(sink, args.job)['jobs'])
+            _show_jobs(result['jobs'])
     return 0
 
 

@@ -68,13 +68,11 @@ def main(args: argparse.Namespace) -> int:
         return _export_session(args)
     common.check_output(args.output)
     check_available(form)
-    task_set = None if args.graph is None else common.load_graph(args.graph)
-    with common.input_recording(args.trace) as (path, name), \
+    with recorded.opened(args) as (path, name, task_set), \
             common.output_file(args.output) as file:
         writes = target(form, file, args.rows == 'jobs')
         warnings = _export(args, path, name, task_set, writes)
-    for warning in warnings:
-        warn(warning)
+    warn(*warnings)
     if form == 'mcap':
         common.write_json(str(PurePath(args.output).with_suffix('.json')), layout_of(writes))
     if args.output != '-':
@@ -113,8 +111,7 @@ def _export_session(args: argparse.Namespace) -> int:
         if args.caret:
             export_dicts(caret_events(path), args.output, line.events)
         else:
-            for warning in export_ctf(path, args.output, name=name, progress=line.events):
-                warn(warning)
+            warn(*export_ctf(path, args.output, name=name, progress=line.events))
     print(f'exported: {printable(args.output)}')
     return 0
 
@@ -133,5 +130,5 @@ def _form(args: argparse.Namespace) -> str:
     if form in ('pftrace', 'mcap') and args.rows is not None:
         raise UsageError(
             f'--rows: a .{form} gets both, executions and jobs: leave the option out')
-    recorded.check(args, args.trace, args.graph)
+    recorded.check(args)
     return form

@@ -9,9 +9,8 @@ Those modules import nothing heavy before they run: `mddag graph --help` stays q
 from __future__ import annotations
 
 import argparse
-from importlib import import_module
 
-from mddag_executor.cli.options import add_verb
+from mddag_executor.cli.options import add_verbs
 
 EXAMPLE = """\
 mddag graph check config/autoware.yaml
@@ -25,7 +24,4 @@ VERBS = ('check', 'draw', 'schema', 'fmt', 'from-caret', 'from-trace', 'from-ros
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the verbs of this verb, with their arguments."""
-    verbs = parser.add_subparsers(dest='graph_verb', metavar='VERB', required=True, title='verbs')
-    for name in VERBS:
-        module = import_module(f'mddag_executor.cli.graph_{name.replace("-", "_")}')
-        add_verb(verbs, name, module, module.HELP, module.DESCRIPTION)
+    add_verbs(parser, 'graph', VERBS)

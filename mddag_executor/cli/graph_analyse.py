@@ -33,18 +33,15 @@ _ABOUT = ('test', 'source', 'scheduler', 'assumption')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    options.add_graph(parser)
     parser.add_argument(
         '--budget', choices=defaults.BUDGETS, default='max',
         help='what of each execution time counts: its maximum (default), 99 %% quantile or mean')
-    options.add_workers(parser)
-    options.add_json(parser)
+    options.add(parser, 'graph', '--workers', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Analyse."""
     from mddag_executor.analysis import analyse
-    common.check_output(args.json)
     task_set = common.load_graph(args.graph)
     with Progress('analysing') as line:
         analysis = analyse(

@@ -40,9 +40,8 @@ _TARGET = 0.95
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    options.add_graph(parser)
-    add('-o', '--output', metavar='OUT', default='-',
-        help="the declaration ('-': standard output, the default)")
+    options.add(parser, 'graph', '--output', '--workers', '--overhead', '--duration', '--jobs',
+                '--json')
     add('--by', choices=('path', 'search'), default='path',
         help='how to find them (default: %(default)s)')
     add('--base', choices=('period', 'deadline'),
@@ -54,17 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'with --by search: the least acceptance ratio (default: {_TARGET})')
     add('--budget', choices=defaults.BUDGETS, default='p99',
         help='what of each execution time makes the critical path (default: %(default)s)')
-    add('--policy', default='rad', metavar='P', help='to simulate (default: %(default)s)')
-    options.add_workers(parser)
+    options.add_policy(parser, 'to simulate, ')
     add('--non-preemptive', action='store_true',
         help="simulate as an executor of callbacks runs them, not in the policy's own mode")
-    options.add_overhead(parser)
     add('--runs', type=options.positive_int, default=1000, metavar='N',
         help='runs that measure the acceptance of each scale (default: %(default)s)')
-    options.add_virtual_time(parser)
     options.add_seed(parser, 'of the draws')
-    options.add_jobs(parser)
-    options.add_json(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -75,10 +69,6 @@ def main(args: argparse.Namespace) -> int:
     if args.by == 'search' and (args.factor is not None or args.base is not None):
         option = '--base' if args.factor is None else '--factor'
         raise UsageError(f"{option}: '--by search' has none: leave it out, or give --by path")
-    if args.json == '-' and args.output == '-':
-        raise UsageError('-: standard output can take only one of -o and --json: name a file')
-    for path in (args.output, args.json):
-        common.check_output(path)
     name, text = common.read_text(args.graph)
     task_set, missing = load_with_or_without_deadlines(text, name)
     if args.base == 'deadline' and missing:
@@ -86,10 +76,9 @@ def main(args: argparse.Namespace) -> int:
                          "add it, or use '--base period'")
     deadlines, measured, found = _assign(args, task_set)
     common.write_text(args.output, deadlines_in_text(task_set, text, deadlines))
-    if args.json is not None:
-        common.write_json(args.json, _result(args, deadlines, measured, found))
-    if common.wants_tables(args):
-        _tell(args, task_set, deadlines, measured, found)
+    common.write_result(args, _result(args, deadlines, measured, found))
+    if args.json != '-':
+        _show(args, task_set, deadlines, measured, found)
     return 0
 
 
@@ -135,7 +124,7 @@ def _result(
     return result
 
 
-def _tell(
+def _show(
     args: argparse.Namespace, task_set: TaskSet, deadlines: dict[str, int], measured: Measured,
     found: Found | None,
 ) -> None:

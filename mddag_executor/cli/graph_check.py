@@ -36,13 +36,11 @@ _HEADER = ('DAG', 'period', 'vertices', 'critical path', 'load', 'sink', 'deadli
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    options.add_graph(parser)
-    options.add_json(parser)
+    options.add(parser, 'graph', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Check."""
-    common.check_output(args.json)
     task_set = common.load_graph(args.graph)
     result = check_result(task_set)
     if common.write_result(args, result):

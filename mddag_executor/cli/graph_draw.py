@@ -39,9 +39,9 @@ _ENDINGS = (*_BY_GRAPHVIZ, '.dot', '.mmd')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    options.add_graph(parser)
+    options.add(parser, 'graph')
     parser.add_argument(
-        '-o', '--output', metavar='OUT', required=True,
+        '-o', '--output', metavar='OUT', type=options.Output, required=True,
         help=f'the picture; its name ends in {", ".join(_ENDINGS)}')
 
 
@@ -51,7 +51,6 @@ def main(args: argparse.Namespace) -> int:
     if ending not in _ENDINGS:
         raise UsageError(
             f'{args.output}: no ending that says what to draw: use one of {", ".join(_ENDINGS)}')
-    common.check_output(args.output)
     program = _find_dot(args.output) if ending in _BY_GRAPHVIZ else ''
     task_set = common.load_graph(args.graph)
     from mddag_executor.report.picture import picture

@@ -23,7 +23,7 @@ broken near column 90. Comments, quotes, order and meaning stay. The file is rep
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    options.add_graph(parser)
+    options.add(parser, 'graph')
     parser.add_argument(
         '--check', action='store_true',
         help='change nothing; exit with 1 if the declaration is not in its normal form')

@@ -7,9 +7,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from mddag_executor.cli import common
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import warn
-from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
     from msg_graph.draft import Draft
@@ -32,24 +31,19 @@ topic are no longer in doubt."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('architecture', metavar='ARCHITECTURE.yaml',
+    parser.add_argument('architecture', metavar='ARCHITECTURE.yaml', type=options.Input,
                         help="the architecture file ('-': standard input)")
-    parser.add_argument('--trace', metavar='TRACE',
+    parser.add_argument('--trace', metavar='TRACE', type=options.Input,
                         help='measure rates and execution times in this recording: a trace '
                         "(MCAP; '-': standard input), or the folder of a session that LTTng "
                         'recorded (needs python3-bt2)')
-    parser.add_argument('-o', '--output', metavar='GRAPH', default='-',
-                        help="the declaration ('-': standard output, the default)")
+    options.add(parser, '--output')
 
 
 def main(args: argparse.Namespace) -> int:
     """Write the declaration."""
     from mddag_executor.cli.systems import recorded_system, write_declaration
     from msg_graph.caret import declaration_from_caret
-    common.check_output(args.output)
-    if args.architecture == '-' and args.trace == '-':
-        raise UsageError('-: standard input can be only one of ARCHITECTURE.yaml and TRACE: name '
-                         'the other')
     name, text = common.read_text(args.architecture)
 
     def measure(draft: Draft) -> None:

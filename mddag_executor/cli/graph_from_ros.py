@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 
-from mddag_executor.cli import common, options
+from mddag_executor.cli import options
 from mddag_executor.cli.text import Progress, warn
 from mddag_executor.errors import InputError
 
@@ -29,20 +29,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--timeout', type=options.positive_float, default=5.0, metavar='SECONDS',
         help='how long to look and to measure rates (default: 5)')
-    parser.add_argument('-o', '--output', metavar='GRAPH', default='-',
-                        help="the declaration ('-': standard output, the default)")
+    options.add(parser, '--output')
 
 
 def main(args: argparse.Namespace) -> int:
     """Write the declaration."""
-    common.check_output(args.output)
     from mddag_executor.cli.systems import write_declaration
     from mddag_executor.live.graph_probe import draft_of, probe
     from msg_graph.draft_text import declaration_of
     with Progress('looking at the nodes', args.timeout) as line:
         found = probe(args.timeout, line.update)
-    for warning in found.warnings:
-        warn(warning)
+    warn(*found.warnings)
     draft = draft_of(found)
     if not draft.nodes:
         raise InputError(

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 
-from mddag_executor.cli import common
+from mddag_executor.cli import options
 
 HELP = 'make a declaration to fill in from a recorded run'
 EXAMPLE = """\
@@ -26,18 +26,15 @@ services, is left out."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('trace', metavar='TRACE',
+    parser.add_argument('trace', metavar='TRACE', type=options.Input,
                         help="a trace (MCAP; '-': standard input), or the folder of a session "
                         'that LTTng recorded (needs python3-bt2)')
-    parser.add_argument('-o', '--output', metavar='GRAPH', default='-',
-                        help="the declaration ('-': standard output, the default)")
+    options.add(parser, '--output')
 
 
 def main(args: argparse.Namespace) -> int:
     """Write the declaration."""
     from mddag_executor.cli.systems import recorded_system, write_declaration
     from msg_graph.draft_text import declaration_of
-    common.check_output(args.output)
-    draft = recorded_system(args.trace).draft()
-    write_declaration(args.output, declaration_of(draft))
+    write_declaration(args.output, declaration_of(recorded_system(args.trace).draft()))
     return 0

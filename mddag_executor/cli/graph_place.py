@@ -13,8 +13,6 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, one_line, printable, Progress, table
-from mddag_executor.core import POLICIES
-from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
 from mddag_executor.text import counted
 
@@ -41,16 +39,14 @@ _MOST_FACTOR = 4.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    options.add_graph(parser)
     add('--processes', type=options.positive_int, required=True, metavar='N',
         help='how many processes')
-    add('-o', '--output', metavar='PLACED.yaml', required=True,
+    add('-o', '--output', metavar='PLACED.yaml', type=options.Output, required=True,
         help="the declaration to write ('-': to standard output)")
     options.add_cpus(parser, 'those of this machine')
     add('--workers', type=options.positive_int, metavar='M',
         help=f"threads of each process (default: the declaration's, else {defaults.WORKERS})")
-    add('--policy', default='rad', metavar='P',
-        help=f'one of {", ".join(POLICIES)} (default: rad)')
+    options.add_policy(parser)
     add('--trace', metavar='TRACE', action='append', default=[],
         help='take execution times, and who computes in Python, from a recorded run (default: '
         'those that are declared); repeat it for the traces of several processes')
@@ -61,8 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='nodes that run in one process; repeat it for more groups')
     add('--apart', metavar='NODE,NODE…', action='append', default=[],
         help='nodes of which no two run in one process; repeat it for more groups')
-    options.add_virtual_time(parser)
-    options.add_json(parser)
+    options.add(parser, 'graph', '--duration', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -70,13 +65,8 @@ def main(args: argparse.Namespace) -> int:
     from mddag_executor.assign.placed import cost_of, improve, Predictor
     from mddag_executor.assign.placement import Placing
     from msg_graph.processes import with_processes
-    if args.json == '-' and args.output == '-':
-        raise UsageError('-: standard output can take only one of -o and --json: name a file')
     if args.trace and args.utilisation is not None:
         raise UsageError('--utilisation: recorded execution times are not scaled: leave it out')
-    find_policy(args.policy)
-    for path in (args.output, args.json):
-        common.check_output(path)
     task_set = common.load_graph(args.graph)
     workers = defaults.workers(args.workers, task_set)
     times, judged = _times(args, task_set, workers)
@@ -99,11 +89,10 @@ def main(args: argparse.Namespace) -> int:
             'factor': _factor(predictor, processes, times),
             'draws': _draws(args, task_set, workers, predictor, processes)}
     common.write_text(args.output, with_processes(task_set, processes).text)
-    if args.json is not None:
-        common.write_json(args.json, result)
-    if common.wants_tables(args):
+    common.write_result(args, result)
+    if args.json != '-':
         stream = sys.stderr if args.output == '-' else sys.stdout
-        for text in _told(result):
+        for text in _lines(result):
             print(text, file=stream)
     return 0
 
@@ -218,7 +207,7 @@ def _draws(
     return found
 
 
-def _told(result: dict[str, Any]) -> Iterator[str]:
+def _lines(result: dict[str, Any]) -> Iterator[str]:
     """Yield the lines about a placement."""
     from mddag_executor.report.tables import sink_table, verdicts_line
     rows: list[list[Cell]] = [

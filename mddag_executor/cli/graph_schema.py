@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 
-from mddag_executor.cli import common
+from mddag_executor.cli import common, options
 
 HELP = 'print the JSON Schema of declarations, for editors'
 EXAMPLE = """\
@@ -20,13 +20,12 @@ and check a declaration that begins with the line
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument(
-        '-o', '--output', metavar='OUT', default='-', help="the file ('-': standard output)")
+    parser.add_argument('-o', '--output', metavar='OUT', type=options.Output, default='-',
+                        help="the file ('-': standard output)")
 
 
 def main(args: argparse.Namespace) -> int:
     """Print the schema."""
     from msg_graph.language import schema
-    common.check_output(args.output)
     common.write_json(args.output, schema())
     return 0

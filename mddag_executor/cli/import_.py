@@ -5,15 +5,11 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common
+from mddag_executor.cli.options import NamedFile
 from mddag_executor.cli.text import printable, Progress, warn
-from mddag_executor.errors import UsageError
 from mddag_executor.text import counted
-
-if TYPE_CHECKING:
-    from mddag_executor.trace import Imported
 
 EXAMPLE = """\
 mddag import ctf ~/.ros/tracing/session-20261121101500 -o drive.mcap
@@ -32,18 +28,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         epilog='example:\n  ' + EXAMPLE.replace('\n', '\n  '),
         formatter_class=argparse.RawDescriptionHelpFormatter)
     ctf.add_argument('session', metavar='SESSION', help='the folder that was recorded to')
-    ctf.add_argument('-o', '--output', metavar='OUT.mcap', required=True,
+    ctf.add_argument('-o', '--output', metavar='OUT.mcap', required=True, type=NamedFile,
                      help='the trace to write')
 
 
 def main(args: argparse.Namespace) -> int:
     """Import a session and say what was in it."""
-    if args.output == '-':
-        raise UsageError('-o -: a trace is not written to standard output: name a file')
-    common.check_output(args.output)
-    imported = _import(args.session, args.output)
-    for warning in imported.warnings:
-        warn(warning)
+    from mddag_executor.trace import import_ctf
+    with common.output_trace(args.output) as path, Progress('importing') as line:
+        imported = import_ctf(
+            args.session, path, progress=lambda events: line.update(events, 'events'))
+    warn(*imported.warnings)
     print(f'{counted(imported.events, "event")} of {counted(imported.kinds, "kind")} from '
           f'{counted(len(imported.processes), "process", "processes")}: {printable(args.output)}')
     if imported.unread:
@@ -51,16 +46,3 @@ def main(args: argparse.Namespace) -> int:
                           for provider, count in imported.unread.most_common())
         print(f'replay does not use the events of these providers: {named}')
     return 0
-
-
-def _import(session: str, output: str) -> Imported:
-    """Write the trace as a whole or not at all."""
-    from mddag_executor.trace import import_ctf, TraceError
-    with common.output_file(output) as file, Progress('importing') as line:
-        try:
-            return import_ctf(session, file.name,
-                              progress=lambda events: line.update(events, 'events'))
-        except TraceError as error:
-            if error.file != file.name:
-                raise
-            raise TraceError(output, error.problem, error.remedy) from None

@@ -130,6 +130,8 @@ def run(argv: Sequence[str]) -> int:
     """
     parser = build_parser(argv[0] if argv else None)
     args = parser.parse_args(argv)
+    from mddag_executor.cli.common import check_files
+    check_files(args)
     status = int(args.main(args))
     # Here, not at the interpreter's exit: a full disk or a closed pipe must still be reported.
     sys.stdout.flush()

@@ -10,7 +10,8 @@ help are the same, too. Like the verbs' modules this one imports nothing heavy.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from importlib import import_module
 import math
 from types import ModuleType
 from typing import Any, TypeVar
@@ -100,39 +101,6 @@ def policies(text: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-# --- options that several verbs have -------------------------------------------------------------
-
-def add_graph(parser: argparse.ArgumentParser) -> None:
-    """Declare the argument `GRAPH`."""
-    parser.add_argument(
-        'graph', metavar='GRAPH', help="the declaration, a YAML file ('-': standard input)")
-
-
-def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
-    """
-    Declare the arguments `TRACE… [GRAPH]`; see `common.recording_and_graph`.
-
-    :param what: the help of TRACE
-    """
-    parser.add_argument(
-        'trace', metavar='TRACE', nargs='+',
-        help=f'{what}; of one run in several processes the traces of all')
-    parser.add_argument(
-        'graph', metavar='GRAPH', nargs='?',
-        help="the declaration that judges, a YAML file ('-': standard input; default: the one "
-        'that the trace was recorded with)')
-    add_offset(parser)
-
-
-def add_offset(parser: argparse.ArgumentParser) -> None:
-    """Declare `--offset`."""
-    parser.add_argument(
-        '--offset', metavar='NAME=TIME', type=_offset, action='append', default=[],
-        help='of several machines: how far the clock of process NAME (of RUN.NAME.mcap; or that '
-        "trace itself) is ahead of the first trace's, as 2.5ms, or -2.5ms where it is behind "
-        '(default: as messages both ways tell)')
-
-
 def _offset(text: str) -> tuple[str, int]:
     """Return the process and the time that `NAME=TIME` gives."""
     import msg_graph
@@ -147,32 +115,107 @@ def _offset(text: str) -> tuple[str, int]:
     return name, -ahead if time.startswith('-') else ahead
 
 
-def add_workload(parser: argparse.ArgumentParser) -> None:
-    """Declare `--graph` of a benchmark; see `common.load_workload`."""
+# --- files ---------------------------------------------------------------------------------------
+
+class Input(str):
+    """A file to read, `-` for standard input."""
+
+
+class Output(str):
+    """A file to write, `-` for standard output; `common.check_files` looks at it early."""
+
+
+class Report(Output):
+    """An HTML file to write."""
+
+
+class NamedFile(Output):
+    """A file to write that cannot be standard output."""
+
+
+# --- options that several verbs have -------------------------------------------------------------
+
+_SHARED: dict[str, dict[str, Any]] = {
+    'graph': {
+        'metavar': 'GRAPH', 'type': Input,
+        'help': "the declaration, a YAML file ('-': standard input)"},
+    '--graph': {
+        'metavar': 'FILE', 'type': Input,
+        'help': "a declaration to take instead of the one that ships with the package ('-': "
+        'standard input)'},
+    '--output': {
+        'metavar': 'GRAPH', 'type': Output, 'default': '-',
+        'help': "the declaration ('-': standard output, the default)"},
+    '--json': {
+        'metavar': 'FILE', 'type': Output,
+        'help': "write the whole result as JSON ('-': to standard output, instead of the tables)"},
+    '--report': {
+        'metavar': 'OUT.html', 'type': Report,
+        'help': 'write tables and pictures of the run as one HTML file that needs no network '
+        "(needs mddag_executor[report]; '-': to standard output)"},
+    '--workers': {
+        'type': positive_int, 'metavar': 'M',
+        'help': "threads that run callbacks (default: the declaration's, else "
+        f'{defaults.WORKERS})'},
+    '--duration': {
+        'type': duration, 'default': defaults.DURATION_NS, 'metavar': 'TIME',
+        'help': f'virtual time of each run (default: {defaults.DURATION_NS // 10 ** 9}s)'},
+    '--overhead': {
+        'type': or_zero(duration), 'default': 0, 'metavar': 'TIME',
+        'help': 'what each dispatch of a callback takes more (default: 0)'},
+    '--jobs': {
+        'type': positive_int, 'metavar': 'N',
+        'help': 'runs to simulate at a time (default: the number of processors)'},
+    '--utilisation': {
+        'type': positive_float, 'metavar': 'U',
+        'help': 'scale the execution times to this normalised utilisation, sum(C/T)/workers'},
+    '--skip': {
+        'type': or_zero(duration), 'default': 0, 'metavar': 'TIME',
+        'help': 'leave out a warm-up: jobs that were released less than this after the first one, '
+        'as 1s, are not judged (default: all are)'},
+    '--offset': {
+        'type': _offset, 'action': 'append', 'default': [], 'metavar': 'NAME=TIME',
+        'help': 'of several machines: how far the clock of process NAME (of RUN.NAME.mcap; or that '
+        "trace itself) is ahead of the first trace's, as 2.5ms, or -2.5ms where it is behind "
+        '(default: as messages in both directions show)'},
+    '--ros-args': {
+        'nargs': argparse.REMAINDER, 'metavar': '…',
+        'help': 'the rest of the command line goes to rclpy.init, as -r from:=to'},
+}
+
+
+def add(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Declare some of the arguments that have the same meaning in all verbs."""
+    for name in names:
+        flags = ('-o', name) if name == '--output' else (name,)
+        parser.add_argument(*flags, **_SHARED[name])
+
+
+def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
+    """
+    Declare the arguments `TRACE… [GRAPH]`; see `common.recording_and_graph`.
+
+    :param what: the help of TRACE
+    """
     parser.add_argument(
-        '--graph', metavar='FILE',
-        help="a declaration to take instead of the paper's workload ('-': standard input)")
-
-
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Declare `--json`."""
-    parser.add_argument('--json', metavar='FILE',
-                        help="write the whole result as JSON ('-': to standard output, "
-                             'instead of the tables)')
-
-
-def add_report(parser: argparse.ArgumentParser) -> None:
-    """Declare `--report`."""
-    parser.add_argument('--report', metavar='OUT.html',
-                        help='write tables and pictures of the run as one HTML file that needs no '
-                             "network (needs mddag_executor[report]; '-': to standard output)")
-
-
-def add_workers(parser: argparse.ArgumentParser) -> None:
-    """Declare `--workers`, whose default is that of `defaults.workers`."""
+        'trace', metavar='TRACE', nargs='+', type=Input,
+        help=f'{what}; of one run in several processes the traces of all')
     parser.add_argument(
-        '--workers', type=positive_int, metavar='M',
-        help=f"threads that run callbacks (default: the declaration's, else {defaults.WORKERS})")
+        'graph', metavar='GRAPH', nargs='?', type=Input,
+        help="the declaration that judges, a YAML file ('-': standard input; default: the one "
+        'that the trace was recorded with)')
+    add(parser, '--offset')
+
+
+def add_policy(
+    parser: argparse.ArgumentParser, prefix: str = '', default: str = 'rad',
+) -> None:
+    """Declare `--policy`; a default with a blank in it is words, and stands for none."""
+    from mddag_executor.core import POLICIES, policy
+    parser.add_argument(
+        '--policy', metavar='P', type=lambda text: policy(text).name,
+        default=default if default in POLICIES else None,
+        help=f'{prefix}one of {", ".join(POLICIES)} (default: {default})')
 
 
 def add_cpus(parser: argparse.ArgumentParser, default: str) -> None:
@@ -180,20 +223,6 @@ def add_cpus(parser: argparse.ArgumentParser, default: str) -> None:
     parser.add_argument(
         '--cpus', type=positive_int, metavar='C',
         help=f'CPUs that callbacks which compute share (default: {default})')
-
-
-def add_virtual_time(parser: argparse.ArgumentParser) -> None:
-    """Declare `--duration` of simulated runs."""
-    parser.add_argument(
-        '--duration', type=duration, default=defaults.DURATION_NS, metavar='TIME',
-        help=f'virtual time of each run (default: {defaults.DURATION_NS // 10 ** 9}s)')
-
-
-def add_overhead(parser: argparse.ArgumentParser) -> None:
-    """Declare `--overhead` of simulated runs."""
-    parser.add_argument(
-        '--overhead', type=or_zero(duration), default=0, metavar='TIME',
-        help='what each dispatch of a callback takes more (default: 0)')
 
 
 def add_seed(
@@ -206,13 +235,6 @@ def add_seed(
     """
     parser.add_argument('--seed', type=kind, default=default, metavar='N',
                         help=f'{what} (default: %(default)s)')
-
-
-def add_jobs(parser: argparse.ArgumentParser) -> None:
-    """Declare `--jobs`, whose default is `defaults.processors()`."""
-    parser.add_argument(
-        '--jobs', type=positive_int, metavar='N',
-        help='runs to simulate at a time (default: the number of processors)')
 
 
 def add_repeat(
@@ -241,3 +263,12 @@ def add_verb(parsers: Any, name: str, module: ModuleType, summary: str, descript
     module.add_arguments(parser)
     if hasattr(module, 'main'):
         parser.set_defaults(main=module.main)
+
+
+def add_verbs(parser: argparse.ArgumentParser, verb: str, names: Sequence[str]) -> None:
+    """Add the verbs of a verb; each is a module, `VERB_NAME`."""
+    parsers = parser.add_subparsers(
+        dest=f'{verb}_verb', metavar='VERB', required=True, title='verbs')
+    for name in names:
+        module = import_module(f'mddag_executor.cli.{verb}_{name.replace("-", "_")}')
+        add_verb(parsers, name, module, module.HELP, module.DESCRIPTION)

@@ -11,13 +11,12 @@ only be rescheduled.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from mddag_executor.cli import bags, common, options
 from mddag_executor.cli.text import Progress
-from mddag_executor.core import POLICIES
-from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -43,35 +42,23 @@ def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
     add('--processes', metavar='N|FILE',
         help='with --reschedule: the nodes in N processes, packed by the recorded times, or in '
         'those of a YAML file with `processes:` (default: as recorded)')
-    add('--policy', metavar='P',
-        help=f'with --reschedule: one of {", ".join(POLICIES)} (default: as recorded)')
+    options.add_policy(parser, 'with --reschedule: ', 'as recorded')
     add('--preemptive', action=argparse.BooleanOptionalAction,
         help='with --reschedule: what is more urgent takes the worker of what runs, or not '
         '(default: as recorded, where the policy can)')
     bags.add_arguments(parser)
-    parser.set_defaults(skip=0)     # who leaves out a warm-up: add_skip
+    parser.set_defaults(skip=0)     # for verbs without --skip
 
 
-def add_skip(parser: argparse.ArgumentParser) -> None:
-    """Declare `--skip`."""
-    parser.add_argument(
-        '--skip', type=options.or_zero(options.duration), default=0, metavar='TIME',
-        help='leave out a warm-up: jobs that were released less than this after the first one, as '
-        '1s, are not judged (default: all are)')
-
-
-def check(args: argparse.Namespace, *files: str | None) -> None:
+def check(args: argparse.Namespace) -> None:
     """
     Check the arguments.
 
-    :param files: what else may be standard input.
     :raises mddag_executor.errors.UsageError: where they do not go together
     """
-    if args.policy is not None:
-        find_policy(args.policy)
     if args.processes == '0':
         raise UsageError('--processes 0: give 1 or more, or a file')
-    bags.check(args, *files)
+    bags.check(args)
     if args.reschedule:
         if getattr(args, 'callbacks', False):
             raise UsageError(
@@ -82,6 +69,14 @@ def check(args: argparse.Namespace, *files: str | None) -> None:
             raise UsageError(
                 f'--{option.replace("_", "-")}: a run is replayed as it was recorded: add '
                 '--reschedule')
+
+
+@contextmanager
+def opened(args: argparse.Namespace) -> Iterator[tuple[Recording, str, TaskSet | None]]:
+    """Give the recording that TRACE… names, what messages call it, and GRAPH's task set."""
+    task_set = None if args.graph is None else common.load_graph(args.graph)
+    with common.input_recording(args.trace) as (path, name):
+        yield path, name, task_set
 
 
 def is_bag(path: Recording) -> bool:

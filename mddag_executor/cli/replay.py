@@ -38,22 +38,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'ordinary bag, a folder or a file')
     recorded.add_arguments(
         parser, 'run the scheduler over the recorded releases and execution times')
-    recorded.add_skip(parser)
     add('--callbacks', action='store_true', help='show a table of all callbacks, too')
     verdicts.add_arguments(parser)
-    options.add_report(parser)
-    options.add_json(parser)
+    options.add(parser, '--skip', '--report', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Replay a trace and print what came of its deadlines."""
     common.recording_and_graph(args)
-    common.check_output(args.json)
-    common.check_report(args.report)
     verdicts.check(args)
-    recorded.check(args, args.trace, args.graph)
-    task_set = None if args.graph is None else common.load_graph(args.graph)
-    with common.input_recording(args.trace) as (path, name):
+    recorded.check(args)
+    with recorded.opened(args) as (path, name, task_set):
         watch = common.report_watch(args.report)
         drift: list[Drift] = []
         outcome: Replay | Reschedule
@@ -63,18 +58,15 @@ def main(args: argparse.Namespace) -> int:
             outcome = recorded.as_recorded(
                 path, name, task_set, None if watch is None else watch.of, skip=args.skip)
             drift = outcome.drift()
-    for warning in outcome.warnings:
-        warn(warning)
+    warn(*outcome.warnings)
     result = outcome.result()
     if not args.reschedule:
         result['drift'] = [each.result() for each in drift]
     status = verdicts.judge(args, outcome.tally, result)
-    if args.json is not None:
-        common.write_json(args.json, result)
     if args.report is not None:
         from mddag_executor.report.html import of_outcome
         common.write_report(args.report, lambda: of_outcome(outcome, watch))
-    if verdicts.wants_tables(args):
+    if common.write_result(args, result):
         _show(args, result)
         verdicts.show(args, result)
     return status

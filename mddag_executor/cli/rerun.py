@@ -19,9 +19,6 @@ from typing import Any, BinaryIO, TYPE_CHECKING
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import printable, Progress, warn
-from mddag_executor.core import POLICIES
-from mddag_executor.core import policy as find_policy
-from mddag_executor.errors import UsageError
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
@@ -40,15 +37,16 @@ _PROGRAMS = ('bin/mddag', 'mddag_executor/__main__.py')
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('recording', metavar='BAG|TRACE',
+    add('recording', metavar='BAG|TRACE', type=options.Input,
         help="a bag with the messages that the nodes take, or a trace of mddag run ('-': standard "
         'input)')
-    options.add_graph(parser)
+    options.add(parser, 'graph', '--workers', '--json', '--ros-args')
     add('--node', metavar='SPEC', action='append', required=True,
         help='run this node, as mddag run does; repeat it for more nodes')
-    add('-o', '--output', metavar='OUT.mcap',
+    add('-o', '--output', metavar='OUT.mcap', type=options.Output,
         help='write what the nodes publish to this bag, with virtual times')
-    add('--trace', metavar='RUN.mcap', help='record the run to this file, for mddag replay')
+    add('--trace', metavar='RUN.mcap', type=options.NamedFile,
+        help='record the run to this file, for mddag replay')
     add('--expect', metavar='OUT.mcap',
         help='compare what the nodes publish with this bag, and exit with status 1 where it '
         'differs')
@@ -58,28 +56,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--times', metavar='WHICH',
         help='how long callbacks take: recorded (the default for a trace), declared (the default '
         'for a bag), or a file: a trace, or JSON with execution times')
-    options.add_workers(parser)
     options.add_cpus(parser, 'as many as are needed')
-    add('--policy', default='rad', metavar='P',
-        help=f'one of {", ".join(POLICIES)} (default: rad)')
+    options.add_policy(parser)
     options.add_seed(
         parser, "the seed of Python's and numpy's random numbers and of declared times", int)
     add('--all-clocks', action='store_true',
         help='steady and system clocks and the functions of time are virtual, too')
-    options.add_json(parser)
-    add('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='…',
-        help='the rest of the command line goes to rclpy.init, as -r from:=to')
 
 
 def main(args: argparse.Namespace) -> int:
     """Run the nodes, and say what came of it."""
-    _check(args)
+    if args.expect is not None:
+        os.stat(args.expect)  # now, not after the run
+    args.ros_args = args.ros_args or []
     _fix_hashes()
     # With `--json -` what nodes print must not get into the JSON.
     with redirect_stdout(sys.stdout if common.wants_tables(args) else sys.stderr):
         result, found = _run(args)
-    for warning in result.warnings:
-        warn(warning)
+    warn(*result.warnings)
     values = result.result()
     if found is not None:
         values['differences'] = [each._asdict() for each in found]
@@ -89,20 +83,6 @@ def main(args: argparse.Namespace) -> int:
     for difference in found or ():
         print(printable(difference.line()), file=sys.stdout if tables else sys.stderr)
     return int(bool(found))
-
-
-def _check(args: argparse.Namespace) -> None:
-    find_policy(args.policy)
-    for option in ('output', 'trace', 'json'):
-        common.check_output(getattr(args, option))
-    if args.trace == '-':
-        raise UsageError('--trace -: a trace is not written to standard output: name a file')
-    if args.output == args.json == '-':
-        raise UsageError('-: standard output can be only one of -o and --json: name a file')
-    if args.expect is not None:
-        os.stat(args.expect)  # else it would be missed after the run
-    if args.recording == args.graph == '-':
-        raise UsageError('-: standard input can be only one of BAG and GRAPH: name the other')
 
 
 def _fix_hashes() -> None:

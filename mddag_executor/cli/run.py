@@ -33,8 +33,6 @@ from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.stuck import told_when_stuck
 from mddag_executor.cli.text import Progress, warn
-from mddag_executor.core import POLICIES
-from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.report.live_runs import summary
 from mddag_executor.report.tables import sink_table
@@ -64,7 +62,6 @@ _PART_ENDS_S = 60
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('graph', metavar='GRAPH', help="the declaration, a YAML file ('-': standard input)")
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
         '--node', metavar='SPEC', action='append', default=[],
@@ -84,10 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--duration', type=options.duration, metavar='TIME',
         help='end after this time, as 20s (default: with Ctrl-C); with --synthetic after a '
         'warm-up of 1 s')
-    add('--workers', type=options.positive_int, metavar='M',
-        help='threads that run callbacks (default: what the declaration says, else 7)')
-    add('--policy', default='rad', metavar='P',
-        help=f'one of {", ".join(POLICIES)} (default: rad)')
+    options.add_policy(parser)
     add('--cpu-order', action='store_true',
         help='give workers the CPUs by the urgency of what they run, as nice levels: for more '
         'processes than CPUs, where the user may')
@@ -111,9 +105,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='when one of several processes ends by itself: end the run, go on without it, or '
         'start it again (default: end)')
     add('--part', help=argparse.SUPPRESS)  # the folder of a run of several processes
-    options.add_json(parser)
-    add('--ros-args', nargs=argparse.REMAINDER, metavar='…',
-        help='the rest of the command line goes to rclpy.init, as -r from:=to')
+    options.add(parser, 'graph', '--workers', '--json', '--ros-args')
 
 
 def _or_off(text: str) -> int:
@@ -123,7 +115,6 @@ def _or_off(text: str) -> int:
 
 def main(args: argparse.Namespace) -> int:
     """Run nodes until the run ends, and print what came of the deadlines."""
-    common.check_output(args.json)
     _check_arguments(args)
     if args.part is not None:
         return part(args)
@@ -217,7 +208,6 @@ def _leave_threads_behind(error: BaseException | None) -> None:
 
 
 def _check_arguments(args: argparse.Namespace) -> None:
-    find_policy(args.policy)
     from mddag_executor.live.settings import diagnostics_period_ns
     diagnostics_period_ns(args.diagnostics)
     if args.trace == '-':

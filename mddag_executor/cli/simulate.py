@@ -16,9 +16,6 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor import defaults
 from mddag_executor.cli import common, options, verdicts
 from mddag_executor.cli.text import format_ns, printable, Progress
-from mddag_executor.core import POLICIES
-from mddag_executor.core import policy as find_policy
-from mddag_executor.errors import UsageError
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
@@ -33,36 +30,28 @@ mddag simulate graph.yaml --execution-times times.json --json - --fail-on-miss""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    options.add_graph(parser)
-    add('--policy', default='rad', metavar='P',
-        help=f'one of {", ".join(POLICIES)} (default: rad)')
-    options.add_workers(parser)
+    options.add_policy(parser)
     options.add_cpus(parser, 'enough for all')
-    options.add_virtual_time(parser)
     add('--preemptive', action='store_true',
         help='what is more urgent takes the worker of what runs')
-    add('--execution-times', metavar='FILE',
+    add('--execution-times', metavar='FILE', type=options.Input,
         help='JSON {"DAG": {"/node:callback": microseconds}}: the execution time of each vertex '
         "('-': standard input; default: drawn from the declaration)")
     options.add_seed(parser, 'draw the execution times with this', int)
-    add('--utilisation', type=options.positive_float, metavar='U',
-        help='scale the execution times to this normalised utilisation, sum(C/T)/workers')
     add('--judge', choices=('horizon', 'completions'), default='horizon',
         help='what is overdue at the end is late (horizon, the default), or only what completed '
         'is judged (completions, as in the paper)')
     add('--stop-at-first-miss', action='store_true',
         help='end the run with the first missed deadline')
-    add('--trace', metavar='OUT.mcap', help='record the run to this file')
+    add('--trace', metavar='OUT.mcap', type=options.NamedFile, help='record the run to this file')
     add('--fail-on-miss', action='store_true',
         help='exit with status 1 if a deadline was missed, or no job was due')
-    options.add_report(parser)
-    options.add_json(parser)
+    options.add(parser, 'graph', '--workers', '--duration', '--utilisation', '--report', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Simulate and print what came of the deadlines."""
     from mddag_executor.simulate import periodic_load, Settings, utilisation
-    _check_arguments(args)
     task_set = common.load_graph(args.graph)
     workers = defaults.workers(args.workers, task_set)
     times = execution_times(args, task_set, workers)
@@ -90,18 +79,6 @@ def main(args: argparse.Namespace) -> int:
         return 0
     return verdicts.exit_status(
         result['dags'], run.tally.missed, task_set.file, 'simulate for longer')
-
-
-def _check_arguments(args: argparse.Namespace) -> None:
-    if args.graph == '-' and args.execution_times == '-':
-        raise UsageError(
-            '-: standard input can be only one of GRAPH and --execution-times: name the other')
-    if args.trace == '-':
-        raise UsageError('--trace -: a trace is not written to standard output: name a file')
-    find_policy(args.policy)
-    common.check_output(args.json)
-    common.check_output(args.trace)
-    common.check_report(args.report)
 
 
 def execution_times(

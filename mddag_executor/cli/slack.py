@@ -15,7 +15,6 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor import defaults
 from mddag_executor.cli import common, options, recorded, simulate
 from mddag_executor.cli.text import Progress, warn
-from mddag_executor.core import POLICIES
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -42,33 +41,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='threads that run callbacks, of each process (default: as recorded, or the '
         "declaration's)")
     options.add_cpus(parser, 'as recorded, or enough for all')
-    add('--policy', metavar='P',
-        help=f'one of {", ".join(POLICIES)} (default: as recorded, or rad)')
+    options.add_policy(parser, default='as recorded, or rad')
     add('--preemptive', action=argparse.BooleanOptionalAction,
         help='what is more urgent takes the worker of what runs, or not (default: as recorded)')
     add('--duration', type=options.duration, metavar='TIME',
         help=f'with GRAPH: virtual time (default: {defaults.DURATION_NS // 10 ** 9}s)')
-    add('--execution-times', metavar='FILE',
+    add('--execution-times', metavar='FILE', type=options.Input,
         help='with GRAPH: JSON with fixed execution times (default: drawn from the declared ones)')
     add('--seed', type=int, metavar='N', help='with GRAPH: of the draws (default: 0)')
     add('--utilisation', type=options.positive_float, metavar='U',
         help='with GRAPH: scale the execution times to this normalised utilisation')
-    recorded.add_skip(parser)
     add('--jobs', type=options.positive_int, metavar='N',
         help='processes that search (default: one for each processor)')
     add('--fail-under', type=options.positive_float, metavar='FACTOR',
         help='exit with status 1 if a callback may not take so many times as long, or a deadline '
         'is missed as things are')
-    options.add_report(parser)
-    options.add_json(parser)
+    add('--report', metavar='OUT.html', type=options.Output,
+        help="write the tables with bars as one HTML file ('-': to standard output)")
+    options.add(parser, '--skip', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Find the slack and print it."""
     from mddag_executor.replay.slack import find_slack, slack_result
     common.recording_and_graph(args)
-    common.check_output(args.json)
-    common.check_output(args.report)
     is_graph = str(args.trace).lower().endswith(_GRAPHS)
     problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
     callbacks = len(set(problem.callback_of))
@@ -95,8 +91,7 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
         if getattr(args, option) is not None:
             raise UsageError(f'--{option.replace("_", "-")}: a recording has its own: leave the '
                              'option out')
-    task_set = None if args.graph is None else common.load_graph(args.graph)
-    with common.input_recording(args.trace) as (path, name), Progress('replaying') as line:
+    with recorded.opened(args) as (path, name, task_set), Progress('replaying') as line:
         if recorded.is_bag(path):
             raise UsageError(
                 f'{name}: it has no execution times: give the declaration instead of an ordinary '
@@ -104,8 +99,7 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
         outcome = reschedule(
             path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
             name=name, progress=line.events, skip=args.skip, cpus=args.cpus)
-    for warning in outcome.warnings:
-        warn(warning)
+    warn(*outcome.warnings)
     problem = Problem(outcome.work, outcome.settings, outcome.tables,
                       outcome.task_set.places_of_vertices())
     return problem, outcome.task_set, outcome.result()['dags']

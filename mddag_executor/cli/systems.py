@@ -41,13 +41,12 @@ def recorded_system(given: str) -> System:
             name = common.STDIN if given == '-' else given
             with common.input_file(given) as path:
                 system = System(path if given == '-' else given, name, line.events)
-    for warning in system.warnings:
-        warn(warning)
+    warn(*system.warnings)
     return system
 
 
 def write_declaration(output: str, text: str) -> None:
-    """Write a declaration with blanks, and tell how many there are."""
+    """Write a declaration with blanks, and say how many there are."""
     from msg_graph.draft_text import MARK
     common.write_text(output, text)
     if output == '-':

@@ -21,9 +21,10 @@ def one_line(text: str) -> str:
     return printable(' '.join(text.split()))
 
 
-def warn(text: str) -> None:
-    """Print a warning on standard error, as a single harmless line."""
-    print(f'warning: {one_line(text)}', file=sys.stderr)
+def warn(*texts: str) -> None:
+    """Print warnings on standard error, each as a single harmless line."""
+    for text in texts:
+        print(f'warning: {one_line(text)}', file=sys.stderr)
 
 
 class Progress:

@@ -42,12 +42,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='end after this time, as 20s (default: with Ctrl-C)')
     add('--timeout', type=options.duration, default=PATIENCE_NS, metavar='TIME',
         help='with --once or --duration: give up when nothing has come by then (default: 10s)')
-    options.add_json(parser)
+    options.add(parser, '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Listen and show."""
-    common.check_output(args.json)
     live = sys.stdout.isatty() and not args.once and common.wants_tables(args)
     if live:
         _check_rich()
@@ -67,10 +66,8 @@ def main(args: argparse.Namespace) -> int:
         raise NothingHeard(
             f'{printable(args.topic)}: no executor has published its state here: start one with '
             'mddag run, or with diagnostics_period, and check ROS_DOMAIN_ID')
-    if args.once and common.wants_tables(args):
+    if common.write_result(args, board.result()) and args.once:
         print(plain(board.statuses()), end='')
-    if args.json is not None:
-        common.write_json(args.json, board.result())
     return 0
 
 

@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '0 to 1')
     add('--tolerate-burst', type=options.or_zero(options.positive_int), metavar='B',
         help='the same: how many jobs of a sink may miss in a row')
-    add('--junit', metavar='OUT.xml',
+    add('--junit', metavar='OUT.xml', type=options.Output,
         help="write JUnit XML, a test case for each sink ('-': to standard output)")
 
 
@@ -38,22 +38,14 @@ def check(args: argparse.Namespace) -> None:
     """
     Check the arguments.
 
-    :raises mddag_executor.errors.MddagError: where they do not go together or cannot be written
+    :raises mddag_executor.errors.UsageError: where they do not go together
     """
-    common.check_output(args.junit)
-    if args.json == args.junit == '-':
-        raise UsageError('-: standard output can be only one of --json and --junit: name a file')
     if args.fail_on_miss or args.junit:
         return
     for option in ('tolerate_ratio', 'tolerate_burst'):
         if getattr(args, option) is not None:
             raise UsageError(f'--{option.replace("_", "-")}: it decides about --fail-on-miss and '
                              '--junit: add one of them')
-
-
-def wants_tables(args: argparse.Namespace) -> bool:
-    """Tell whether standard output is for people."""
-    return common.wants_tables(args) and args.junit != '-'
 
 
 def judge(args: argparse.Namespace, tally: MissTally, result: dict[str, Any]) -> int:

@@ -143,7 +143,7 @@ def test_a_folder_without_write_permission(tmp_path: Path) -> None:
 
 def test_tables_give_way_to_json_on_standard_output() -> None:
     parser = argparse.ArgumentParser()
-    options.add_json(parser)
+    options.add(parser, '--json')
     assert common.wants_tables(parser.parse_args([]))
     assert common.wants_tables(parser.parse_args(['--json', 'file']))
     assert not common.wants_tables(parser.parse_args(['--json', '-']))

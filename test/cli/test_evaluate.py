@@ -131,11 +131,11 @@ def test_samples(graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     (['--overhead', 'x'], 'mddag evaluate: argument --overhead: '),
     (['--dask', 'nonsense'], '--dask nonsense: this is no usable address (ValueError: '),
     (['--dask', 'tcp://127.0.0.1:1'], '--dask tcp://127.0.0.1:1: no Dask scheduler answers there'),
-    (['--resume', '-'], '--resume: standard input and output keep nothing: name a file'),
+    (['--resume', '-'], '--resume -: it is not written to standard output: name a file'),
     (['--resume', 'few.npz'], 'few.npz: it is damaged, or no file of kept runs: remove it, or '),
     (['--resume', 'nowhere/k'], 'nowhere/k: there is no directory nowhere: make it first'),
     (['empty'], 'empty: there is no *.yaml in this folder: name a declaration, or make some'),
-    (['-', '-'], '-: standard input can be only one GRAPH: name files'),
+    (['-', '-'], '-: standard input can be only one of graph and graph: name a file '),
     (['none.yaml'], 'none.yaml: '),
     (['--samples', 'none.npz'], 'none.npz: no such file or directory: check the path'),
     (['--samples', 'graph.yaml'], 'graph.yaml: this is no .npz file: '),
@@ -146,7 +146,7 @@ def test_samples(graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     (['--plot', 'nowhere/a.png'], 'nowhere/a.png: there is no directory nowhere: make it first'),
     (['--json', 'nowhere/a.json'], 'nowhere/a.json: there is no directory nowhere: '),
     (['--csv', '.'], '.: this is a directory: name a file'),
-    (['--csv', '-', '--json', '-'], '-: standard output can take only one of --json and --csv: '),
+    (['--csv', '-', '--json', '-'], '-: standard output can be only one of csv and json: '),
 ])
 def test_bad_input(
     graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str],

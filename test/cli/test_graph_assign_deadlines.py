@@ -96,7 +96,7 @@ def test_standard_input_and_output(
     (['g.yaml', '--runs', '0'], "mddag graph assign-deadlines: argument --runs: '0' is no whole "),
     (['g.yaml', '--workers', '0'], "mddag graph assign-deadlines: argument --workers: '0' is no "),
     (['g.yaml', '-o', 'x/y'], 'x/y: there is no directory x: make it first'),
-    (['g.yaml', '--json', '-'], '-: standard output can take only one of -o and --json: '),
+    (['g.yaml', '--json', '-'], '-: standard output can be only one of output and json: '),
     (['no_times.yaml'], 'no_times.yaml:7: /n:t (and 1 more callback) declares no '),
     (['wrong.yaml'], "wrong.yaml:7: callback '/n:t': nothing says what starts the callback: "),
     (['busy.yaml', '--by', 'search', '--duration', '200ms', '--runs', '100', '--workers', '1'],

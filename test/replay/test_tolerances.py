@@ -303,7 +303,7 @@ def test_a_run_in_which_nothing_was_due_is_no_better(
     (['--tolerate-burst', '-1', '--fail-on-miss'], "'-1' is no whole number from 1 up"),
     (['--tolerate-burst', '2'], 'it decides about --fail-on-miss and --junit: add one'),
     (['--junit', '/gone/out.xml'], 'there is no directory /gone'),
-    (['--junit', '-', '--json', '-'], 'can be only one of --json and --junit'),
+    (['--junit', '-', '--json', '-'], 'can be only one of junit and json'),
 ])
 def test_wrong_options(
     trace: Path, options: list[str], says: str, capsys: pytest.CaptureFixture[str]
