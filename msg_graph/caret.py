@@ -45,7 +45,6 @@ def declaration_from_caret(
     :param text: the architecture file's.
     :param file: its name, for errors and for the first line.
     :param measure: fills in what was measured, before the declaration is written.
-    :raises GraphError: it is not YAML, or no architecture file.
     """
     draft = read_architecture(text, file)
     if measure is not None:
@@ -54,11 +53,7 @@ def declaration_from_caret(
 
 
 def read_architecture(text: str, file: str) -> Draft:
-    """
-    Return what an architecture file says.
-
-    :raises GraphError: it is not YAML, or no architecture file.
-    """
+    """Return what an architecture file says."""
     tree = parse_yaml(text, file)
     if not isinstance(tree, Mapping) or 'nodes' not in tree.entries:
         raise GraphError(file, None, 'this is no architecture file of CARET', _REMEDY)

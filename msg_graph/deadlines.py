@@ -15,7 +15,6 @@ Theory of operation
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import Any
 
 from msg_graph.duration import exact_duration, SECOND
@@ -33,7 +32,6 @@ def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, list[
     Return the task set of a declaration whose sinks may lack deadlines.
 
     :return: the task set, and the keys of the callbacks that lack theirs; it is a second there.
-    :raises GraphError: anything else is wrong.
     """
     missing: list[str] = []
     task_set = loads(text, name, without_deadline=missing)
@@ -46,7 +44,6 @@ def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Mapping[str, int]
 
     :param task_set: what the text declares.
     :param deadlines: by the callback's key, ns.
-    :raises GraphError: the text cannot be written anew without another change of its meaning.
     """
     try:
         result = _changed(text, deadlines)
@@ -101,12 +98,4 @@ def with_deadlines(task_set: TaskSet, deadlines: Mapping[str, int]) -> TaskSet:
 
     :param deadlines: by the callback's key, ns; of sinks only.
     """
-    callbacks = {
-        callback.key: replace(callback, deadline_ns=deadlines[callback.key])
-        if callback.key in deadlines else callback for callback in task_set.callbacks}
-    return replace(
-        task_set, callbacks=tuple(callbacks.values()),
-        dags=tuple(replace(dag, vertices=tuple(
-            replace(vertex, callback=callbacks[vertex.callback.key],
-                    deadline_ns=callbacks[vertex.callback.key].deadline_ns)
-            for vertex in dag.vertices)) for dag in task_set.dags))
+    return task_set.with_callbacks({key: {'deadline_ns': ns} for key, ns in deadlines.items()})

@@ -48,7 +48,6 @@ def parse_declaration(text: str, file: str, path: str | None = None) -> Declarat
     Return the declaration that a YAML text holds, with all that it includes.
 
     :param path: the file that it was read from, if it was; beside it others are looked for.
-    :raises GraphError: it is not YAML, or an entry is wrong by itself.
     """
     tree, top = top_of(text, file)
     found = Collector()
@@ -99,7 +98,6 @@ def read_processes(entry: Entry, nodes: Iterable[str]) -> tuple[Process, ...]:
     Return the processes that an entry declares.
 
     :param nodes: the declared ones, in file order.
-    :raises GraphError: it names a node twice, one that is not declared, or a process has none.
     """
     said: dict[str, dict[str, int]] = entry.get('processes')
     nodes = list(dict.fromkeys(nodes))

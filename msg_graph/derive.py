@@ -59,7 +59,6 @@ def derive_task_set(
 
     :param without_deadline: takes the keys of the sinks that have no deadline; None: they are
         errors.
-    :raises GraphError: the graph breaks a rule of the model.
     """
     links = Links(declaration)
     found = Collector()

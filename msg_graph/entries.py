@@ -93,11 +93,7 @@ class Entry:
         return key in self._tree.entries
 
     def get(self, key: str) -> Any:
-        """
-        Return the value of a key; what the kind has for a missing one, where it is missing.
-
-        :raises GraphError: it is not of its kind, or missing and needed.
-        """
+        """Return the value of a key; what the kind has for a missing one, where it is missing."""
         value = self._tree.entries.get(key)
         described = self._keys[key]
         if value is None:

@@ -99,11 +99,7 @@ class Collector:
         return True
 
     def check(self) -> None:
-        """
-        End a stage: what comes next would only stumble over the errors of this one.
-
-        :raises GraphError: the error that was held back, or all of them.
-        """
+        """End a stage: what comes next would only stumble over the errors of this one."""
         if len(self.errors) == 1:
             raise self.errors[0]
         if self.errors:
@@ -111,11 +107,7 @@ class Collector:
 
 
 def for_each(items: Iterable[T], work: Callable[[T], R]) -> list[R]:
-    """
-    Return what a function returns of each item.
-
-    :raises GraphError: all that it raised, together.
-    """
+    """Return what a function returns of each item."""
     found = Collector()
     results: list[R] = []
     for item in items:

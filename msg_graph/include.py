@@ -53,11 +53,7 @@ Part = tuple[Tree, str]
 
 
 def top_of(text: str, file: str) -> tuple[Mapping, Entry]:
-    """
-    Return the outermost mapping of a file, as a tree and as an entry.
-
-    :raises GraphError: the text is not YAML, or no declaration of this format.
-    """
+    """Return the outermost mapping of a file, as a tree and as an entry."""
     tree = parse_yaml(text, file)
     if tree is None or (isinstance(tree, Scalar) and tree.is_null):
         raise GraphError(
@@ -94,11 +90,7 @@ class Assembler:
     _size: int = 0
 
     def assemble(self, tree: Mapping, file: str) -> tuple[Entry, list[Part], list[Part]]:
-        """
-        Return the first file with its arguments filled in, and the nodes and paths of all files.
-
-        :raises GraphError: a file cannot be included, or an argument is missing.
-        """
+        """Return the first file with its arguments filled in, and all nodes and paths."""
         chain = [] if self.path is None else [(os.path.realpath(self.path), file)]
         return self._file(tree, file, {}, chain)
 

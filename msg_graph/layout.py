@@ -27,7 +27,7 @@ from typing import Any
 from msg_graph.errors import GraphError
 from msg_graph.include import is_composed, top_of
 from msg_graph.loading import loads
-from msg_graph.model import Callback, Dag, TaskSet
+from msg_graph.model import TaskSet
 from msg_graph.yamltext import Scalar, Sequence, Tree
 import yaml
 
@@ -40,8 +40,6 @@ def format_text(text: str, name: str = '<string>') -> str:
     Return a declaration in normal form.
 
     :param name: what errors call it.
-    :raises GraphError: it is no declaration, or it cannot be laid out anew without a change of
-        its meaning.
     """
     before = _meaning(text, name)
     writer = _Writer(text.lstrip('\ufeff'), name)
@@ -226,12 +224,5 @@ class _Writer:
 
 def without_lines(task_set: TaskSet) -> TaskSet:
     """Return the task set with everything left out that tells where in the text it stood."""
-    callbacks = {callback.key: replace(callback, line=0) for callback in task_set.callbacks}
-    return replace(
-        task_set, text='', callbacks=tuple(callbacks.values()),
-        dags=tuple(_dag_without_lines(dag, callbacks) for dag in task_set.dags))
-
-
-def _dag_without_lines(dag: Dag, callbacks: dict[str, Callback]) -> Dag:
-    return replace(dag, vertices=tuple(
-        replace(vertex, callback=callbacks[vertex.callback.key]) for vertex in dag.vertices))
+    nowhere = {callback.key: {'line': 0} for callback in task_set.callbacks}
+    return replace(task_set.with_callbacks(nowhere), text='')

@@ -23,11 +23,7 @@ from msg_graph.yamltext import Mapping, parse_yaml
 
 
 def load_processes(text: str, file: str, task_set: TaskSet) -> tuple[Process, ...]:
-    """
-    Return the processes that a file declares for a task set; the rest of it is not looked at.
-
-    :raises GraphError: it is not YAML, or declares none or wrong ones.
-    """
+    """Return the processes that a file declares for a task set; its other keys do not count."""
     entry = Entry(parse_yaml(text, file) or Mapping(1), file, 'the file', FILE)
     processes = read_processes(entry, (callback.node for callback in task_set.callbacks))
     if not processes:
@@ -37,11 +33,7 @@ def load_processes(text: str, file: str, task_set: TaskSet) -> tuple[Process, ..
 
 
 def with_processes(task_set: TaskSet, processes: Iterable[Process]) -> TaskSet:
-    """
-    Return a task set, and its text, with other processes, which have all of its nodes.
-
-    :raises GraphError: the text cannot be written anew without another change of its meaning.
-    """
+    """Return a task set, and its text, with other processes, which have all of its nodes."""
     order = {callback.node: i for i, callback in enumerate(reversed(task_set.callbacks))}
     processes = tuple(
         replace(each, nodes=tuple(sorted(each.nodes, key=lambda node: -order[node])))

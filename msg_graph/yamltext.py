@@ -92,11 +92,7 @@ Tree = Scalar | Sequence | Mapping
 
 
 def decode(data: bytes, file: str) -> str:
-    """
-    Return the text of a file.
-
-    :raises GraphError: it is too large or not UTF-8.
-    """
+    """Return the text of a file."""
     if len(data) > MAX_BYTES:
         raise GraphError(
             file, None, f'the file is larger than {MAX_BYTES // 1024 ** 2} MiB',
@@ -138,11 +134,7 @@ def yaml_lines(tree: Tree) -> list[str]:
 
 
 def parse_yaml(text: str, file: str) -> Tree | None:
-    """
-    Return the tree of the one document in ``text``, or None where there is none.
-
-    :raises GraphError: not YAML, or YAML that the module's rules refuse.
-    """
+    """Return the tree of the one document in ``text``, or None where there is none."""
     text = text[1:] if text.startswith('\ufeff') else text
     strange = _NOT_YAML.search(text)
     if strange is not None:

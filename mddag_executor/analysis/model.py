@@ -57,7 +57,6 @@ def tasks_of(task_set: TaskSet, budget: str = 'max') -> list[Task]:
     Return the tasks of a task set.
 
     :param budget: what of each declared execution time counts: ``max``, ``p99`` or ``mean``.
-    :raises AnalysisError: an execution time is not declared.
     """
     tables = Tables.build(task_set)
     tasks = []

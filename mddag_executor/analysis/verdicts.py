@@ -89,7 +89,6 @@ def analyse(
 
     :param budget: what of each execution time counts: ``max``, ``p99`` or ``mean``.
     :param progress: told how many tests are done.
-    :raises AnalysisError: an execution time is not declared, or there are no workers.
     """
     if workers < 1:
         raise AnalysisError(f'workers: {workers} is too few: give at least 1')

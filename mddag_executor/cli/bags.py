@@ -39,11 +39,7 @@ def _overheads(text: str) -> int:
 
 
 def check(args: argparse.Namespace) -> None:
-    """
-    Check the arguments.
-
-    :raises mddag_executor.errors.UsageError: where they do not go together
-    """
+    """Check the arguments."""
     if args.execution_times is not None and args.seed is not None:
         raise UsageError(
             '--seed: nothing is drawn where --execution-times are given: leave one out')
@@ -61,11 +57,7 @@ def no_graph(name: str) -> UsageError:
 def reschedule_bag(
     args: argparse.Namespace, path: str, name: str, task_set: TaskSet | None
 ) -> Reschedule:
-    """
-    Run the scheduler over a bag.
-
-    :raises mddag_executor.errors.MddagError: where that cannot be
-    """
+    """Run the scheduler over a bag."""
     from mddag_executor.replay.bags_reschedule import reschedule_bag as run
     from mddag_executor.simulate import read_execution_times
     if task_set is None or not args.reschedule:

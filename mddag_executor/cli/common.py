@@ -41,13 +41,7 @@ _read_already: object = None  # the stream that was standard input when it was r
 
 
 def read_bytes(path: str) -> tuple[str, bytes]:
-    """
-    Return the name for messages and the content of a file, or of standard input for `-`.
-
-    :raises OSError: when the file cannot be read
-    :raises mddag_executor.errors.InputError: when it is larger than any declaration, or endless
-    :raises mddag_executor.errors.UsageError: when standard input was read already
-    """
+    """Return the name for messages and the content of a file, or of standard input for `-`."""
     if path != '-':
         name = path
         with open(path, 'rb') as file:
@@ -60,13 +54,7 @@ def read_bytes(path: str) -> tuple[str, bytes]:
 
 
 def read_text(path: str) -> tuple[str, str]:
-    """
-    Return the name for messages and the text of a file, or of standard input for `-`.
-
-    :raises OSError: when the file cannot be read
-    :raises mddag_executor.errors.InputError: when it is not UTF-8
-    :raises mddag_executor.errors.UsageError: when standard input was read already
-    """
+    """Return the name for messages and the text of a file, or of standard input for `-`."""
     name, data = read_bytes(path)
     try:
         return name, data.decode('utf-8-sig')
@@ -77,11 +65,7 @@ def read_text(path: str) -> tuple[str, str]:
 
 
 def load_graph(path: str) -> TaskSet:
-    """
-    Return the task set that a declaration gives, from a file or from standard input for `-`.
-
-    :raises msg_graph.GraphError: when the declaration is wrong
-    """
+    """Return the task set that a declaration gives, from a file or from standard input for `-`."""
     import msg_graph
     if path != '-':
         return msg_graph.load(path)
@@ -96,11 +80,7 @@ def load_workload(given: str | None) -> TaskSet:
 
 @contextmanager
 def input_file(path: str) -> Iterator[Path]:
-    """
-    Give a seekable file for a path; what comes from standard input (`-`) is kept in a copy.
-
-    :raises OSError: when it cannot be read
-    """
+    """Give a seekable file for a path; what comes from standard input (`-`) is kept in a copy."""
     if path != '-':
         yield Path(path)
         return
@@ -117,8 +97,6 @@ def recording_and_graph(args: argparse.Namespace) -> None:
     Separate TRACE… from GRAPH, which `options.add_recording` leaves together.
 
     The last one is a trace, too, if it looks like one.
-
-    :raises mddag_executor.errors.UsageError: where they cannot be taken together
     """
     traces = args.trace
     if len(traces) > 1 and not _is_trace(traces[-1]):
@@ -131,8 +109,6 @@ def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | T
     Return the one recording that is given, or the several traces of one run.
 
     One folder stands for all traces in it, as `mddag run --trace FOLDER` leaves them.
-
-    :raises mddag_executor.errors.UsageError: where they cannot be taken together
     """
     if len(paths) == 1:
         paths = _traces_in(paths[0])
@@ -221,11 +197,7 @@ def _claim_stdin() -> BinaryIO:
 
 
 def check_files(args: argparse.Namespace) -> None:
-    """
-    Find out whether the files of a command line can be written, before the work starts.
-
-    :raises mddag_executor.errors.MddagError: when one cannot, or two are the same stream
-    """
+    """Find out whether the files of a command line can be written, before the work starts."""
     for kind, stream in ((Input, 'input'), (Output, 'output')):
         same = [name for name, each in _files(args) if isinstance(each, kind) and each == '-']
         if len(same) > 1:
@@ -252,7 +224,6 @@ def check_output(path: str | None) -> None:
     Find out whether a file can be written.
 
     :param path: as given on the command line; None and `-` are always fine
-    :raises mddag_executor.errors.InputError: when it cannot be written
     """
     if path is None or path == '-':
         return
@@ -282,7 +253,6 @@ def output_file(path: str) -> Iterator[BinaryIO]:
     Give a binary file that becomes `path` when the block ends well, and vanishes otherwise.
 
     :param path: the target; `-` is standard output
-    :raises OSError: when it cannot be written
     """
     if path == '-':
         sys.stdout.flush()
@@ -317,11 +287,7 @@ def output_file(path: str) -> Iterator[BinaryIO]:
 
 @contextmanager
 def output_trace(path: str) -> Iterator[str]:
-    """
-    Give the path of a file that becomes `path` when the block ends well; errors speak of `path`.
-
-    :raises mddag_executor.trace.TraceError: when the trace cannot be written
-    """
+    """Give a file that becomes `path` when the block ends well; errors speak of `path`."""
     from mddag_executor.trace import TraceError
     with output_file(path) as file:
         try:
@@ -339,11 +305,7 @@ def write_text(path: str, text: str) -> None:
 
 
 def write_json(path: str, value: Any) -> None:
-    """
-    Write a result for machines as a whole, or to standard output for `-`.
-
-    :raises ValueError: when it holds a number that JSON lacks (infinity, not a number)
-    """
+    """Write a result for machines as a whole, or to standard output for `-`."""
     encoder = json.JSONEncoder(indent=2, allow_nan=False, default=_plain)
     with output_file(path) as file:
         file.writelines(part.encode() for part in encoder.iterencode(value))

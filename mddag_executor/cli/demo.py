@@ -14,18 +14,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from functools import partial
 import json
 import os
 from pathlib import Path
-import subprocess
 import sys
-import threading
-import time
 from typing import Any
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
-from mddag_executor.cli.text import Cell, format_ns, printable, Progress, table
+from mddag_executor.cli.text import Cell, format_ns, printable, Progress, run_program, table
 from mddag_executor.core.tally import counts
 from mddag_executor.errors import MddagError
 from mddag_executor.live.bench.spec import Spec
@@ -78,7 +76,8 @@ def main(args: argparse.Namespace) -> int:
     output = Path(args.output)
     output.mkdir(parents=True, exist_ok=True)
     graph = find('config/autoware.yaml')
-    say = _say if common.wants_tables(args) else _say_nothing
+    # at once, also into a pipe: the next step takes long
+    say = partial(print, flush=True) if common.wants_tables(args) else lambda text: None
     if args.processes is not None:
         from mddag_executor.cli.demo_processes import run_demo
         result = run_demo(args, graph, output, say)
@@ -105,14 +104,6 @@ def main(args: argparse.Namespace) -> int:
         'live': live, 'recorded': recorded, 'rescheduled': rescheduled, 'baseline': baseline,
         'trace': str((output / 'demo.mcap').absolute())})
     return 0
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)  # at once, also into a pipe: the next step takes long
-
-
-def _say_nothing(text: str) -> None:
-    """Print nothing: standard output belongs to the JSON."""
 
 
 def _introduction(args: argparse.Namespace, graph: Path) -> Iterator[str]:
@@ -178,34 +169,16 @@ def mddag(*arguments: str) -> list[str]:
 def json_of(command: list[str], what: str, seconds: float | None = None) -> dict[str, Any]:
     """Run a program that prints JSON, with progress on a terminal meanwhile."""
     # Of this machine only: the demo must not find another one's nodes, nor be found by them.
-    environment = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ}
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
-    ) as process, Progress(what, seconds) as progress:
-        done = threading.Event()
-        watcher = threading.Thread(target=_tick, args=(progress, done), daemon=True)
-        watcher.start()
-        try:
-            out, err = process.communicate()
-        except BaseException:
-            process.terminate()
-            raise
-        finally:
-            done.set()
-            watcher.join()
-    if process.returncode != 0:
-        lines = err.strip().splitlines() or [f'it ended with status {process.returncode}']
+    done = run_program(command, what, seconds, environment={
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ})
+    errors = done.stderr.decode()
+    if done.returncode != 0:
+        lines = errors.strip().splitlines() or [f'it ended with status {done.returncode}']
         name = ' '.join(command[2:4]).replace('mddag_executor ', 'mddag ')
         raise DemoError(f'{name}: {lines[-1].removeprefix("error: ")}')
-    sys.stderr.write(err)
-    result: dict[str, Any] = json.loads(out)
+    sys.stderr.write(errors)
+    result: dict[str, Any] = json.loads(done.stdout)
     return result
-
-
-def _tick(progress: Progress, done: threading.Event) -> None:
-    begin = time.monotonic()
-    while not done.wait(0.5):
-        progress.update(round(time.monotonic() - begin, 1))
 
 
 def replay_table(

@@ -7,10 +7,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 import shutil
-import subprocess
 
 from mddag_executor.cli import common, options
-from mddag_executor.cli.text import one_line, Progress
+from mddag_executor.cli.text import one_line, run_program
 from mddag_executor.errors import InputError, UsageError
 
 HELP = 'draw the DAGs of a declaration (SVG, PNG, PDF, DOT, Mermaid)'
@@ -81,24 +80,9 @@ def _find_dot(output: str) -> str:
 
 def _render(program: str, text: str, kind: str, output: str) -> bytes:
     """Let Graphviz lay a picture out."""
-    with Progress('drawing') as progress, subprocess.Popen(
-            [program, f'-T{kind}'], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE) as process:
-        given: bytes | None = text.encode()
-        begin_s = 0.0
-        try:
-            while True:
-                try:
-                    data, errors = process.communicate(given, timeout=0.5)
-                    break
-                except subprocess.TimeoutExpired:
-                    given, begin_s = None, begin_s + 0.5
-                    progress.update(begin_s, 's')
-        except BaseException:
-            process.kill()
-            raise
-    if process.returncode != 0:
-        said = one_line(errors.decode('utf-8', 'replace')) or f'status {process.returncode}'
+    done = run_program([program, f'-T{kind}'], 'drawing', given=text.encode())
+    if done.returncode != 0:
+        said = one_line(done.stderr.decode('utf-8', 'replace')) or f'status {done.returncode}'
         raise InputError(output, f'Graphviz failed ({said})',
                          "write OUT.dot and try other programs on it, for instance 'sfdp'")
-    return data
+    return done.stdout

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 import sys
 from typing import Any, TYPE_CHECKING
 
@@ -142,12 +141,9 @@ def _recorded(traces: list[str], task_set: TaskSet) -> tuple[list[list[int]], Ta
         if not count and callback.execution_time is not None:
             count, busy = 1, callback.execution_time.mean_ns
         times[callback.key] = busy // count if count else 0
-    callbacks = {c.key: c if c.holds_interpreter is not None else replace(
-        c, holds_interpreter=holds.get(c.key)) for c in task_set.callbacks}
-    judged = replace(task_set, callbacks=tuple(callbacks.values()), dags=tuple(
-        replace(dag, vertices=tuple(
-            replace(vertex, callback=callbacks[vertex.callback.key]) for vertex in dag.vertices))
-        for dag in task_set.dags))
+    judged = task_set.with_callbacks({
+        c.key: {'holds_interpreter': holds.get(c.key)} for c in task_set.callbacks
+        if c.holds_interpreter is None})
     return [[times[v.callback.key] for v in dag.vertices] for dag in task_set.dags], judged
 
 

@@ -67,7 +67,7 @@ VERBS = {
     'export': Verb('export', 'turn a trace into a file for Perfetto, spreadsheets or data frames'),
     'diff': Verb('diff', 'compare two recorded runs sink by sink'),
     'top': Verb('top', 'show live what running executors say of their deadlines and workers'),
-    'bench': Verb('bench', 'measure the executor, the core, the replayer and the simulator'),
+    'bench': Verb('bench', 'measure the executor, the replayer and the simulator'),
 }
 # What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.
 _ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_python')
@@ -126,7 +126,6 @@ def run(argv: Sequence[str]) -> int:
     Parse and do what a command line says.
 
     :returns: the verb's exit status
-    :raises mddag_executor.errors.UsageError: when the command line is wrong
     """
     parser = build_parser(argv[0] if argv else None)
     args = parser.parse_args(argv)

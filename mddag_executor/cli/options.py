@@ -87,11 +87,7 @@ def list_of(kind: Callable[[str], T]) -> Callable[[str], list[T]]:
 
 
 def policies(text: str) -> tuple[str, ...]:
-    """
-    Return the policies that `--policies` names.
-
-    :raises mddag_executor.errors.MddagError: there is no such policy, or it stands there twice
-    """
+    """Return the policies that `--policies` names."""
     from mddag_executor.core import policy
     names = [name.strip() for name in text.split(',')]
     for i, name in enumerate(names):

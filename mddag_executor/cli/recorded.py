@@ -51,11 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def check(args: argparse.Namespace) -> None:
-    """
-    Check the arguments.
-
-    :raises mddag_executor.errors.UsageError: where they do not go together
-    """
+    """Check the arguments."""
     if args.processes == '0':
         raise UsageError('--processes 0: give 1 or more, or a file')
     bags.check(args)
@@ -86,11 +82,7 @@ def is_bag(path: Recording) -> bool:
 
 
 def check_declared(path: Recording, name: str) -> None:
-    """
-    Find out whether a recording says which deadlines there are, where no graph is given.
-
-    :raises mddag_executor.errors.MddagError: where it does not
-    """
+    """Find out whether a recording says which deadlines there are, where no graph is given."""
     if is_bag(path):
         raise bags.no_graph(name)
     from mddag_executor.replay.run import open_run
@@ -107,7 +99,6 @@ def as_recorded(
 
     :param more: makes further observers.
     :param jobs: whether to keep of each miss why.
-    :raises mddag_executor.errors.MddagError: where that cannot be
     """
     from mddag_executor.replay import replay
     with Progress(doing) as line:
@@ -119,11 +110,7 @@ def as_recorded(
 def rescheduled(
     args: argparse.Namespace, path: Recording, name: str, task_set: TaskSet | None
 ) -> Reschedule:
-    """
-    Run the scheduler over a recording of any kind.
-
-    :raises mddag_executor.errors.MddagError: where that cannot be
-    """
+    """Run the scheduler over a recording of any kind."""
     if isinstance(path, str) and is_bag(path):
         if args.processes is not None:
             raise UsageError('--processes: an ordinary bag does not say what computes: leave the '

@@ -44,11 +44,7 @@ Record = Callable[[str, str], None]
 def check_slack(
     args: argparse.Namespace, task_set: TaskSet, folder: str, record: Record
 ) -> dict[str, Any]:
-    """
-    Return the result of `bench replay --slack`.
-
-    :raises mddag_executor.errors.MddagError: when a live run fails, or nothing can be tried
-    """
+    """Return the result of `bench replay --slack`."""
     from mddag_executor.replay.slack import find_slack, NOTHING, Problem
     from mddag_executor.simulate import draw_execution_times, periodic_load, Settings
     from msg_graph import loads

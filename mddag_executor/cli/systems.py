@@ -21,8 +21,6 @@ def recorded_system(given: str) -> System:
     Return the system that was recorded to a trace, or to a session of LTTng (a folder).
 
     :param given: as on the command line; `-` is standard input.
-    :raises mddag_executor.trace.TraceError: when it is neither.
-    :raises mddag_executor.errors.InputError: when no system is recorded in it.
     """
     from mddag_executor.replay.drafting import System
     with Progress('reading the trace') as line:

@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+import subprocess
 import sys
 import time
 from types import TracebackType
@@ -13,7 +14,8 @@ from typing import TextIO
 from mddag_executor import progress
 from mddag_executor.report.text import Cell, format_ns, printable, table
 
-__all__ = ['Cell', 'Progress', 'format_ns', 'one_line', 'printable', 'table', 'warn']
+__all__ = [
+    'Cell', 'Progress', 'format_ns', 'one_line', 'printable', 'run_program', 'table', 'warn']
 
 
 def one_line(text: str) -> str:
@@ -96,3 +98,30 @@ class Progress:
     def events(self, done: int) -> None:
         """Tell how many events of a trace have been read so far."""
         self.update(round(done / 1e6, 1), 'million events')
+
+
+def run_program(
+    command: Sequence[str], what: str, seconds: float | None = None, given: bytes | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> subprocess.CompletedProcess[bytes]:
+    """
+    Run a program, with progress on a terminal meanwhile.
+
+    :param seconds: how long it will take, where that is known.
+    :param given: its standard input.
+    """
+    begin = time.monotonic()
+    with Progress(what, seconds) as line, subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            env=environment) as process:
+        try:
+            while True:
+                try:
+                    out, errors = process.communicate(given, timeout=0.5)
+                    return subprocess.CompletedProcess(command, process.returncode, out, errors)
+                except subprocess.TimeoutExpired:
+                    given = None
+                    line.update(round(time.monotonic() - begin, 1), 's')
+        except BaseException:
+            process.terminate()
+            raise

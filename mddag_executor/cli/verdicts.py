@@ -35,11 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(args: argparse.Namespace) -> None:
-    """
-    Check the arguments.
-
-    :raises mddag_executor.errors.UsageError: where they do not go together
-    """
+    """Check the arguments."""
     if args.fail_on_miss or args.junit:
         return
     for option in ('tolerate_ratio', 'tolerate_burst'):

@@ -39,7 +39,6 @@ def generate(options: Options, number: int = 0) -> str:
     Return the declaration of a random task set.
 
     :param number: which of the task sets of this seed.
-    :raises GenerateError: there can be none like that.
     """
     options.check()
     dice = Dice(f'mddag {options.seed} {number}')

@@ -62,11 +62,7 @@ class Options:
     seed: int = 0
 
     def check(self) -> None:
-        """
-        Find out whether a task set can be like that.
-
-        :raises GenerateError: it cannot.
-        """
+        """Find out whether a task set can be like that."""
         _bounds('--dags', self.dags, 1, _MOST_DAGS)
         _bounds('--vertices', self.vertices, 1, _MOST_VERTICES)
         _bounds('--sinks', self.sinks, 1, _MOST_VERTICES)

@@ -71,7 +71,6 @@ def deal(dice: Dice, method: str, total: float, most: Sequence[float]) -> list[f
     Return shares that sum up to a total, each with its upper bound.
 
     :param method: ``dirichlet`` or ``uunifast``.
-    :raises GenerateError: the bounds leave no room, or too little to find it by UUniFast.
     """
     if total > sum(most) * (1 + 1e-9):
         raise GenerateError(

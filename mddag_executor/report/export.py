@@ -401,11 +401,7 @@ class ParquetWriter:
 
 
 def check_available(form: str) -> None:
-    """
-    Find out whether a format can be written, before long work starts.
-
-    :raises mddag_executor.errors.MddagError: when a package is missing.
-    """
+    """Find out whether a format can be written, before long work starts."""
     module = {'parquet': 'pyarrow', 'pftrace': 'perfetto'}.get(form)
     if module is None:
         return

@@ -3,8 +3,8 @@
 """
 The HTML report of a run: one file with tables and pictures that needs no network.
 
-``Watch`` is what a replay is given to collect what the report shows; ``of_replay`` and
-``of_schedule`` make a report's data of it, ``write`` writes the page.
+``Watch`` collects during a replay what the report shows; ``of_outcome`` and ``of_run`` return a
+report's data, ``write`` writes the page.
 """
 
 from __future__ import annotations
@@ -90,11 +90,7 @@ class Watch:
 
 
 def check_available() -> None:
-    """
-    Find out whether reports can be made, before long work starts.
-
-    :raises mddag_executor.errors.MddagError: when Bokeh is not installed.
-    """
+    """Find out whether reports can be made, before long work starts."""
     try:
         import bokeh  # noqa: F401
     except ImportError:

@@ -4,10 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from html import escape
 
-from mddag_executor.core.tally import counts, total
 from mddag_executor.replay.chains import Breakdown
 from mddag_executor.report.html_data import Prepared, ReportData
 from mddag_executor.report.replays import (
@@ -18,7 +17,7 @@ from mddag_executor.report.replays import (
     RECORDED_HEADER,
     recorded_rows,
 )
-from mddag_executor.report.tables import rare_ends, response_cells, short_names
+from mddag_executor.report.tables import short_names, sink_rows
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import ABORTED, DONE, EXPIRED, FAILED, OVERDUE
 
@@ -39,14 +38,14 @@ class Html(str):
 
 
 def html_table(
-    header: Sequence[str], rows: Iterable[Sequence[object]], texts: int, bad: int = -1,
+    header: Sequence[str], rows: Iterable[Sequence[object]], texts: int, bad: Container[int] = (),
     attributes: Iterable[str] | None = None,
 ) -> str:
     """
     Return a table.
 
     :param texts: how many columns on the left hold text; the others are aligned to the right.
-    :param bad: a column that stands out where it is neither 0 nor empty.
+    :param bad: columns that stand out where they are neither 0 nor empty.
     :param attributes: of each row, markup already.
     """
     extra = iter(attributes) if attributes is not None else None
@@ -58,7 +57,7 @@ def html_table(
         for i, cell in enumerate(row):
             shown = cell if isinstance(cell, Html) else escape(
                 '-' if cell is None else printable(str(cell)))
-            mark = ' class="bad"' if i == bad and cell else _text(i < texts)
+            mark = ' class="bad"' if i in bad and cell else _text(i < texts)
             lines.append(f'<td{mark} data-title="{escape(header[i])}">{shown}</td>')
         lines.append('</tr>\n')
     return ''.join([*lines, '</tbody></table>'])
@@ -70,21 +69,9 @@ def _text(is_text: bool) -> str:
 
 def sinks_html(data: ReportData) -> str:
     """Return the table of sinks: verdicts, and response times by the deadline."""
-    result = data.tally.result()['dags']
-    short = short_names(name for dag in result.values() for name in dag['sinks'])
-    rare = rare_ends(total(result))
-    header = ('DAG', 'sink', 'due', 'in time', 'missed', 'late', 'expired', *rare, 'median',
-              'p99', 'max', 'deadline')
-    rows = []
-    for dag_name, dag in result.items():
-        for name, sink in dag['sinks'].items():
-            verdicts = counts(sink)
-            rows.append((
-                dag_name, short[name], verdicts.due, verdicts.in_time,
-                verdicts.missed, verdicts.late, verdicts.expired,
-                *(getattr(verdicts, name) for name in rare), *response_cells(sink['response_ns']),
-                format_ns(sink['relative_deadline_ns'])))
-    return f'<div class="wide">{html_table(header, rows, 2, bad=4)}</div>'
+    header, rows = sink_rows(data.tally.result()['dags'])
+    bad = range(header.index('late'), header.index('median'))
+    return f'<div class="wide">{html_table(header, rows, 2, bad)}</div>'
 
 
 def misses_html(data: ReportData, prepared: Prepared) -> str:

@@ -62,6 +62,11 @@ def each_sink(dags: Mapping[str, Any]) -> Iterator[Sink]:
 
 def sink_table(dags: Mapping[str, Any]) -> str:
     """Return a table with a row for each sink: counts, and response times by its deadline."""
+    return table(*sink_rows(dags))
+
+
+def sink_rows(dags: Mapping[str, Any]) -> tuple[list[str], list[list[Cell]]]:
+    """Return the header and the rows of the table of sinks."""
     rare = rare_ends(total(dags))
     header = [*HEADER[:7], *rare, *HEADER[7:]]
     rows: list[list[Cell]] = []
@@ -73,7 +78,7 @@ def sink_table(dags: Mapping[str, Any]) -> str:
             verdicts.expired, *(getattr(verdicts, name) for name in rare),
             *response_cells(sink.result['response_ns']),
             format_ns(sink.result['relative_deadline_ns'])])
-    return table(header, rows)
+    return header, rows
 
 
 def rare_ends(every: Counts) -> list[str]:

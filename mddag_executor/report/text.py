@@ -64,7 +64,6 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
 
     :param header: the titles of the columns
     :param rows: their cells; None is printed as `-`, a float with two decimals
-    :raises ValueError: when a row has more or fewer cells than the header
     """
     body = [[_cell(cell) for cell in row] for row in rows]
     for row in body:

@@ -263,7 +263,7 @@ def test_other_bad_input_is_one_line(
         ([trace, '--reschedule', '--policy', 'best'], "policy 'best': there is no such policy: "),
         ([trace, '--reschedule', '--workers', '0'], 'mddag replay: argument --workers: '),
         ([trace, '--reschedule', '--workers', '99999'], 'workers: 99999 is out of range: give'),
-        (['-', '-'], '-: standard input can be only one of trace and trace: name a file for each other one'),
+        (['-', '-'], '-: standard input can be only one of trace and trace: name a file '),
         ([], 'mddag replay: the following arguments are required: TRACE'),
     ):
         status, out, err = call(capsys, *arguments)

@@ -141,7 +141,7 @@ def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path: Path) -> No
 @pytest.mark.parametrize('workers', [2, 7])
 def test_a_rescheduled_run_has_the_verdicts_of_its_report(workers: int) -> None:
     outcome = reschedule(runs.CONFIG.parent / 'bags' / 'demo_short.mcap', workers=workers)
-    data = html.of_reschedule(outcome)
+    data = html.of_outcome(outcome, None)
     assert data.tally.result()['dags'] == outcome.tally.result()['dags']
     executions = data.timeline.columns().executions
     busy = [int((executions[END] - executions[START])[executions[2] == w].sum())
