@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from functools import partial
+from io import StringIO
 import json
 import os
 from pathlib import Path
@@ -77,7 +78,7 @@ def main(args: argparse.Namespace) -> int:
     output.mkdir(parents=True, exist_ok=True)
     graph = find('config/autoware.yaml')
     # at once, also into a pipe: the next step takes long
-    say = partial(print, flush=True) if common.wants_tables(args) else lambda text: None
+    say = partial(print, flush=True, file=None if common.wants_tables(args) else StringIO())
     if args.processes is not None:
         from mddag_executor.cli.demo_processes import run_demo
         result = run_demo(args, graph, output, say)
