@@ -116,7 +116,7 @@ def test_the_tables_have_the_figures_of_the_replay(tmp_path: Path) -> None:
     page, _ = report(runs.by_hand(tmp_path / 'run.mcap'))
     text = ' '.join(' '.join(page.texts).split())
     assert '3 sink jobs due, 2 in time (66.67 %), 1 late, 0 expired' in text
-    assert '/driver filter:run 3 2 1 1 0 6 ms 10 ms 10 ms 8 ms' in text
+    assert '/driver filter:run 3 2 66.67 % 1 0 6 ms 10 ms 10 ms 8 ms' in text
     assert '/driver filter:run late 2 0.020000 s 10 ms 2 ms' in text    # the table of misses
     assert '/driver:tick 3 9 ms 3 ms 6 ms 0 ns 0 ns' in text
     bars = [attributes['style'] or '' for tag, attributes in page.elements
