@@ -171,8 +171,8 @@ _SHARED: dict[str, dict[str, Any]] = {
         'as 1s, are not judged (default: all are)'},
     '--offset': {
         'type': _offset, 'action': 'append', 'default': [], 'metavar': 'NAME=TIME',
-        'help': 'of several machines: how far the clock of process NAME (of RUN.NAME.mcap; or that '
-        "trace itself) is ahead of the first trace's, as 2.5ms, or -2.5ms where it is behind "
+        'help': 'of several machines: how far the clock of process NAME (of RUN.NAME.mcap; or '
+        "that trace itself) is ahead of the first trace's, as 2.5ms, or -2.5ms where it is behind "
         '(default: as messages in both directions show)'},
     '--ros-args': {
         'nargs': argparse.REMAINDER, 'metavar': '…',
