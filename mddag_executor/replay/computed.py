@@ -33,7 +33,7 @@ from mddag_executor.replay.happenings import (
     STARTED,
 )
 from mddag_executor.simulate import END, Load, LogEntry, Run, START
-from mddag_executor.simulate.load import FAILS
+from mddag_executor.simulate.load import as_lists, FAILS
 from msg_graph import TaskSet
 
 Delay = Callable[[int, int, int, int], int]
@@ -56,7 +56,7 @@ class ComputedRun(NamedTuple):
 
     task_set: TaskSet
     load: Load
-    log: list[LogEntry]
+    log: Sequence[LogEntry]
     decisions: Sequence[Decision]
     horizon: int
     end: int
@@ -93,6 +93,7 @@ class _Teller:
     def __init__(self, schedule: ComputedRun, observers: Sequence[Observer]) -> None:
         task_set = schedule.task_set
         self._schedule = schedule
+        self._load = as_lists(schedule.load)
         self._batches = Batches(observers)
         self._tell = self._batches.add
         self._vertices = task_set.vertices
@@ -133,7 +134,7 @@ class _Teller:
 
     def _until(self, now: int) -> None:
         """Tell what is released and given up to an instant."""
-        load, schedule = self._schedule.load, self._schedule
+        load, schedule = self._load, self._schedule
         while True:
             release = load.times[self._next] if self._next < len(load.times) else now + 1
             if release >= schedule.horizon:
@@ -149,7 +150,7 @@ class _Teller:
                 return
 
     def _release(self, i: int, now: int) -> None:
-        load = self._schedule.load
+        load = self._load
         dag, job = load.dags[i], load.jobs[i]
         if dag >= self._n_dags:
             self._ready[dag, len(self._vertices), job] = now
@@ -190,7 +191,7 @@ class _Teller:
                 self._complete(what, last, before, now, busy)
 
     def _fails(self, dag: int, v: int, job: int) -> bool:
-        load = self._schedule.load
+        load = self._load
         return len(load.fates) > 0 and load.fates[
             load.cost_base[dag] + job * load.cost_stride[dag] + v - self._first[dag]] == FAILS
 

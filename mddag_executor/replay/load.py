@@ -75,7 +75,7 @@ class RecordedLoad(NamedTuple):
     unknown: list[str]
     dispatch_ns: int | None = None
     transport_ns: int | None = None
-    dispatches: Sequence[int] = ()
+    dispatches: Any = ()
 
 
 class _Jobs:
@@ -268,14 +268,14 @@ class LoadBuilder(Observer):
         typical = self._typical()
         unknown: dict[str, None] = {}
         estimated = 0
-        costs: list[int] = []
-        computed: list[int] = []
-        holds: list[int] = []
-        bases: list[int] = []
-        dispatches: list[int] = []
+        # columns in parts, one after the other
+        costs: list[Any] = []
+        computed: list[Any] = []
+        holds: list[Any] = []
+        late: list[Any] = [np.empty(0, dtype=np.int64)]
+        bases = [0]
         demand = 0
         for dag, jobs in zip(self._task_set.dags, self._jobs):
-            bases.append(len(costs))
             took = np.array(jobs.took, dtype=np.int64).reshape(-1, jobs.size)
             took[[row for of, row in self._skipped if of == dag.index]] = 0
             missing = took < 0
@@ -289,26 +289,31 @@ class LoadBuilder(Observer):
             demand += int(took.sum())
             self._computing(dag, jobs, took, missing, computed, holds, process)
             if overheads:
-                took += np.array(jobs.late, dtype=np.int64).reshape(-1, jobs.size)
-                dispatches.extend(jobs.late)
-            costs.extend(took.ravel().tolist())
-        executions = len(costs)
-        bases.append(len(costs))
+                late.append(np.array(jobs.late, dtype=np.int64))
+                took += late[-1].reshape(-1, jobs.size)
+            costs.append(took.ravel())
+            bases.append(bases[-1] + took.size)
+        executions = bases[-1]
         others = sorted(self._others)
-        costs.extend(max(0, took) + (int(every[number]) if number >= 0 else 0)
-                     for _, took, number in others)
-        computed += [_UNKNOWN] * len(others)
-        holds += [0] * len(others)
+        costs.append(np.array([
+            max(0, took) + (int(every[number]) if number >= 0 else 0)
+            for _, took, number in others], dtype=np.int64))
+        computed.append(np.full(len(others), _UNKNOWN))
+        holds.append(np.zeros(len(others), dtype=np.int64))
+        all_holds: Any = np.concatenate(holds)
+        all_computed: Any = np.concatenate(computed)
+        all_locks: Any = np.concatenate([locks, holds[-1]]).astype(np.int64)
         delays, transport = self._transports(overheads, process)
-        load = self._load(costs, bases, [ready for ready, _, _ in others], overheads)._replace(
-            holds=holds if any(holds) else [],
-            computed=computed if max(computed, default=-1) >= 0 else [],
-            locks=[*locks.tolist(), *([0] * len(others))], fates=self._fates(bases, len(costs)),
+        load = self._load(
+            np.concatenate(costs), bases, [ready for ready, _, _ in others], overheads)._replace(
+            holds=all_holds if all_holds.any() else [],
+            computed=all_computed if (all_computed >= 0).any() else [],
+            locks=all_locks, fates=self._fates(bases, executions + len(others)),
             delays=delays, delay_stride=[jobs.n_edges for jobs in self._jobs],
             delay_base=[0, *accumulate(len(jobs.arrived) for jobs in self._jobs[:-1])])
         return RecordedLoad(
             load, [jobs.numbers for jobs in self._jobs], demand, executions, estimated,
-            list(unknown), usual, transport, dispatches)
+            list(unknown), usual, transport, np.concatenate(late))
 
     def _fates(self, bases: list[int], executions: int) -> list[int]:
         """Return which executions failed, or were skipped; empty: none."""
@@ -380,8 +385,8 @@ class LoadBuilder(Observer):
         return every, usual if len(known) else None
 
     def _computing(
-        self, dag: Dag, jobs: _Jobs, took: Any, missing: Any, computed: list[int],
-        holds: list[int], process: Sequence[int],
+        self, dag: Dag, jobs: _Jobs, took: Any, missing: Any, computed: list[Any],
+        holds: list[Any], process: Sequence[int],
     ) -> None:
         """Add what the executions of a DAG computed, and which held the interpreter."""
         import numpy as np
@@ -400,27 +405,34 @@ class LoadBuilder(Observer):
                 if vertex.callback.holds_interpreter:
                     cpu[~known, v] = took[~known, v]
             held[:, v] *= process[self._first[dag.index] + v]
-        computed.extend(cpu.ravel().tolist())
-        holds.extend(held.ravel().tolist())
+        computed.append(cpu.ravel())
+        holds.append(held.ravel())
 
     def _load(
-        self, costs: list[int], bases: list[int], others: list[int], overheads: bool
+        self, costs: Any, bases: list[int], others: list[int], overheads: bool
     ) -> Load:
-        # (time when ready, DAG, place of the job in its DAG, release)
-        releases = [(ready, len(self._jobs), place, ready) for place, ready in enumerate(others)]
+        import numpy as np
+        # time when ready, DAG, place of the job in its DAG, release
+        parts = [np.array(
+            [(ready, len(self._jobs), place, ready) for place, ready in enumerate(others)],
+            dtype=np.int64).reshape(-1, 4)]
+        rounds = np.array([*self._rounds, _UNKNOWN], dtype=np.int64)    # the last of none
         for dag, jobs in zip(self._task_set.dags, self._jobs):
+            release, noticed, number = (
+                np.array(each, dtype=np.int64)
+                for each in (jobs.release, jobs.noticed, jobs.round))
             ideal = self._timer[dag.index] and not overheads
-            for row, (release, noticed) in enumerate(zip(jobs.release, jobs.noticed)):
-                ready = release if ideal else max(noticed, self._round_end(jobs, row))
-                releases.append((ready, dag.index, row, release))
-        releases.sort()
+            ready = release if ideal else np.maximum(noticed, rounds[number])
+            parts.append(np.column_stack((
+                ready, np.full(len(ready), dag.index), np.arange(len(ready)), release)))
+        columns = np.concatenate(parts).T
+        ready, dags, rows, release = columns[:, np.lexsort(columns[::-1])]
         return Load(
-            [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases], costs,
-            bases, [*(jobs.size for jobs in self._jobs), 1], [r[3] for r in releases])
+            ready, dags, rows, costs, bases, [*(jobs.size for jobs in self._jobs), 1], release)
 
     def _transports(
         self, overheads: bool, process: Sequence[int]
-    ) -> tuple[list[int], int | None]:
+    ) -> tuple[Any, int | None]:
         """
         Return the transports by job, and the median of all that were measured.
 
@@ -452,7 +464,7 @@ class LoadBuilder(Observer):
             view[:] = np.median(times) if len(times) else DELAY_NS * after
         flat = np.concatenate([each.ravel() for each in delays] or [np.zeros(0, dtype=np.int64)])
         everything = np.concatenate(list(usual.values()))
-        return ((flat if overheads else np.zeros_like(flat)).tolist(),
+        return (flat if overheads else np.zeros_like(flat),
                 int(np.median(everything)) if len(everything) else None)
 
     def _crossings(self, process: Sequence[int]) -> list[list[tuple[bool, bool]]]:

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from functools import cached_property
 from typing import Any
 
 from mddag_executor.core import NEVER, POLICIES, processes_of, Tables
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
-from mddag_executor.memory import no_garbage
+from mddag_executor.memory import give_back, no_garbage
 from mddag_executor.replay.as_recorded import Progress, recording_result, Replay
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.groups import with_groups
@@ -27,11 +28,11 @@ from mddag_executor.replay.recording import Head, ReplayError
 from mddag_executor.replay.run import open_run, Recording, Run
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
-from mddag_executor.simulate import schedule, Settings
-from mddag_executor.simulate.engine import busy_times
+from mddag_executor.simulate import LogEntry, schedule, Settings
 from mddag_executor.simulate.load import edge_numbers
 from mddag_executor.text import counted, listed
 from msg_graph import Process, TaskSet
+import numpy as np
 
 MAX_WORKERS = 4096
 
@@ -47,8 +48,7 @@ class Reschedule:
     :param notes: what was assumed, one line each.
     :ivar processes: which nodes run in which process; empty: all in one.
     :ivar workers: of all processes.
-    :ivar log: every start, end and preemption, on the recording's clock.
-    :ivar decisions: what the core decided.
+    :ivar decisions: what the core decided; ``busy``: how long each worker was busy, ns.
     :ivar warnings: what is missing or doubtful, one line each.
     """
 
@@ -66,11 +66,17 @@ class Reschedule:
         self._start = start
         self.tally = MissTally(task_set, tables)
         load, end = work.load, settings.duration_ns
-        _, self.log, self.decisions = schedule(tables, load, settings, log=True)
-        for time, dag, release in zip(load.times, load.dags, load.releases or load.times):
+        _, _, self.decisions, self.busy = schedule(tables, load, settings)
+        for time, dag, release in zip(*(
+                np.asarray(each).tolist() for each in (load.times, load.dags, load.releases))):
             if time < end and release >= settings.judge_from:
                 self.tally.released(dag)
         self.tally.add(self.decisions)
+
+    @cached_property
+    def log(self) -> Sequence[LogEntry]:
+        """Return every start, end and preemption, on the recording's clock; it runs once more."""
+        return schedule(self.tables, self.work.load, self.settings, log=True).log
 
     @property
     def worker_names(self) -> list[str]:
@@ -89,8 +95,8 @@ class Reschedule:
         end = self.settings.duration_ns
 
         def delay(dag: int, job: int, before: int, after: int) -> int:
-            return load.delays[
-                load.delay_base[dag] + job * load.delay_stride[dag] + edges[before, after]]
+            return int(load.delays[
+                load.delay_base[dag] + job * load.delay_stride[dag] + edges[before, after]])
 
         return ComputedRun(
             self.task_set, load, self.log, self.decisions, end, end, True, self.work.jobs,
@@ -100,14 +106,9 @@ class Reschedule:
         """Return the recorded index of a job of the log or tally."""
         return self.work.jobs[dag][job]
 
-    def worker_busy(self) -> list[int]:
-        """Return for each worker how long it was busy, ns."""
-        return busy_times(self.log, self.workers, self.settings.duration_ns)
-
     def result(self) -> dict[str, Any]:
         """Return the result format of ``replay --json``, with the recorded run beside it."""
         duration, settings, work = self.duration_ns, self.settings, self.work
-        busy = self.worker_busy()
         verdicts = self.tally.result()
         miss = verdicts['first_miss']
         if miss is not None:
@@ -128,8 +129,8 @@ class Reschedule:
                 'dispatch_median_ns': work.dispatch_ns,
                 'transport_median_ns': work.transport_ns},
             'worker_use': {
-                'busy_ns': {str(w): took for w, took in enumerate(busy)},
-                'use': share(sum(busy), self.workers, duration)},
+                'busy_ns': {str(w): took for w, took in enumerate(self.busy)},
+                'use': share(sum(self.busy), self.workers, duration)},
             'recorded': None if self.recorded is None else {
                 'policy': self.recorded.run.head.policy, 'workers': self.recorded.run.head.workers,
                 **self.recorded.tally.result()},
@@ -189,15 +190,11 @@ def reschedule(
     bound = head.max_active_jobs if head.max_active_jobs > 0 else NEVER
     tables = Tables.build(
         run.task_set, default_deadline=head.default_deadline, max_active_jobs=bound)
-    builders: list[LoadBuilder] = []
-
-    def build(recorded: Replay) -> list[LoadBuilder]:
-        builders.append(LoadBuilder(
-            run.task_set, tables, run.who, each, max(0, head.cpus), _processes(run, ran)))
-        return builders
-
-    recorded = Replay(run, skip, progress, build, paths=False)
-    builder, = builders
+    builder = LoadBuilder(
+        run.task_set, tables, run.who, each, max(0, head.cpus), _processes(run, ran))
+    builders = [builder]
+    recorded = Replay(run, skip, progress, lambda _: builders, paths=False)
+    give_back()
     placed = _placed(run, ran, builder) if processes is None else processes(
         run.task_set, builder.times())
     if len(placed) < 2:
@@ -213,8 +210,11 @@ def reschedule(
             'give a GRAPH that declares it')
     tables = with_groups(
         tables, builder.callback_of, run.who.groups(), declared_first=not run.same)
+    builders.clear()    # what it holds, the load has too
+    del builder
+    give_back()
     warnings = recorded.warnings
-    if cpus is not None and run.declared and not work.load.computed:
+    if cpus is not None and run.declared and len(work.load.computed) == 0:
         warnings.append(
             f'{run.name}: CPU times are not recorded in it, so with --cpus each '
             'execution computes all the time')

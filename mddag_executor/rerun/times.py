@@ -22,7 +22,7 @@ from collections.abc import Sequence
 
 from mddag_executor.core import quantile, Tables
 from mddag_executor.replay.load import RecordedLoad
-from mddag_executor.simulate.load import edge_numbers, needs_python
+from mddag_executor.simulate.load import as_lists, edge_numbers, needs_python
 
 
 class SameInEachJob:
@@ -62,7 +62,7 @@ class AsRecorded:
 
     def __init__(self, tables: Tables, work: RecordedLoad) -> None:
         self._tables = tables
-        self._load = load = work.load
+        self._load = load = as_lists(work.load)
         self._releases: list[list[tuple[int, int]]] = [[] for _ in range(tables.n_dags)]
         for dag, job, release in zip(load.dags, load.jobs, load.releases or load.times):
             if dag < tables.n_dags:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, TYPE_CHECKING
 
@@ -69,7 +69,7 @@ def compile_here(name: str) -> None:
     """Compile, or load, by running nothing."""
     if name == RUN_ONCE:
         run_once(Tables.build(None), Load([], [], [], [], [], []), 'rad',
-                 Orders(*[0] * len(Orders._fields)), False)
+                 Orders(*[0] * len(Orders._fields)))
         return
     nothing = EmptyMemory(max(len(Tables._fields) + 1, len(State._fields)))
     _entries()[ACCEPT_RUNS](
@@ -110,18 +110,22 @@ class CompiledJudge:
 
 
 def run_once(
-    tables: Tables, load: Load, policy: str, orders: Orders, keep_log: bool
-) -> tuple[int, list[LogEntry], list[Decision]]:
-    """Do what ``engine.run_load`` does: return the end, the log of every worker, the decisions."""
+    tables: Tables, load: Load, policy: str, orders: Orders
+) -> tuple[int, Sequence[LogEntry], Sequence[Decision], list[int]]:
+    """
+    Do what ``engine.run_load`` does.
+
+    :return: the end, the log of every worker, the decisions, how long each worker was busy.
+    """
     lent = [LentTuple(tables, list(POLICIES).index(policy)), LentTuple(load), LentTuple(orders)]
-    state, deliveries, machine, log = working = [
+    state, _, _, busy, log = working = [
         EmptyMemory(len(fields)) for fields in (
-            State._fields, Deliveries._fields, Machine._fields, ('log',))]
+            State._fields, Deliveries._fields, Machine._fields, ('busy',), ('log',))]
     addresses = [each.address for each in working]
     ended = _entries()[RUN_ONCE](*(each.address for each in lent), *addresses)
     try:
         place = State._fields.index('decisions')
-        return (int(ended), log.rows(0, 6) if keep_log else [],  # type: ignore[return-value]
-                state.rows(place, 6))
+        return (int(ended), log.rows(0, 6), state.rows(place, 6),  # type: ignore[return-value]
+                busy.words(0, 1)[:, 0].tolist())
     finally:
         _entries()['free_run'](*addresses)

@@ -24,7 +24,7 @@ what is None then costs nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 from mddag_executor.core import jobs, rules
@@ -70,13 +70,18 @@ class Orders(NamedTuple):
     horizon: int
     stop_at_first_miss: int
     judge_open: int
+    keep_log: int
 
 
 def run_load(
     t: Tables, s: State, d: Deliveries, m: Machine, key: KeyFunction, load: Load, o: Orders,
-    log: list[LogEntry] | None, progress: Callable[[int], None] | None,
+    busy: list[int], log: list[LogEntry], progress: Callable[[int], None] | None,
 ) -> int:
-    """Run the core over a load (see ``run``) with a state and so on that are all empty."""
+    """
+    Run the core over a load (see ``run``) with a state and so on that are all empty.
+
+    :param busy: gets for each worker how long it was busy, ns; ``log`` what they did, if kept.
+    """
     sends = len(load.delay_base) > 0
     stops = len(load.holds) > 0 or o.cpus < NEVER
     fill_state(
@@ -85,21 +90,25 @@ def run_load(
     if o.processes > 1:
         divide(s, [o.workers] * o.processes)
     s.scalars[JUDGE_FROM] = o.judge_from
-    stop = o.stop_at_first_miss != 0
+    stop, keep = o.stop_at_first_miss != 0, o.keep_log != 0
+    for _ in range(o.workers * o.processes):
+        busy.append(0)
     if stops:
         fill_machine(t, s, m, o.cpus, int(needs_python(load)))
     if sends:
         d.sent.append(0)
         if stops:
-            ended = run(t, s, key, load, o.horizon, stop, log, progress, d, m)
+            ended = run(t, s, key, load, o.horizon, stop, log, progress, d, m, busy, keep)
         else:
-            ended = run(t, s, key, load, o.horizon, stop, log, progress, d, None)
+            ended = run(t, s, key, load, o.horizon, stop, log, progress, d, None, busy, keep)
     elif stops:
-        ended = run(t, s, key, load, o.horizon, stop, log, progress, None, m)
+        ended = run(t, s, key, load, o.horizon, stop, log, progress, None, m, busy, keep)
     else:
-        ended = run(t, s, key, load, o.horizon, stop, log, progress, None, None)
+        ended = run(t, s, key, load, o.horizon, stop, log, progress, None, None, busy, keep)
     if o.judge_open != 0 and ended == o.horizon:
         jobs.finish(t, s, ended)
+    if not keep:
+        log.clear()
     return ended
 
 
@@ -114,21 +123,28 @@ def run(
     progress: Callable[[int], None] | None = None,
     deliveries: Deliveries | None = None,
     machine: Machine | None = None,
+    busy: list[int] | None = None,
+    keep_log: bool = True,
 ) -> int:
     """
     Run the core over a load and return the time at which the run ended, ns.
 
     Decisions are left in ``s.decisions``.  With ``stop_at_first_miss`` the run ends with the
     instant at which the first miss is known: a late completion, an expiry or an abort.
-    ``progress`` is told the virtual time at each event.
+    ``progress`` is told the virtual time at each event.  To ``busy`` is added how long each worker
+    was busy.
     """
     n_workers = len(s.worker_x)
     finish_at = [NEVER] * n_workers
     running = [-1] * n_workers
+    since = [-1] * n_workers
     next_release = 0
     n_releases = len(load.times)
     now = 0
     while True:
+        if log is not None:
+            if not keep_log:
+                log.clear()
         instant = NEVER
         if next_release < n_releases and load.times[next_release] < horizon:
             instant = load.times[next_release]
@@ -140,6 +156,7 @@ def run(
         if machine is not None:
             instant = min(instant, machine.scalars[NEXT_TIME])
         if instant > horizon:
+            _end_busy(busy, since, horizon)
             return horizon
         now = instant
         if progress is not None:
@@ -151,6 +168,9 @@ def run(
             if finish_at[w] == now:
                 finish_at[w] = NEVER
                 x = s.worker_x[w]
+                if busy is not None:
+                    busy[w] += now - since[w]
+                    since[w] = -1
                 if log is not None:
                     running[w] = -1
                     _note(t, s, log, now, END, w, x)
@@ -159,17 +179,28 @@ def run(
                 else:
                     rules.complete(t, s, key, x, now)
         if now == horizon:
+            _end_busy(busy, since, horizon)
             return horizon
         if deliveries is not None:
             arrive_due(t, s, key, load, deliveries, machine, now)
         while next_release < n_releases and load.times[next_release] == now:
             release_load(t, s, key, load, next_release, now)
             next_release += 1
-        _dispatch(t, s, key, load, now, finish_at, running, log, deliveries, machine)
+        _dispatch(t, s, key, load, now, finish_at, running, since, busy, log, deliveries,
+                  machine)
         if machine is not None:
             share(t, s, machine, now, finish_at)
         if stop_at_first_miss and any_missed(s, seen):
+            _end_busy(busy, since, now)
             return now
+
+
+def _end_busy(busy: list[int] | None, since: list[int], now: int) -> None:
+    """Count what still runs at the end."""
+    if busy is not None:
+        for w in range(len(since)):
+            if since[w] >= 0:
+                busy[w] += now - since[w]
 
 
 def release_load(
@@ -200,8 +231,8 @@ def release_load(
 
 def _dispatch(
     t: Tables, s: State, key: KeyFunction, load: Load, now: int, finish_at: list[int],
-    running: list[int], log: list[LogEntry] | None, deliveries: Deliveries | None,
-    machine: Machine | None,
+    running: list[int], since: list[int], busy: list[int] | None, log: list[LogEntry] | None,
+    deliveries: Deliveries | None, machine: Machine | None,
 ) -> None:
     """Dispatch what is to run now; ``running`` is kept for the log, which wants the preempted."""
     if machine is not None:
@@ -210,6 +241,10 @@ def _dispatch(
     while x >= 0:
         worker = s.x_worker[x]
         finish_at[worker] = now + s.x_left[x]
+        if busy is not None:
+            if since[worker] >= 0:
+                busy[worker] += now - since[worker]
+            since[worker] = now
         if log is not None:
             if running[worker] >= 0:
                 _note(t, s, log, now, PREEMPT, worker, running[worker])
@@ -237,17 +272,3 @@ def any_missed(s: State, first: int) -> bool:
         if jobs.is_miss(s.decisions[i][0]):
             return True
     return False
-
-
-def busy_times(log: Sequence[LogEntry], workers: int, end: int) -> list[int]:
-    """Return for each worker how long it was busy until the end, ns."""
-    busy = [0] * workers
-    since = [-1] * workers
-    for time, kind, worker, *_ in log:
-        if since[worker] >= 0:
-            busy[worker] += time - since[worker]
-        since[worker] = time if kind == START else -1
-    for worker, start in enumerate(since):
-        if start >= 0:
-            busy[worker] += end - start
-    return busy

@@ -85,15 +85,16 @@ def accept_runs(
 
 
 def run_once(
-    tables: int, load: int, orders: int, state: int, deliveries: int, machine: int, log: int
+    tables: int, load: int, orders: int, state: int, deliveries: int, machine: int, busy: int,
+    log: int,
 ) -> int:
     """Run a load and return when it ended; what it leaves is the caller's to free."""
     return run_load(
         as_tables(tables), as_state(state), as_deliveries(deliveries), as_machine(machine),
-        key_of_policy, as_load(load), as_orders(orders), as_log(log), None)
+        key_of_policy, as_load(load), as_orders(orders), as_vector(busy), as_log(log), None)
 
 
-def free_run(state: int, deliveries: int, machine: int, log: int) -> None:
+def free_run(state: int, deliveries: int, machine: int, busy: int, log: int) -> None:
     """Free what ``run_once`` left."""
     free_state(state)
     queues = as_machine(machine).lock_queue
@@ -101,4 +102,5 @@ def free_run(state: int, deliveries: int, machine: int, log: int) -> None:
         free(queues[process])
     free_fields(deliveries, DELIVERIES_FIELDS)
     free_fields(machine, MACHINE_FIELDS)
+    free(as_vector(busy))
     free(as_log(log))

@@ -9,9 +9,10 @@ integer in the first of them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from copy import copy
 import ctypes
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -55,10 +56,37 @@ class EmptyMemory:
         """Return where it is, as long as this object lives."""
         return int(self._words.ctypes.data)
 
-    def rows(self, field: int, width: int) -> list[tuple[int, ...]]:
-        """Return a copy of a field, which is a vector of tuples."""
+    def words(self, field: int, width: int) -> npt.NDArray[np.int64]:
+        """Return a copy of a field, which is a vector of elements with so many words."""
         address, length = self._words[3 * field:3 * field + 2].tolist()
         if length == 0:
-            return []
+            return np.empty((0, width), dtype=np.int64)
         data = (ctypes.c_int64 * (length * width)).from_address(address)
-        return list(zip(*np.ctypeslib.as_array(data).reshape(length, width).T.tolist()))
+        return np.ctypeslib.as_array(data).reshape(length, width).copy()
+
+    def rows(self, field: int, width: int) -> Rows:
+        """Return the same as tuples."""
+        return Rows(self.words(field, width))
+
+
+class Rows(Sequence[tuple[int, ...]]):
+    """Tuples of integers that are made when they are asked for: as numbers they take a sixth."""
+
+    _SOME = 8192
+
+    def __init__(self, words: npt.NDArray[np.int64]) -> None:
+        self._words = words
+
+    def __len__(self) -> int:
+        return len(self._words)
+
+    def __getitem__(self, place: Any) -> Any:
+        found = self._words[place].tolist()
+        return list(map(tuple, found)) if isinstance(place, slice) else tuple(found)
+
+    def __iter__(self) -> Iterator[tuple[int, ...]]:
+        for first in range(0, len(self), self._SOME):
+            yield from self[first:first + self._SOME]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)

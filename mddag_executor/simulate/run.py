@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from mddag_executor.core import NEVER, Tables, Tally
@@ -32,8 +32,8 @@ class Run:
     ended_ns: int
     utilisation: float | None
     preemptive: bool
-    log: list[LogEntry] = field(default_factory=list)
-    decisions: list[Decision] = field(default_factory=list)
+    log: Sequence[LogEntry] = ()
+    decisions: Sequence[Decision] = ()
 
     def result(self) -> dict[str, Any]:
         """Return the result format of ``simulate --json``."""
@@ -67,7 +67,7 @@ def simulate(
     check(settings)
     tables = Tables.build(
         task_set, max_active_jobs=NEVER if max_active_jobs is None else max_active_jobs)
-    ended, entries, decisions = schedule(tables, load, settings, log=log, progress=progress)
+    ended, entries, decisions, _ = schedule(tables, load, settings, log=log, progress=progress)
     tally = Tally(task_set, tables)
     for time, dag in zip(load.times, load.dags):
         if time < settings.duration_ns and time <= ended:

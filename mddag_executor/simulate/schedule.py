@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -69,15 +69,20 @@ class Settings:
             self.workers, self.processes, int(self.preempts),
             int(find_policy(self.policy).polling), self.dispatch_overhead_ns,
             self.switch_overhead_ns, self.judge_from, self.cpus or NEVER, self.duration_ns,
-            int(self.stop_at_first_miss), int(self.judge == 'horizon'))
+            int(self.stop_at_first_miss), int(self.judge == 'horizon'), 1)
 
 
 class Scheduled(NamedTuple):
-    """What came of a load: when the run ended, and, in order of time, logs and decisions."""
+    """
+    What came of a load: when the run ended, and, in order of time, log and decisions.
+
+    :ivar busy: how long each worker was busy, ns.
+    """
 
     ended: int
-    log: list[LogEntry]
-    decisions: list[Decision]
+    log: Sequence[LogEntry]
+    decisions: Sequence[Decision]
+    busy: list[int]
 
 
 def schedule(
@@ -92,19 +97,20 @@ def schedule(
     :param compiled: whether compiled, which gives the same; None: what is sooner done.
     :raises mddag_executor.core.PolicyError: as ``Settings.preempts``.
     """
-    orders = settings.orders
+    orders = settings.orders._replace(keep_log=int(log))
     if compiled is None:
         compiled = prepare(tables, load, settings)
     if compiled:
         from mddag_executor.simulate.compiled import run_once
-        return Scheduled(*run_once(tables, load, settings.policy, orders, log))
+        return Scheduled(*run_once(tables, load, settings.policy, orders))
     state = as_object(empty(State))
     entries: list[LogEntry] = []
+    busy: list[int] = []
     ended = run_load(
         as_object(tables), state, empty(Deliveries), empty(Machine),
-        find_policy(settings.policy).key, as_lists(load), orders, entries if log else None,
-        progress)
-    return Scheduled(ended, entries, state.decisions)
+        find_policy(settings.policy).key, as_lists(load), orders, busy,
+        entries, progress)
+    return Scheduled(ended, entries, state.decisions, busy)
 
 
 def prepare(tables: Tables, load: Load, settings: Settings, runs: int = 1) -> bool:

@@ -274,7 +274,8 @@ def test_whatever_gets_ready_ends_or_is_dropped_or_is_there(case: Case, horizon:
     log: list[LogEntry] = []
     run_load(
         tables, state, empty(Deliveries), empty(Machine), policy(case.policy).key,
-        case.load(horizon), replace(settings, judge='completions').orders, log, None)
+        case.load(horizon), replace(settings, judge='completions').orders, [], log,
+        None)
     kinds = Counter(kind for _, kind, *_ in log)
     ready = state.scalars[ORDER] - kinds[PREEMPT]
     dropped = sum(kind == DROP for kind, *_ in state.decisions)

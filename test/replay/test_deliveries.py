@@ -10,9 +10,9 @@ from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Tables
 from mddag_executor.core.state import new_state, SINK_COMPLETED
 from mddag_executor.replay import reschedule
-from mddag_executor.simulate import END, Load, LogEntry, PREEMPT, START
+from mddag_executor.simulate import END, Load, LogEntry, START
 from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.engine import busy_times, run
+from mddag_executor.simulate.engine import run
 from mddag_executor.simulate.load import edge_numbers, edges_of
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
@@ -107,12 +107,6 @@ def test_a_message_of_a_job_that_has_ended_is_ignored() -> None:
     starts, done = engine([20 * MS, 0, 0], jobs=6, bound=1)
     assert [vertex for _, _, vertex in starts].count(1) == 1
     assert [vertex for vertex, _ in done] == [2, 3]
-
-
-def test_busy_times() -> None:
-    log = [(0, START, 0, 0, 0, 0), (4, PREEMPT, 0, 0, 0, 0), (4, START, 0, 0, 1, 0),
-           (6, END, 0, 0, 1, 0), (7, START, 1, 0, 0, 0)]
-    assert busy_times(log, 3, 10) == [6, 3, 0]
 
 
 def record(path: Path, delay: int, wake: int, ready_early: int = 0) -> None:

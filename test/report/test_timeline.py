@@ -146,7 +146,7 @@ def test_a_rescheduled_run_has_the_verdicts_of_its_report(workers: int) -> None:
     executions = data.timeline.columns().executions
     busy = [int((executions[END] - executions[START])[executions[2] == w].sum())
             for w in range(workers)]
-    for ours, theirs in zip(busy, outcome.worker_busy()):
+    for ours, theirs in zip(busy, outcome.busy):
         assert 0 <= theirs - ours < 200 * runs.MS   # what still ran at the end is no execution yet
 
 
