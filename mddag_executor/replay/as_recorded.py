@@ -16,15 +16,13 @@ from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.own import OwnRun
 from mddag_executor.replay.own_paths import OwnPaths
 from mddag_executor.replay.run import open_run, Recording, Run
-from mddag_executor.replay.usage import share, Usage
-from mddag_executor.replay.waits import GroupWaits
+from mddag_executor.replay.usage import GroupWaits, share, Usage
 from mddag_executor.text import counted
 from msg_graph import TaskSet
 from msg_graph.drift import Drift
 
 if TYPE_CHECKING:
-    from mddag_executor.replay.communications import Communications
-    from mddag_executor.replay.imported_figures import ImportedDrift, ImportedPaths
+    from mddag_executor.replay.imported_figures import Communications, ImportedDrift, ImportedPaths
 
 Progress = Callable[[int], None]
 

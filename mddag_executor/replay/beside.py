@@ -27,7 +27,7 @@ from mddag_executor.replay.happenings import Batch, KINDS, Observer
 from mddag_executor.replay.own import OwnRun, STOP
 from mddag_executor.replay.own_paths import OwnPaths
 from mddag_executor.replay.run import open_run
-from mddag_executor.replay.waits import GroupWaits
+from mddag_executor.replay.usage import GroupWaits
 from mddag_executor.resources import import_environment
 
 LEAST_EVENTS = 1_000_000

@@ -50,7 +50,7 @@ from mddag_executor.replay.happenings import (
     WITHDRAWN,
 )
 from mddag_executor.replay.tolerances import MissTally
-from mddag_executor.replay.waits import GroupWaits
+from mddag_executor.replay.usage import GroupWaits
 from mddag_executor.text import counted
 from msg_graph import TaskSet
 import numpy as np

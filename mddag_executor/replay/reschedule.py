@@ -21,7 +21,6 @@ from mddag_executor.errors import UsageError
 from mddag_executor.memory import give_back, no_garbage
 from mddag_executor.replay.as_recorded import Progress, recording_result, Replay
 from mddag_executor.replay.computed import ComputedRun
-from mddag_executor.replay.groups import with_groups
 from mddag_executor.replay.load import LoadBuilder, RecordedLoad
 from mddag_executor.replay.own import OwnRun
 from mddag_executor.replay.recording import Head, ReplayError
@@ -270,3 +269,25 @@ def _settings(
                 name, f'it says that it was recorded with {counted(workers, "worker")}',
                 'give --workers')
     return policy, workers
+
+
+def with_groups(
+    tables: Tables, callback_of: dict[int, int], groups: dict[int, int], declared_first: bool
+) -> Tables:
+    """
+    Return tables with the callback groups that callbacks had in the recording.
+
+    :param callback_of: by global vertex the callback that ran as it.
+    :param groups: by callback its group in the recording, -1 for a reentrant one.
+    :param declared_first: whether declared groups go before recorded ones.
+    """
+    numbers: dict[tuple[bool, int], int] = {}
+    column = []
+    for vertex, declared in enumerate(tables.group):
+        recorded = groups.get(callback_of.get(vertex, 0))
+        if recorded is None or (declared_first and declared >= 0):
+            choice = (False, declared)
+        else:
+            choice = (True, recorded)
+        column.append(-1 if choice[1] == -1 else numbers.setdefault(choice, len(numbers)))
+    return tables._replace(group=column, n_groups=len(numbers))

@@ -161,7 +161,7 @@ def test_policy_workers_and_preemption_are_those_asked_for(tmp_path: Path) -> No
     preemptive = reschedule(path, workers=1, preemptive=True)
     assert starts(preemptive.log) == [(0, 0, 0, 0), (5, 0, 1, 0), (7, 0, 0, 0), (15, 0, 1, 1)]
     assert [e[0] - START_TIME for e in preemptive.log if e[1] == PREEMPT] == [5 * MS]
-    assert preemptive.worker_busy() == [16 * MS]
+    assert preemptive.busy == [16 * MS]
     assert not preemptive.tally.missed
     fifo = reschedule(path, workers=1, policy='fifo', preemptive=True).result()
     assert (fifo['policy'], fifo['workers'], fifo['preemptive']) == ('fifo', 1, True)
@@ -395,7 +395,7 @@ def test_settings_that_can_not_be(tmp_path: Path) -> None:
 
 
 def test_tables_without_groups_stay_as_they_are() -> None:
-    from mddag_executor.replay.groups import with_groups
+    from mddag_executor.replay.reschedule import with_groups
     tables = Tables.build(loads(TIMER_AND_MESSAGE.replace('dag: b', 'dag: b, group: g'), 'g.yaml'))
     assert with_groups(tables, {}, {}, declared_first=False) == tables
 

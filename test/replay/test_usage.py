@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.replay import replay
 from mddag_executor.replay.happenings import Batch, Piece, RAN
-from mddag_executor.replay.usage import PoolUse
-from mddag_executor.replay.waits import GroupWaits
+from mddag_executor.replay.usage import GroupWaits, PoolUse
 from mddag_executor.trace import TraceFile
 from mddag_executor.trace.census import Census
 import numpy as np
