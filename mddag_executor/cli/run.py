@@ -57,6 +57,9 @@ mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20
 _SAME_INTERRUPT_S = 1.0
 # A part whose run was killed must not stay for ever, whatever its nodes do.
 _PART_ENDS_S = 60
+# So long nodes of several processes wait for each other, once the programs have started: where
+# the run has started all of them, and where nobody knows whether the others will come.
+_MEET_S, _ALONE_S = 10.0, 4.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -295,7 +298,7 @@ def _run(
                 warn_of(plan, args.ros_args)
             books = _run_synthetic(args, session, task_set, plan, seconds, progress)
         else:
-            _run_programs(session, executor, programs, args.ros_args, seconds, progress)
+            _run_programs(args, task_set, session, executor, programs, seconds, progress)
     result = {
         'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
         **executor.statistics(),
@@ -313,36 +316,51 @@ def _run_synthetic(
     seconds: float | None, progress: Progress,
 ) -> Books | None:
     from mddag_executor.live import current_job
-    from mddag_executor.live.session import run_and_note, Session
+    from mddag_executor.live.session import run_and_note
     from mddag_executor.live.synthetic import SyntheticWorkload
-    begin = Session.wait_until_matched
-    if args.part is not None:
-        from mddag_executor.live.parts import Part
-        begin = partial(Part.read(args.part).start_together, args.process,
-                        [process.name for process in task_set.processes])
     workload = SyntheticWorkload(
         task_set, plan, current_job=current_job, process=args.process)
     for node in workload.nodes:
         session.executor.add_node(node)
     try:
         with session:
-            return run_and_note(session, workload, seconds, progress.update, begin=begin)
+            return run_and_note(
+                session, workload, seconds, progress.update, begin=_begin(args, task_set))
     finally:
         workload.destroy()
 
 
+def _begin(args: argparse.Namespace, task_set: TaskSet) -> Callable[..., int | None]:
+    """Return what waits until publishers and subscriptions have met, and for other processes."""
+    from mddag_executor.live.parts import Part
+    from mddag_executor.live.session import Session
+    if args.part is None:
+        return Session.wait_until_matched
+    return partial(Part.read(args.part).start_together, args.process,
+                   [process.name for process in task_set.processes])
+
+
 def _run_programs(
-    session: Session, executor: MultiDeadlineExecutor, programs: list[Program],
-    ros_args: list[str] | None, seconds: float | None, progress: Progress,
+    args: argparse.Namespace, task_set: TaskSet, session: Session,
+    executor: MultiDeadlineExecutor, programs: list[Program], seconds: float | None,
+    progress: Progress,
 ) -> None:
     from mddag_executor.live.hosting import Host
     from mddag_executor.live.loading import ros_arguments
+    from mddag_executor.live.session import SessionError
     with Host(executor, session.stop) as host:
         executor.set_judging(False)
         try:
             with session:
-                host.start(programs, ros_arguments(ros_args))
-                executor.set_judging(True)
+                host.start(programs, ros_arguments(args.ros_args))
+                begins: int | None = None
+                if args.process is not None:  # what is lost until then is no job's fault
+                    try:
+                        begins = _begin(args, task_set)(
+                            session, executor.unmatched, _MEET_S if args.part else _ALONE_S)
+                    except SessionError as error:
+                        warn(f'{error}; what is lost meanwhile counts as missed')
+                executor.set_judging(True, begins)
                 session.wait(seconds, progress.update)
                 host.close()
         except MddagError:

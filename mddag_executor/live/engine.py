@@ -610,9 +610,9 @@ class Engine:
                 work.x = -1
                 self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'aborted', now)
 
-    def set_judging(self, judging: bool, now: int) -> None:
-        """Give verdicts about jobs that are released from now on, or about none for now."""
-        release = now if judging else NEVER
+    def set_judging(self, judging: bool, since: int | None, now: int) -> None:
+        """Give verdicts about jobs released from now (or a time) on, or about none for now."""
+        release = NEVER if not judging else now if since is None else since
         judge_from(self._state, release)
         if self.record is not None:
             self.record('judge_from', now, get_native_id(), release)

@@ -600,13 +600,25 @@ class MultiDeadlineExecutor(BareExecutor):
         while self._spinning.locked() and time.monotonic() < end:
             time.sleep(0.001)
 
-    def set_judging(self, judging: bool) -> None:
-        """Give verdicts about jobs that are released from now on, or about none until told so."""
-        self._pool.tell(self._engine.set_judging, judging)
+    def set_judging(self, judging: bool, since: int | None = None) -> None:
+        """
+        Give verdicts about jobs that are released from now on, or about none until told so.
+
+        :param since: a time to judge from (monotonic ns), if that is not now.
+        """
+        if since is not None:
+            since += self._trace_clock.offset_ns
+        self._pool.tell(self._engine.set_judging, judging, since)
 
     def unmatched(self) -> list[str]:
-        """Return the topics on which it has not met the executors of the other processes yet."""
-        return [] if self._announcements is None else self._announcements.unmatched()
+        """Return the topics on which it has not met the other processes of its DAGs yet."""
+        self._upkeep.refresh()
+        found = [] if self._announcements is None else self._announcements.unmatched()
+        others = self._engine.other_processes
+        if others is not None:
+            found += others.unmatched(
+                [*self._registry.subscriptions()], self._groups.served_nodes())
+        return found
 
     def statistics(self) -> dict[str, Any]:
         """Return a snapshot of what has happened so far (see the module ``statistics``)."""

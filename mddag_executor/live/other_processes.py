@@ -39,15 +39,17 @@ Two executors in one process that share a graph are to each other as two process
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Hashable, Iterable, Sequence, Set
 import threading
+from typing import Any
 
 from mddag_executor.core import Scheduler, Tables
 from mddag_executor.live.entity import Entity
 from mddag_executor.live.jobs import Jobs, Origin
 from mddag_executor.live.verdicts import Record
 from msg_graph import Dag, TaskSet, Vertex
+from rclpy.exceptions import InvalidHandle
 
 KEEP = 4096
 """The jobs of so many stamps are remembered."""
@@ -78,6 +80,8 @@ class OtherProcesses:
         self._job_notes = jobs
         self._callbacks = [v.callback.key for d in task_set.dags for v in d.vertices]
         self._here: dict[int, list[int]] = {}
+        # on which topics messages go to other processes
+        self._leaving: set[str] = set()
         # by DAG and stamp, or DAG and name; the names of jobs that have entered
         self._jobs: dict[tuple[int, Hashable], Origin] = {}
         self._kept: deque[tuple[int, Hashable]] = deque()
@@ -124,6 +128,9 @@ class OtherProcesses:
                 (announced if dag.index in self._announced else leaving).update(
                     t for v in dag.vertices if here[v.index] for t in v.callback.publishes
                     if dag.index in self._crossing or self._leaves(dag, v, here, t))
+        self._leaving = {
+            t for dag in self._dags for v in dag.vertices if self._here[dag.index][v.index]
+            for t in v.callback.publishes if self._leaves(dag, v, self._here[dag.index], t)}
         self._job_notes.note_headers(self.note, leaving)
         self._job_notes.announce_on(announced)
         for entity in entities:
@@ -132,6 +139,21 @@ class OtherProcesses:
                 for v in entity.targets)
             entity.remote_publishers = self._entrance(entity, hosted)
         return changes
+
+    def unmatched(self, entities: Iterable[Entity], nodes: Iterable[Any]) -> list[str]:
+        """Return the topics by which jobs leave or enter, and nobody else has been met on."""
+        here = Counter(entity.label for entity in entities)
+        found = []
+        try:
+            found = [e.label for e in entities if (e.awaits or e.remote_publishers)
+                     and not e.rclpy.get_publisher_count()]
+            for publisher in (p for node in nodes for p in node.publishers):
+                topic = publisher.topic_name
+                if topic in self._leaving and publisher.get_subscription_count() <= here[topic]:
+                    found.append(topic)
+        except InvalidHandle:
+            pass  # destroyed meanwhile
+        return found
 
     @staticmethod
     def _leaves(dag: Dag, vertex: Vertex, here: list[int], topic: str) -> bool:

@@ -32,7 +32,7 @@ from mddag_executor.core.tally import of_processes
 from mddag_executor.live.entity import COUNTS
 from mddag_executor.live.execution import ExecutionPlan
 from mddag_executor.live.measure import Books
-from mddag_executor.live.session import measured, Session
+from mddag_executor.live.session import MATCH_TIMEOUT_S, measured, Session
 from msg_graph import TaskSet
 from msg_graph.binding import Entity
 from msg_graph.drift import drift, Observed, Releases
@@ -84,18 +84,24 @@ class Part:
         Path(folder, f'{name}.ended').touch()
 
     def start_together(
-        self, name: str, names: Sequence[str], session: Session, unmatched: Callable[[], list[str]]
-    ) -> None:
+        self, name: str, names: Sequence[str], session: Session,
+        unmatched: Callable[[], list[str]], patience_s: float = MATCH_TIMEOUT_S,
+    ) -> int:
         """
-        Wait for the instant at which all processes start; not if the run is to end.
+        Wait for the instant at which all processes start, and return it (monotonic ns).
 
-        :param unmatched: returns the topics where publishers and subscriptions have not met yet.
+        Not if the run is to end.
+
+        :param unmatched: returns the topics where publishers and subscriptions have not met yet;
+            ``patience_s``: for how long to wait until more of them have.
         :raises mddag_executor.live.session.SessionError: when they do not meet.
         """
         self._come_to('made', name, names, session)
-        session.wait_until_matched(lambda: [] if self._is_left_alone() else unmatched())
+        session.wait_until_matched(
+            lambda: [] if self._is_left_alone() else unmatched(), patience_s)
         at = self._come_to('ready', name, names, session) + LEAD_NS
         session.wait(max(0, at - time.monotonic_ns()) / 1e9)
+        return at
 
     def _is_left_alone(self) -> bool:
         return any(self.folder.glob('*.ended'))

@@ -122,24 +122,27 @@ class Session:
             if tick is not None:
                 tick(time.monotonic() - begin)
 
-    def wait_until_matched(self, unmatched: Callable[[], list[str]]) -> None:
+    def wait_until_matched(
+        self, unmatched: Callable[[], list[str]], patience_s: float = MATCH_TIMEOUT_S
+    ) -> None:
         """
         Wait until publishers and subscriptions have met, or the run is to end.
 
         :param unmatched: returns the topics where they have not yet.
-        :raises SessionError: when for ``MATCH_TIMEOUT_S`` no more of them do.
+        :param patience_s: for how long to wait until more of them have.
+        :raises SessionError: when in that time no more of them have.
         """
         fewest = math.inf
         end = 0.0
         while topics := unmatched():
             if len(topics) < fewest:
-                fewest, end = len(topics), time.monotonic() + MATCH_TIMEOUT_S
+                fewest, end = len(topics), time.monotonic() + patience_s
             if self.wait(0.02):
                 return
             if time.monotonic() > end:
                 raise SessionError(
                     f'{topics[0]}: its publishers and subscriptions have not met within '
-                    f'{MATCH_TIMEOUT_S:.0f} s ({counted(len(topics), "topic")} in all): check '
+                    f'{patience_s:.0f} s ({counted(len(topics), "topic")} in all): check '
                     'ROS_DOMAIN_ID and the network')
 
     def end(self) -> None:
@@ -192,7 +195,7 @@ def measured(books: Books, plan: ExecutionPlan, warm_up_s: float = WARM_UP_S) ->
 def run_and_note(
     session: Session, workload: SyntheticWorkload, duration_s: float | None,
     tick: Tick | None = None, warm_up_s: float = WARM_UP_S,
-    begin: Callable[[Session, Callable[[], list[str]]], None] = Session.wait_until_matched,
+    begin: Callable[[Session, Callable[[], list[str]]], int | None] = Session.wait_until_matched,
 ) -> Books | None:
     """
     Run a synthetic workload as ``run_synthetic`` does.
