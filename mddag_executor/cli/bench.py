@@ -10,7 +10,7 @@ from mddag_executor.cli.options import add_verbs
 
 EXAMPLE = 'mddag bench live --load autoware --executors rad-events,multi --utilisation 0.6'
 
-VERBS = ('live', 'replay', 'evaluate')
+VERBS = ('live', 'core', 'replay', 'evaluate')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

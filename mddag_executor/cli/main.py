@@ -67,7 +67,7 @@ VERBS = {
     'export': Verb('export', 'turn a trace into a file for Perfetto, spreadsheets or data frames'),
     'diff': Verb('diff', 'compare two recorded runs sink by sink'),
     'top': Verb('top', 'show live what running executors say of their deadlines and workers'),
-    'bench': Verb('bench', 'measure the executor, the replayer and the simulator'),
+    'bench': Verb('bench', 'measure the executor, the core, the replayer and the simulator'),
 }
 # What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.
 _ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_python')

@@ -82,7 +82,7 @@ def test_choices_are_those_of_the_program(verb: str, option: str, known: tuple[s
 
 @pytest.mark.parametrize(('words', 'says'), [
     (['graph', 'check', '--help'], 'Validate a declaration and show the DAG tasks'),
-    (['bench', 'evaluate', '--help'], 'time for each run and policy'),
+    (['bench', 'core', '--help'], 'CPU time for each event'),
     (['graph', '--help'], 'lay a declaration out evenly'),
     (['bench', '--help'], 'measure the batch evaluation'),
 ])
