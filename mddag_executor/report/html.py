@@ -44,12 +44,13 @@ from mddag_executor.simulate import Load, Run
 from mddag_executor.text import counted
 from msg_graph import TaskSet
 
-_SCRIPTS = [Path(__file__).with_name(name) for name in ('html_columns.js', 'html.js')]
+_SCRIPT = Path(__file__).with_name('html.js')
 _STYLE = Path(__file__).with_name('html.css')
 _LEGEND = (
     ('#d7191c', 'deadline missed'), ('#fd8d3c', 'slack below 10 % of the deadline'),
     ('#fec44f', 'below 25 %'), ('#9ecae1', 'below 50 %'), ('#3182bd', '50 % and more'),
     ('#969696', 'no deadline, or no verdict'))
+_BARS = 'Each bar is one execution, in the colour of the least slack that it leads to.'
 
 
 class Watch:
@@ -190,7 +191,7 @@ def _page(
     yield ('<p class="buttons"><button id="mddag-previous">&#9664; previous miss</button> '
            '<button id="mddag-next">next miss &#9654;</button> '
            '<button id="mddag-whole">whole run</button> <span id="mddag-status"></span></p>\n')
-    yield f'{plots[0]}\n<p class="note" id="mddag-detail"></p>\n'
+    yield f'{plots[0]}\n<p class="note">{_BARS}</p>\n'
     yield f'<h3>By worker</h3>\n{plots[1]}\n<h3>By callback</h3>\n{plots[2]}\n'
     if data.paths:
         yield ('<h2>End to end</h2>\n<p class="note">From the first publication to the start of '
@@ -203,12 +204,9 @@ def _page(
         yield f'<h2>Where the time of the worst jobs went</h2>\n{worst_html(data)}\n'
     yield f'<h2>Callbacks</h2>\n{callbacks_html(data)}\n'
     yield f'<footer>mddag_executor {escape(__version__)}</footer>\n'
-    yield f'<script id="mddag-meta" type="application/json">{json_for_html(prepared.meta)}'
-    yield '</script>\n<script id="mddag-data" type="application/octet-stream;base64">'
-    yield prepared.blob
-    yield f'</script>\n{script}\n'
-    for path in _SCRIPTS:
-        yield f'<script>{path.read_text(encoding="utf-8")}</script>\n'
+    yield ('<script id="mddag-meta" type="application/json">'
+           f'{json_for_html({"duration": data.duration_ns / 1e9, "missed": prepared.steps})}'
+           f'</script>\n{script}\n<script>{_SCRIPT.read_text(encoding="utf-8")}</script>\n')
     yield '</body></html>\n'
 
 
@@ -229,4 +227,5 @@ def _head(data: ReportData) -> Iterator[str]:
     if timeline.kept < timeline.n_executions:
         yield (f'<p class="warning">The timelines show {timeline.kept} of '
                f'{counted(timeline.n_executions, "execution")}: around missed deadlines, '
-               'and evenly spread over the run elsewhere. Tables and histograms are of all.</p>\n')
+               'and evenly spread over the run elsewhere. Tables and histograms are of all; '
+               'mddag export -o RUN.pftrace shows all in Perfetto.</p>\n')

@@ -3,29 +3,16 @@
 """
 The data of an HTML report: what its pictures are drawn from in the browser.
 
-Theory of operation
--------------------
-All executions that the timeline kept go into the file, and the browser chooses what it draws:
-each one where few are in view, sums where there are many.  To keep the file small
-
-* times are in units of 100 ns since the first instant, and numbers that follow one another are
-  stored as differences;
-* each column becomes bytes of equal weight one after the other (first all lowest bytes, and so
-  on), as many as its largest number needs, which compresses well;
-* all columns together are one zlib stream in base64.
-
-A signed number n is stored as 2n, or as -2n-1 where it is negative.  What a column is called and
-how it is stored stands in the JSON beside it, with the names: a name is only ever JSON here, text
-in HTML or text on a canvas, never markup or code.
+The executions that the timeline kept go into the file, as columns of the pictures: those around
+missed deadlines, and some of all other times (``timeline``).  Times are seconds since the first
+instant.  A name is only ever JSON here, text in HTML or text on a canvas, never markup or code.
 """
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator, Mapping, Sequence
 import json
 from typing import Any, NamedTuple
-import zlib
 
 from mddag_executor.core import Tables, Tally
 from mddag_executor.replay.chains import Chains
@@ -33,9 +20,14 @@ from mddag_executor.replay.usage import Usage
 from mddag_executor.report.tables import short_names
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import (
+    ABORTED,
+    DONE,
     END,
+    EXPIRED,
+    FAILED,
     Ints,
     JOB,
+    OVERDUE,
     READY,
     ROW,
     START,
@@ -45,10 +37,15 @@ from mddag_executor.report.timeline import (
 from msg_graph import TaskSet
 import numpy as np
 
-UNIT_NS = 100
 MOST_MISSES = 200
 LONGEST_LABEL = 40
-_LARGEST = 2 ** 51      # what JavaScript's numbers hold exactly, with room for the sign
+KINDS = {
+    DONE: 'late', OVERDUE: 'not completed at the end', EXPIRED: 'expired', ABORTED: 'aborted',
+    FAILED: 'failed'}
+UNKNOWN = '#969696'
+CLASSES = ((0.0, '#d7191c'), (0.1, '#fd8d3c'), (0.25, '#fec44f'), (0.5, '#9ecae1'),
+           (float('inf'), '#3182bd'))
+"""The colour of an execution whose slack is less than such a share of the deadline."""
 
 
 class ReportData(NamedTuple):
@@ -97,66 +94,162 @@ class Miss(NamedTuple):
     completed: int | None
     kind: int
 
+    @property
+    def shown(self) -> int:
+        """Return when it is marked in the pictures."""
+        return self.deadline if self.completed is None else self.completed
+
 
 class Prepared(NamedTuple):
-    """A report's data, ready to be drawn; ``meta`` is for JSON, ``blob`` is base64."""
+    """
+    A report's data, ready to be drawn.
 
-    meta: dict[str, Any]
-    blob: str
+    :ivar executions: the columns of the executions; ``marks`` those of the missed deadlines.
+    :ivar misses: in the order of ``Miss.shown``.
+    :ivar worst: of these the worst ones, in the order of their releases.
+    :ivar steps: for the page's script: start, deadline and end of each miss (s), and its text.
+    """
+
+    executions: dict[str, Any]
+    marks: dict[str, Any]
     lines: list[Line]
+    worker_lines: list[int]
+    gaps: list[tuple[float, float]]
     origin: int
     misses: list[Miss]
+    worst: list[int]
+    steps: list[tuple[float, float, float, str]]
 
 
 def prepare(data: ReportData) -> Prepared:
     """Return what the pictures of a report are drawn from."""
     columns = data.timeline.columns()
-    executions = columns.executions
-    n_declared = len(data.task_set.vertices)
-    undeclared = data.timeline.undeclared_names()
-    origin = _origin(columns.releases, executions)
-    lines, ys = _lines(data.task_set, undeclared)
-    rows = np.where(executions[ROW] >= 0, executions[ROW], n_declared - 1 - executions[ROW])
-    start = _units(executions[START], origin)
-    sinks = data.tables.sinks
-    place = {vertex: i for i, vertex in enumerate(sinks)}
-    releases = columns.releases[:, np.lexsort((columns.releases[1], columns.releases[0]))]
-    verdicts = columns.verdicts.copy()
-    verdicts[0] = [place[v] for v in verdicts[0].tolist()]
-    verdicts = verdicts[:, np.lexsort((verdicts[1], verdicts[0]))]
-    packer = Packer()
-    packer.add('start', start, delta=True)
-    packer.add('took', _units(executions[END], origin) - start)
-    packer.add('wait', start - _units(executions[READY], origin))
-    packer.add('row', rows)
-    packer.add('worker', executions[WORKER])
-    packer.add('job', _differences_by(executions[JOB], rows))
-    packer.add('release_dag', releases[0], delta=True)
-    packer.add('release_job', releases[1], delta=True)
-    packer.add('release_time', _units(releases[2], origin), delta=True)
-    packer.add('verdict_sink', verdicts[0], delta=True)
-    packer.add('verdict_job', verdicts[1], delta=True)
-    packer.add('verdict_slack', np.where(
-        verdicts[3] >= 0, (verdicts[2] - verdicts[3]) // UNIT_NS, 0))
-    packer.add('verdict_kind', verdicts[4])
-    misses = _misses(verdicts, origin, [data.tables.sink_deadline[v] for v in data.tables.sinks])
-    names = [vertex.name for vertex in data.task_set.vertices]
-    short = short_names(names)
-    meta = {
-        'unit_ns': UNIT_NS, 'origin_ns': origin, 'workers': data.workers,
-        'duration': data.duration_ns // UNIT_NS,
-        'executions': data.timeline.n_executions, 'kept': data.timeline.kept,
-        'gaps': [[_unit(a, origin), _unit(b, origin)] for a, b in data.timeline.gaps()],
-        'dags': [printable(dag.name) for dag in data.task_set.dags],
-        'rows': [*_rows(data, names, ys, place),
-                 *({'name': printable(name), 'dag': -1, 'y': ys[n_declared + i], 'sinks': []}
-                   for i, name in enumerate(undeclared))],
-        'sinks': [{'row': v, 'dag': data.tables.dag_of[v], 'name': printable(short[names[v]]),
-                   'deadline': data.tables.sink_deadline[v] // UNIT_NS} for v in sinks],
-        'worker_lines': _worker_lines(data),
-        'worker_names': [printable(name) for name in data.worker_names],
-        'misses': [miss[:2] for miss in misses], 'columns': packer.columns}
-    return Prepared(meta, packer.blob(), lines, origin, misses)
+    origin = _origin(columns.releases, columns.executions)
+    lines, ys = _lines(data.task_set, data.timeline.undeclared_names())
+    verdicts = {(v, job): Miss(v, job, deadline - origin,
+                               None if done < 0 else done - origin, kind)
+                for v, job, deadline, done, kind in columns.verdicts.T.tolist()}
+    misses = sorted((each for each in verdicts.values()
+                     if each.completed is None or each.completed > each.deadline),
+                    key=lambda miss: miss.shown)
+    words = _Words(data, verdicts, {
+        (dag, job): release - origin for dag, job, release in columns.releases.T.tolist()})
+    worst = sorted(range(len(misses)), key=lambda i: _badness(misses[i]))[:MOST_MISSES]
+    deadline_of = data.tables.sink_deadline
+    return Prepared(
+        words.executions(columns.executions, origin, ys), words.marks(misses, ys), lines,
+        words.worker_lines,
+        [((a - origin) / 1e9, (b - origin) / 1e9) for a, b in data.timeline.gaps()], origin,
+        misses, sorted(worst, key=lambda i: (
+            misses[i].deadline - deadline_of[misses[i].sink], misses[i].sink)),
+        [((miss.deadline - deadline_of[miss.sink]) / 1e9, miss.deadline / 1e9, miss.shown / 1e9,
+          f'{words.job(miss.sink, miss.job)}: {words.verdict(miss)}') for miss in misses])
+
+
+def _badness(miss: Miss) -> tuple[int, int, int]:
+    """Return what misses are ordered by: first those that never completed, then the latest."""
+    if miss.completed is None:
+        return 0, 0, miss.deadline
+    return 1, miss.deadline - miss.completed, miss.deadline
+
+
+class _Words:
+    """What is known of executions and jobs, in words."""
+
+    def __init__(
+        self, data: ReportData, verdicts: Mapping[tuple[int, int], Miss],
+        releases: Mapping[tuple[int, int], int],
+    ) -> None:
+        self._data = data
+        self._verdicts = verdicts
+        self._releases = releases
+        self._names = [vertex.name for vertex in data.task_set.vertices]
+        self._short = short_names(self._names)
+        self._leads_to = list(_leads_to(data))
+        self.worker_lines = _worker_lines(data)
+
+    def executions(self, executions: Ints, origin: int, ys: list[int]) -> dict[str, Any]:
+        """Return the columns of executions; ``a`` to ``d`` are the lines about them."""
+        undeclared = self._data.timeline.undeclared_names()
+        n_declared = len(self._names)
+        rows = np.where(executions[ROW] >= 0, executions[ROW], n_declared - 1 - executions[ROW])
+        names = [printable(name) for name in (*self._names, *undeclared)]
+        texts: list[tuple[str, str, str, str]] = []
+        colours = []
+        for row, job, worker, ready, start, end in zip(
+                rows.tolist(), *executions[[JOB, WORKER, READY, START, END]].tolist()):
+            least = self._least(row, job) if row < n_declared else None
+            verdict = '' if row >= n_declared else 'no verdict known'
+            if least is not None:
+                verdict = self.verdict(least)
+            colours.append(self._colour(least))
+            texts.append((
+                names[row], 'declared by no DAG' if row >= n_declared else self.job(row, job),
+                f'started {_instant(start - origin)} {self._worker(worker)}, waited '
+                f'{format_ns(start - ready)}, ran {format_ns(end - start)}', verdict))
+        lines = [self.worker_lines[w if 0 <= w < self._data.workers else -1]
+                 for w in executions[WORKER].tolist()]
+        return {
+            'left': (executions[START] - origin) / 1e9, 'right': (executions[END] - origin) / 1e9,
+            'workers': np.array(lines, dtype=np.int32),
+            'callbacks': np.array(ys, dtype=np.int32)[rows], 'colour': colours, **_lines_of(texts)}
+
+    def marks(self, misses: list[Miss], ys: list[int]) -> dict[str, Any]:
+        """Return the columns of missed deadlines."""
+        return {
+            'x': [miss.shown / 1e9 for miss in misses], 'workers': [0] * len(misses),
+            'callbacks': [ys[miss.sink] for miss in misses], **_lines_of([
+                (printable(self._names[miss.sink]), self.job(miss.sink, miss.job),
+                 self.verdict(miss), '') for miss in misses])}
+
+    def job(self, vertex: int, job: int) -> str:
+        """Return which job it is, and when it was released."""
+        dag = self._data.tables.dag_of[vertex]
+        release = self._releases.get((dag, job))
+        text = f'job {job} of {printable(self._data.task_set.dags[dag].name)}'
+        return text if release is None else f'{text}, released at {_instant(release)}'
+
+    def verdict(self, miss: Miss) -> str:
+        """Return what came of a job at a sink."""
+        relative = self._data.tables.sink_deadline[miss.sink]
+        name, due = printable(self._short[self._names[miss.sink]]), format_ns(relative)
+        if miss.completed is None:
+            return f'MISSED at {name}: {KINDS[miss.kind]} (deadline {due})'
+        slack = miss.deadline - miss.completed
+        how = f'{format_ns(-slack)} late' if slack < 0 else f'{format_ns(slack)} of slack'
+        return (f'{"MISSED" if slack < 0 else "in time"} at {name}: response '
+                f'{format_ns(relative - slack)}, {how} (deadline {due})')
+
+    def _least(self, row: int, job: int) -> Miss | None:
+        """Return the verdict with the least slack of those that an execution leads to."""
+        found = [verdict for sink in self._leads_to[row]
+                 if (verdict := self._verdicts.get((sink, job))) is not None]
+        return min(found, key=_slack, default=None)
+
+    def _colour(self, verdict: Miss | None) -> str:
+        if verdict is None:
+            return UNKNOWN
+        share = _slack(verdict) / max(1, self._data.tables.sink_deadline[verdict.sink])
+        return next(colour for limit, colour in CLASSES if share < limit)
+
+    def _worker(self, worker: int) -> str:
+        if worker < 0:
+            return 'on a spare thread'
+        names = self._data.worker_names
+        return f'on {printable(names[worker]) if worker < len(names) else f"worker {worker}"}'
+
+
+def _slack(verdict: Miss) -> float:
+    return float('-inf') if verdict.completed is None else verdict.deadline - verdict.completed
+
+
+def _instant(ns: int) -> str:
+    return f'{ns / 1e9:.6f} s'
+
+
+def _lines_of(texts: list[tuple[str, str, str, str]]) -> dict[str, list[str]]:
+    """Return the columns of the four lines that are shown about a place."""
+    return {key: [text[i] for text in texts] for i, key in enumerate('abcd')}
 
 
 def json_for_html(value: Any) -> str:
@@ -174,53 +267,9 @@ def label(text: str, longest: int = LONGEST_LABEL) -> str:
     return f'{text[:longest - 1 - half]}…{text[-half:]}'
 
 
-class Packer:
-    """Puts columns of whole numbers into one compressed text."""
-
-    def __init__(self) -> None:
-        self.columns: list[dict[str, Any]] = []
-        self._zlib = zlib.compressobj(6)
-        self._parts: list[bytes] = []
-
-    def add(self, name: str, values: Ints, delta: bool = False) -> None:
-        """Add a column; with ``delta`` as differences from one number to the next."""
-        if delta:
-            values = np.diff(values, prepend=0)
-        values = np.clip(values, -_LARGEST, _LARGEST)
-        plain = np.where(values < 0, -2 * values - 1, 2 * values).astype('<u8')
-        width = max(1, (int(plain.max(initial=0)).bit_length() + 7) // 8)
-        planes = plain.view(np.uint8).reshape(-1, 8).T[:width]
-        self._parts.append(self._zlib.compress(np.ascontiguousarray(planes).tobytes()))
-        self.columns.append({'name': name, 'n': len(values), 'width': width, 'delta': delta})
-
-    def blob(self) -> str:
-        """Return the text; call it once, at the end."""
-        self._parts.append(self._zlib.flush())
-        return base64.b64encode(b''.join(self._parts)).decode()
-
-
 def _origin(releases: Ints, executions: Ints) -> int:
     starts = [int(column.min()) for column in (releases[2], executions[READY]) if len(column)]
     return min(starts, default=0)
-
-
-def _unit(time: int, origin: int) -> int:
-    return time // UNIT_NS - origin // UNIT_NS
-
-
-def _units(times: Ints, origin: int) -> Ints:
-    return times // UNIT_NS - origin // UNIT_NS
-
-
-def _differences_by(values: Ints, rows: Ints) -> Ints:
-    """Return each value minus the one before it of the same row."""
-    order = np.argsort(rows, kind='stable')
-    differences = np.diff(values[order], prepend=0)
-    firsts = np.flatnonzero(np.diff(rows[order], prepend=-1))
-    differences[firsts] = values[order][firsts]
-    result = np.empty_like(differences)
-    result[order] = differences
-    return result
 
 
 def _lines(task_set: TaskSet, undeclared: list[str]) -> tuple[list[Line], list[int]]:
@@ -243,37 +292,16 @@ def _worker_lines(data: ReportData) -> list[int]:
     return [data.workers - w + spare for w in range(data.workers)] + [int(spare)]
 
 
-def _rows(
-    data: ReportData, names: list[str], ys: list[int], place: dict[int, int]
-) -> Iterator[dict[str, Any]]:
-    """Yield what is known of each declared vertex, with the sinks that it leads to."""
+def _leads_to(data: ReportData) -> Iterator[list[int]]:
+    """Yield the sinks that each declared vertex leads to, as global vertices."""
     for dag in data.task_set.dags:
-        first = data.tables.first_vertex[dag.index]
-        leads_to: list[list[int]] = [[] for _ in dag.vertices]
+        found: list[list[int]] = [[] for _ in dag.vertices]
         for sink in dag.sinks:
             seen = {sink}
             todo = [sink]
             for local in todo:
-                leads_to[local].append(place[first + sink])
+                found[local].append(data.tables.first_vertex[dag.index] + sink)
                 before = [p for p in dag.vertices[local].predecessors if p not in seen]
                 seen.update(before)
                 todo.extend(before)
-        for vertex in dag.vertices:
-            row = first + vertex.index
-            yield {'name': printable(names[row]), 'dag': dag.index, 'y': ys[row],
-                   'sinks': leads_to[vertex.index]}
-
-
-def _misses(verdicts: Ints, origin: int, relative: list[int]) -> list[Miss]:
-    """
-    Return the worst misses, in the order in which their jobs were released.
-
-    Worst are those that never completed, then those that completed latest.
-    """
-    late = (verdicts[3] < 0) | (verdicts[3] > verdicts[2])
-    found = verdicts[:, late]
-    order = np.lexsort((found[2], found[2] - found[3], found[3] >= 0))[:MOST_MISSES]
-    misses = [
-        Miss(sink, job, deadline - origin, None if completed < 0 else completed - origin, kind)
-        for sink, job, deadline, completed, kind in found[:, order].T.tolist()]
-    return sorted(misses, key=lambda miss: (miss.deadline - relative[miss.sink], miss.sink))
+        yield from found

@@ -3,14 +3,14 @@
 """
 The figures of an HTML report, made with Bokeh.
 
-The timelines, which are zoomed, hold nothing yet: ``html.js`` fills them with what is in view.
-Overview and histograms are whole.
+The page's script ``html.js`` moves the timelines to a missed deadline.
 """
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from bokeh.colors import RGB
 from bokeh.models import (
     BasicTickFormatter,
     ColumnDataSource,
@@ -23,16 +23,15 @@ from bokeh.models import (
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 from mddag_executor.replay.usage import PoolUse
-from mddag_executor.report.html_data import label, Line, Prepared, ReportData, UNIT_NS
+from mddag_executor.report.html_data import label, Line, Prepared, ReportData
 from mddag_executor.report.tables import short_names
-from mddag_executor.report.text import format_ns
+from mddag_executor.report.text import format_ns, printable
 import numpy as np
 
 MOST_HISTOGRAMS = 30
-_BAR_COLUMNS = ('left', 'right', 'bottom', 'top', 'colour', 'edge', 'a', 'b', 'd', 'e', 'f')
 _LEFT = 270             # room for the labels, the same in all timelines, so that they align
 _LINE = 16              # height of a line of a timeline, pixels
-_TOOLTIP = ('<div style="max-width:46em"><b>@a</b><br>@b<br>@d<br>@e<br>@f</div>')
+_TOOLTIP = ('<div style="max-width:46em"><b>@a</b><br>@b<br>@c<br>@d</div>')
 _FONT = '11px'
 _ZOOM = 'xpan,xbox_zoom,xzoom_in,xzoom_out,reset,save'
 _RED, _BLUE, _GREY = '#d7191c', '#3182bd', '#969696'
@@ -52,14 +51,19 @@ def figures(data: ReportData, prepared: Prepared) -> Figures:
     duration = max(1, data.duration_ns) / 1e9
     time = Range1d(
         start=0, end=duration, bounds=(-0.2 * duration, 1.2 * duration), name='timeline_range')
-    names = prepared.meta['worker_names'] or [f'worker {w}' for w in range(data.workers)]
+    names = [printable(name) for name in data.worker_names] or [
+        f'worker {w}' for w in range(data.workers)]
     workers = [Line('spare threads' if w == data.workers else names[w], y, False)
-               for w, y in enumerate(prepared.meta['worker_lines']) if y]
+               for w, y in enumerate(prepared.worker_lines) if y]
     workers.append(Line('missed deadlines', 0, False))
-    gaps = prepared.meta['gaps']
-    return Figures(
-        _overview(data, prepared, time), _timeline('workers', workers, time, gaps),
-        _timeline('callbacks', prepared.lines, time, gaps), _histograms(data))
+    edges = {colour: RGB.from_hex_string(colour).darken(0.1).to_hex()
+             for colour in set(prepared.executions['colour'])}
+    executions = ColumnDataSource({**prepared.executions, 'edge': [
+        edges[colour] for colour in prepared.executions['colour']]}, name='executions')
+    marks = ColumnDataSource(prepared.marks, name='marks')
+    shown = [_timeline(name, lines, time, prepared.gaps, executions, marks)
+             for name, lines in (('workers', workers), ('callbacks', prepared.lines))]
+    return Figures(_overview(data, prepared, time), *shown, _histograms(data))
 
 
 def _style(plot: Any, grid: bool = True) -> None:
@@ -112,8 +116,11 @@ def _over_time(use: PoolUse, origin: int) -> tuple[Any, Any]:
             np.array(found['busy_ns']) / found['step_ns'])
 
 
-def _timeline(name: str, lines: list[Line], time: Range1d, gaps: list[list[int]]) -> Any:
-    """Return an empty timeline with a line for each worker or callback."""
+def _timeline(
+    name: str, lines: list[Line], time: Range1d, gaps: list[tuple[float, float]],
+    executions: ColumnDataSource, marks: ColumnDataSource,
+) -> Any:
+    """Return a timeline with a line for each worker or callback; ``name`` is the column of it."""
     count = len(lines)
     plot: Any = figure(
         height=count * _LINE + 94, sizing_mode='stretch_width', x_range=time,
@@ -126,17 +133,17 @@ def _timeline(name: str, lines: list[Line], time: Range1d, gaps: list[list[int]]
                 line_color=None, level='underlay'))
     for left, right in gaps:
         plot.add_layout(BoxAnnotation(
-            left=left * UNIT_NS / 1e9, right=right * UNIT_NS / 1e9, hatch_pattern='/',
+            left=left, right=right, hatch_pattern='/',
             hatch_color='#cccccc', fill_color=None, line_color=None, level='underlay'))
     for kind, colour in (('job', '#ffe08a'), ('late', '#f4a6a0')):
         plot.add_layout(BoxAnnotation(
             left=0, right=0, fill_color=colour, fill_alpha=0.35, line_color=None,
             level='underlay', visible=False, name=f'{name}_{kind}'))
     _wheel(plot)
-    _bars(plot, f'{name}_bars')
-    marks = ColumnDataSource({key: [] for key in ('x', 'y', 'a', 'b', 'd', 'e', 'f')},
-                             name=f'{name}_marks')
-    marked = plot.scatter('x', 'y', source=marks, marker='inverted_triangle', size=9,
+    bars = plot.hbar(y=name, left='left', right='right', height=0.8, source=executions,
+                     fill_color='colour', line_color='edge', line_width=0.5)
+    plot.add_tools(HoverTool(renderers=[bars], tooltips=_TOOLTIP, point_policy='follow_mouse'))
+    marked = plot.scatter('x', name, source=marks, marker='inverted_triangle', size=9,
                           fill_color=_RED, line_color='#ffffff')
     plot.add_tools(HoverTool(renderers=[marked], tooltips=_TOOLTIP))
     _lines(plot, lines)
@@ -150,14 +157,6 @@ def _wheel(plot: Any) -> None:
     tool = WheelZoomTool(dimensions='width', modifiers='ctrl')
     plot.add_tools(tool)
     plot.toolbar.active_scroll = tool
-
-
-def _bars(plot: Any, name: str) -> None:
-    source = ColumnDataSource({key: [] for key in _BAR_COLUMNS}, name=name)
-    bars = plot.quad(
-        left='left', right='right', bottom='bottom', top='top', source=source,
-        fill_color='colour', line_color='edge', line_width=0.5)
-    plot.add_tools(HoverTool(renderers=[bars], tooltips=_TOOLTIP, point_policy='follow_mouse'))
 
 
 def _lines(plot: Any, lines: list[Line]) -> None:

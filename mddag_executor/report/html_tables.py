@@ -8,7 +8,7 @@ from collections.abc import Container, Iterable, Sequence
 from html import escape
 
 from mddag_executor.replay.chains import Breakdown
-from mddag_executor.report.html_data import Prepared, ReportData
+from mddag_executor.report.html_data import KINDS, Prepared, ReportData
 from mddag_executor.report.replays import (
     CALLBACKS_HEADER,
     callbacks_rows,
@@ -19,11 +19,7 @@ from mddag_executor.report.replays import (
 )
 from mddag_executor.report.tables import short_names, sink_rows
 from mddag_executor.report.text import format_ns, printable
-from mddag_executor.report.timeline import ABORTED, DONE, EXPIRED, FAILED, OVERDUE
 
-_KINDS = {
-    DONE: 'late', OVERDUE: 'not completed at the end', EXPIRED: 'expired', ABORTED: 'aborted',
-    FAILED: 'failed'}
 _COLOURS = {
     'release_lag_ns': '#c7c7c7', 'waiting_ns': '#fd8d3c', 'executing_ns': '#3182bd',
     'suspended_ns': '#9e9ac8', 'transport_ns': '#74c476', 'unknown_ns': '#636363'}
@@ -80,20 +76,20 @@ def misses_html(data: ReportData, prepared: Prepared) -> str:
         return '<p class="note">No deadline was missed.</p>\n'
     short = short_names(vertex.name for vertex in data.task_set.vertices)
     rows = []
-    for miss in prepared.misses:
-        vertex = data.task_set.vertices[data.tables.sinks[miss.sink]]
+    for miss in (prepared.misses[i] for i in prepared.worst):
+        vertex = data.task_set.vertices[miss.sink]
         dag = data.task_set.dags[vertex.dag]
-        release = miss.deadline - data.tables.sink_deadline[data.tables.sinks[miss.sink]]
+        release = miss.deadline - data.tables.sink_deadline[miss.sink]
         late = None if miss.completed is None else format_ns(miss.completed - miss.deadline)
         response = None if miss.completed is None else format_ns(miss.completed - release)
-        rows.append((dag.name, short[vertex.name], _KINDS[miss.kind], miss.job,
+        rows.append((dag.name, short[vertex.name], KINDS[miss.kind], miss.job,
                      f'{release / 1e9:.6f} s', response, late))
     header = ('DAG', 'sink', 'what', 'job', 'released at', 'response', 'late by')
-    shown = len(prepared.misses)
+    shown = len(prepared.worst)
     what = f'The {shown} worst of {data.timeline.n_missed}' if shown < data.timeline.n_missed \
         else 'All'
     what += ' in the order of time'
-    attributes = (f'data-miss="{i}"' for i in range(shown))
+    attributes = (f'data-miss="{i}"' for i in prepared.worst)
     return (f'<h2>Missed deadlines</h2>\n<p class="note">{what}; click on one to see it in the '
             f'timeline.</p>\n<div class="scroll">'
             f'{html_table(header, rows, 3, attributes=attributes)}</div>\n')

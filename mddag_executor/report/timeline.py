@@ -42,8 +42,8 @@ from mddag_executor.replay.usage import PoolUse
 import numpy as np
 import numpy.typing as npt
 
-MOST_EXECUTIONS = 1_000_000
-BLOCK = 8192
+MOST_EXECUTIONS = 30_000
+BLOCK = 512
 MOST_UNDECLARED = 200
 OTHERS = 'other undeclared callbacks'
 

@@ -111,9 +111,9 @@ def test_the_report_opens_and_shows_it(browser: Any, folder: Path) -> None:
     assert 'imported 12 threads ran callbacks' in ' '.join(text.split())
     assert re.search(r'target\s+47 of 56\s+all\s+46', text)
     assert re.search(r'/filter_node:callback_0\s+49\s', text)
-    names = pages.bars(browser, 1, 'a')
+    names = pages.bars(browser, 'a')
     assert len(names) == 480 and names.count(FILTER) == 49
-    starts = [left for left, name in zip(pages.bars(browser, 1, 'left'), names) if name == FILTER]
+    starts = [left for left, name in zip(pages.bars(browser, 'left'), names) if name == FILTER]
     expected = [start for start, _ in filter_times()]
     for left, start in zip(sorted(starts), expected):   # the page counts in 100 ns
         assert abs((left - min(starts)) * 1e9 - (start - expected[0])) <= 101

