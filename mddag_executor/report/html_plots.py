@@ -61,9 +61,11 @@ def figures(data: ReportData, prepared: Prepared) -> Figures:
     executions = ColumnDataSource({**prepared.executions, 'edge': [
         edges[colour] for colour in prepared.executions['colour']]}, name='executions')
     marks = ColumnDataSource(prepared.marks, name='marks')
-    shown = [_timeline(name, lines, time, prepared.gaps, executions, marks)
-             for name, lines in (('workers', workers), ('callbacks', prepared.lines))]
-    return Figures(_overview(data, prepared, time), *shown, _histograms(data))
+    return Figures(
+        _overview(data, prepared, time),
+        _timeline('workers', workers, time, prepared.gaps, executions, marks),
+        _timeline('callbacks', prepared.lines, time, prepared.gaps, executions, marks),
+        _histograms(data))
 
 
 def _style(plot: Any, grid: bool = True) -> None:
