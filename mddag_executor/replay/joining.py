@@ -19,7 +19,7 @@ The joined trace has the events of all in the order of time, and is replayed lik
    than a timer is due.  What fits nothing is a job of its own.  A stamp is a time of the source's
    clock, wherever it is recorded.
 4. Of a DAG that several run, those vertices are expected that are in any of the processes.  Jobs
-   are judged from the time on from which all processes have judged.
+   are judged from the time on from which all processes have judged that were there at first.
 5. A process whose end is not recorded was killed.  Its open jobs are said, and the run goes on.
 6. *One run.*  Traces are of one run if their times, from the first event to the last, overlap, or
    others' bridge them; but a vertex runs in one process at a time.  All else is refused.
@@ -33,7 +33,7 @@ import heapq
 import os
 from typing import Any
 
-from mddag_executor.core import legs_of
+from mddag_executor.core import legs_of, NEVER
 from mddag_executor.errors import UsageError
 from mddag_executor.replay import clocks
 from mddag_executor.replay.recording import (
@@ -251,8 +251,7 @@ class Joined:
         """
         head = self.head
         begin = min(part.first for part in self._parts)
-        judges_from = max(part.judges_from + part.shift * (part.judges_from > 0)
-                          for part in self._parts)
+        judges_from = max(self._judging(), default=0)
         end = judged = 0
         with TraceFile(path) as file:
             file.add(TASK_SET, begin, 0, 0, head.yaml, head.file, head.policy, self._workers,
@@ -296,6 +295,14 @@ class Joined:
                 'from one to the other', 'give the traces of one run: ' + ', or '.join(
                     ' '.join(part.name for part in run) for run in runs)
                 + several * ' (or --offset, if clocks of machines differed)')
+
+    def _judging(self) -> Iterator[int]:
+        """Yield from when on processes judge; not of one started again, or that never did."""
+        labels = {part.label for part in self._parts}
+        for part in self._parts:
+            if 0 < part.judges_from < NEVER and part.label.partition('.')[0] not in labels - {
+                    part.label}:
+                yield part.judges_from + part.shift
 
     def placed(self) -> list[Process]:
         """Return which nodes ran in which process, once the joined trace is written."""

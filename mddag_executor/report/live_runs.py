@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from mddag_executor.core.tally import total
+from mddag_executor.core.tally import counts, total
 from mddag_executor.report.tables import drift_lines, never_due_lines, percent, verdicts_line
 from mddag_executor.report.text import listed, printable
 from mddag_executor.text import counted
@@ -28,27 +28,29 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
                + ', '.join(f'{n} {cause}' for cause, n in sorted(
                    others.items(), key=lambda item: -item[1])))
     yield from never_due_lines(result['dags'])
+    if 'processes' in result:
+        yield from _absent(result['dags'])
     measured = result['measured']
     if measured is not None:
         yield from measured_lines(measured)
     dropped = result['dropped']
     yield f'{sum(dropped.values())} dropped' + _details(dropped)
-    raised = {name: counts['failed'] for name, counts in result['callbacks'].items()
-              if counts['failed']}
+    raised = {name: each['failed'] for name, each in result['callbacks'].items()
+              if each['failed']}
     if raised:
         yield f'{counted(sum(raised.values()), "run")} of callbacks that raised' + _details(raised)
-    skipped = {name: counts['skipped'] for name, counts in result['callbacks'].items()
-               if counts['skipped']}
+    skipped = {name: each['skipped'] for name, each in result['callbacks'].items()
+               if each['skipped']}
     if skipped:
         yield f'{counted(sum(skipped.values()), "timer release")} skipped' + _details(skipped)
     undeclared = {
-        name: counts['unattributed' if counts['declared'] else 'ran']
-        for name, counts in result['callbacks'].items()}
+        name: each['unattributed' if each['declared'] else 'ran']
+        for name, each in result['callbacks'].items()}
     yield (f'{counted(result["undeclared"], "run")} of undeclared callbacks'
            + _details({name: count for name, count in undeclared.items() if count}))
     never = [*result['never_ran'], *(
-        name for name, counts in result['callbacks'].items()
-        if counts['declared'] and not counts['ran'])]
+        name for name, each in result['callbacks'].items()
+        if each['declared'] and not each['ran'])]
     drift = result.get('drift', ())
     yield from drift_lines(drift)
     if never and not any(each['kind'] == 'never ran' for each in drift):
@@ -58,6 +60,17 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
             lost = trace['lost']
             yield (f'trace: {printable(str(Path(trace["path"]).absolute()))}'
                    + (f' ({counted(lost, "event")} lost: the disk was too slow)' if lost else ''))
+
+
+def _absent(dags: dict[str, Any]) -> Iterator[str]:
+    """Yield a line for each sink to which more than one job has not come from its process."""
+    for name, dag in dags.items():
+        for sink, verdicts in dag['sinks'].items():
+            absent = dag['jobs'] - counts(verdicts).due
+            if absent > 1:
+                yield printable(
+                    f'{absent} of {counted(dag["jobs"], "job")} of {name} did not come to {sink}: '
+                    'skipped, lost, or still under way; a replay of the traces tells')
 
 
 def ended_line(process: dict[str, Any]) -> str:

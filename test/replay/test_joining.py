@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from mddag_executor.core import NEVER
 from mddag_executor.core.tally import counts
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.clocks import offsets
@@ -231,6 +232,20 @@ def test_jobs_are_judged_once_all_judge(tmp_path: Path) -> None:
         up.runs(i * 10 * MS, i * 10 * MS + MS)
         down.runs(i * 10 * MS, i * 10 * MS + 3 * MS)
     assert counts(sink(replay([up.end(90 * MS), down.end(90 * MS)]).result())).due == 2
+
+
+def test_who_is_started_again_or_never_judged_keeps_no_job_from_being_judged(
+        tmp_path: Path) -> None:
+    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
+    again = Trace(tmp_path, 'down.2', 1, begin=30 * MS, judges_from=45 * MS)
+    killed = Trace(tmp_path, 'other', 1, judges_from=NEVER - BASE)
+    for i in range(6):
+        up.runs(i * 10 * MS, i * 10 * MS + MS)
+        if i not in (2, 3):
+            (down if i < 2 else again).runs(i * 10 * MS, i * 10 * MS + 3 * MS)
+    result = replay([up.end(90 * MS), down.end(None), again.end(90 * MS), killed.end(None)])
+    verdicts = counts(sink(result.result()))
+    assert (verdicts.due, verdicts.in_time, verdicts.late) == (6, 4, 2)
 
 
 def test_a_joined_run_is_rescheduled(tmp_path: Path) -> None:

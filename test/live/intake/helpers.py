@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 import itertools
+import os
 import threading
 import time
 from typing import Any
@@ -108,6 +109,7 @@ class PollingIntake:
         self._context = context
         self._thread: threading.Thread | None = None
         self._stopping = False
+        self._error: Exception | None = None
         self.update = self._intake.update
         self.wake = self._intake.wake
 
@@ -117,8 +119,11 @@ class PollingIntake:
         self._thread.start()
 
     def _run(self) -> None:
-        while not self._stopping and self._context.ok():
-            self._intake.poll(None)
+        try:
+            while not self._stopping and self._context.ok():
+                self._intake.poll(None)
+        except Exception as error:  # else the test would only wait in vain
+            self._error = error
 
     def stop(self) -> None:
         self._stopping = True
@@ -127,6 +132,7 @@ class PollingIntake:
             self._thread.join(5.0)
             assert not self._thread.is_alive()
             self._thread = None
+        assert self._error is None, self._error
 
 
 def make_intake(kind: str, context: Context, receiver: Recorder) -> Any:
@@ -145,7 +151,7 @@ def make_node(context: Context, **options: Any) -> Node:
 
 def topic() -> str:
     """Return a name that no other test has used."""
-    return f'/name_{next(_numbers)}'
+    return f'/name_{os.getpid()}_{next(_numbers)}'
 
 
 def text(data: str) -> std_msgs.msg.String:

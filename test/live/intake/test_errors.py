@@ -84,8 +84,9 @@ def test_a_receiver_that_raises_is_an_error_and_no_end(
         publisher.publish(text(''))
         client.call_async(SetBool.Request())
         guard.trigger()
-        assert wait_for(lambda k=k: (
-            len(recorder.messages), len(recorder.requests), len(recorder.guards)) == (k, k, k))
+        kinds = recorder.messages, recorder.requests, recorder.guards
+        wait_for(lambda k=k, kinds=kinds: all(len(each) == k for each in kinds))
+        assert [len(each) for each in kinds] == [k] * 3
     assert wait_for(lambda: len(recorder.errors) == 9)
     assert {str(error) for error in recorder.errors} == {'on purpose'}
 
