@@ -16,7 +16,7 @@ def peak_memory_mb() -> float:
     """
     Return the most memory that this process has had in RAM so far, MB.
 
-    From the kernel's ``VmHWM`` where there is one: what ``getrusage`` tells includes what the
+    From the kernel's ``VmHWM`` where there is one: what ``getrusage`` returns includes what the
     process that started this one had by then.
     """
     try:

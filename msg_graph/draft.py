@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Drafts of declarations: a system as far as a file, a trace or the system itself tells of it.
+Drafts of declarations: a system as far as a file, a trace or the system itself shows it.
 
 Drafts come from CARET architecture files (``caret``), from traces and from running systems;
 ``draft_text`` writes them as declarations to fill in. Names in a draft are valid: whoever makes

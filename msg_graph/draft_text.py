@@ -107,7 +107,7 @@ class _Writer:
     def lines(self) -> Iterator[str]:
         yield f'# From {printable(self._draft.origin)}.'
         yield f"# Lines with '{MARK}' are blanks: correct the value, then take the '# ' away."
-        yield "# 'mddag graph check' tells what is still open."
+        yield "# 'mddag graph check' lists what is still open."
         yield 'mddag: 1'
         if self._draft.workers is not None:
             yield f'workers: {self._draft.workers}'

@@ -6,8 +6,8 @@ Entries of a declaration, and the kinds of values that stand in them.
 Theory of operation
 -------------------
 An *entry* is a mapping of the declaration. A table says which keys it may have, and of what *kind*
-the value of each is. A kind reads a value, with errors that name file, line and entry, and tells
-what it looks like in the JSON Schema; so what a file may hold stands in one place, the tables of
+the value of each is. A kind reads a value, with errors that name file, line and entry, and has its
+part of the JSON Schema; so what a file may hold stands in one place, the tables of
 ``language``.
 """
 
@@ -53,7 +53,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class Key:
-    """A key that an entry may have: the kind of its value, and what editors tell of it."""
+    """A key that an entry may have: the kind of its value, and what editors show of it."""
 
     kind: Kind
     about: str

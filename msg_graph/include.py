@@ -8,8 +8,8 @@ Theory of operation
 1. ``include:`` lists files. Their nodes and paths come before those of the file itself, in that
    order, each time that the file is listed. ``workers:`` and ``processes:`` of an included file do
    not count: they are about the whole system.
-2. ``arguments:`` names what a file can be told, with default values (none: it must be told).
-   ``set:`` of an include tells it, and ``$(name)`` in any value of the file stands for it.
+2. ``arguments:`` names the arguments of a file, with default values (none: it must be given).
+   ``set:`` of an include gives it, and ``$(name)`` in any value of the file stands for it.
 3. Names in an included file (nodes, topics, services, DAGs and, with dots, paths) are put below
    the ``namespace:`` of the include. A name that ``remap:`` lists, as it stands in the included
    file, becomes the other name instead, which the including file knows.
@@ -179,7 +179,7 @@ def _argument_values(entry: Entry, tree: Mapping, given: dict[str, str]) -> dict
     """
     Return the values of a file's arguments.
 
-    :param given: those that an include tells; the others have their defaults.
+    :param given: those that an include sets; the others have their defaults.
     """
     declared = tree.entries.get('arguments', Mapping(tree.line))
     if not isinstance(declared, Mapping):
@@ -197,7 +197,7 @@ def _argument_values(entry: Entry, tree: Mapping, given: dict[str, str]) -> dict
                              'write a text, a number or a time')
         if value.is_null and name not in given:
             raise GraphError(entry.file, line, f'the argument {shown(name)} has no value',
-                             "tell it with 'set:' of the include, or give it a default here")
+                             "set it with 'set:' of the include, or give it a default here")
         values[name] = given.get(name, value.text)
     for name in given:
         if name not in values:

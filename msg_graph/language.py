@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 The tables here are what the parser goes by, and what the JSON Schema is made from. The schema is
 that of draft 7, which the language servers for YAML know best. It says what one entry may look
-like; what takes more than one entry to judge (publishers, cycles, sinks) only ``load`` can tell.
+like; what takes more than one entry to judge (publishers, cycles, sinks) only ``load`` can say.
 """
 
 from __future__ import annotations

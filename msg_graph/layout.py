@@ -83,7 +83,7 @@ _Comment = tuple[int, int, str]
 
 class _Writer:
     """
-    Writes what the parser tells anew.
+    Writes the parser's events as text again.
 
     ``_open`` has of each list and mapping in which the next entry may stand its column in the old
     and in the new text, ``_above`` the same for the last line that was written.
@@ -223,6 +223,6 @@ class _Writer:
 
 
 def without_lines(task_set: TaskSet) -> TaskSet:
-    """Return the task set with everything left out that tells where in the text it stood."""
+    """Return the task set without the places in the text."""
     nowhere = {callback.key: {'line': 0} for callback in task_set.callbacks}
     return replace(task_set.with_callbacks(nowhere), text='')

@@ -88,7 +88,7 @@ def analyse(
     Analyse a task set.
 
     :param budget: what of each execution time counts: ``max``, ``p99`` or ``mean``.
-    :param progress: told how many tests are done.
+    :param progress: gets how many tests are done.
     """
     if workers < 1:
         raise AnalysisError(f'workers: {workers} is too few: give at least 1')

@@ -11,7 +11,7 @@ One process computes Python on one core, so what a process can take is bounded b
    time over period, of all vertices that do not say ``holds_interpreter: false``.
 2. A message that leaves its process costs ``TRANSPORT_NS`` more at either end.
 3. Nodes that stay together are one *block*; those that publish one topic do, since else nobody
-   could tell which of them a message is of.  Blocks are placed, the largest first, where the
+   could find which of them a message is of.  Blocks are placed, the largest first, where the
    largest load of a process is least; then single blocks are moved, and pairs exchanged, as long
    as that lowers the largest load, or the sum of all loads at an equal largest one.
 """

@@ -118,7 +118,7 @@ class Search:
     :param experiment: with one policy; its task set's deadlines are ignored.
     :param budget: ``mean``, ``p99`` or ``max``: of what a critical path consists.
     :param runs: with each scale.
-    :param progress: told the scale, and how many of its runs are done.
+    :param progress: gets the scale, and how many of its runs are done.
     :raises AssignError: the target cannot be shown with so many runs.
     """
 

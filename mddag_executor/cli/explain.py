@@ -102,4 +102,4 @@ def _show_jobs(jobs: list[dict[str, Any]]) -> None:
     if not jobs:
         print('no such job missed its deadline')
     elif len(jobs) > MOST_SHOWN:
-        print(f'{len(jobs) - MOST_SHOWN} more: --job or --json tells of them')
+        print(f'{len(jobs) - MOST_SHOWN} more: see --job or --json')

@@ -47,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
     name, text = common.read_text(args.architecture)
 
     def measure(draft: Draft) -> None:
-        """Fill in what the recording shows, and tell of how much of the system."""
+        """Fill in what the recording shows; warn where callbacks did not run."""
         if args.trace is None:
             return
         system = recorded_system(args.trace)

@@ -57,7 +57,7 @@ VERBS = {
     'run': Verb('run', 'run rclpy nodes, or nodes made from the declaration, and record them'),
     'rerun': Verb('rerun', 'run real nodes again from a recording, in virtual time'),
     'replay': Verb('replay', 'check a recorded run against its deadlines, or reschedule it'),
-    'explain': Verb('explain', 'tell why each deadline of a recorded run was missed'),
+    'explain': Verb('explain', 'say why each deadline of a recorded run was missed'),
     'slack': Verb('slack', 'find how much longer callbacks may take before a deadline is missed'),
     'simulate': Verb('simulate', 'run a declaration in virtual time'),
     'evaluate': Verb('evaluate', 'measure acceptance ratios over many simulated runs'),
@@ -181,7 +181,7 @@ def _user_lines(error: BaseException, line: str) -> list[str]:
 
 
 def user_line(error: BaseException) -> str | None:
-    """Return the line that tells the user about an error, or None when it is a defect."""
+    """Return the line that reports an error to the user, or None when it is a defect."""
     if isinstance(error, known_errors()):
         return one_line(str(error))
     if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:

@@ -133,7 +133,7 @@ def rescheduled(
 def _processes(
     args: argparse.Namespace
 ) -> Callable[[TaskSet, list[list[int]]], Sequence[Process]] | None:
-    """Return what tells which node runs in which process, as `--processes` says."""
+    """Return a function that says which node runs in which process, as `--processes` says."""
     from msg_graph.processes import load_processes
     given = args.processes
     if given is None:

@@ -364,7 +364,7 @@ def _run_programs(
                 session.wait(seconds, progress.update)
                 host.close()
         except MddagError:
-            # What a callback raised tells more than that its program failed to start.
+            # What a callback raised says more than that its program failed to start.
             if session.error is None:
                 raise
         left = host.end()

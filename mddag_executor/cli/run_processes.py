@@ -121,7 +121,7 @@ def _warn_of_contested(task_set: TaskSet) -> None:
     dags = divided(task_set)
     topics = {t for v in task_set.vertices if v.dag in dags for t in v.callback.publishes}
     for topic in sorted(contested(task_set) & topics):
-        warn(f'{topic}: nodes of several processes publish it, so nobody can tell which job a '
+        warn(f'{topic}: nodes of several processes publish it, so nobody knows which job a '
              'message belongs to: put them into one process')
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The verb `top`: what executors tell on `/diagnostics`, live in a terminal.
+The verb `top`: what executors report on `/diagnostics`, live in a terminal.
 
 It only listens, so it watches processes on any machine that ROS reaches, and costs them nothing.
 Statuses of others on the topic are left out. On a terminal the picture is renewed in place (with
@@ -84,7 +84,7 @@ def _wait(spin: Callable[[float], None], board: Board, seconds: float) -> None:
     end = time.monotonic() + seconds
     while not board.statuses() and time.monotonic() < end:
         spin(0.1)
-    # what other processes tell within the same second belongs to the picture
+    # what other processes publish within the same second is shown, too
     end = min(end, time.monotonic() + INTERVAL_S)
     while time.monotonic() < end:
         spin(0.1)

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What `replay` shares with whoever judges a run: tolerances, JUnit XML and the exit status."""
+"""What verbs share that judge a run: tolerances, JUnit XML and the exit status."""
 
 from __future__ import annotations
 

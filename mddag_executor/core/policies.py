@@ -90,8 +90,8 @@ class Policy(NamedTuple):
     """
     A row of the policy table.
 
-    ``preemptive`` tells how the paper's experiment runs the policy; an executor of callbacks
-    cannot preempt and ignores it.  ``polling`` tells that it works in rounds (rule 9 of
+    ``preemptive`` says how the paper's experiment runs the policy; an executor of callbacks
+    cannot preempt and ignores it.  ``polling`` says that it works in rounds (rule 9 of
     ``rules``).
     """
 

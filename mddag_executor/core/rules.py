@@ -5,7 +5,7 @@ The scheduling rules, all of them and only here (what concerns whole jobs is in 
 
 Theory of operation
 -------------------
-A driver (live executor, replayer, simulator) tells what happened and when; the rules change the
+A driver (live executor, replayer, simulator) reports what happened and when; the rules change the
 state and answer with decisions.  There is no clock, thread, ROS or file in here.  Every function
 takes the tables ``t`` and the state ``s``, and uses nothing but integer arithmetic, list indexing
 and ``heapq``, so that the same source runs on plain lists and can be compiled on arrays.

@@ -28,7 +28,7 @@ class Scheduler:
     """
     The scheduling rules bound to one run.
 
-    A driver tells what happens in order of time; it is not thread-safe.  Executions ``x``,
+    A driver reports what happens in order of time; it is not thread-safe.  Executions ``x``,
     slots, DAGs and vertices are the integers of ``core.state`` and ``core.tables``.
 
     :param tables: the task set's tables.

@@ -137,7 +137,7 @@ def new_state(
     :param preemptive: a smaller key takes the worker of a larger one.
     :param propagate: 1: completions make the graph's edges true at once (simulation); 0: messages
         do, leg by leg, and the driver makes each leg ready (live); 2: messages do, and the driver
-        tells of each with ``rules.edge`` (rescheduling, where they take their time).
+        reports each with ``rules.edge`` (rescheduling, where they take their time).
     :param dispatch_overhead: added to an execution each time it is dispatched, ns.
     :param switch_overhead: added to an execution each time it is preempted, ns.
     :param polling: what becomes ready waits for a poll (see ``queues``); never with preemption.

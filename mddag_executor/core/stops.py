@@ -33,7 +33,7 @@ class Stops:
         """
         Take in a stop; each begins after the one before has ended.
 
-        Return what `missed` was told of the misses that turn out to fall into it.
+        Return what `missed` got of the misses that turn out to fall into it.
         """
         self._count += 1
         self._total_ns += end - begin

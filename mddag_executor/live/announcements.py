@@ -1,18 +1,18 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What the executors of one machine tell each other of their publications.
+What the executors of one machine announce to each other of their publications.
 
 Theory of operation
 -------------------
 A message says when it was published and the how-manieth of its publisher it is, and nothing else
 of its job.  Within a process the window of time of each publication is noted (``jobs``).  So the
-process that publishes for another one tells it just that, right behind the message: topic, window,
-sequence number, and the job, on a topic of its own.  Both have the same system clock.
+process that publishes for another one announces just that, right behind the message: topic,
+window, sequence number, and the job, on a topic of its own.  Both have the same system clock.
 
 1.  *Announced* is each publication on a topic by which a DAG leaves the process, for the DAGs that
-    ``processes:`` divides and whose jobs no header stamp tells (``other_processes``); also one of
-    no job, so that nobody waits for it.
+    ``processes:`` divides and whose jobs no header stamp identifies (``other_processes``); also
+    one of no job, so that nobody waits for it.
 2.  A job is called by the executor that released it first and its number there, wherever it goes,
     and has one release, by the steady clock that all processes of a machine share.
     Those of a topic that overlap in time are announced together, when the last of them has

@@ -129,7 +129,7 @@ class Join:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def completes(self, release: int, sender: str) -> bool:
-        """Note a message; tell whether it was the last one of its job."""
+        """Note a message; return whether it was the last one of its job."""
         with self.lock:
             seen = self.waiting.setdefault(release, set())
             seen.add(sender)
@@ -145,7 +145,7 @@ class Join:
 def plain_callback(
     roles: list[Role], ledger: Ledger, current_job: CurrentJob
 ) -> Callable[[Header], None]:
-    """Make the callback of a subscription: the sender of a message tells which vertex runs."""
+    """Make the callback of a subscription: the sender of a message says which vertex runs."""
     by_sender = {sender: role for role in roles for sender in role.senders}
 
     def on_message(message: Header) -> None:

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What an executor tells on ``/diagnostics``, the topic that ROS's own tools look at.
+What an executor reports on ``/diagnostics``, the topic that ROS's own tools look at.
 
 Theory of operation
 -------------------
@@ -259,7 +259,7 @@ class Diagnostics:
         self._dags = []
         for dag in task_set.dags if task_set is not None else ():
             sinks = tables.sinks[tables.first_sink[dag.index]:tables.first_sink[dag.index + 1]]
-            # one that several processes share is told of where its source and its sinks are
+            # one that several processes share is reported where its source and its sinks are
             told_by = dag.vertices if process is None else [
                 dag.vertices[i] for i in (dag.source, *dag.sinks)]
             self._dags.append((

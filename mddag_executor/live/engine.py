@@ -5,8 +5,8 @@ The engine of a live run: the core, and the work that waits in it.
 
 Theory of operation
 -------------------
-The engine is told what happens, with the time of it, and says what to run.  It has no thread,
-lock or clock and knows nothing of rclpy; ``pool`` has all of these, and tells the engine under its
+The engine gets what happens, with the time of it, and says what to run.  It has no thread,
+lock or clock and knows nothing of rclpy; ``pool`` has all of these, and calls the engine under its
 lock, so that times never decrease.  Nobody but the engine and its parts (``jobs``,
 ``other_processes``) changes the core's state.
 
@@ -21,7 +21,7 @@ lock, so that times never decrease.  Nobody but the engine and its parts (``jobs
 3.  *What to run* (``dispatch``) and *what became of it* (``finished``,
     ``suspended``, ``refused``, …) is the core's decision, see ``core.rules``.
 4.  *What the core decides beside* (verdicts, ends of jobs, what an abort drops) is counted,
-    recorded and told to the user (``verdicts``).
+    recorded and reported to the user (``verdicts``).
 5.  *What no DAG declares and ends at once runs past the core* (``begins_alone``) where an idle
     worker would take it anyway.  Only if something is to be dispatched meanwhile the core is told
     of it (``tell_of_alone``).
@@ -372,7 +372,7 @@ class Engine:
         """
         Dispatch the next execution on a worker that runs nothing; None: nothing may run.
 
-        ``has_more`` tells then whether anything is left that a worker may be able to run.
+        ``has_more`` says then whether anything is left that a worker may be able to run.
 
         :param worker: -1: the idle one with the lowest number, if there is any.
         """
@@ -528,7 +528,7 @@ class Engine:
             leg = x - state.job_base[slot] - tables.region_offset[vertex]
             held = state.x_holds[x]
             whole = end_it(x, end)
-            if failed:  # told first, or its completion would count
+            if failed:  # this first, or its completion would count
                 self.record('fail', now, vtid, dag, tables.index_in_dag[vertex], job)
             self.record(
                 EXECUTION, start, vtid, entity.address, dag, tables.index_in_dag[vertex],

@@ -43,7 +43,7 @@ Emulate = Callable[[int], None]
 """
 Executes for that many nanoseconds in the calling thread.
 
-A sleeper's attribute ``busy_below_ns`` tells up to which execution time it takes CPU for it.
+A sleeper's attribute ``busy_below_ns`` says up to which execution time it takes CPU for it.
 """
 
 

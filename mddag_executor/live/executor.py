@@ -303,7 +303,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._ring()
 
     def _ring(self) -> None:
-        """End the wait of whoever spins."""
+        """End the wait of the thread that spins."""
         self._attention.ring()
         self.ring()
 
@@ -602,7 +602,7 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def set_judging(self, judging: bool, since: int | None = None) -> None:
         """
-        Give verdicts about jobs that are released from now on, or about none until told so.
+        Give verdicts about jobs that are released from now on, or about none until called again.
 
         :param since: a time to judge from (monotonic ns), if that is not now.
         """

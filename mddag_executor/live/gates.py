@@ -44,7 +44,7 @@ class Gate:
     """
     An entity's callback group that decides itself.
 
-    :param passed: told of an execution that may run, before it does.
+    :param passed: called with an execution that may run, before it does.
     """
 
     def __init__(self, group: Any, entity: Any, passed: Callable[[Work], None]) -> None:

@@ -5,7 +5,7 @@ A draft of the system that runs now, from the ROS graph and from the rates of it
 
 Theory of operation
 -------------------
-The ROS graph tells which node publishes, subscribes and serves what. It does not tell of timers,
+The ROS graph shows which node publishes, subscribes and serves what. It does not show timers,
 of callback groups, nor which callback publishes a topic. So:
 
 1. A node that subscribes a topic has a callback for it, and so for a service. Each of a node's
@@ -69,7 +69,7 @@ class Seen(Releases):
     _number: int | None = None
 
     def message(self, stamp: int, number: int | None = None) -> None:
-        """Count a message; its number is its publisher's, and several publishers tell nothing."""
+        """Count a message; its number is its publisher's, and useless with several publishers."""
         self.add(stamp)
         if number is not None and self._number is not None and number > self._number:
             self.lost += number - self._number - 1
@@ -110,7 +110,7 @@ def probe(seconds: float, tick: Callable[[float], None] | None = None) -> Probe:
     Look at the ROS graph of this domain.
 
     :param seconds: how long; most of it goes to measuring rates.
-    :param tick: told now and then for how many seconds it has been looking.
+    :param tick: gets now and then for how many seconds it has been looking.
     """
     context = Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
@@ -187,7 +187,7 @@ def _nodes(node: Node, found: Probe) -> None:
 
 
 def _listen(node: Node, found: Probe) -> list[tuple[Any, Seen]]:
-    """Subscribe every new topic whose rate tells something, as best effort."""
+    """Subscribe every new topic whose rate is needed, as best effort."""
     qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT,
                      durability=DurabilityPolicy.VOLATILE)
     types = {topic: kind for endpoints in found.nodes.values()

@@ -12,8 +12,8 @@ more.  Who owns a group is known to the process (``_owners``), not to the node: 
 one executor.  What an executor sees of a node that is shared is a ``NodeShare``, the node with
 only those entities that the executor is to run.
 
-A node tells its one executor when entities come and go.  So that the owners of its groups hear of
-it too, they are told beside it, from when somebody first adds a group.
+A node notifies its one executor when entities come and go.  So that the owners of its groups hear
+of it too, they are notified beside it, from when somebody first adds a group.
 
 The middleware calls one listener for each entity, so an entity changes hands in this order: the
 executor that had it lets go (its intake has taken back its listener), then the other one takes

@@ -29,14 +29,14 @@ Nothing may get lost or wait by that:
     gone within that time a second later; sooner where one of these nodes publishes on its topic.
     (More often would cost too much: a look at a hundred subscriptions takes half a millisecond.)
 
-Why not the middleware's event "matched"?  rclpy's native executor crashes when it is told of an
-event whose waitable is just being removed (it lets go of Python objects without the interpreter
+Why not the middleware's event "matched"?  rclpy's native executor crashes when it is notified of
+an event whose waitable is just being removed (it lets go of Python objects without the interpreter
 lock), and publishers come and go just when nodes are destroyed.  In a wait set such an event wakes
 for every message.
 
 Subscriptions with durability other than volatile get messages from the past at some later time,
-so they are not direct; nor are those on which time depends: whoever tells the time is not to run
-what waits for it.
+so they are not direct; nor are those on which time depends: a callback that sets the time is not
+to run what waits for it.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Direct:
         try:
             return bool(self.subscription.get_publisher_count() != self.publishers)
         except InvalidHandle:
-            return False  # destroyed: its node tells the executor
+            return False  # destroyed: its node notifies the executor
 
     def take(self, begin: int, arrivals: list[Work]) -> bool:
         """
@@ -181,7 +181,7 @@ class InlineDelivery:
         """
         Choose the direct subscriptions; return what is left for the intake to look after.
 
-        Publishers begin to take at once.  The caller tells the intake, then calls ``settle``.
+        Publishers begin to take at once.  The caller notifies the intake, then calls ``settle``.
         """
         publishers: dict[str, list[Any]] = {}
         for node in entities.nodes:

@@ -59,7 +59,7 @@ NO_ORIGIN = Origin(-1, -1, -1, -1)
 
 class Announced(NamedTuple):
     """
-    What another process tells of the execution that published.
+    What another process announces of the execution that published.
 
     :ivar name: of its job: where that was released first, and its number there.
     :ivar dag: its index, -1 for none.
@@ -183,7 +183,7 @@ class Jobs:
         self._release_from = [d.release_from for d in task_set.dags] if task_set else []
         self.unknown = 0
         self.doubtful = 0
-        # tells other processes of publications that have returned
+        # announces publications to other processes that have returned
         self.announce: Announce | None = None
 
     def publish(
@@ -209,7 +209,7 @@ class Jobs:
             with topic.lock:
                 topic.to_announce.append(publication)
                 if topic.open:
-                    return  # their stamps may lie in this window, so they are told together
+                    return  # their stamps may lie in this window, so they are announced together
                 several, topic.to_announce = topic.to_announce, []
             self.announce(send, state.topic, several)
 

@@ -160,7 +160,7 @@ def _call(spec: str, function: Callable[..., Any]) -> Any:
     """Call with the command line arguments if the function requires one argument."""
     try:
         parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):  # a builtin that does not tell
+    except (TypeError, ValueError):  # a builtin without a signature
         parameters = []
     required = [
         p for p in parameters

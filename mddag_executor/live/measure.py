@@ -19,7 +19,7 @@ counted either way.
 
 CPU for each callback is all CPU that the process took during the window (executor, middleware,
 interpreter, publishing, emulation of short bodies), divided by the vertices that executed in it.
-In ``spin`` mode the CPU that the bodies were told to take is subtracted.  Legs of a sync callback
+In ``spin`` mode the CPU that the bodies were to take is subtracted.  Legs of a sync callback
 that do not complete the join are not counted as callbacks: their cost is overhead.
 """
 

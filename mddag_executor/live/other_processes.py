@@ -9,8 +9,8 @@ In a process of its own every executor sees only the publications of its own cal
 processes and machines the message itself must say which job it belongs to, and it does where the
 DAG's source declares ``release_from: header_stamp``: nodes pass the stamp of the sensor's message
 on from the source to the sinks, and that stamp is the release of the job.  Of other DAGs that the
-declared ``processes`` divide, the executors of one machine tell each other which publication is of
-which job (``announcements``).  These are the rules, for such DAGs only:
+declared ``processes`` divide, the executors of one machine announce to each other which
+publication is of which job (``announcements``).  These are the rules, for such DAGs only:
 
 1.  A vertex is *here* when an entity of this executor is bound to its callback now.  A job has in
     this process the vertices that are here when it is released here; its sinks elsewhere are

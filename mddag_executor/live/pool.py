@@ -5,7 +5,7 @@ The threads: a fixed pool of workers that run what the engine dispatches.
 
 Theory of operation
 -------------------
-Everything that happens is told to the engine under one lock, with the time of it.  Times never
+Everything that happens is given to the engine under one lock, with the time of it.  Times never
 decrease: where two threads read the clock in one order and get the lock in the other, the later
 gets the earlier one's time.  So the order of a trace's mddag events is that of the core.
 
@@ -454,7 +454,7 @@ class Pool:
 
     def look_around(self) -> float:
         """
-        Do what nobody else is told to do; the thread that spins calls this now and then.
+        Do what nobody else does; the thread that spins calls this now and then.
 
         Coroutines look again that wait for something unknown, callback groups are asked again
         that have refused something, idle workers are woken for what is still there because a

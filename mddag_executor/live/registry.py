@@ -44,7 +44,8 @@ class Registry:
     look entities up.
 
     :ivar by_id: what is kept for each entity of rclpy, by the ``id`` of that.
-    :param passed: told of each execution that a callback group has let through (see ``gates``).
+    :param passed: called with each execution that a callback group has let through (see
+        ``gates``).
     """
 
     def __init__(

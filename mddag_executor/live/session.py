@@ -149,7 +149,7 @@ class Session:
         """
         Shut the executor down, once.
 
-        ``clean`` tells whether all callbacks have ended; one that does not is left behind.
+        ``clean`` says whether all callbacks have ended; one that does not is left behind.
         """
         self.stop()
         if self._ended:

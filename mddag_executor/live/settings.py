@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What an executor is told when it is made: checked, and brought into one form."""
+"""The settings with which an executor is made: checked, and brought into one form."""
 
 from __future__ import annotations
 

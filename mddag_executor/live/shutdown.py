@@ -83,7 +83,7 @@ def stop_at_exit(thing: _Stopped) -> None:
 
 
 def join(thread: threading.Thread, seconds: float | None = None) -> None:
-    """Wait for the end of a thread that has been told to end; never for the calling one."""
+    """Wait for the end of a thread that has been asked to end; never for the calling one."""
     if thread is threading.current_thread():
         return
     try:
@@ -126,8 +126,8 @@ def call_at_shutdown(context: Context, method: Any) -> None:
     A context never forgets a callback of somebody who is alive, and executors can make an intake
     for each spin; so it gets only one for all.
 
-    :param method: must not wait for a lock: whoever ends the context may hold it.  Of an object
-        it can be only one.
+    :param method: must not wait for a lock: the thread that ends the context may hold it.  Of an
+        object it can be only one.
     """
     methods = _by_context.get(context)
     if methods is None:

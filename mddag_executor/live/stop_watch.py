@@ -7,16 +7,16 @@ Theory of operation
 -------------------
 The spinning thread mostly waits, and it does that in slices of ``SLICE_NS``.  If a slice ends
 late, either other threads of the process kept the interpreter's lock, or nothing of the process
-ran.  The CPU time of the process tells which: in a stop it does not grow.
+ran.  The CPU time of the process shows which: in a stop it does not grow.
 
 * A stop is as long as the lateness, less the CPU time that the process took since the slice
   before.  Its end is known, so its begin is taken that much before it.  CPU time before and after
   the stop counts, too, and that of threads beside each other, so it was longer, if anything.
 * What the spinning thread does between two waits belongs to the slice after it: it may be stopped
   there as well.
-* What is shorter than ``SHORT_NS`` is not told.  A stop may begin up to a slice before what is
+* What is shorter than ``SHORT_NS`` is not reported.  A stop may begin up to a slice before what is
   told of it, so what is told as too short for a stop is recorded, too, for `mddag explain`.
-* When it starts it tells a stop of no length: from then on stops are noticed.
+* When it starts it reports a stop of no length: from then on stops are noticed.
 
 Nothing is added to the way of a message or a timer.  If a callback waits while it keeps the
 interpreter's lock, no thread runs either: that looks the same.
@@ -35,7 +35,7 @@ SHORT_NS = 5_000_000
 
 class StopWatch:
     """
-    Waits for a bell, and tells of the stops meanwhile.
+    Waits for a bell, and reports stops meanwhile.
 
     :param stopped: gets begin and end of each stop, as ``clock`` has them.
     :param clock: ns.

@@ -6,7 +6,8 @@ Tasks of the executor: futures that know whether somebody takes care of their ex
 Theory of operation
 -------------------
 What a task raises comes out of spin, as with rclpy's executors, unless somebody else takes care of
-it: who awaits the task, or has asked to be told of its end, before it fails (it is *observed*).
+it: who awaits the task, or has asked for a callback at its end, before it fails (it is
+*observed*).
 
 With several workers a task that a callback creates may have failed before that callback gets to
 its ``await``, or to ``result()``.  So such an exception is put by for as long as that callback is
@@ -34,7 +35,7 @@ class ObservedTask(BareTask):
     A task that knows whether somebody waits for it, and so takes care of its exception.
 
     :ivar maker: the execution whose callback has created it, or None.
-    :ivar put_by: told its exception where nobody took care of that, once it was put by.
+    :ivar put_by: gets its exception where nobody took care of that, once it was put by.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -72,12 +73,12 @@ class Unclaimed:
     """
     The exceptions of tasks that nobody takes care of so far.
 
-    :param fail: told those that nobody will take care of.
+    :param fail: gets those that nobody will take care of.
     """
 
     def __init__(self, fail: Callable[[BaseException], None]) -> None:
         self._fail = fail
-        # weakly, so that a task can go that nobody holds on to: it tells its exception then
+        # weakly, so that a task can go that nobody holds on to: it reports its exception then
         self._tasks: deque[weakref.ref[ObservedTask]] = deque()
 
     def ended(self, task: ObservedTask) -> None:

@@ -4,8 +4,8 @@
 Keeping up with nodes: whose entities there are now, and who has to know.
 
 Nodes say that something has changed (``Executor.wake``), not what.  So registry, intakes and trace
-are brought up to date with all nodes at once, by whoever spins, and where entities are made in a
-row not anew for each of them.
+are brought up to date with all nodes at once, by the thread that spins, and where entities are
+made in a row not anew for each of them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What is done with the core's decisions: counted, told to the user, written to the trace."""
+"""What is done with the core's decisions: counted, reported to the user, written to the trace."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class DeadlineMiss:
     """
     A sink that missed its deadline; times in ns since the epoch.
 
-    ``completed_ns`` is None where it never completed: ``kind`` tells why (``late``, ``overdue``
+    ``completed_ns`` is None where it never completed: ``kind`` says why (``late``, ``overdue``
     at the run's end, ``expired``, ``aborted``, or ``failed``: a callback of the job raised).
     """
 

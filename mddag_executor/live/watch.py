@@ -3,7 +3,7 @@
 """
 What the drift rules need to know of a live run.
 
-``Watch`` is told each release. Everything else the executor keeps anyway: its statistics, and on
+``Watch`` gets each release. Everything else the executor keeps anyway: its statistics, and on
 which topics each callback has published. The rules are in ``msg_graph.drift``.
 """
 

@@ -48,7 +48,7 @@ class Work:
     :ivar rclpy_entity: the timer, subscription, service, guard condition or waitable.
     :ivar function: what is to be called for it, with ``args``.
     :ivar then: what is to be called with its result, or None: a service's response is sent so.
-    :ivar info: of a message: what the middleware tells of it, with its stamps.
+    :ivar info: of a message: what the middleware says of it, with its stamps.
     :ivar due: of a timer: its nominal due time, ns on the scale of ``time.monotonic_ns``, a point
         of the timer's exact phase grid; with simulated time active, when it was noticed. After
         an overrun it is when the first of the missed periods was due.

@@ -3,7 +3,7 @@
 """
 Replay of recorded runs: as recorded, and rescheduled through the core.
 
-``replay`` tells which deadlines a recorded run held and where its time went, ``reschedule`` what
+``replay`` says which deadlines a recorded run held and where its time went, ``reschedule`` what
 the scheduler core would have done with its releases and execution times.
 """
 

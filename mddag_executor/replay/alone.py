@@ -15,7 +15,7 @@ What the model does not explain stays in the time, so that a schedule like the r
 the recorded response times.
 
 That is right where as many run beside one another as in the recording.  Where fewer do, what the
-model leaves over has to be told apart:  a callback *computes* if its executions that wait least
+model leaves over has to be divided:  a callback *computes* if its executions that wait least
 wait for less than they compute; what such a callback waits for itself is told by its executions
 that hardly any other ran beside: the median; where there are too few, by those that waited least
 beyond what others explain.  What one waited for more than that, while others ran, is *theirs*.
@@ -37,7 +37,7 @@ LEAST = 0.05
 HARDLY = 0.1
 """Others hardly ran beside one if they did for no more than this part of its time."""
 ENOUGH = 5
-"""So many executions that hardly any other ran beside are enough to tell."""
+"""So many executions that hardly any other ran beside are enough."""
 TURNS = 8
 
 Flags = npt.NDArray[np.bool_]
@@ -47,8 +47,8 @@ class Recorded(NamedTuple):
     """
     Recorded executions, by columns, ns.
 
-    ``could`` tells when they could have started, and ``took`` what they took from then on;
-    ``cpu`` is -1 where it is not known; ``locks`` tells whether they compute with Python's lock,
+    ``could`` says when they could have started, and ``took`` what they took from then on;
+    ``cpu`` is -1 where it is not known; ``locks`` says whether they compute with Python's lock,
     ``interpreter`` which one that is, from 1; ``callback`` is a number.
     """
 

@@ -29,7 +29,7 @@ Progress = Callable[[int], None]
 
 class Replay:
     """
-    Plays a recorded run, and tells what came of it.
+    Plays a recorded run, and says what came of it.
 
     :param more: makes further observers, who come after the judge.
     :param paths: whether to follow the declared paths, to look for drift, and to count why
@@ -137,7 +137,7 @@ def slack(sink: dict[str, Any]) -> dict[str, int] | None:
 
 
 def recording_result(run: Run) -> dict[str, Any]:
-    """Return the part of a result that tells of the trace itself."""
+    """Return the part of a result about the trace itself."""
     return {
         'trace': run.name, 'declaration': run.head.file, 'start_ns': run.start,
         'end_ns': run.end, 'shut_down': run.shut_down, 'lost': run.lost}

@@ -6,7 +6,7 @@ A long trace of this executor, read and linked in a process beside this one.
 Theory of operation
 -------------------
 Python computes on one CPU.  Where there is another one and the trace is long, a second process
-reads and links it, and tells the observers that need no verdicts.  What it tells of the run it
+reads and links it, and feeds the observers that need no verdicts.  What it tells of the run it
 sends here, where the judge is, and at the end what has become of the run and its observers.
 """
 
@@ -47,7 +47,7 @@ def play_beside(
     """
     Tell observers of a run that another process reads; return that run, and who observed there.
 
-    :param waits: is told there, too, and then what was found by it.
+    :param waits: is fed there, too, and then what was found by it.
     :raises mddag_executor.errors.MddagError: as ``OwnRun.play``, and where that
         process ends early.
     """
@@ -116,7 +116,7 @@ class _Sender(Observer):
 
 
 def serve() -> None:
-    """Read and link the run that standard input names, and tell standard output of it."""
+    """Read and link the run that standard input names, and write it to standard output."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     with os.fdopen(os.dup(1), 'wb') as out:
         os.dup2(2, 1)

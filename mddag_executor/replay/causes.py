@@ -349,7 +349,7 @@ def behind(
 
     :param chosen: the numbers of the parts.
     :param runs: by callback when it ran.
-    :param same_group: tells of a vertex and a callback whether they share a group.
+    :param same_group: returns of a vertex and a callback whether they share a group.
     """
     found: dict[int, list[tuple[int, int]]] = {}
     if not len(chosen) or not runs:

@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 1. *Machines.*  A trace says in which boot of which machine it was recorded (``mddag:host``).  Of
    older traces those are of one machine whose clocks differ by less than ``SAME_CLOCK``.
-2. *Messages* tell how clocks differ: the publisher's says when one was sent (the source
+2. *Messages* show how clocks differ: the publisher's says when one was sent (the source
    timestamp), the receiver's when it was taken.  The least of these times from A to B is the
    least transport plus the offset of B's clock, and that from B to A the least transport minus
    it.  So half their difference is the offset, and half their sum how far that may be wrong.
@@ -121,10 +121,10 @@ def offsets(
     of: Iterable[int], found: Ways, given: Mapping[int, int]
 ) -> dict[int, Offset]:
     """
-    Return the offsets of machines from machine 0: as given, or as messages tell (rules 2 and 4).
+    Return the offsets of machines from machine 0: as given, or as messages show (rules 2 and 4).
 
     :param given: those that are known, by machine.
-    :return: without those of which nothing tells.
+    :return: without those that are not known.
     """
     known = {0: Offset(0, 0), **{machine: Offset(ahead, 0) for machine, ahead in given.items()}}
     for _ in set(of):

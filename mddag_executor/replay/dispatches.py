@@ -26,7 +26,7 @@ from typing import Any
 
 class Dispatches:
     """
-    Collects executions, in the order of their ends on each worker, and tells how late they were.
+    Collects executions, in the order of their ends on each worker, and says how late they were.
 
     :param n_workers: how many there were in each process.
     """

@@ -8,7 +8,7 @@ Theory of operation
 A job that has not completed counts as late or expired only where the recording shows it.  It
 is in doubt where, at or after its release,
 
-* a callback of one of its vertices that has not completed ran, and nobody can tell for which job:
+* a callback of one of its vertices that has not completed ran, and it is not known for which job:
   its message is not known, or its start or end is not recorded.  Where the message's source
   timestamp is known but its publication is not, that concerns only jobs of which no publication
   with a source timestamp to this callback is recorded,
@@ -73,7 +73,7 @@ class Doubts:
             self._sent[dag, job].add(topic)
 
     def close(self, dag: int, job: int, release: int) -> bool:
-        """Forget a job; tell whether it is one that cannot be judged."""
+        """Forget a job; return whether it is one that cannot be judged."""
         done = self._done.pop((dag, job))
         sent = self._sent.pop((dag, job))
         first, vertices, sinks = self._vertices[dag]

@@ -5,11 +5,11 @@ Drafts of systems from traces: nodes, callbacks, what each publishes, rates, exe
 
 Theory of operation
 -------------------
-1. ``Census`` tells who there is. What every node has anyway (parameter services and their like) is
-   left out, and with it nodes that have nothing else.
+1. ``Census`` lists what there is. What every node has anyway (parameter services and their like)
+   is left out, and with it nodes that have nothing else.
 2. A callback that the recorded declaration names keeps its name, and what was declared of it that
    a trace does not show: deadline, queue edges, period, sync, group, name of the DAG.  Others have
-   the name of their function where the trace tells it, else ``callback_0``, ``callback_1``, … by
+   the name of their function where the trace has it, else ``callback_0``, ``callback_1``, … by
    node, in the order in which they were made.
 3. A topic of a node is published by the callbacks that were seen to publish it. Where none was,
    each callback of the node may; where the node has no callback, there is supposed to be a timer.
@@ -39,7 +39,7 @@ _TASK_SET, _DISPATCH, _COMPLETE = 'mddag:task_set', 'mddag:dispatch', 'mddag:com
 
 class System:
     """
-    What a trace tells of the system that was recorded.
+    What a trace shows of the system that was recorded.
 
     :param path: a trace of this executor, or an imported recording of CARET or ros2_tracing.
     :param name: what messages call it.

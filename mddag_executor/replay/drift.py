@@ -41,7 +41,7 @@ _MIX = 0x9E3779B97F4A7C1
 
 
 class OwnDrift(Observer):
-    """Collects, while a trace of this executor is played, what tells where it drifted."""
+    """Collects, while a trace of this executor is played, what shows where it drifted."""
 
     def __init__(self, run: OwnRun) -> None:
         self._run = run

@@ -309,7 +309,7 @@ class Entities:
     # --- looking up ------------------------------------------------------------------------------
 
     def _label(self) -> None:
-        """Give callbacks labels that tell them apart."""
+        """Give callbacks labels that are different."""
         used: dict[str, int] = {}
         for callback in sorted(self.every, key=lambda c: (c.made, c.number)):
             description = callback.description

@@ -5,7 +5,7 @@ What happened in a run, many things at once, and who gets it.
 
 Theory of operation
 -------------------
-A run of any source (see ``run``) tells *batches* of what happened, in order.  Everything is in
+A run of any source (see ``run``) gives *batches* of what happened, in order.  Everything is in
 terms of the declaration that judges: DAG and vertex are -1 for what it does not declare, a vertex
 is counted over all DAGs.  Of each kind there are rows, and the same as columns for numpy; each is
 made of the other when it is asked for.
@@ -47,7 +47,7 @@ _WIDTHS = (4, 7, 9, 13, 4, 2, 4, 5, 7)
 
 
 class Piece(NamedTuple):
-    """One run of a callback in a thread; `first` tells the first piece of an execution."""
+    """One run of a callback in a thread; `first` marks the first piece of an execution."""
 
     callback: int
     dag: int
@@ -64,7 +64,7 @@ class Execution(NamedTuple):
     """
     A whole execution: ready, first start, last end, and the time that its pieces took, ns.
 
-    :ivar number: tells it from others; -1: its times are not recorded.
+    :ivar number: identifies it; -1: its times are not recorded.
     """
 
     ready: int
@@ -191,7 +191,7 @@ class Observer:
         """Note that a job was aborted or, else, has expired."""
 
     def withdrawn(self, dag: int, job: int) -> None:
-        """Note that nobody can tell what became of a job: it is not to be judged."""
+        """Note that it is not known what became of a job: it is not to be judged."""
 
     def failed(self, dag: int, vertex: int, job: int, now: int) -> None:
         """Note that an execution of a vertex failed, and with it its job, before it completes."""
@@ -216,7 +216,7 @@ class Observer:
 
 
 class Batches:
-    """Collects what happens, one thing after the other, and tells it many at a time."""
+    """Collects what happens, one thing after the other, and passes it on in batches."""
 
     def __init__(self, observers: Sequence[Observer]) -> None:
         self._observers = observers
@@ -251,7 +251,7 @@ class Batches:
 
 
 def merged(several: Sequence[Handlers]) -> Handlers:
-    """Return handlers that tell all who want to know of an event, in order."""
+    """Return handlers that call all others for an event, in order."""
     every: dict[str, list[Callable[[Event], None]]] = {}
     for handlers in several:
         for name, handler in handlers.items():

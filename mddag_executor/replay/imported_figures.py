@@ -193,7 +193,7 @@ class ImportedPaths(LinkObserver):
 
 class ImportedDrift(LinkObserver):
     """
-    Collects, while an imported run is played, what tells where it drifted.
+    Collects, while an imported run is played, what shows where it drifted.
 
     Such a recording has no jobs; the starts of a source's callback count as its releases.
     """

@@ -24,7 +24,7 @@ what is linked, and go to the observers.
    when a message has reached its reader is not recorded, so the way there counts as waiting.
 4. A job that has not completed `EXPIRE_AFTER_NS` past its latest deadline, and of which nothing
    runs, counts as expired, as in the executor's core does it.  What is open at the end of the
-   recording is judged as of the last event.  A job of which nobody can tell what it did, because
+   recording is judged as of the last event.  A job of which it is not known what it did, because
    of what is missing in the recording (see ``doubts``), is withdrawn instead: it is not judged.
 """
 
@@ -163,7 +163,7 @@ class ImportedRun(LinkObserver):
 
     @property
     def unjudged(self) -> dict[int, int]:
-        """Return by DAG how many jobs there are of which nobody can tell what they did."""
+        """Return by DAG for how many jobs it is not known what they did."""
         return self._doubts.withdrawn
 
     def play(
@@ -203,7 +203,7 @@ class ImportedRun(LinkObserver):
     # --- executions ------------------------------------------------------------------------------
 
     def began(self, run: Execution, message: Publication | None) -> None:
-        """Find the job of an execution that has begun, and tell of it."""
+        """Find the job of an execution that has begun, and report it."""
         target = self.targets.get(run.callback.number)
         run.ready = self._ready(run, message)
         if target is not None:
@@ -310,14 +310,14 @@ class ImportedRun(LinkObserver):
             jobs.extendleft(reversed(running))
 
     def _close(self, dag: int, job: int, release: int) -> bool:
-        """Take a job that cannot be judged out of the run; tell whether it is one."""
+        """Take a job that cannot be judged out of the run; return whether it is one."""
         doubted = self._doubts.close(dag, job, release)
         if doubted:
             self._tell(WITHDRAWN, dag, job)
         return doubted
 
     def lost_sight(self, callback: Callback | None, run: Execution | None, time: int) -> None:
-        """Keep in mind what nobody can tell of a callback."""
+        """Note what is not known of a callback."""
         if callback is None:
             self._doubts.discarded(time)
         elif (target := self.targets.get(callback.number)) is not None:

@@ -9,7 +9,7 @@ The joined trace has the events of all in the order of time, and is replayed lik
 
 1. *Clocks.*  Each process counts its trace's time from the steady clock of the machine, by an
    offset that is recorded (``caret_init``).  So the times of one machine are put on the first
-   trace's clock exactly; those of others by an offset that is given, or that messages tell
+   trace's clock exactly; those of others by an offset that is given, or that messages show
    (``clocks``), else they are taken as they are.
 2. *Who is who.*  Addresses, which are those of one process, get the number of the trace above
    their 48 bits; workers are counted through.
@@ -382,7 +382,7 @@ class Joined:
         return release - part.shift + found.shift
 
     def _find(self, dag: Dag, release: int, place: int) -> tuple[int, int, set[int]] | None:
-        """Return the job of a release that another process has told of (rule 3)."""
+        """Return the job of a release that another process has announced (rule 3)."""
         stamped = dag.release_from == 'header_stamp'
         best = None
         for known in reversed(self._releases[dag.index]):

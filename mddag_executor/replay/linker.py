@@ -6,7 +6,7 @@ What belongs together in a recording of CARET or ros2_tracing: executions and th
 Theory of operation
 -------------------
 Two stages go through the events in the order of time.  The first keeps what each thread does; the
-second, `LAG_NS` of recorded time later, tells its observer, also in the order of time: a
+second, `LAG_NS` of recorded time later, calls its observer, also in the order of time: a
 subscriber may run before the tracer has recorded the stamp of the message that it runs for.
 
 1. *Executions*: `callback_start` to the next `callback_end` of the same callback in the same
@@ -75,7 +75,7 @@ class Execution:
     :ivar ready: for those who use it: when it became ready, ns.
     :ivar of: for those who use it: DAG, vertex and job that it belongs to.
     :ivar leg: for those who use it: which leg of the vertex it is.
-    :ivar number: for those who use it: tells it from others.
+    :ivar number: for those who use it: identifies it.
     """
 
     __slots__ = ('callback', 'thread', 'start', 'end', 'stamp', 'stated', 'taken', 'message',
@@ -103,7 +103,7 @@ class Publication:
 
     :ivar run: the execution that published it, None: none did.
     :ivar message: its address, and `written` that of what the middleware made of it.
-    :ivar number: for those who use it: tells it from others.
+    :ivar number: for those who use it: identifies it.
     """
 
     __slots__ = ('publisher', 'run', 'rclcpp', 'rcl', 'dds', 'stamp', 'message', 'written',
@@ -155,7 +155,7 @@ class LinkObserver(Observer):
         """
         Note that something is not recorded.
 
-        :param callback: it ran, nobody can tell for what; None: events were discarded.
+        :param callback: it ran, it is not known for what; None: events were discarded.
         :param run: its execution, where only the end is not recorded.
         """
 
@@ -183,7 +183,7 @@ class Losses:
             (self.starts, 'execution', 'without a start in it (the event was lost): left out'),
             (self.messages, 'execution', 'for a message whose publication is not in it: of no job '
              'and no path'),
-            (self.unlinked, 'execution', 'for a message whose publication cannot be told (not all '
+            (self.unlinked, 'execution', 'for a message whose publication is not known (not all '
              'of its topic have a source timestamp in it): of no job and no path'),
             (self.untold, 'execution', 'of a subscription without a message in it (its taking is '
              'not recorded): of no job and no path'),

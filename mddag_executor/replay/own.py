@@ -8,7 +8,7 @@ Theory of operation
 1. The executor records `job_release`, `fail`, `complete`, `expire`, `abort`, `deadline` and `drop`
    in the order in which its scheduler core saw them, with times that never decrease.  So in the
    order of time (a stable one: what has the same time stays in the order of the file) they are the
-   same sequence again, and whoever feeds it to a core gets the same verdicts.
+   same sequence again, and a core that gets it gives the same verdicts.
 2. `dispatch`, `callback_start` and `callback_end` come from the thread that ran the callback; they
    belong together by thread and by the callback's address.  `complete` is of the execution whose
    piece ended last in its thread.
@@ -301,7 +301,7 @@ class OwnRun:
             self.start = least if self.start is None else min(self.start, least)
 
     def left_out(self, name: str, why: str, rows: Any) -> None:
-        """Count events that make no sense; ``rows`` tells which."""
+        """Count events that make no sense; ``rows`` says which."""
         count = int(rows.sum())
         if count:
             self._strange[f'{name} {why}'] += count

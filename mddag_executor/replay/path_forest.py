@@ -37,7 +37,7 @@ class Steps(NamedTuple):
     Steps as columns; times in ns.
 
     ``parent`` is the number of another step or -1, ``path`` the path's number; ``first`` and
-    ``last`` tell whether it is at the first and the last place of it, ``is_run`` whether it is an
+    ``last`` say whether it is at the first and the last place of it, ``is_run`` whether it is an
     execution.  ``time`` is the start of an execution or the time of a publication (0: not
     recorded), ``end`` the end of an execution (-1: none).  ``marks`` holds what was seen of
     children that are gone: bits HAS_CHILD and, of an execution that read it, WENT_ON.

@@ -143,7 +143,7 @@ class PathBook:
         took: Ints | None = None,
     ) -> None:
         """
-        Collect a stretch of what happened; the first column tells the places in its order.
+        Collect a stretch of what happened; the first column has the places in its order.
 
         :param length: how many places there are.
         :param started: executions: callback, run, start, the topic that started it, the message
@@ -319,7 +319,7 @@ class PathBook:
         start of the last callback, ``whole`` those from the start of the first to the end of the
         last.  ``reaction_time`` is the worst case with external latency, ``data_age`` that of
         every output.  Median and p99 are exact up to 32,768 response times; where there are more,
-        ``quantiles_within`` tells how exact they are, as a share.
+        ``quantiles_within`` says how exact they are, as a share.
         """
         if self._results is None:
             self._round()

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded runs of every kind: one place to tell them apart."""
+"""Recorded runs of every kind: one place that distinguishes them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ class Traces:
 
     :ivar paths: of the traces.
     :ivar offsets: how far clocks of other machines are ahead of the first trace's, ns, by the
-        last word of a trace's name, as ``control`` of ``run.control.mcap``.  Else messages tell.
+        last word of a trace's name, as ``control`` of ``run.control.mcap``.  Else they are
+        estimated from messages.
     """
 
     paths: Sequence[str]

@@ -64,7 +64,7 @@ class Spread:
         """
         Return count, min, mean, median, p99 and max; None: there is none.
 
-        Where the quantiles are not exact ``quantiles_within`` tells how exact, as a share.
+        Where the quantiles are not exact ``quantiles_within`` says how exact, as a share.
         """
         if not self.count:
             return None

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What executors tell of themselves on ``/diagnostics``: the newest of it, and its tables.
+What executors report of themselves on ``/diagnostics``: the newest of it, and its tables.
 
 The statuses are those of ``mddag_executor.live.diagnostics``; others on the topic are left out.
 On a terminal rich draws the tables (the extra ``top``), elsewhere they are plain text.
@@ -77,7 +77,7 @@ class Board:
                     del self._statuses[next(iter(self._statuses))]
 
     def statuses(self) -> list[Status]:
-        """Return them by process and name; of a process that tells nothing more, as GONE."""
+        """Return them by process and name; of a process that is silent, as GONE."""
         now = self._clock()
         found = []
         for _, s in sorted(self._statuses.items()):

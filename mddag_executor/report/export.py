@@ -10,7 +10,7 @@ are open and, because a callback may still run when its job has ended, the last 
 executions that have ended until it is known what they completed.
 
 Executions (``ExecutionRow``): a row is one run of a callback on a worker; a coroutine that was
-suspended has several, ``first`` tells the first.  What no DAG declares has neither DAG nor job.
+suspended has several, ``first`` marks the first.  What no DAG declares has neither DAG nor job.
 
 Jobs (``JobRow``): a row is the verdict about one job at one sink: ``in_time``, ``late``,
 ``overdue`` (not completed when the run ended past its deadline), ``expired``, ``failed`` or

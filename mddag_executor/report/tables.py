@@ -27,7 +27,7 @@ def short_names(names: Iterable[str]) -> dict[str, str]:
     """
     Return for each vertex its name with only the last part of the node's.
 
-    Where that is not enough to tell it from the others it keeps the whole name.
+    A name that would then be ambiguous stays whole.
     """
     shortened = {name: name[name.rfind('/') + 1:] for name in names}
     used = Counter(shortened.values())

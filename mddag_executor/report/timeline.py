@@ -105,7 +105,7 @@ class Timeline(Observer):
     Collects what ran when.
 
     :param most: how many executions are kept at most.
-    :param names: tells the names of callbacks that are not declared.
+    :param names: returns the names of callbacks that are not declared.
     :ivar n_executions: how many there were; ``n_missed`` the deadlines missed.
     :ivar busy_over_time: how busy the workers were over time, without the threads beside them; in
         ``missed_over_time`` each missed deadline is one nanosecond.

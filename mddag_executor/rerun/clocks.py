@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What tells the time, or waits for it, goes by virtual time while a run lasts.
+What gives the time, or waits for it, uses virtual time while a run lasts.
 
 Theory of operation
 -------------------
@@ -103,7 +103,7 @@ class VirtualTime:
         _Asked.run = self
 
     def uninstall(self) -> None:
-        """Have the functions of ``time`` tell real time again."""
+        """Have the functions of ``time`` give real time again."""
         _Asked.run = None
 
     # --- clocks ----------------------------------------------------------------------------------

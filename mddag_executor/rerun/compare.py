@@ -5,9 +5,9 @@ Whether two runs have published the same: message by message, field by field.
 
 Theory of operation
 -------------------
-The messages of a topic are compared one by one, in their order.  What is told of a topic is where
-it differs first, and whether only in *timing*: the same messages, but at other times, or with
-other stamps in them (fields of type ``builtin_interfaces/Time``).
+The messages of a topic are compared one by one, in their order.  What is reported of a topic is
+where it differs first, and whether only in *timing*: the same messages, but at other times, or
+with other stamps in them (fields of type ``builtin_interfaces/Time``).
 
 Numbers with a point are equal within a tolerance ``x``: where their difference is at most ``x``,
 or ``x`` times the larger one.  What is not a number equals itself.

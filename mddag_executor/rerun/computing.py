@@ -3,7 +3,7 @@
 """
 When executions end that share CPUs and the interpreter.
 
-The machine is the simulator's (``simulate.machine``): it tells who stands still.  What an
+The machine is the simulator's (``simulate.machine``): it says which one stands still.  What an
 execution has sent before its end leaves when it is as far as it was then in the recording.
 """
 

@@ -7,7 +7,7 @@ Of a recording is loaded what nodes subscribe to, and what they publish, to be c
 node subscribes to a further topic later, that is loaded then, and its messages come from then on.
 
 Where somebody subscribes to ``/clock``, and it is neither recorded nor published by a node, it
-tells virtual time.
+gives virtual time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rosgraph_msgs.msg import Clock
 
 CLOCK = '/clock'
 CLOCK_EVERY_NS = 10_000_000
-"""How often ``/clock`` tells the time."""
+"""How often ``/clock`` gives the time."""
 
 
 class Playing:

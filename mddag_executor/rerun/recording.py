@@ -26,7 +26,7 @@ class Recorded(NamedTuple):
     """
     A recorded message: when it came, when it was published, its topic with its type.
 
-    :ivar place: tells it from the others.
+    :ivar place: identifies it.
     """
 
     time: int

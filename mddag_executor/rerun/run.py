@@ -217,7 +217,7 @@ class Rerun:
         Run the programs from the start of the recording to its end.
 
         :param programs: finds them, with virtual time in place.
-        :param tick: told now and then how far the run is, ns.
+        :param tick: gets now and then how far the run is, ns.
         :raises RerunError: on whatever keeps it from going on.
         """
         self._begun = time.monotonic()

@@ -46,7 +46,7 @@ class Strand:
     """
     A thread of the run, and what it waits for.
 
-    :ivar until: tells whether that has come true; None: it waits for a time, or for the end.
+    :ivar until: returns whether that has come true; None: it waits for a time, or for the end.
     :ivar deadline: the virtual time at which it waits no longer; None: there is none.
     :ivar execution: what it runs: kept for whoever drives the run.
     :ivar ended: whether its function has ended.

@@ -8,7 +8,7 @@ Theory of operation
 The middleware leaves what lies between two fields, to align the second one, and what follows the
 last one, as it was in memory.  So equal messages have unequal bytes.  ``canonical`` walks through
 a message (CDR, little endian) and sets these bytes to zero.  How to walk is found out once for
-each type, from what its Python class tells of its fields.
+each type, from what its Python class says of its fields.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ def _stamp() -> Path | None:
     Return a file beside which numba may keep what it compiles; None where there can be none.
 
     numba keeps the code with the source file of a function, and compiles anew when that file is
-    changed.  This file is never changed: its folder's name tells the sources.
+    changed.  This file is never changed: its folder's name identifies the sources.
     """
     folder = _folder()
     if folder is None:

@@ -6,7 +6,7 @@ What executions deliver in virtual time, where that is more than the edges of th
 Theory of operation
 -------------------
 Where messages take time, what a vertex publishes makes its edge to a successor true ``delay``
-after the vertex completes; the core is told of each with ``rules.edge``.  A delay may be negative:
+after the vertex completes; the core gets each by ``rules.edge``.  A delay may be negative:
 the callback published before its end.  Then the edge comes true that long before the end, as far
 as the execution had begun.  Where executions may be preempted, their edges come true at the end.
 Where they may stand still (see ``machine``), the end is not known in advance; but how far the
@@ -36,7 +36,7 @@ class Deliveries(NamedTuple):
     The messages of one run of a state that was made with ``propagate=2``; empty to begin with.
 
     ``messages`` are those under way, a heap: (time, order, slot, job, vertex that it starts);
-    ``sent`` has one element: how many there were.  ``next_vertex`` tells, by execution that runs
+    ``sent`` has one element: how many there were.  ``next_vertex`` says, by execution that runs
     and may stand still, what it starts next before its end, at ``Machine.publishes_at``.
     """
 

@@ -6,13 +6,13 @@ The event loop of simulation and rescheduling: virtual time around the core's ru
 Theory of operation
 -------------------
 Time jumps from event to event; an event is the release of a job or the end of an execution.  At
-one instant first the completions are told to the core, workers in ascending order, then the
+one instant first the completions are given to the core, workers in ascending order, then the
 releases in DAG order, then the core dispatches until it has nothing left to do (design section 9).
 A completion at the horizon counts; nothing is released or dispatched there any more.
 
 Where messages take time or executions fail, ``deliveries`` ends the executions, and the messages
 of an instant arrive between its completions and its releases.  Where CPUs are few
-or executions hold the interpreter, ``machine`` tells after each instant when those finish that
+or executions hold the interpreter, ``machine`` says after each instant when those finish that
 run.
 
 A job's deadlines count from its release, which is the time at which its source becomes ready,
@@ -131,7 +131,7 @@ def run(
 
     Decisions are left in ``s.decisions``.  With ``stop_at_first_miss`` the run ends with the
     instant at which the first miss is known: a late completion, an expiry or an abort.
-    ``progress`` is told the virtual time at each event.  To ``busy`` is added how long each worker
+    ``progress`` gets the virtual time at each event.  To ``busy`` is added how long each worker
     was busy.
     """
     n_workers = len(s.worker_x)

@@ -61,7 +61,7 @@ def evaluate(
     :param core: ``compiled``, ``plain``, or ``auto`` for the one that is sooner done.
     :param cluster: who does the runs instead of this machine's processors.
     :param checkpoint: goes on from what it holds, and keeps there what is done.
-    :param progress: told now and then how many runs are done.
+    :param progress: gets now and then how many runs are done.
     :return: the outcome; after a KeyboardInterrupt that of the runs that were done.
     :raises SimulationError: on settings that make no sense.
     :raises mddag_executor.core.PolicyError: when there is no such policy.

@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 Each run draws one execution time for each vertex (see ``draws``) and simulates its task set under
 every policy with these same times, until the first miss.  A run without a miss is accepted.  As in
-the paper only completions are judged, unless told otherwise.
+the paper only completions are judged, unless said otherwise.
 
 An evaluation has one task set or many (random ones, say), each with the same number of runs.  A
 run has a *place*, task set by task set, and a *number*, which its draw depends on (and on the

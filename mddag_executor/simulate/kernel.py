@@ -63,7 +63,7 @@ def accept_runs(
     accepted: Any,
 ) -> None:
     """
-    Simulate runs up to the first miss; tell which of them had none.
+    Simulate runs up to the first miss; return which of them had none.
 
     :param costs: address of the first run's execution times, from where run after run stands.
     :param row: bytes from one run's to the next.

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 FORMATS = ('.png', '.svg', '.pdf')
 
-# Colours of Okabe and Ito, which the colour-blind can tell apart too; each with its own marker.
+# Colours of Okabe and Ito, which the colour-blind can distinguish, too; each with its own marker.
 _STYLES = (
     ('#0072B2', 'o'), ('#D55E00', 's'), ('#009E73', '^'), ('#CC79A7', 'D'), ('#E69F00', 'v'),
     ('#56B4E9', 'P'), ('#000000', 'X'),
@@ -43,7 +43,7 @@ def check_plot(path: str) -> None:
     """
     if os.path.splitext(path)[1].lower() not in FORMATS:
         raise InputError(
-            path, 'the ending tells no kind of picture', f'use one of {", ".join(FORMATS)}')
+            path, 'the ending names no kind of picture', f'use one of {", ".join(FORMATS)}')
     if find_spec('matplotlib') is None:
         raise InputError(
             path, 'matplotlib, which draws it, is not there',
@@ -54,7 +54,7 @@ def draw(evaluation: Evaluation, file: BinaryIO, path: str) -> None:
     """
     Draw the figure of an evaluation into a file.
 
-    :param path: its name, whose ending tells the kind.
+    :param path: its name, whose ending says the kind.
     """
     width = 6.4 if len(evaluation.experiments) == 1 else 8.8  # with the legend beside it
     with two_plots(file, path, (width, 4.8), (4, 1)) as (above, below):
@@ -66,7 +66,7 @@ def draw(evaluation: Evaluation, file: BinaryIO, path: str) -> None:
 def two_plots(
     file: BinaryIO, path: str, size: tuple[float, float], heights: tuple[int, int]
 ) -> Iterator[tuple[Axes, Axes]]:
-    """Give two plots, one above the other, and write their figure; ``path`` tells the kind."""
+    """Give two plots, one above the other, and write their figure; ``path`` says the kind."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
     kind = os.path.splitext(path)[1].lower()[1:]

@@ -43,7 +43,7 @@ class Pool:
         pass
 
     def failure(self, error: BaseException) -> MddagError | None:
-        """Return the error that tells the user what an exception of a chunk means, if any."""
+        """Return the error that says to the user what an exception of a chunk means, if any."""
         return None
 
     def check(self) -> None:

@@ -60,7 +60,7 @@ def simulate(
     :param utilisation: of the load, for the result.
     :param max_active_jobs: bound on the open jobs of a DAG that declares none itself.
     :param log: keep the log of every worker.
-    :param progress: told the virtual time (ns) now and then.
+    :param progress: gets the virtual time (ns) now and then.
     :raises SimulationError: on settings that make no sense.
     :raises mddag_executor.core.PolicyError: when there is no such policy.
     """

@@ -93,7 +93,7 @@ def schedule(
     Run the core over a load.
 
     :param log: keep the log of every worker.
-    :param progress: told the virtual time (ns) now and then, by plain Python.
+    :param progress: gets the virtual time (ns) now and then, by plain Python.
     :param compiled: whether compiled, which gives the same; None: what is sooner done.
     :raises mddag_executor.core.PolicyError: as ``Settings.preempts``.
     """

@@ -54,7 +54,7 @@ def key_of_policy(t: Any, v: int, release: int, job: int, order: int) -> Key:
     """
     Return the key of the policy whose number the tables have in one more field, ``policy``.
 
-    This is no compiled function but one that numba is told how to compile, because only these can
+    This is no compiled function but one for which numba gets a recipe, because only these can
     be handed from function to function in code that is kept on disk.
     """
     key: Key = list(POLICIES.values())[t.policy].key(t, v, release, job, order)

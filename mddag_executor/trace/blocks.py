@@ -20,8 +20,8 @@ trusted to be what it seems.
    never have one.
 6. A chunk that is the same as one before it is left out and noted. Only the first chunk may have a
    copy right behind it (`trace_file`, rule 5), which stands in for it where it is not sound.
-7. The footer tells where the summary begins. Where it begins elsewhere, right behind the data,
-   something was cut out or put in: then the summary's list of chunks tells where.
+7. The footer says where the summary begins. Where it begins elsewhere, right behind the data,
+   something was cut out or put in: then the summary's list of chunks says where.
 """
 
 from __future__ import annotations

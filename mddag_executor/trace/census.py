@@ -44,9 +44,9 @@ class Entity:
     :ivar kind: ``timer``, ``subscription`` or ``service``.
     :ivar start: the topic or service, as its name; empty for a timer.
     :ivar period_ns: the timer's period.
-    :ivar callback: its callback's address; None where the trace does not tell.
+    :ivar callback: its callback's address; None where the trace does not say.
     :ivar group: its mutually exclusive callback group, or None.
-    :ivar symbol: of its function; empty where the trace does not tell.
+    :ivar symbol: of its function; empty where the trace does not say.
     """
 
     kind: str
@@ -128,7 +128,7 @@ class Census:
         }
 
     def take(self, event: Event) -> None:
-        """Note what an event tells; one without some fields, or of another kind, is left out."""
+        """Note what an event says; one without some fields, or of another kind, is left out."""
         handler = self.handlers.get(event[0])
         if handler is not None and None not in event:
             if event[0] in self.who:

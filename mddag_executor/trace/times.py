@@ -5,7 +5,7 @@ Which times of a recording cannot be: the one rule for traces and ordinary bags.
 
 Theory of operation
 -------------------
-One flipped bit makes a time that is years away; whoever believes it waits for years.
+One flipped bit makes a time that is years away; a program that believes it waits for years.
 
 1. A time before 1970 or at or after `NEVER` (2116) is impossible.
 2. The other times, in the order of the file, are put into groups: times that are `GAP_NS` or less

@@ -11,7 +11,7 @@ Theory of operation:
    goes to the operating system with its message indexes in one piece, so a process that is killed
    leaves a file of whole chunks and at most one that is cut off.
 3. The summary (schemas, channels, statistics, chunk indexes) and the footer follow only when the
-   file is finished. They make seeking possible and tell a reader what should be there; nothing
+   file is finished. They make seeking possible and show a reader what should be there; nothing
    else depends on them.
 4. When writing fails the file is cut back to its last whole chunk.
 5. Without the declaration a trace is of no use. Where it is recorded first, it gets a chunk of its

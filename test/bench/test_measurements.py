@@ -310,7 +310,7 @@ def test_nothing_outlives_a_killed_bench() -> None:
     (['--load', 'autoware', '--phases', 'drawn'], '--phases: it means nothing to --load autoware'),
     (['--load', 'entities', '--idle', '1,-1'], "argument --idle: '-1' is no whole number"),
     (['--load', 'autoware', '--graph', '/none.yaml'], '/none.yaml: '),
-    (['--load', 'topics', '--plot', 'x.gif'], 'x.gif: the ending tells no kind of picture'),
+    (['--load', 'topics', '--plot', 'x.gif'], 'x.gif: the ending names no kind of picture'),
     (['--load', 'topics', '--json', '/none/x'], '/none/x: there is no directory /none'),
 ])
 def test_a_wrong_command_line_is_one_line(mddag: Mddag, arguments: list[str], text: str) -> None:

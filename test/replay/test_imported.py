@@ -203,7 +203,7 @@ def test_a_lost_link_is_said_and_its_job_is_not_judged(
     assert (sink['completed'], sink['expired']) == (N - 1, 0)
     assert result['dags']['/camera']['unjudged'] == 1
     assert [line for line in warnings if '/detect subscription /image (1)' in line] == [
-        '1 execution for a message whose publication cannot be told (not all of its topic have a '
+        '1 execution for a message whose publication is not known (not all of its topic have a '
         'source timestamp in it): of no job and no path: /detect subscription /image (1)']
     assert [line for line in warnings if 'periods of timers' in line]
 

@@ -264,7 +264,7 @@ def test_what_else_the_thread_writes_is_not_the_publication(recorded: Recorded) 
     assert told.published_at == [('/image', 101 * MS, 101 * MS + 1, 0), ('/image', 201 * MS, 0, 0)]
     assert [link[2] for link in told.links if link[0].startswith('/detector')] == [None, None]
     assert warnings == [
-        '2 executions for a message whose publication cannot be told (not all of its topic have a '
+        '2 executions for a message whose publication is not known (not all of its topic have a '
         'source timestamp in it): of no job and no path: /detector subscription /image (2)']
 
 

@@ -126,8 +126,8 @@ def run_all(
     """
     Make all measurements in turn, ``repeat`` times; return a result for each of them.
 
-    :param tick: told now and then which one goes on, how many were made, and for how many s.
-    :param warn: told of each that crashed; its figures are None when it never succeeded.
+    :param tick: gets now and then which one goes on, how many were made, and for how many s.
+    :param warn: gets each that crashed; its figures are None when it never succeeded.
     :raises BenchError: when a measurement cannot be made, or when all of them crashed.
     """
     runs: list[list[dict[str, Any]]] = [[] for _ in specs]

@@ -59,7 +59,7 @@ def run_declared(spec: Spec) -> dict[str, Any]:
     if books is None:
         raise BenchError('the run was ended before anything was measured: run it again')
     # rclpy's EventsExecutor moves a timer on before it queues the call, so that calls in a backlog
-    # do not tell for which due time they stand: only messages are counted there.
+    # do not say for which due time they stand: only messages are counted there.
     latencies = starts.within(
         books.start.at_ns, books.end.at_ns, timers=spec.executor != 'events')
     if spec.process is not None:

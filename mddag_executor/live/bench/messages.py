@@ -105,7 +105,7 @@ def _middleware_cpu_ns() -> int | None:
             if (task / 'comm').read_text().startswith(MIDDLEWARE):
                 times.append(int((task / 'schedstat').read_text().split()[0]))
         except (OSError, ValueError, IndexError):
-            continue  # it has ended, or is not told
+            continue  # it has ended, or is not known
     return sum(times) if times else None
 
 

@@ -32,7 +32,7 @@ def draw(results: Sequence[dict[str, Any]], file: BinaryIO, path: str) -> None:
     Draw results of one load into a file.
 
     :param results: as ``run_all`` returns them.
-    :param path: the file's name, whose ending tells the kind of picture.
+    :param path: the file's name, whose ending says the kind of picture.
     """
     from matplotlib import style
     first = results[0]

@@ -89,7 +89,7 @@ class PublisherProcess:
                 self._process.stdin.write(line + '\n')
                 self._process.stdin.flush()
             except BrokenPipeError:
-                pass  # the missing answer tells
+                pass  # the missing answer shows it
 
     def _answer(self, begin: str) -> str:
         line = '' if self._process.stdout is None else self._process.stdout.readline()
@@ -119,7 +119,7 @@ class _Orders:
 def publish(
     publishers: Sequence[Publisher], rate_hz: float, seed: int | None, stop: threading.Event
 ) -> list[int]:
-    """Publish on all topics until told to stop; return how often on each."""
+    """Publish on all topics until asked to stop; return how often on each."""
     period = round(1e9 / rate_hz)
     generator = random.Random(seed)
     begin = time.monotonic_ns() + 1_000_000
@@ -141,7 +141,7 @@ def publish(
 
 
 def main(text: str) -> int:
-    """Publish as told; return the exit status."""
+    """Publish as asked; return the exit status."""
     what = json.loads(text)
     orders = _Orders()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)

@@ -278,7 +278,7 @@ class BareExecutor(Executor):
                 pass
 
     def is_ending(self) -> bool:
-        """Return whether the executor has been told to end."""
+        """Return whether the executor has been asked to end."""
         return bool(self._is_shutdown)
 
     def begin_end(self) -> None:
@@ -290,7 +290,7 @@ class BareExecutor(Executor):
 
 
 class _FirstNode:
-    """Stands among a context's nodes, to be told first that they are destroyed."""
+    """Stands first among a context's nodes, to notice that they are destroyed."""
 
     def __init__(self, tell: Callable[[], None]) -> None:
         self.destroy_node = tell

@@ -29,7 +29,7 @@ rules keep it from using what is gone, or what has come in its place:
 
 Before an entity is shown, everything is taken from it, and once more an update later. For the
 native executor takes as many as the middleware announces, and that does not announce everything
-that was there before: messages that an executor before this one was told of and did not take.
+that was there before: messages that an executor before this one did not take.
 
 Seen in 7.1 and 9.1. In 7.1.5 it dispatches only with a time-out. Waitables (actions, QoS events)
 crash it when they are removed, and it refuses guard conditions: it gets none of these.
@@ -316,7 +316,7 @@ class NativeExecutor:
     It installs no signal handler; rclpy's own, where it is installed, ends its spin on SIGINT and
     SIGTERM.
 
-    :param on_error: told an exception of a take, and one that came out of a spin.
+    :param on_error: gets an exception of a take, and one that came out of a spin.
     """
 
     def __init__(self, context: Any, on_error: Callable[[BaseException], None]) -> None:

@@ -28,7 +28,7 @@ class RefilledSet:
     A wait set with what it is filled with; the entities are held from the start.
 
     :param guards: guard conditions that only end a wait.
-    :param on_error: told an exception of a take.
+    :param on_error: gets an exception of a take.
     :ivar size: how many sources it waits for.
     """
 

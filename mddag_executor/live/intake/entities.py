@@ -3,7 +3,7 @@
 """
 What an executor's nodes have to wait for.
 
-An ``EntitySet`` is what all nodes had at one moment. Nodes tell an executor that *something* has
+An ``EntitySet`` is what all nodes had at one moment. Nodes notify an executor that *something* has
 changed (``Executor.wake``) but not what, so the set is taken again and compared: lists are
 compared node by node, which for equal lists is one identity test for each entity.
 """

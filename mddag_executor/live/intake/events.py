@@ -148,7 +148,7 @@ class EventsIntake:
     :param context: the context of all nodes.
     :param receiver: whom to hand over to.
     :param guards: for the same signature as ``WaitSetIntake``; not waited for, since no thread
-        of this intake needs to be told more than by ``update``, ``wake`` and ``stop``.
+        of this intake needs to be notified otherwise than by ``update``, ``wake`` and ``stop``.
     :param on_shutdown: called in a thread of the intake when that ends because the context has
         ended, also by a signal.
     :param serve_here: entered in the thread that takes messages, requests and responses: the

@@ -7,12 +7,12 @@ Theory of operation
 -------------------
 rcl keeps a timer's state (next call time, period, cancelled), and stays the authority: whether a
 timer is due is asked of rcl, and ``call_timer`` moves it on (missed periods are skipped there, the
-phase is kept; ``on_missed`` tells how many they were). What is kept here is only when to ask: the
+phase is kept; ``on_missed`` gets how many they were). What is kept here is only when to ask: the
 next due time of each timer in a heap. So a wake-up costs the same beside ten timers and beside a
 thousand, where a wait set has to be filled with all of them again.
 
 Nominal due time
-    rcl tells how long it is *until* the next call, not when that is. Reading the clock before and
+    rcl says how long it is *until* the next call, not when that is. Reading the clock before and
     after asking gives an interval that holds the next call time. Once for each timer the interval
     is made narrow and its middle becomes the anchor of the timer's phase grid, anchor + k*period;
     from then on due times are points of that grid as long as they lie in the interval (widened by
@@ -120,7 +120,7 @@ class TimerQueue:
         """
         Wake on jumps of the timers' ROS clocks, or no longer.
 
-        A clock only borrows its jump callbacks, so whoever has started watching must end it.
+        A clock only borrows its jump callbacks, so who starts watching must end it.
         """
         wanted = {}
         if watch:
