@@ -18,8 +18,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from msg_graph.duration import exact_duration, SECOND
-from msg_graph.errors import GraphError
-from msg_graph.layout import refused, without_lines
+from msg_graph.layout import checked, refused
 from msg_graph.loading import loads
 from msg_graph.model import TaskSet
 import yaml
@@ -47,12 +46,9 @@ def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Mapping[str, int]
     """
     try:
         result = _changed(text, deadlines)
-        after = loads(result, task_set.file)
-    except (GraphError, KeyError):  # of a declaration of several files
+    except KeyError:  # of a declaration of several files
         raise refused(task_set.file) from None
-    if without_lines(after) != without_lines(with_deadlines(task_set, deadlines)):
-        raise refused(task_set.file)
-    return result
+    return checked(result, with_deadlines(task_set, deadlines))
 
 
 def _callbacks(text: str) -> Iterator[tuple[str, Any, dict[str, Any]]]:

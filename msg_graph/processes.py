@@ -16,8 +16,7 @@ from msg_graph.declaration import processes_text, read_processes
 from msg_graph.entries import Entry
 from msg_graph.errors import GraphError
 from msg_graph.language import FILE
-from msg_graph.layout import refused, without_lines
-from msg_graph.loading import loads
+from msg_graph.layout import checked
 from msg_graph.model import Process, TaskSet
 from msg_graph.yamltext import Mapping, parse_yaml
 
@@ -40,12 +39,7 @@ def with_processes(task_set: TaskSet, processes: Iterable[Process]) -> TaskSet:
         for each in processes)
     after = replace(task_set, processes=processes,
                     text=_changed(task_set.text, task_set.file, processes))
-    try:
-        same = without_lines(loads(after.text, after.file)) == without_lines(after)
-    except GraphError:
-        same = False
-    if not same:
-        raise refused(task_set.file)
+    checked(after.text, after)
     return after
 
 

@@ -40,8 +40,8 @@ MOST_BYTES = 64 << 20
 _read_already: object = None  # the stream that was standard input when it was read
 
 
-def read_bytes(path: str) -> tuple[str, bytes]:
-    """Return the name for messages and the content of a file, or of standard input for `-`."""
+def read_text(path: str) -> tuple[str, str]:
+    """Return the name for messages and the text of a file, or of standard input for `-`."""
     if path != '-':
         name = path
         with open(path, 'rb') as file:
@@ -50,12 +50,6 @@ def read_bytes(path: str) -> tuple[str, bytes]:
         name, data = STDIN, _claim_stdin().read(MOST_BYTES + 1)
     if len(data) > MOST_BYTES:
         raise InputError(name, f'it is larger than {MOST_BYTES >> 20} MiB', 'name the right file')
-    return name, data
-
-
-def read_text(path: str) -> tuple[str, str]:
-    """Return the name for messages and the text of a file, or of standard input for `-`."""
-    name, data = read_bytes(path)
     try:
         return name, data.decode('utf-8-sig')
     except UnicodeDecodeError as error:

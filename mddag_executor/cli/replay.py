@@ -74,7 +74,6 @@ def main(args: argparse.Namespace) -> int:
 
 def _show(args: argparse.Namespace, result: dict[str, Any]) -> None:
     from mddag_executor.report.replays import (
-        callbacks_table,
         comparison_table,
         recorded_tables,
         summary,
@@ -96,7 +95,5 @@ def _show(args: argparse.Namespace, result: dict[str, Any]) -> None:
         print(times_table(result['dags']))
     for line in recorded_tables(result, args.callbacks):
         print(line)
-    if args.callbacks:
-        print(callbacks_table(result['callbacks']))
     for line in (*summary(result), *drift_lines(result.get('drift', ()))):
         print(line)

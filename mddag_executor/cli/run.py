@@ -31,7 +31,7 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
-from mddag_executor.cli.stuck import told_when_stuck
+from mddag_executor.cli.stuck import dump_when_stuck
 from mddag_executor.cli.text import Progress, warn
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.report.live_runs import summary
@@ -180,7 +180,7 @@ def run_here(
     else:
         from mddag_executor.live.loading import resolve, ros_arguments
         programs = [resolve(spec, ros_arguments(args.ros_args)) for spec in args.node]
-    with told_when_stuck() as ends, Signals(
+    with dump_when_stuck() as ends, Signals(
             _PART_ENDS_S if args.part else 0) as signals, _rclpy(args.ros_args or []):
         from mddag_executor.live.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(

@@ -9,8 +9,8 @@ The slack of a declaration with fixed execution times is found as `mddag slack G
 Then, for some callbacks, two live runs follow: with a little less than the factor (``HOLDS``) no
 deadline may be missed, with a little more (``BREAKS``) some deadline must be.
 
-The slack is told of callbacks that take what is declared, and of timers that are punctual.  A live
-run is neither: of each late job ``explain`` tells how long callbacks ran beyond the declared time,
+The slack is that of callbacks that take what is declared, and of timers that are punctual.  A live
+run is neither: ``explain`` says of each late job how long callbacks ran beyond the declared time,
 how late the release was noticed, and how long the machine stood still.  A job that would not have
 been late without these (``DISTURBED``) says nothing of the slack, at either share.  What waited
 for a worker or for the interpreter counts.
@@ -113,12 +113,12 @@ def _misses(trace: str) -> tuple[int, int]:
     from mddag_executor.replay import replay
     explainer = replay(trace, skip=WARM_UP_NS, jobs=True).explainer
     assert explainer is not None
-    told = [is_told(job) for job in explainer.result()['jobs']]
-    return sum(told), len(told) - sum(told)
+    count = [is_counted(job) for job in explainer.result()['jobs']]
+    return sum(count), len(count) - sum(count)
 
 
-def is_told(job: Mapping[str, Any]) -> bool:
-    """Tell whether a job would have missed its deadline without disturbances."""
+def is_counted(job: Mapping[str, Any]) -> bool:
+    """Return whether a job would have missed its deadline without disturbances."""
     disturbed = sum(part['ns'] for part in job['parts'] if part['cause'] in DISTURBED)
     return job['late_ns'] is None or bool(job['late_ns'] > disturbed)
 
@@ -127,8 +127,8 @@ def show(result: dict[str, Any]) -> None:
     """Print the result."""
     short = short_names([row['callback'] for row in result['callbacks']])
     print(table(('callback', 'may take', f'missed at {HOLDS:g} of it', 'disturbed',
-                 f'missed at {BREAKS:g}', 'disturbed', 'as told'), [
+                 f'missed at {BREAKS:g}', 'disturbed', 'as predicted'), [
         [short[row['callback']], f'{row["factor"]:.2f} times', row['missed_below'],
          row['disturbed_below'], row['missed_above'], row['disturbed_above'],
          'yes' if row['as_told'] else 'no'] for row in result['callbacks']]))
-    print(f'{result["as_told"]} of {len(result["callbacks"])} callbacks behave as told')
+    print(f'{result["as_told"]} of {len(result["callbacks"])} callbacks behave as predicted')

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""A run that does not come to its end tells where it stands."""
+"""Where a run stands that does not come to its end."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _STDERR = 2
 
 
 @contextmanager
-def told_when_stuck(seconds: float = STUCK_S) -> Iterator[Callable[[], None]]:
+def dump_when_stuck(seconds: float = STUCK_S) -> Iterator[Callable[[], None]]:
     """
     Give a function to call when the end begins.
 

@@ -303,7 +303,7 @@ def by_start(row: ExecutionRow) -> int:
 
 class Rows:
     """
-    A target that writes rows of one kind, in batches.
+    A target that writes rows of one kind.
 
     :param kind: of the rows: executions, or jobs.
     """
@@ -313,34 +313,22 @@ class Rows:
     ) -> None:
         self._kind = kind
         self._writer = writer
-        self._batch: list[tuple[Any, ...]] = []
 
     def begin(self, task_set: TaskSet, tables: Tables) -> None:
         """Write what the run is of: nothing."""
 
     def execution(self, ran: Ran) -> None:
         """Write an execution."""
-        self._add(ran.row)
+        if self._kind is ExecutionRow:
+            self._writer.write(ran.row)
 
     def verdict(self, row: JobRow, vertex: int) -> None:
         """Write a verdict."""
-        self._add(row)
-
-    def _add(self, row: tuple[Any, ...]) -> None:
-        if not isinstance(row, self._kind):
-            return
-        self._batch.append(row)
-        if len(self._batch) >= BATCH:
-            self._flush()
-
-    def _flush(self) -> None:
-        if self._batch:
-            self._writer.write(self._batch)
-            self._batch.clear()
+        if self._kind is JobRow:
+            self._writer.write(row)
 
     def finish(self) -> None:
         """Write what is left."""
-        self._flush()
         self._writer.end()
 
 
@@ -352,9 +340,9 @@ class CsvWriter:
         self._writer = csv.writer(self._text)
         self._writer.writerow(kind._fields)
 
-    def write(self, rows: Sequence[tuple[Any, ...]]) -> None:
-        """Write rows."""
-        self._writer.writerows([[_cell(value) for value in row] for row in rows])
+    def write(self, row: tuple[Any, ...]) -> None:
+        """Write a row."""
+        self._writer.writerow([_cell(value) for value in row])
 
     def end(self) -> None:
         """Leave the file to its owner."""
@@ -386,17 +374,26 @@ class ParquetWriter:
             fields.append(pyarrow.field(name, types[kinds[0]], nullable=len(kinds) > 1))
         self._schema: Any = pyarrow.schema(fields)
         self._arrow: Any = pyarrow
+        self._batch: list[tuple[Any, ...]] = []
         self._writer: Any = pyarrow.parquet.ParquetWriter(
             file, self._schema, compression='zstd')
 
-    def write(self, rows: Sequence[tuple[Any, ...]]) -> None:
-        """Write rows."""
-        columns = [self._arrow.array(column, type=field.type)
-                   for column, field in zip(zip(*rows), self._schema)]
-        self._writer.write_table(self._arrow.table(columns, schema=self._schema))
+    def write(self, row: tuple[Any, ...]) -> None:
+        """Write a row, some time."""
+        self._batch.append(row)
+        if len(self._batch) >= BATCH:
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._batch:
+            columns = [self._arrow.array(column, type=field.type)
+                       for column, field in zip(zip(*self._batch), self._schema)]
+            self._writer.write_table(self._arrow.table(columns, schema=self._schema))
+            self._batch.clear()
 
     def end(self) -> None:
-        """Write the footer."""
+        """Write what is left, and the footer."""
+        self._flush()
         self._writer.close()
 
 

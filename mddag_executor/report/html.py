@@ -25,10 +25,12 @@ from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.usage import Usage
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.html_data import (
+    CLASSES,
     json_for_html,
     prepare,
     Prepared,
     ReportData,
+    UNKNOWN,
 )
 from mddag_executor.report.html_tables import (
     callbacks_html,
@@ -47,9 +49,8 @@ from msg_graph import TaskSet
 _SCRIPT = Path(__file__).with_name('html.js')
 _STYLE = Path(__file__).with_name('html.css')
 _LEGEND = (
-    ('#d7191c', 'deadline missed'), ('#fd8d3c', 'slack below 10 % of the deadline'),
-    ('#fec44f', 'below 25 %'), ('#9ecae1', 'below 50 %'), ('#3182bd', '50 % and more'),
-    ('#969696', 'no deadline, or no verdict'))
+    'deadline missed', 'slack below 10 % of the deadline', 'below 25 %', 'below 50 %',
+    '50 % and more', 'no deadline, or no verdict')
 _BARS = 'Each bar is one execution, in the colour of the least slack that it leads to.'
 
 
@@ -183,7 +184,8 @@ def _page(
     else:
         yield '<p class="note">No DAG is declared: give a GRAPH to judge deadlines.</p>\n'
     yield ('<h2 id="mddag-timeline">Timeline</h2>\n<p class="legend">' + ''.join(
-        f'<span><i style="background:{colour}"></i>{text}</span>' for colour, text in _LEGEND)
+        f'<span><i style="background:{colour}"></i>{text}</span>' for colour, text in zip(
+            (*(colour for _, colour in CLASSES), UNKNOWN), _LEGEND))
         + '<span><b class="miss">&#9660;</b>where a deadline was missed</span></p>\n')
     yield ('<p class="note">Times count from the beginning of the run. Drag the window of the '
            'first picture, or its edges. In the others drag to move, zoom with Ctrl and the wheel '

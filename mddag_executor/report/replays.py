@@ -50,11 +50,6 @@ def _time(nanoseconds: int) -> str:
     return format_ns(nanoseconds, 3)
 
 
-def callbacks_table(callbacks: Mapping[str, Mapping[str, int]]) -> str:
-    """Return a table with a row for each declared callback."""
-    return table(CALLBACKS_HEADER, callbacks_rows(callbacks))
-
-
 def callbacks_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[Cell]]:
     """Yield the rows of the table of callbacks."""
     for key, use in callbacks.items():
@@ -70,11 +65,6 @@ def _computed(use: Mapping[str, int]) -> list[Cell]:
     n, busy = use.get('measured', 0), use.get('measured_busy_ns', 0)
     return [f'{use["cpu_ns"] / busy:.0%}' if n and busy else None,
             f'{use["held_interpreter"] / n:.0%}' if n else None]
-
-
-def recorded_table(callbacks: Mapping[str, Mapping[str, int]]) -> str:
-    """Return a table with a row for each callback of an imported recording that ran."""
-    return table(RECORDED_HEADER, recorded_rows(callbacks))
 
 
 def recorded_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[Cell]]:
@@ -107,18 +97,15 @@ def recorded_tables(result: Mapping[str, Any], callbacks: bool) -> Iterator[str]
     """
     if result.get('paths'):
         yield 'End to end, from the first publication to the start of the last callback:'
-        yield paths_table(result['paths'])
+        yield table(PATHS_HEADER, paths_rows(result['paths']))
     if 'recorded_callbacks' in result and (callbacks or not result['dags']):
         yield 'Callbacks in the recording:'
-        yield recorded_table(result['recorded_callbacks'])
+        yield table(RECORDED_HEADER, recorded_rows(result['recorded_callbacks']))
         if result['communications']:
             yield 'Messages, from publication to the start of the callback:'
             yield communications_table(result['communications'])
-
-
-def paths_table(paths: Mapping[str, Any]) -> str:
-    """Return a table of the paths' end-to-end times, four response-time cases and data age."""
-    return table(PATHS_HEADER, paths_rows(paths))
+    if callbacks:
+        yield table(CALLBACKS_HEADER, callbacks_rows(result['callbacks']))
 
 
 def paths_rows(paths: Mapping[str, Any]) -> Iterator[list[Cell]]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from mddag_executor.cli import bench_replay
 from mddag_executor.cli import main as program
-from mddag_executor.cli.slack_check import is_told
+from mddag_executor.cli.slack_check import is_counted
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import replay
 from mddag_executor.replay.measure import measure, READERS, write_long_trace
@@ -161,7 +161,7 @@ def test_slack_holds_where_runs_are_simulated(
         'bench', 'replay', '--slack', '--graph', str(graph), '--utilisation', '0.12',
         '--workers', '2', '--callbacks', '3']) == 0
     out = capsys.readouterr().out
-    assert out.endswith('3 of 3 callbacks behave as told\n')
+    assert out.endswith('3 of 3 callbacks behave as predicted\n')
     assert 'c:c       10.37 times' in out     # (90 - 9 - 8) / 7
     for arguments, error in (
             (['--slack', '--accuracy'], 'leave it or --accuracy out'),
@@ -176,5 +176,5 @@ def test_slack_holds_where_runs_are_simulated(
 def test_what_a_disturbance_made_late_says_nothing_of_slack(
     late: int | None, parts: dict[str, int], told: bool
 ) -> None:
-    assert told == is_told({'late_ns': late, 'parts': [
+    assert told == is_counted({'late_ns': late, 'parts': [
         {'cause': cause, 'ns': took} for cause, took in parts.items()]})

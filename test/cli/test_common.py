@@ -34,9 +34,9 @@ def test_standard_input_is_read_once(stdin) -> None:
     stdin(b'a: b\n')
     common.read_text('-')
     with pytest.raises(UsageError, match='only once'):
-        common.read_bytes('-')
+        common.read_text('-')
     stdin(b'again')
-    assert common.read_bytes('-') == ('<stdin>', b'again')
+    assert common.read_text('-') == ('<stdin>', 'again')
 
 
 def test_a_trace_from_standard_input_is_seekable(stdin) -> None:

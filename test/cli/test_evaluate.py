@@ -14,7 +14,6 @@ import subprocess
 import sys
 import time
 
-from mddag_executor.cli import main as program
 from msg_graph import load
 import numpy as np
 import pytest
@@ -320,11 +319,3 @@ def test_the_first_graph_is_as_alone(
 def test_one_run_of_each_of_several(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = call(capsys, graph, graph, graph, '--policies', 'rad')
     assert status == 0 and '3 runs of 3 task sets in' in out
-
-
-def test_help(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        program.main(['evaluate', '--help'])
-    out = capsys.readouterr().out
-    assert caught.value.code == 0
-    assert 'mddag evaluate config/autoware.yaml --runs 5000 --plot acceptance.png' in out

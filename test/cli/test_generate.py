@@ -94,10 +94,3 @@ def test_bad_input(
     assert (status, out) == (2, '')
     assert err.startswith(f'error: {line}') and err.count('\n') == 1
     assert sorted(folder.rglob('*')) == before
-
-
-def test_help(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        program.main(['generate', '--help'])
-    assert caught.value.code == 0
-    assert 'mddag generate --utilisation 0.6 --seed 7 -o random.yaml' in capsys.readouterr().out

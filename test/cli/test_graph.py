@@ -121,11 +121,3 @@ def test_missing_file_and_bad_usage(mddag: Mddag, tmp_path: Path) -> None:
         assert done.returncode == 2
         assert done.stderr.startswith('error: ')
         assert done.stderr.count('\n') == 1
-
-
-def test_help_has_an_example(mddag: Mddag) -> None:
-    for arguments in (('graph', '--help'), ('graph', 'check', '--help')):
-        done = mddag(*arguments)
-        assert done.returncode == 0
-        assert 'mddag graph check config/autoware.yaml' in done.stdout
-    assert 'mean execution times' in done.stdout

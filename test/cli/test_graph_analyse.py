@@ -59,10 +59,3 @@ def test_bad_input(mddag: Mddag) -> None:
         assert (done.returncode, done.stdout) == (2, '')
         assert done.stderr.startswith('error: ')
         assert done.stderr.count('\n') == 1
-
-
-def test_help_has_an_example(mddag: Mddag) -> None:
-    done = mddag('graph', 'analyse', '--help')
-    assert done.returncode == 0
-    assert 'mddag graph analyse config/autoware.yaml --budget p99' in done.stdout
-    assert '99 % quantile' in done.stdout

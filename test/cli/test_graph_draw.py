@@ -81,9 +81,3 @@ def test_bad_usage(mddag: Mddag, tmp_path: Path) -> None:
         assert done.stderr == (
             f'error: {name}: no ending that says what to draw: use one of .svg, .png, .pdf, '
             '.dot, .mmd\n')
-
-
-def test_help_has_an_example(mddag: Mddag) -> None:
-    done = mddag('graph', 'draw', '--help')
-    assert done.returncode == 0
-    assert 'mddag graph draw config/autoware.yaml -o autoware.svg' in done.stdout

@@ -39,9 +39,3 @@ def test_standard_input_and_output(mddag: Mddag) -> None:
     assert (done.returncode, done.stdout) == (2, '')
     assert done.stderr.startswith('error: <stdin>: this is no architecture file of CARET: ')
     assert done.stderr.count('\n') == 1
-
-
-def test_help_has_an_example(mddag: Mddag) -> None:
-    done = mddag('graph', 'from-caret', '--help')
-    assert done.returncode == 0
-    assert 'mddag graph from-caret architecture.yaml -o graph.yaml' in done.stdout

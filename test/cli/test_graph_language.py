@@ -60,10 +60,3 @@ def test_fmt_leaves_a_wrong_declaration_alone(mddag: Mddag, tmp_path: Path) -> N
     assert done.returncode == 2
     assert done.stderr.startswith('error: g.yaml:3: ')
     assert path.read_text() == UGLY.replace('timer', 'tmer')
-
-
-def test_help_has_an_example(mddag: Mddag) -> None:
-    for verb, example in (('schema', 'mddag graph schema -o'), ('fmt', 'mddag graph fmt --check')):
-        done = mddag('graph', verb, '--help')
-        assert done.returncode == 0
-        assert example in done.stdout

@@ -9,8 +9,8 @@ from collections.abc import Callable
 import importlib
 
 from mddag_executor import defaults
+from mddag_executor.cli import bench, graph, options
 from mddag_executor.cli import main as program
-from mddag_executor.cli import options
 from mddag_executor.core import POLICIES, PolicyError
 from mddag_executor.errors import UsageError
 from mddag_executor.simulate import JUDGES
@@ -80,18 +80,19 @@ def test_choices_are_those_of_the_program(verb: str, option: str, known: tuple[s
     assert sorted(action.choices) == sorted(known)
 
 
-@pytest.mark.parametrize(('words', 'says'), [
-    (['graph', 'check', '--help'], 'Validate a declaration and show the DAG tasks'),
-    (['bench', 'core', '--help'], 'CPU time for each event'),
-    (['graph', '--help'], 'lay a declaration out evenly'),
-    (['bench', '--help'], 'measure the batch evaluation'),
-])
+@pytest.mark.parametrize('verb', [
+    *(('graph', name) for name in graph.VERBS), *(('bench', name) for name in bench.VERBS)])
 def test_the_help_of_verbs_of_verbs(
-    words: list[str], says: str, capsys: pytest.CaptureFixture[str]
+    verb: tuple[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(SystemExit) as stop:
-        program.main(words)
-    assert stop.value.code == 0
-    out = capsys.readouterr().out
-    assert says in ' '.join(out.split())
-    assert 'example:\n  mddag ' in out
+    module = importlib.import_module(
+        f'mddag_executor.cli.{verb[0]}_{verb[1].replace("-", "_")}')
+    for words, says in ((verb, module.DESCRIPTION), (verb[:1], module.HELP)):
+        with pytest.raises(SystemExit) as stop:
+            program.main([*words, '--help'])
+        assert stop.value.code == 0
+        out = ' '.join(capsys.readouterr().out.split())
+        assert ' '.join(says.replace('%%', '%').split()) in out
+        assert 'example: mddag ' in out
+    assert all(line.startswith(f'mddag {verb[0]} ') or line.startswith('mddag run')
+               for line in module.EXAMPLE.strip().splitlines())

@@ -195,13 +195,6 @@ def test_standard_input(mddag: Mddag, graph: Path, times: Path) -> None:
     assert json.loads(first.stdout)['dags'] == json.loads(plain.stdout)['dags']
 
 
-def test_help_shows_an_example(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as done:
-        main(['simulate', '--help'])
-    assert done.value.code == 0
-    assert 'mddag simulate config/autoware.yaml' in capsys.readouterr().out
-
-
 def changed(**times: Any) -> str:
     return json.dumps({'lidar': {**TIMES['lidar'], **times}})
 

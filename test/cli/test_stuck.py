@@ -11,7 +11,7 @@ import pytest
 
 PROGRAM = """
 import threading, time
-from mddag_executor.cli.stuck import told_when_stuck
+from mddag_executor.cli.stuck import dump_when_stuck
 from mddag_executor.live.session import Session
 
 class Executor:
@@ -20,7 +20,7 @@ class Executor:
     def shutdown(self, timeout_sec):
         time.sleep({takes})
 
-with told_when_stuck({patience}) as ends:
+with dump_when_stuck({patience}) as ends:
     with Session(Executor(), on_end=ends) as session:
         session.wait(None)
 print('end')
