@@ -11,6 +11,6 @@ LISTENERS: list[Callable[[str], None]] = []
 
 
 def tell(what: str) -> None:
-    """Tell what is being done; call it now and then meanwhile."""
+    """Show what is being done; call it now and then meanwhile."""
     if LISTENERS:
         LISTENERS[-1](what)

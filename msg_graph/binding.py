@@ -110,7 +110,7 @@ class Binder:
 
 
 def is_period(period_ns: int, declared_ns: int) -> bool:
-    """Tell whether a timer's period is the declared one."""
+    """Return whether a timer's period is the declared one."""
     return abs(declared_ns - period_ns) <= _PERIOD_TOLERANCE * declared_ns
 
 
@@ -142,7 +142,7 @@ def meant(callback: Callback, undeclared: Iterable[Entity]) -> str | None:
 
 
 def _same_below(name: str, other: str) -> bool:
-    """Tell whether two names are the same, but for namespaces before one of them."""
+    """Return whether two names are the same, but for namespaces before one of them."""
     return name.endswith(other) or other.endswith(name)
 
 

@@ -71,7 +71,7 @@ def _top(tree: Tree, file: str) -> Entry:
 
 
 def is_composed(entry: Entry) -> bool:
-    """Tell whether a declaration is put together, or has arguments."""
+    """Return whether a declaration is put together, or has arguments."""
     return entry.has('include') or entry.has('arguments')
 
 

@@ -91,7 +91,7 @@ _LIFECYCLE = {
 
 def is_background(name: str, node: str) -> bool:
     """
-    Tell whether a node has a topic or service as every node has, or is an action's inner one.
+    Return whether a node has a topic or service as every node has, or is an action's inner one.
 
     So it is with what every lifecycle node has. A declaration is about what a system is there for,
     not about what the client library adds.

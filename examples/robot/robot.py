@@ -270,7 +270,7 @@ class Planner(Logging):
 
 
 class OdometryNode(Node):
-    """Tell where the robot is, 50 times a second."""
+    """Publish where the robot is, 50 times a second."""
 
     def __init__(self, scale: float) -> None:
         super().__init__('odometry')

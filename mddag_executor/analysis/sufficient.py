@@ -179,7 +179,7 @@ def own_urgent(task: Task, deadline: int) -> int:
 
 
 class _Blocking:
-    """Tells the sum of the m largest budgets of vertices with a RAD offset above a value, ns."""
+    """Returns the sum of the m largest budgets of vertices with a RAD offset above a value, ns."""
 
     def __init__(self, tasks: Sequence[Task], workers: int) -> None:
         every = sorted(((rad, cost) for task in tasks for rad, cost in zip(task.rad, task.costs)),

@@ -234,7 +234,7 @@ def check_output(path: str | None) -> None:
 
 
 def _is_special(path: Path) -> bool:
-    """Tell a pipe or device (`/dev/stdout`), which is written to and never replaced."""
+    """Return whether it is a pipe or device (`/dev/stdout`), which is never replaced."""
     try:
         return not stat.S_ISREG(path.stat().st_mode)
     except OSError:

@@ -76,7 +76,7 @@ def opened(args: argparse.Namespace) -> Iterator[tuple[Recording, str, TaskSet |
 
 
 def is_bag(path: Recording) -> bool:
-    """Tell whether a recording is an ordinary bag, which can only be rescheduled."""
+    """Return whether a recording is an ordinary bag, which can only be rescheduled."""
     from mddag_executor.replay.bags import is_ordinary
     return isinstance(path, str) and is_ordinary(path)
 

@@ -225,7 +225,7 @@ def _check_arguments(args: argparse.Namespace) -> None:
 def warn_of(
     plan: ExecutionPlan, ros_args: Sequence[str] | None, n_processes: int = 1
 ) -> None:
-    """Tell what the draw makes impossible, whatever the executor does, and what is in vain."""
+    """Warn of what the draw makes impossible, and of options without effect."""
     for sink in plan.infeasible():
         warn(f'{sink.vertex}: no scheduler can keep its deadline of '
              f'{sink.deadline_ns / 1e6:.1f} ms: with seed {plan.seed} its critical path takes '

@@ -71,7 +71,7 @@ class Progress:
 
     def update(self, done: int | float, note: str = '') -> None:
         """
-        Tell how much is done so far; cheap enough for an inner loop.
+        Show how much is done so far; cheap enough for an inner loop.
 
         :param done: in the unit of the total
         :param note: something to add to the line
@@ -96,7 +96,7 @@ class Progress:
         self._shown = max(self._shown, len(line))
 
     def events(self, done: int) -> None:
-        """Tell how many events of a trace have been read so far."""
+        """Show how many events of a trace have been read so far."""
         self.update(round(done / 1e6, 1), 'million events')
 
 

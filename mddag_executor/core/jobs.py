@@ -141,12 +141,12 @@ def judge_from(s: State, release: int) -> None:
 
 
 def is_judged(s: State, slot: int) -> bool:
-    """Tell whether a job was released when there are verdicts already (rule 6)."""
+    """Return whether a job was released when there are verdicts already (rule 6)."""
     return s.job_release[slot] >= s.scalars[JUDGE_FROM]
 
 
 def is_miss(kind: int) -> bool:
-    """Tell whether a decision of that kind is a miss: of a sink, and not in time (rule 6)."""
+    """Return whether a decision of that kind is a miss: of a sink, and not in time (rule 6)."""
     return SINK_IN_TIME < kind < JOB_END
 
 
@@ -230,7 +230,7 @@ def _give_up_sinks(t: Tables, s: State, slot: int, kind: int) -> None:
 
 
 def overdue(t: Tables, s: State, slot: int, now: int) -> bool:
-    """Tell whether a sink that has not completed is past its absolute deadline."""
+    """Return whether a sink that has not completed is past its absolute deadline."""
     dag = s.job_dag[slot]
     for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
         vertex = t.sinks[i]

@@ -47,7 +47,7 @@ SWEEP_AT = 64
 
 
 def is_stale(s: State, entry: QueueEntry) -> bool:
-    """Tell whether a queue's entry is of a dropped execution (whose id may be in use again)."""
+    """Return whether a queue's entry is of a dropped execution (whose id may be in use again)."""
     return s.x_state[entry[4]] != WAITING or s.x_key[entry[4]] != entry
 
 
@@ -143,7 +143,7 @@ def idle_worker(t: Tables, s: State, x: int) -> int:
 
 def may_start(t: Tables, s: State, entry: QueueEntry) -> bool:
     """
-    Tell whether what waits may start.
+    Return whether what waits may start.
 
     Its process has an idle worker (rule 12), and nothing that is as urgent or more holds the
     interpreter that it is to hold (rule 11).
@@ -174,7 +174,7 @@ def overtaking_pays(
     t: Tables, s: State, process: int, held: int, usual: int, preempts: bool
 ) -> bool:
     """
-    Tell whether what waits first may overtake one that holds its process' interpreter (rule 11).
+    Return whether what waits first may overtake one that holds its process' interpreter (rule 11).
 
     The two would share the interpreter, and lose by that.  So it waits where that is short
     beside the time that it has.  (Not beside what is left of that: when all are late, all

@@ -290,7 +290,7 @@ class Tally:
 
     @property
     def missed(self) -> bool:
-        """Tell whether any deadline was missed."""
+        """Return whether any deadline was missed."""
         return self.first_miss is not None
 
     def result(self) -> dict[str, Any]:

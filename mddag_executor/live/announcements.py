@@ -126,7 +126,7 @@ class Announcements:
     def _announce(
         self, send: Callable[[Any, Any], None], topic: str, several: list[Publication]
     ) -> None:
-        """Tell the others of publications (rules 1 and 2)."""
+        """Announce publications to the others (rules 1 and 2)."""
         entries = b''.join(self._entry(topic, publication) for publication in several)
         publisher = self._publisher
         if publisher is not None:

@@ -196,7 +196,7 @@ class Engine:
         return True
 
     def tell_of_alone(self, now: int) -> None:
-        """Tell the core of what runs past it, if anything does."""
+        """Give the core what runs past it, if anything does."""
         work, self.alone = self.alone, None
         if work is None:
             return

@@ -182,7 +182,7 @@ class Host:
 
     @property
     def adopting(self) -> bool:
-        """Tell whether the calling thread just hands a node over."""
+        """Return whether the calling thread just hands a node over."""
         return bool(getattr(self._local, 'adopting', False))
 
     def adopt(self, node: Node, guest: Guest | None) -> None:

@@ -105,7 +105,7 @@ class OtherProcesses:
 
     @property
     def announces(self) -> bool:
-        """Tell whether there are DAGs whose publications are announced."""
+        """Return whether there are DAGs whose publications are announced."""
         return bool(self._announced)
 
     def update(self, hosted: set[str], entities: Iterable[Entity]) -> list[tuple[int, list[int]]]:
@@ -157,7 +157,7 @@ class OtherProcesses:
 
     @staticmethod
     def _leaves(dag: Dag, vertex: Vertex, here: list[int], topic: str) -> bool:
-        """Tell whether a topic of a vertex starts one that is not here."""
+        """Return whether a topic of a vertex starts one that is not here."""
         return any(not here[after] and topic in dag.vertices[after].callback.topics
                    for after in vertex.successors)
 

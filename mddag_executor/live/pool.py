@@ -105,7 +105,7 @@ class Pool:
 
     def tell(self, event: Callable[..., None], *args: Any) -> None:
         """
-        Tell the engine of an event, and have run what is ready then.
+        Give the engine an event, and have run what is ready then.
 
         :param event: a method of the engine; it gets the arguments and the time.
         """
@@ -412,7 +412,7 @@ class Pool:
         self, seat: Seat, work: Work, waits_for: Any, raised: BaseException | None, start: int,
         end: int, now: int,
     ) -> None:
-        """Tell the engine what became of an execution that has not simply ended."""
+        """Give the engine what became of an execution that has not simply ended."""
         engine = self.engine
         if isinstance(raised, Refused):
             engine.refused(work, now)

@@ -39,7 +39,7 @@ HURRIED_END_TIMEOUT_S = 0.5
 MATCH_TIMEOUT_S = 30.0
 
 Tick = Callable[[float], None]
-"""Told now and then for how many seconds the run has been going on."""
+"""Called now and then with how many seconds the run has been going on."""
 
 
 class SessionError(MddagError):
@@ -106,7 +106,7 @@ class Session:
 
     @property
     def stopped(self) -> bool:
-        """Tell whether the run is to end."""
+        """Return whether the run is to end."""
         return self._stopped
 
     def wait(self, seconds: float | None, tick: Tick | None = None) -> bool:

@@ -76,7 +76,7 @@ class Run:
 
     @property
     def died(self) -> bool:
-        """Tell whether it ended by an exception, a signal or an error."""
+        """Return whether it ended by an exception, a signal or an error."""
         # asked to end while it started: ahead of its own handler, or its nodes cannot start then
         as_asked = self.asked and self.status in (-signal.SIGTERM, _BAD_INPUT)
         return self.status not in (None, 0) and not as_asked
@@ -89,7 +89,7 @@ class Run:
 
     @property
     def how(self) -> str:
-        """Tell how it ended."""
+        """Return how it ended."""
         if self.status is not None and self.status < 0:
             try:
                 return f'was ended by {signal.Signals(-self.status).name}'

@@ -164,7 +164,7 @@ class SyntheticWorkload:
 
     @property
     def evicted_joins(self) -> int:
-        """Tell how many joins were dropped incomplete."""
+        """Return how many joins were dropped incomplete."""
         return sum(join.evicted for joins in self._joins.values() for join in joins)
 
     def unmatched(self) -> list[str]:

@@ -46,7 +46,7 @@ class ObservedTask(BareTask):
         super().__init__(*args, **kwargs)
 
     def __del__(self) -> None:
-        """Tell an exception that was put by: nobody can take care of it any more."""
+        """Report an exception that was put by: nobody can take care of it any more."""
         if self.put_by is not None:
             self.give_out()
         super().__del__()  # type: ignore[no-untyped-call]
@@ -56,7 +56,7 @@ class ObservedTask(BareTask):
         return None if self.observed else self.unfetched()
 
     def give_out(self) -> None:
-        """Tell an exception that was put by, unless somebody has taken care of it."""
+        """Report an exception that was put by, unless somebody has taken care of it."""
         tell, self.put_by = self.put_by, None
         error = self.unclaimed()
         if error is not None and tell is not None:
@@ -99,7 +99,7 @@ class Unclaimed:
         self._tasks.append(weakref.ref(task))
 
     def look(self) -> None:
-        """Tell the exceptions of tasks whose makers have ended."""
+        """Report the exceptions of tasks whose makers have ended."""
         for _ in range(len(self._tasks)):
             reference = self._tasks.popleft()
             task = reference()

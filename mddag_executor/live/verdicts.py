@@ -111,7 +111,7 @@ class Verdicts:
                 'abort' if end == ABORTED else 'expire', now, threading.get_native_id(), dag, job)
 
     def was_aborted(self, dag: int, job: int) -> bool:
-        """Tell whether a job was aborted (the last few thousand are remembered)."""
+        """Return whether a job was aborted (the last few thousand are remembered)."""
         return (dag, job) in self._aborted
 
     def _missed(

@@ -282,7 +282,7 @@ def _stray_stamps(arrivals: Sequence[int], stamps: Sequence[int]) -> list[int]:
 
 
 def is_ordinary(path: str) -> bool:
-    """Tell whether a path is a bag in which nothing was traced, so that it holds no jobs."""
+    """Return whether a path is a bag in which nothing was traced, so that it holds no jobs."""
     if not os.path.isdir(path):
         return _what(path) == 'bag'
     names = [name for name in os.listdir(path) if _BAG_FILE.fullmatch(name)]
@@ -407,7 +407,7 @@ def _topic_of(connection: Any) -> Topic:
 
 
 def _is_stamped(topic: Topic) -> bool:
-    """Tell whether messages of a type begin with a header or a time."""
+    """Return whether messages of a type begin with a header or a time."""
     if topic.definition_encoding == 'ros2msg' and topic.definition.strip():
         for line in topic.definition.splitlines():
             words = line.split('#')[0].split()

@@ -36,7 +36,7 @@ _PROGRAM = 'from mddag_executor.replay.beside import serve; serve()'
 
 
 def pays(run: OwnRun) -> bool:
-    """Tell whether a second process is quicker: the trace is long, and there is a CPU for it."""
+    """Return whether a second process is quicker: the trace is long, and there is a CPU for it."""
     return run.when_played is None and run.events >= LEAST_EVENTS and processors() > 1
 
 
@@ -45,7 +45,7 @@ def play_beside(
     progress: Callable[[int], None] | None,
 ) -> Played:
     """
-    Tell observers of a run that another process reads; return that run, and who observed there.
+    Feed observers a run that another process reads; return that run, and who observed there.
 
     :param waits: is fed there, too, and then what was found by it.
     :raises mddag_executor.errors.MddagError: as ``OwnRun.play``, and where that

@@ -108,7 +108,7 @@ def ways(traces: Sequence[Messages], machine: Sequence[int], shifts: Sequence[in
 
 
 def _near(sent: np.ndarray, stamps: np.ndarray) -> np.ndarray:
-    """Tell which stamps are near one of the times at which something was sent."""
+    """Return which stamps are near one of the times at which something was sent."""
     after = np.searchsorted(sent, stamps)
     away = np.minimum(
         np.abs(stamps - sent[np.minimum(after, len(sent) - 1)]),

@@ -74,7 +74,7 @@ class ComputedRun(NamedTuple):
         return cls(task_set, load, run.log, run.decisions, horizon, run.ended_ns, judged)
 
     def play(self, observers: Sequence[Observer]) -> None:
-        """Tell the observers everything."""
+        """Give the observers everything."""
         _Teller(self, observers).run()
 
 
@@ -133,7 +133,7 @@ class _Teller:
                 yield time, dag, job, how == ABORTED
 
     def _until(self, now: int) -> None:
-        """Tell what is released and given up to an instant."""
+        """Report what is released and given up to an instant."""
         load, schedule = self._load, self._schedule
         while True:
             release = load.times[self._next] if self._next < len(load.times) else now + 1

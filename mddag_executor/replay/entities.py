@@ -337,7 +337,7 @@ _NEEDED = {
 
 
 def _complete(name: str, fields: Fields) -> bool:
-    """Tell whether an event has all fields that are needed of it, with values of their kind."""
+    """Return whether an event has all fields that are needed of it, with values of their kind."""
     needed = _NEEDED.get(name)
     if needed is None:
         event = EVENTS.get(f'ros2:{name}') or EVENTS.get(f'ros2_caret:{name}')

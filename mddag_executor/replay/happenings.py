@@ -229,19 +229,19 @@ class Batches:
         self._rows.setdefault(kind, []).append(row)
 
     def tell_if_full(self) -> None:
-        """Tell the observers of it if it is much; the caller is between two happenings."""
+        """Feed the observers if there is much; the caller is between two happenings."""
         if len(self._order) >= BATCH:
             self.tell()
 
     def tell(self) -> None:
-        """Tell the observers what happened so far."""
+        """Feed the observers what happened so far."""
         batch = Batch(self._order, self._rows)
         self._order, self._rows = [], {}
         for observer in self._observers:
             observer.take(batch)
 
     def finish(self, now: int, judged: bool = True) -> None:
-        """Tell the rest, and where what is open is judged, that the run has ended."""
+        """Pass on the rest and, where what is open is judged, the end of the run."""
         self.tell()
         if judged:
             batch = Batch((), {})

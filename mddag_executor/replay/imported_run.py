@@ -170,7 +170,7 @@ class ImportedRun(LinkObserver):
         self, observers: Sequence[Observer], progress: Function[[int], None] | None = None
     ) -> None:
         """
-        Tell the observers everything, with the numbers of callbacks in place of addresses.
+        Give the observers everything, with the numbers of callbacks in place of addresses.
 
         :param progress: called now and then with the number of events so far.
         """
@@ -266,7 +266,7 @@ class ImportedRun(LinkObserver):
         return min(run.taken or run.start, run.start)
 
     def over(self, run: Execution) -> None:
-        """Tell of an execution that has ended, and of what it completes."""
+        """Report an execution that has ended, and of what it completes."""
         for observer in self._links:
             observer.over(run)
         dag, vertex, job = run.of if run.of is not None else (-1, -1, -1)
@@ -284,7 +284,7 @@ class ImportedRun(LinkObserver):
                    run.start, run.end, run.end - run.start, self._number, -1, 0)
 
     def _is_whole(self, vertex: int, job: int, leg: int) -> bool:
-        """Tell whether an execution completes its vertex: of a sync's legs the last one does."""
+        """Return whether an execution completes its vertex: of a sync's legs the last one does."""
         if self._sizes[vertex] == 1:
             return True
         done = self._legs.setdefault((vertex, job), set())

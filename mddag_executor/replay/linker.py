@@ -285,7 +285,7 @@ class Linker:
         known[1](event, thread, state)
 
     def finish(self) -> None:
-        """Tell what is left; what runs has no end, or, where others ran after it, may have one."""
+        """Report what is left; what runs has no end, unless others ran after it."""
         for run in self.running:
             if run.inner:
                 self._without_end(run, run.inner)

@@ -136,7 +136,7 @@ class OwnRun:
         self, observers: Sequence[Observer], progress: Callable[[int], None] | None = None
     ) -> None:
         """
-        Tell the observers everything.
+        Give the observers everything.
 
         :param progress: called now and then with the number of events so far.
         """
@@ -197,7 +197,7 @@ class OwnRun:
     # --- batches ---------------------------------------------------------------------------------
 
     def _play(self, events: Events, who: Handlers) -> None:
-        """Tell of a batch of the trace's events, in parts where it must be cut."""
+        """Report a batch of the trace's events, in parts where it must be cut."""
         numbers, others = self._sorted_out(events)
         cuts = [place for place, event in others
                 if event[0] in who or event[0] in (_HOSTED, _JUDGE_FROM, _SHUTDOWN)]
@@ -253,7 +253,7 @@ class OwnRun:
         return numbers, others
 
     def _tell(self, numbers: dict[str, Numbers], length: int) -> None:
-        """Tell the observers what some events say; their places are below the length."""
+        """Give the observers what some events say; their places are below the length."""
         rows: dict[int, Ints] = {}
         places: dict[int, Ints] = {}
 

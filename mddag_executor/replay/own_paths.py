@@ -55,7 +55,7 @@ class OwnPaths(Observer):
                             if topic in book.topics] for v in vertices]
 
     def take(self, batch: Batch) -> None:
-        """Tell the book what callbacks on paths did."""
+        """Give the book what callbacks on paths did."""
         if not self.book:
             return
         started, ran = batch.columns(STARTED), batch.columns(RAN)

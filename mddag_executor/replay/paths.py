@@ -121,7 +121,7 @@ class PathBook:
         self._results: dict[str, Any] | None = None
 
     def __bool__(self) -> bool:
-        """Tell whether there is any path."""
+        """Return whether there is any path."""
         return bool(self.paths)
 
     def _place(self, task_set: TaskSet, number: int, position: int) -> _Place:

@@ -112,7 +112,7 @@ def _joined(traces: Traces, task_set: TaskSet | None) -> OwnRun:
 
 def is_own(path: str | os.PathLike[str], name: str | None = None) -> bool:
     """
-    Tell whether a trace was recorded by this executor.
+    Return whether a trace was recorded by this executor.
 
     :raises mddag_executor.trace.TraceError: when it is no trace.
     """

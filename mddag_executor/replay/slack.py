@@ -101,7 +101,7 @@ class Problem(NamedTuple):
         return self.work if isinstance(self.work, Load) else self.work.load
 
     def prepare(self) -> bool:
-        """Tell whether to search compiled; if so, compile."""
+        """Return whether to search compiled; if so, compile."""
         runs = _RUNS * len(set(self.callback_of))
         return prepare(self.tables, self.load, self.settings, runs)
 

@@ -20,7 +20,7 @@ class GroupWaits(Observer):
     """
     Finds out how much of each wait was for the callback group: while another of it ran.
 
-    Told before those who ask it.
+    It observes before those that ask it.
 
     :ivar found: of the last batch: by piece, how long its group was busy, ns.
     """

@@ -45,12 +45,12 @@ class Status:
 
     @property
     def is_pool(self) -> bool:
-        """Tell whether it is about the workers, not a DAG."""
+        """Return whether it is about the workers, not a DAG."""
         return 'idle_workers' in self.values
 
     @property
     def is_ours(self) -> bool:
-        """Tell whether an executor of this kind has sent it."""
+        """Return whether an executor of this kind has sent it."""
         return self.is_pool or 'window_missed_ratio' in self.values
 
 

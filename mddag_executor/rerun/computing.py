@@ -64,7 +64,7 @@ class Computing:
             self._leaves_next(work.x)
 
     def _leaves_next(self, x: int) -> None:
-        """Tell the machine how far an execution is when something of it leaves next."""
+        """Give the machine how far an execution is when something of it leaves next."""
         places = self._places[x]
         self._machine.publishes_at[x] = places[-1][0] if places else NEVER
 

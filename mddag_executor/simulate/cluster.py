@@ -177,7 +177,7 @@ class _ClusterPool(Pool):
         return future
 
     def failure(self, error: BaseException) -> MddagError | None:
-        """Tell of a cluster that is gone, or that kills what it is given."""
+        """Report a cluster that is gone, or that kills what it is given."""
         from distributed import KilledWorker
         if isinstance(error, KilledWorker):
             return ClusterError(

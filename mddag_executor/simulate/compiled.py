@@ -44,7 +44,7 @@ _ready: set[str] = set()    # what this process has loaded
 
 
 def pays(name: str, plain_s: float) -> bool:
-    """Tell whether to compile, or load what was, for work that takes plain Python that long."""
+    """Return whether to compile, or load what was, for work that takes plain Python that long."""
     return name in _ready or (
         available() and (plain_s > _COMPILE_S[name] or cached_entries(name)))
 
@@ -95,7 +95,7 @@ class CompiledJudge:
             cost_base=[built.first_vertex[dag.index] for dag in task_set.dags]))
 
     def __call__(self, settings: Settings, times: Times) -> npt.NDArray[np.bool_]:
-        """Tell which of the runs met every deadline."""
+        """Return which of the runs met every deadline."""
         row = find_policy(settings.policy)
         load = self._load.copy()  # whose costs become each run's
         working = EmptyMemory(len(State._fields))

@@ -63,7 +63,7 @@ _KEEP_S = 90 * 86400
 
 
 def available() -> bool:
-    """Tell whether numba is there and allowed to compile."""
+    """Return whether numba is there and allowed to compile."""
     return find_spec('numba') is not None and os.environ.get('NUMBA_DISABLE_JIT', '0') == '0'
 
 
@@ -78,12 +78,12 @@ def entries_of(kernel: ModuleType, names: tuple[str, ...]) -> dict[str, Callable
 
 
 def keeps_entries() -> bool:
-    """Tell whether there is a folder to keep what is compiled (see ``entries_of``)."""
+    """Return whether there is a folder to keep what is compiled (see ``entries_of``)."""
     return _stamp() is not None
 
 
 def cached_entries(name: str) -> bool:
-    """Tell whether an entry point (see ``entries_of``) has been compiled before."""
+    """Return whether an entry point (see ``entries_of``) has been compiled before."""
     folder = _folder()
     return folder is not None and any(folder.glob(f'**/*{name}*.nbc'))
 

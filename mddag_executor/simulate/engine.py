@@ -267,7 +267,7 @@ def _note(
 
 
 def any_missed(s: State, first: int) -> bool:
-    """Tell whether a miss is among the decisions from number ``first`` on."""
+    """Return whether a miss is among the decisions from number ``first`` on."""
     for i in range(first, len(s.decisions)):
         if jobs.is_miss(s.decisions[i][0]):
             return True

@@ -119,7 +119,7 @@ def _check(experiments: Sequence[Experiment], runs: int, jobs: int) -> None:
 
 def uses_compiled(core: str, experiments: Sequence[Experiment], runs: int, jobs: int) -> bool:
     """
-    Tell whether to use the compiled core.
+    Return whether to use the compiled core.
 
     :param runs: number of runs of all experiments together.
     :raises SimulationError: there is no such core, here or at all.

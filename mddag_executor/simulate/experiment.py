@@ -93,7 +93,7 @@ class Judge(Protocol):
     """Simulates runs of a task set."""
 
     def __call__(self, settings: Settings, times: Times) -> Bools:
-        """Tell which of the runs with these execution times met every deadline."""
+        """Return which of the runs with these execution times met every deadline."""
 
 
 class Evaluator:
@@ -179,7 +179,7 @@ class PlainJudge:
             cost_base=[self._tables.first_vertex[dag.index] for dag in task_set.dags])
 
     def __call__(self, settings: Settings, times: Times) -> Bools:
-        """Tell which of the runs met every deadline."""
+        """Return which of the runs met every deadline."""
         tables = self._tables
         accepted = np.zeros(len(times), dtype=np.bool_)
         for row in range(len(times)):

@@ -62,7 +62,7 @@ def as_arrays(load: Load) -> Load:
 
 
 def needs_python(load: Load) -> bool:
-    """Tell whether it is known what needs the interpreter, so that all else does at its end."""
+    """Return whether it is known what needs the interpreter, so that all else does at its end."""
     return len(load.computed) > 0 and len(load.holds) > 0
 
 

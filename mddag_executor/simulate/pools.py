@@ -73,7 +73,7 @@ class _LocalPool(Pool):
         self._executor.shutdown()
 
     def failure(self, error: BaseException) -> MddagError | None:
-        """Tell of a worker process that is gone."""
+        """Report a worker process that is gone."""
         if not isinstance(error, BrokenProcessPool):
             return None
         return SimulationError(

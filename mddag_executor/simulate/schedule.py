@@ -56,7 +56,7 @@ class Settings:
     @property
     def preempts(self) -> bool:
         """
-        Tell whether what is more urgent takes the worker of what runs.
+        Return whether what is more urgent takes the worker of what runs.
 
         :raises mddag_executor.core.PolicyError: there is no such policy, or it cannot do that.
         """
@@ -114,7 +114,7 @@ def schedule(
 
 
 def prepare(tables: Tables, load: Load, settings: Settings, runs: int = 1) -> bool:
-    """Tell whether so many runs are sooner done compiled; if so, compile, or load what was."""
+    """Return whether so many runs are sooner done compiled; if so, compile, or load what was."""
     executions = runs * len(load.times) * tables.n_vertices // max(1, tables.n_dags)
     stops = len(load.holds) > 0 or settings.cpus is not None
     plain_s = executions * (_STOPS_S if stops else _PLAIN_S)

@@ -62,7 +62,7 @@ def key_of_policy(t: Any, v: int, release: int, job: int, order: int) -> Key:
 
 
 def bind_policies(space: dict[str, Any]) -> None:
-    """Tell numba how to compile ``key_of_policy``, with the key functions in a namespace."""
+    """Show numba how to compile ``key_of_policy``, with the key functions in a namespace."""
     arguments = 't, v, release, job, order'
     *others, last = (row.key.__name__ for row in POLICIES.values())
     lines = [f'def choose({arguments}):']

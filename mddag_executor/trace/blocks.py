@@ -167,7 +167,7 @@ def usable(
 
 
 def has_copy(stream: BinaryIO, start: int, size: int) -> bool:
-    """Tell whether the first chunk, which holds one message then, has a copy (rule 6)."""
+    """Return whether the first chunk, which holds one message then, has a copy (rule 6)."""
     try:
         first = next(usable(stream, start, size, None, []), None)
     except Damage:

@@ -110,13 +110,13 @@ class TraceReader:
         return self._summary.messages - self._copies if self._summary else None
 
     def may_have(self, name: str) -> bool:
-        """Tell whether there may be an event of that full name: where the summary names none."""
+        """Return whether there may be an event of that full name: where the summary names none."""
         topic = '/trace/' + name.replace(':', '/')
         return self._summary is None or topic in self._summary.topics
 
     def has_events(self) -> bool:
         """
-        Tell whether there are channels of events, not only of other messages.
+        Return whether there are channels of events, not only of other messages.
 
         :raises TraceError: where the file can no longer be read
         """

@@ -104,12 +104,12 @@ class Times:
 
 
 def credible(stamp: int, arrival: int) -> bool:
-    """Tell whether a stamp can be that of what arrived at a time: not one of years before."""
+    """Return whether a stamp can be that of what arrived at a time: not one of years before."""
     return 0 < stamp and arrival - stamp < FAR_NS
 
 
 def plain(least: int, greatest: int) -> bool:
-    """Tell whether times between these two are all possible, and of one group."""
+    """Return whether times between these two are all possible, and of one group."""
     return 0 <= least and greatest < NEVER and greatest - least <= GAP_NS
 
 

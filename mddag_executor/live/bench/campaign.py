@@ -32,7 +32,7 @@ PATIENCE_S = 90.0
 _KILLED = -9
 
 Tick = Callable[[float], None]
-"""Told now and then for how many seconds a measurement has been going on."""
+"""Called now and then with how many seconds a measurement has been going on."""
 
 
 class CrashError(BenchError):

@@ -62,7 +62,7 @@ def response_taker(client: Any) -> Callable[[], tuple[Any, Any]]:
 
 
 callback_type: Callable[[Any], Any] = attrgetter('_callback_type')
-"""Tells whether a subscription's callback takes a message's info, too: then ``WITH_INFO``."""
+"""Says whether a subscription's callback takes a message's info, too: then ``WITH_INFO``."""
 
 WITH_INFO = Subscription.CallbackType.WithMessageInfo
 
@@ -282,7 +282,7 @@ class BareExecutor(Executor):
         return bool(self._is_shutdown)
 
     def begin_end(self) -> None:
-        """Tell the executor to end."""
+        """Ask the executor to end."""
         self._is_shutdown = True
 
     def _call_task_in_next_spin(self, task: Task) -> None:
@@ -323,7 +323,7 @@ def is_called_by_spin() -> bool:
 
 
 def tell_of_changes(listener: Callable[[Any], None]) -> None:
-    """Tell a function of each node whose entities come, go or change, after its executor."""
+    """Call a function with each node whose entities come, go or change, after its executor."""
     wake: Any = Node._wake_executor
 
     def wake_and_tell(self: Any) -> None:

@@ -150,7 +150,7 @@ class RefilledSet:
         return count, failed
 
     def _failure(self, error: Exception) -> bool:
-        """Tell an exception of a take; return whether it is one (and no destroyed entity)."""
+        """Report an exception of a take; return whether it is one (and no destroyed entity)."""
         if isinstance(error, InvalidHandle):
             return False
         self._on_error(error)
