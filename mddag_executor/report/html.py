@@ -183,10 +183,11 @@ def _page(
         yield misses_html(data, prepared)
     else:
         yield '<p class="note">No DAG is declared: give a GRAPH to judge deadlines.</p>\n'
-    yield ('<h2 id="mddag-timeline">Timeline</h2>\n<p class="legend">' + ''.join(
-        f'<span><i style="background:{colour}"></i>{text}</span>' for colour, text in zip(
-            (*(colour for _, colour in CLASSES), UNKNOWN), _LEGEND))
-        + '<span><b class="miss">&#9660;</b>where a deadline was missed</span></p>\n')
+    colours = (*(colour for _, colour in CLASSES), UNKNOWN)
+    legend = ''.join(f'<span><i style="background:{colour}"></i>{text}</span>'
+                     for colour, text in zip(colours, _LEGEND))
+    yield (f'<h2 id="mddag-timeline">Timeline</h2>\n<p class="legend">{legend}'
+           '<span><b class="miss">&#9660;</b>where a deadline was missed</span></p>\n')
     yield ('<p class="note">Times count from the beginning of the run. Drag the window of the '
            'first picture, or its edges. In the others drag to move, zoom with Ctrl and the wheel '
            '(or the tools above a picture), and point at a bar for its facts.</p>\n')
