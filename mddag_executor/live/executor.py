@@ -201,7 +201,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._pool.pump = self._pump
         self._pool.relieve_intake = self._relieve_intake
         self._stop_watch = StopWatch(
-            self._attention, self._stopped, look=self._pool.relieve_late_intakes)
+            self._attention, self._stopped, look=self._look_at_late)
         self._registry = Registry(task_set, self._engine, self._pool.leave_group)
         self._receiver = Receiver(
             self._pool, self._registry, self, self._fail, self._recorder)
@@ -349,7 +349,7 @@ class MultiDeadlineExecutor(BareExecutor):
         :raises RuntimeError: when the executor spins already.
         :raises Exception: what a callback raised.
         """
-        with short_switch_interval():
+        with short_switch_interval(self._engine.preempts):
             self._spin(lambda: False, None)
 
     def spin_until_future_complete(
@@ -358,7 +358,7 @@ class MultiDeadlineExecutor(BareExecutor):
         """Run callbacks on the pool until a future is done or the time is over."""
         future.add_done_callback(QuickCallback(self._attention.ring))
         try:
-            with short_switch_interval():
+            with short_switch_interval(self._engine.preempts):
                 self._spin(lambda: future.done() or future.cancelled(), timeout_sec)
         except ExternalShutdownException:
             pass
@@ -377,6 +377,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 gc.freeze()
             self._start_intake()
             self._submit_tasks()
+            self._pool.interpreter.looks_late = True
             self._pool.start()
             self._stop_watch.start()
             while not self.is_ending():
@@ -402,6 +403,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._check_context()
             raise
         finally:
+            self._pool.interpreter.looks_late = False
             self._pool.pause()
             self._stop_intake()
             if is_over(self.context):
@@ -466,6 +468,11 @@ class MultiDeadlineExecutor(BareExecutor):
         intake = self._intake
         if isinstance(intake, EventsIntake):
             intake.relieve(relieved)
+
+    def _look_at_late(self) -> None:
+        """Look whether a callback has taken longer than expected; every 20 ms while it spins."""
+        self._pool.relieve_late_intakes()
+        self._pool.interpreter.look_at_late()
 
     def _stopped(self, begin: int, end: int) -> None:
         """Take note that no thread of the process ran from ``begin`` to ``end`` (monotonic)."""

@@ -11,8 +11,9 @@ do is declared or learnt (``habits``).  Here
 
 1.  executions are measured for that;
 2.  while something is held back, a thread looks every ``LOOK_NS`` at the most urgent callback that
-    holds the interpreter (every ``PATIENCE_NS`` at one that has never waited yet: a look costs who
-    computes a tenth of a millisecond), and so does on the way who takes in something that arrives.
+    holds the interpreter, and so does on the way who takes in something that arrives.  A look costs
+    who computes a tenth of a millisecond.  So one that has never waited yet is looked at only if
+    the spinning thread, which wakes every 20 ms, finds it twice in a row (``look_at_late``).
     If its CPU clock stands still though no other process has its CPU, it waits: for a lock, an
     event, a service.  It gives the interpreter back at once, so that nobody is held back for one
     that waits for him; where the lock was not free meanwhile it may have waited for that, and is
@@ -23,7 +24,8 @@ do is declared or learnt (``habits``).  Here
     held back for the first time, and called off when nothing is any more.
 
 Between two threads that compute, Python switches every ``sys.getswitchinterval()``, 5 ms by
-default; while an executor spins it is shorter, so that an arrival is seen sooner.
+default; while an executor spins it is shorter, so that an arrival is seen sooner, and shorter still
+where who computes is to pause for that.
 """
 
 from __future__ import annotations
@@ -44,8 +46,6 @@ from mddag_executor.live.seat import Seat
 from mddag_executor.live.thread_clock import ThreadClock
 from mddag_executor.live.work import Work
 
-PATIENCE_NS = 20_000_000
-"""So often it is looked at one that has never waited yet."""
 SOON_NS = 100_000
 IDLE_LOOKS = 2
 LITTLE = 0.05
@@ -54,6 +54,7 @@ TRIAL_US = 30
 _LIBRARY = ctypes.PyDLL(None)   # which does not release the lock
 
 SWITCH_INTERVAL_S = 0.001
+PREEMPTING_INTERVAL_S = 0.00025
 
 
 class Interpreter:
@@ -67,6 +68,7 @@ class Interpreter:
     :param hand_out: called, under the lock, when somebody has given the interpreter back.
     :param preemption: has those pause that are overtaken; None: they do not.
     :ivar rings_at: when it is looked next; 0: never.
+    :ivar looks_late: whether somebody calls ``look_at_late`` now and then.
     """
 
     def __init__(
@@ -84,12 +86,13 @@ class Interpreter:
         self._may_overlap = len(os.sched_getaffinity(0)) > 1
         self._alarm = Alarm(LOOK_NS)
         self.rings_at = 0
+        self.looks_late = False
         self._thread: threading.Thread | None = None
         self._closed = False
         # whom to look at, when that was done last, and what he had computed then
         self._seen: tuple[Work | None, int, int] = (None, 0, 0)
-        # who has never waited yet, and for whom the alarm is set late enough
-        self._trusted: Work | None = None
+        # who held it when it was looked late
+        self._late: Work | None = None
         self._idle = 0
 
     # --- measuring -------------------------------------------------------------------------------
@@ -126,7 +129,6 @@ class Interpreter:
         holder = engine.interpreter_holder() if engine.held_back or pauses else None
         if holder is None:
             self._seen = None, 0, 0
-            self._trusted = None
             if self.rings_at:
                 self.rings_at = 0
                 self._alarm.start(0)
@@ -137,22 +139,31 @@ class Interpreter:
             if (seat is not None and seat.cpu_clock is not None
                     and seat.thread is not threading.current_thread()):
                 habit.was_released(self._computes_now(seat.cpu_clock))
-        if holder is self._trusted and self.rings_at and not pauses:
+        is_trusted = self.looks_late and habit.is_trusted and not pauses
+        if holder is not self._seen[0]:
+            if not is_trusted:
+                self._idle = 0
+                self._note(holder)
+                self._watch(LOOK_NS)
+        elif not self.rings_at:
+            if not is_trusted:
+                self._watch(LOOK_NS)
+        elif monotonic_ns() - self._seen[1] >= LOOK_NS and not self._has_computed(holder):
+            self._watch(SOON_NS)  # it was seen on the way
+
+    def look_at_late(self) -> None:
+        """Look at who has kept others from the interpreter since the last call of this."""
+        engine = self._engine
+        if not engine.held_back:
+            self._late = None
             return
-        is_trusted = habit.is_trusted and not pauses
-        if holder is self._seen[0]:
-            if not self.rings_at:
-                self._watch(PATIENCE_NS if is_trusted else LOOK_NS)
-            elif monotonic_ns() - self._seen[1] >= LOOK_NS and not self._has_computed(holder):
-                self._watch(SOON_NS)  # it was seen on the way
-        elif not is_trusted:
-            self._idle = 0
-            self._note(holder)
-            self._watch(LOOK_NS)
-        else:
-            self._trusted = holder
-            if self.rings_at - monotonic_ns() < PATIENCE_NS // 2:
-                self._watch(PATIENCE_NS)
+        with self._lock:
+            holder = engine.interpreter_holder()
+            if holder is not None and holder is self._late and not self.rings_at:
+                self._idle = 0
+                self._note(holder)
+                self._watch(LOOK_NS)
+            self._late = holder
 
     def _watch(self, ns: int) -> None:
         """Set the alarm for the next look."""
@@ -256,14 +267,15 @@ _usual_interval = 0.0
 
 
 @contextmanager
-def short_switch_interval() -> Iterator[None]:
+def short_switch_interval(preempts: bool) -> Iterator[None]:
     """Have Python's threads take turns more often while entered; nested and from any thread."""
     global _switchers, _usual_interval
     with _switching:
         if _switchers == 0:
             _usual_interval = sys.getswitchinterval()
-            sys.setswitchinterval(min(_usual_interval, SWITCH_INTERVAL_S))
         _switchers += 1
+        sys.setswitchinterval(min(
+            sys.getswitchinterval(), PREEMPTING_INTERVAL_S if preempts else SWITCH_INTERVAL_S))
     try:
         yield
     finally:

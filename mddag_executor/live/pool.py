@@ -98,7 +98,7 @@ class Pool:
         self._refusals = 0
         self.cpu_order: CpuOrder | None = None
         self.preemption = Preemption() if preempt else None
-        self._interpreter = Interpreter(
+        self.interpreter = Interpreter(
             engine, self.lock, self._seats, self._hand_out_now, self.preemption)
 
     # --- telling the engine ----------------------------------------------------------------------
@@ -222,7 +222,7 @@ class Pool:
             if self.preemption is not None:
                 self.preemption.close()
             seats += self._intakes
-        self._interpreter.close()
+        self.interpreter.close()
         deadline = None if timeout is None else monotonic_ns() + int(timeout * 1e9)
         done = True
         for seat in seats:
@@ -314,8 +314,8 @@ class Pool:
             seat = self._seats[work.worker]
             seat.work = work
             seat.wake.release()
-        if engine.held_back or engine.is_shared or self._interpreter.rings_at:
-            self._interpreter.look_after()
+        if engine.held_back or engine.is_shared or self.interpreter.rings_at:
+            self.interpreter.look_after()
         return chosen
 
     def _hand_out_now(self) -> None:
@@ -355,7 +355,7 @@ class Pool:
                 self.cpu_order.starts(seat, start)
             seat.reading = None
             if entity.habit.is_to_be_measured():
-                self._interpreter.begins(seat, entity.habit)
+                self.interpreter.begins(seat, entity.habit)
         traced = engine.record is not None
         if traced:
             work.cpu_ns -= thread_time_ns()
@@ -375,7 +375,7 @@ class Pool:
         if entity.is_brief.debt or end - start > BRIEF_NS:
             entity.is_brief.took(end - start, entity.ran)
         if seat.reading is not None:
-            self._interpreter.ended(seat, entity.habit, end - start)
+            self.interpreter.ended(seat, entity.habit, end - start)
         with self.lock:
             now = self._last = end if end > self._last else self._last
             if raised is None and waits_for is None:
@@ -387,7 +387,7 @@ class Pool:
                 engine.ask_again()
             seat.work = None
             if seat.thread is None:
-                if engine.has_waiting or engine.is_shared or self._interpreter.rings_at:
+                if engine.has_waiting or engine.is_shared or self.interpreter.rings_at:
                     self._hand_out(now)
             elif self._closed or not self.running or seat.worker < 0:
                 self._leave(seat, now)
@@ -395,8 +395,8 @@ class Pool:
                 seat.work = engine.dispatch(now, seat.worker)
                 if engine.has_more:
                     self._hand_out(now)
-                elif engine.held_back or engine.is_shared or self._interpreter.rings_at:
-                    self._interpreter.look_after()
+                elif engine.held_back or engine.is_shared or self.interpreter.rings_at:
+                    self.interpreter.look_after()
         let_run = type(raised) is not Refused
         if waits_for is not None:
             self._resume_when_done(work, waits_for)

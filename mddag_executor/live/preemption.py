@@ -9,9 +9,9 @@ A callback that is overtaken (rule 11 of ``core.rules``) would share the interpr
 urgent one.  Instead it pauses at the next line or jump of its own code: ``sys.monitoring`` (Python
 3.12) calls a function there, which waits for a lock.
 
-1.  Only code that the overtaken thread executes at that moment is instrumented, and only while it
-    is overtaken, so nobody else is slowed down.  Where another thread executes the same code, the
-    function returns at once.
+1.  Only code that the overtaken thread executes at that moment is instrumented, and only until it
+    pauses, so nobody else is slowed down for long.  Where another thread executes the same code,
+    the function returns at once.
 2.  It pauses in code of its own only: never in this package, in rclpy or in Python's library,
     which may keep locks that others need at once.
 3.  A callback may pause while it keeps a lock that the urgent one needs.  While anybody pauses,
@@ -101,6 +101,7 @@ class _Monitor:
         pause = self.pauses.get(threading.get_ident())
         if pause is not None:
             pause.has_begun = True
+            self.restore(pause)
             pause.lock.acquire()
             pause.lock.release()
 
@@ -119,7 +120,8 @@ class _Monitor:
     def restore(self, pause: _Pause) -> None:
         """Have it called there no longer, unless others pause there."""
         with self._lock:
-            for key, code in pause.codes.items():
+            while pause.codes:
+                key, code = pause.codes.popitem()
                 self._instrumented[key] -= 1
                 if not self._instrumented[key]:
                     del self._instrumented[key]

@@ -112,6 +112,20 @@ def test_the_long_one_pauses_while_the_urgent_one_computes(make_executor, make_n
     assert executor.statistics()['preemption']['pauses'] >= 1
 
 
+@needs_monitoring
+def test_code_is_not_slowed_down_any_more_once_the_long_one_pauses(make_executor, make_node):
+    counter, events = Counter(), []
+
+    def urgent() -> None:
+        counter.is_still()
+        events.append([MONITORING.get_local_events(tool, Counter.count.__code__)
+                       for tool in range(6) if MONITORING.get_tool(tool) == 'mddag_executor'])
+
+    two = Two(preempting(make_executor), make_node(), counter.count, urgent)
+    assert two.run(lambda: counter.n > 0) == ['urgent', 'long']
+    assert counter.stood_still and events == [[0]]
+
+
 def numbers(counter: Counter) -> Iterator[int]:
     while not counter.stop:
         counter.n += 1
