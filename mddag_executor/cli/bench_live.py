@@ -40,7 +40,7 @@ from mddag_executor.text import counted
 HELP = 'measure executors of rclpy nodes, this one and those of rclpy, side by side'
 DESCRIPTION = 'Measure executors of rclpy nodes, this one and those of rclpy, side by side.'
 EXAMPLE = """\
-mddag bench live --load autoware --utilisation 0.3,0.6,0.8 --seconds 10 --plot live.png
+mddag bench live --load autoware --utilisation 0.3,0.6,0.8 --seconds 10
 mddag bench live --load autoware --executors rad-events,multi --policies rad,fifo,rm,wc,gedf
 mddag bench live --load robot --scale 1,1.2 --seconds 20
 mddag bench live --load topics --topics 50 --rate 100 --repeat 3 --json topics.json
@@ -101,7 +101,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'which every deadline of the Autoware workload can be kept', int,
         default=defaults.LIVE_SEED)
     options.add_repeat(parser, 1, 'measure everything R times in turn, and take the medians')
-    add('--plot', metavar='OUT', type=options.Output, help='draw a figure (.png, .svg or .pdf)')
     options.add(parser, '--graph', '--json')
 
 
@@ -119,10 +118,6 @@ def main(args: argparse.Namespace) -> int:
     for result in results:
         if graph is not None:
             result['graph'] = args.graph or graph
-    if args.plot is not None:
-        from mddag_executor.live.bench.plot import draw
-        with common.output_file(args.plot) as file:
-            draw(results, file, args.plot)
     if common.write_result(args, results):
         print(result_table(results))
         for line in notes(results):
@@ -136,9 +131,6 @@ def _check(args: argparse.Namespace) -> None:
             raise UsageError(
                 f'--{option}: it means nothing to --load {args.load}: leave it out, or take '
                 f'--load {" or ".join(loads)}')
-    if args.plot is not None:
-        from mddag_executor.simulate.plot import check_plot
-        check_plot(args.plot)
     if find_spec('rclpy') is None:
         raise ModuleNotFoundError('there is no rclpy', name='rclpy')
 
