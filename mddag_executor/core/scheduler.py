@@ -43,6 +43,9 @@ class Scheduler:
     :ivar complete: ``complete(x, now)`` ends a running execution; it returns False for a leg that
         did not make its vertex whole.
     :ivar fail: ``fail(x, now)`` ends one that failed; see ``complete``.
+
+    What only passes on (``drop``, ``lend``, ``expire``, …) is bound as it is: see ``core.rules``
+    and ``core.jobs``.
     """
 
     def __init__(
@@ -72,6 +75,14 @@ class Scheduler:
         self.complete: Callable[[int, int], bool] = partial(
             rules.complete, *rule, self.policy.key)
         self.fail: Callable[[int, int], bool] = partial(rules.fail, *rule, self.policy.key)
+        self.drop: Callable[[int, int], None] = partial(rules.drop, self.state)
+        self.lend, self.stop_holding, self.suspend, self.refuse, self.leave_group, self.resume = (
+            partial(function, self.state) for function in (
+                rules.lend, rules.stop_holding, rules.suspend, rules.refuse, rules.leave_group,
+                rules.resume))
+        self.expire: Callable[[int, int], None] = partial(jobs.expire_job, *rule)
+        self.abort: Callable[[int, int], None] = partial(jobs.abort_job, *rule)
+        self.finish: Callable[[int], None] = partial(jobs.finish, *rule)
 
     def release(self, dag: int, job: int, release: int, now: int) -> int:
         """Open a job of a DAG and return its slot."""
@@ -117,46 +128,10 @@ class Scheduler:
         if self.state.job_state[slot] == OPEN:
             jobs.fail_job(self.tables, self.state, slot, now)
 
-    def drop(self, x: int, now: int) -> None:
-        """Drop a waiting execution: it never runs."""
-        rules.drop(self.state, x, now)
-
-    def lend(self, x: int) -> None:
-        """Free the worker of an execution that goes on without one."""
-        rules.lend(self.state, x)
-
-    def stop_holding(self, x: int) -> None:
-        """Give the interpreter back for an execution that turns out not to hold it."""
-        rules.stop_holding(self.state, x)
-
-    def suspend(self, x: int) -> None:
-        """Take a running execution off its worker until ``resume``."""
-        rules.suspend(self.state, x)
-
-    def refuse(self, x: int) -> None:
-        """Take an execution that may not begin off its worker until ``resume``."""
-        rules.refuse(self.state, x)
-
-    def leave_group(self, x: int) -> None:
-        """Let a running execution go on without its callback group."""
-        rules.leave_group(self.state, x)
-
-    def resume(self, x: int) -> None:
-        """Make a suspended or refused execution ready again."""
-        rules.resume(self.state, x)
-
     def expire_open(self, slot: int, now: int) -> None:
         """Expire the job in a slot unless it has ended already."""
         if self.state.job_state[slot] == OPEN:
             self.expire(slot, now)
-
-    def expire(self, slot: int, now: int) -> None:
-        """Expire the open job in a slot."""
-        jobs.expire_job(self.tables, self.state, slot, now)
-
-    def abort(self, slot: int, now: int) -> None:
-        """Abort the open job in a slot."""
-        jobs.abort_job(self.tables, self.state, slot, now)
 
     def withdraw(self, slot: int) -> None:
         """Close the open job in a slot without any decision: what became of it is not known."""
@@ -166,10 +141,6 @@ class Scheduler:
         """Expire every job that can no longer complete."""
         for dag in range(self.tables.n_dags):
             jobs.expire_idle(self.tables, self.state, dag, now)
-
-    def finish(self, now: int) -> None:
-        """Judge what is open at the run's end."""
-        jobs.finish(self.tables, self.state, now)
 
     def new_group(self) -> int:
         """Add a mutually exclusive callback group and return its number."""

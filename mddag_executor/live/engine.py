@@ -478,14 +478,6 @@ class Engine:
         """Take in that an execution's callback group has let it run (see ``gates``)."""
         self.scheduler.leave_group(work.x)
 
-    def new_group(self) -> int:
-        """Return the number of a new mutually exclusive callback group."""
-        return self.scheduler.new_group()
-
-    def free_group(self, group: int) -> None:
-        """Forget a group, and use its number again."""
-        self.scheduler.free_group(group)
-
     def ask_again(self) -> None:
         """Make ready again what a callback group did not let run."""
         refused, self.to_ask_again = self.to_ask_again, []

@@ -11,9 +11,10 @@ do is declared or learnt (``habits``).  Here
 
 1.  executions are measured for that;
 2.  while something is held back, a thread looks every ``LOOK_NS`` at the most urgent callback that
-    holds the interpreter, and so does on the way who takes in something that arrives.  A look costs
-    who computes a tenth of a millisecond.  So one that has never waited yet is looked at only if
-    the spinning thread, which wakes every 20 ms, finds it twice in a row (``look_at_late``).
+    holds the interpreter, and so does on the way who takes in something that arrives.  A look
+    costs who computes a tenth of a millisecond.  So one that has never waited yet is looked at
+    only if the spinning thread, which wakes every 20 ms, finds it twice in a row
+    (``look_at_late``).
     If its CPU clock stands still though no other process has its CPU, it waits: for a lock, an
     event, a service.  It gives the interpreter back at once, so that nobody is held back for one
     that waits for him; where the lock was not free meanwhile it may have waited for that, and is
@@ -24,8 +25,8 @@ do is declared or learnt (``habits``).  Here
     held back for the first time, and called off when nothing is any more.
 
 Between two threads that compute, Python switches every ``sys.getswitchinterval()``, 5 ms by
-default; while an executor spins it is shorter, so that an arrival is seen sooner, and shorter still
-where who computes is to pause for that.
+default; while an executor spins it is shorter, so that an arrival is seen sooner, and shorter
+still where who computes is to pause for that.
 """
 
 from __future__ import annotations

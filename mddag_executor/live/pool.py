@@ -135,7 +135,6 @@ class Pool:
                 return False
             seat.worker = work.worker
             seat.work = work
-            work.is_fresh = self.is_settled
         self._run_here(seat)
         return True
 
@@ -356,6 +355,7 @@ class Pool:
             seat.reading = None
             if entity.habit.is_to_be_measured():
                 self.interpreter.begins(seat, entity.habit)
+        work.is_known = self.is_settled
         traced = engine.record is not None
         if traced:
             work.cpu_ns -= thread_time_ns()

@@ -250,7 +250,7 @@ class Registry:
             return -1
         number = self._groups.get(group)
         if number is None:
-            number = self._groups[group] = self._engine.new_group()
+            number = self._groups[group] = self._engine.scheduler.new_group()
             self._numbers.add(number)
         return number
 
@@ -259,7 +259,7 @@ class Registry:
         if len(self._groups) < len(self._numbers):
             for number in self._numbers.difference(list(self._groups.values())):
                 self._numbers.remove(number)
-                self._engine.free_group(number)
+                self._engine.scheduler.free_group(number)
 
     def _unbind(self, entity: Entity) -> None:
         if self._binder is not None and entity.callback is not None:

@@ -57,14 +57,14 @@ class Work:
     :ivar x: the execution in the core; -1 before it is ready and after it has ended.
     :ivar origin: the vertex and job that it executes; None where no DAG declares it.
     :ivar worker: where it runs, or has run last.
-    :ivar is_fresh: whether it has just been taken, and nobody has destroyed an entity since.
+    :ivar is_known: whether the executor would know if the entity were destroyed.
     :ivar ready_ns: when it became ready, on the trace's clock.
     :ivar cpu_ns: what it has computed, while a trace is recorded.
     """
 
     __slots__ = (
         'rclpy_entity', 'function', 'args', 'then', 'info', 'due', 'missed', 'entity', 'x',
-        'coroutine', 'origin', 'worker', 'is_fresh', 'ready_ns', 'cpu_ns')
+        'coroutine', 'origin', 'worker', 'is_known', 'ready_ns', 'cpu_ns')
 
     def __init__(
         self, rclpy_entity: Any, function: Callable[..., Any], args: tuple[Any, ...] = (),
@@ -82,7 +82,7 @@ class Work:
         self.coroutine: Any = None
         self.origin: Origin | None = None
         self.x = self.worker = -1
-        self.is_fresh = False
+        self.is_known = False
         self.ready_ns = self.cpu_ns = 0
 
     def step(self) -> Any:
@@ -94,7 +94,7 @@ class Work:
         """
         if self.coroutine is None:
             handle = self.entity.handle
-            if handle is not None and not self.is_fresh:
+            if handle is not None and not (self.is_known and self.entity.kind != TIMER):
                 try:
                     with handle:
                         # One more may have become due before it was cancelled in its callback.

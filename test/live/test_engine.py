@@ -126,7 +126,8 @@ def entity_without_job(engine: Engine, group: int = -1) -> Entity:
 
 def test_what_runs_past_the_core_keeps_its_worker_and_its_group() -> None:
     engine = Engine(None, 2, 'rad', default_deadline=100, max_active_jobs=64, expire_after=NEVER)
-    entity, other = entity_without_job(engine, engine.new_group()), entity_without_job(engine)
+    entity = entity_without_job(engine, engine.scheduler.new_group())
+    other = entity_without_job(engine)
     alone = Work(None, print, entity=entity)
     assert engine.begins_alone(alone)
     works = [Work(None, print, entity=each) for each in (entity, other, other)]
@@ -144,7 +145,7 @@ def test_what_runs_past_the_core_keeps_its_worker_and_its_group() -> None:
 
 def test_nothing_runs_past_the_core_that_this_would_not_dispatch() -> None:
     engine = Engine(None, 1, 'rad', default_deadline=100, max_active_jobs=64, expire_after=NEVER)
-    entity = entity_without_job(engine, engine.new_group())
+    entity = entity_without_job(engine, engine.scheduler.new_group())
     works = [Work(None, print, entity=entity) for _ in range(3)]
     engine.arrived(works[0], None, -1, -1, 0)
     assert not engine.begins_alone(works[1])    # one waits
