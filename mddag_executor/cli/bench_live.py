@@ -24,7 +24,6 @@ from mddag_executor.errors import UsageError
 from mddag_executor.live.bench.spec import (
     DECLARED,
     EXECUTORS,
-    GROUPS,
     LOADS,
     NONE,
     parse_executors,
@@ -55,7 +54,7 @@ ENTITIES_RATE_HZ = 100.0
 _LOADS_OF_OPTIONS = {
     'graph': ('autoware', 'reference-system'), 'utilisation': ('autoware', 'reference-system'),
     'bodies': ('autoware', 'reference-system'), 'topics': ('topics',),
-    'rate': ('topics', 'entities'), 'idle': ('entities',), 'groups': ('topics', 'entities'),
+    'rate': ('topics', 'entities'), 'idle': ('entities',),
     'phases': ('topics',), 'scale': (ROBOT,)}
 
 
@@ -84,9 +83,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='how often each topic is published (default: see --topics; 100 for entities)')
     add('--idle', type=options.list_of(options.or_zero(options.positive_int)), metavar='N[,N…]',
         help='with --load entities: how many idle subscriptions (default: 1,10,100,1000)')
-    add('--groups', choices=GROUPS,
-        help="with topics and entities: the node's default callback group, one for each "
-        'subscription, or a reentrant one (default: shared)')
     add('--phases', choices=PHASES,
         help='with --load topics: each topic at a phase of its own, or all published in a row, '
         'as one timer does (default: drawn)')
@@ -176,7 +172,6 @@ def make_specs(
 ) -> list[Spec]:
     """Return the measurements that a command line asks for, in the order of the table."""
     variants: list[dict[str, Any]]
-    groups = args.groups or 'shared'
     if args.load == ROBOT:
         variants = [{'graph': graph, 'scale': scale} for scale in args.scale or [1.0]]
     elif graph is not None:
@@ -185,12 +180,12 @@ def make_specs(
     elif args.load == 'topics':
         pairs = TOPICS if args.topics is None and args.rate is None else [
             (args.topics or TOPICS[0][0], args.rate or TOPICS[0][1])]
-        variants = [{'topics': topics, 'rate_hz': rate, 'groups': groups,
+        variants = [{'topics': topics, 'rate_hz': rate,
                      'phases': args.phases or 'drawn'}
                     for topics, rate in pairs]
     else:
         rate = args.rate or ENTITIES_RATE_HZ
-        variants = [{'idle': idle, 'rate_hz': rate, 'groups': groups}
+        variants = [{'idle': idle, 'rate_hz': rate}
                     for idle in args.idle or IDLE]
     return [
         Spec(load=args.load, executor=executor, policy=policy, workers=args.workers,
@@ -280,7 +275,6 @@ def notes(results: Sequence[dict[str, Any]]) -> Iterator[str]:
     how = f', medians of {first["repeat"]}' if first['repeat'] > 1 else ''
     yield (f'{first["seconds"]:g} s each{how}, seed {first["seed"]}, '
            + counted(first['workers'], 'worker')
-           + (f', {first["groups"]} callback groups' if 'groups' in first else '')
            + (', published together' if first.get('phases') == 'together' else ''))
     if first['load'] == ROBOT:
         yield "in time: by the nodes' own stamps, of what was due; cores: CPU of the whole process"

@@ -26,7 +26,7 @@ that do not complete the join are not counted as callbacks: their cost is overhe
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 import time
 from typing import Any
@@ -180,25 +180,36 @@ def measure(
 
 def _judge(ledger: Ledger, dag: Dag, vertex: Vertex, start: int, end: int) -> dict[str, Any]:
     """Return one sink's verdicts about the deadlines within ]start, end]."""
-    deadline = vertex.deadline_ns or 0
-    tally = SinkTally(deadline, None)
-    due = 0
+    deadline, period = vertex.deadline_ns or 0, dag.period_ns
     first = ledger.first_release[dag.index]
-    if first is not None:
-        completed: dict[int, int] = {}
-        for release, completion in list(ledger.completions[dag.index][vertex.index]):
-            job = (release - first + min(_EARLY_NS, dag.period_ns // 4)) // dag.period_ns
-            completed.setdefault(job, completion)
-        first_job = max(0, (start - deadline - first) // dag.period_ns + 1)
-        for job in range(first_job, (end - deadline - first) // dag.period_ns + 1):
-            due += 1
-            if job in completed:
-                response = completed[job] - (first + job * dag.period_ns)
-                tally.done(response, response > deadline)
+    if first is None:
+        return judge_sink(deadline, (), {})
+    completed: dict[int, int] = {}
+    for release, completion in list(ledger.completions[dag.index][vertex.index]):
+        job = (release - first + min(_EARLY_NS, period // 4)) // period
+        completed.setdefault(first + job * period, completion)
+    first_job = max(0, (start - deadline - first) // period + 1)
+    return judge_sink(
+        deadline, range(first + first_job * period, end - deadline + 1, period), completed)
+
+
+def judge_sink(
+    deadline: int, due: Sequence[int], completed: Mapping[int, int]
+) -> dict[str, Any]:
+    """
+    Return the verdicts about a sink.
+
+    :param due: the releases of its jobs; ``completed``: when those completed, by release.
+    """
+    tally = SinkTally(deadline, None)
+    for release in due:
+        if release in completed:
+            response = completed[release] - release
+            tally.done(response, response > deadline)
     return {
-        'relative_deadline_ns': deadline, 'due': due, 'on_time': tally.completed - tally.late,
-        'late': tally.late, 'missing': due - tally.completed,
-        'response_ns': tally.result()['response_ns']}
+        'relative_deadline_ns': deadline, 'due': len(due),
+        'on_time': tally.completed - tally.late, 'late': tally.late,
+        'missing': len(due) - tally.completed, 'response_ns': tally.result()['response_ns']}
 
 
 def _throughput(

@@ -167,23 +167,6 @@ class Session:
         self.clean = not self._thread.is_alive()
 
 
-def run_synthetic(
-    session: Session,
-    workload: SyntheticWorkload,
-    duration_s: float | None,
-    tick: Tick | None = None,
-    warm_up_s: float = WARM_UP_S,
-) -> dict[str, Any] | None:
-    """
-    Run a synthetic workload in a session that spins already, and end the session.
-
-    :return: the figures of ``measured``; None when the run was stopped before the window began.
-    :raises SessionError: when publishers and subscriptions do not find each other.
-    """
-    books = run_and_note(session, workload, duration_s, tick, warm_up_s)
-    return None if books is None else measured(books, workload.plan, warm_up_s)
-
-
 def measured(books: Books, plan: ExecutionPlan, warm_up_s: float = WARM_UP_S) -> dict[str, Any]:
     """Return the figures of ``measure``, and those of the run."""
     result = measure(books.ledger, plan, books.start, books.end)
@@ -198,7 +181,7 @@ def run_and_note(
     begin: Callable[[Session, Callable[[], list[str]]], int | None] = Session.wait_until_matched,
 ) -> Books | None:
     """
-    Run a synthetic workload as ``run_synthetic`` does.
+    Run a synthetic workload in a session that spins already, and end the session.
 
     :param duration_s: length of the measured window, which begins ``warm_up_s`` after the timers;
         None: until the session is stopped.

@@ -59,11 +59,10 @@ def running(pid: int) -> bool:
         return False
 
 
-@pytest.mark.parametrize(('executor', 'groups'), [
-    ('rad-events', 'own'), ('rad-waitset', 'reentrant'), ('single', 'own'), ('events', 'shared')])
-def test_topics_count_every_message(executor: str, groups: str) -> None:
+@pytest.mark.parametrize('executor', ['rad-events', 'rad-waitset', 'single', 'events'])
+def test_topics_count_every_message(executor: str) -> None:
     result = measure(Spec(
-        'topics', executor, topics=5, rate_hz=40.0, seconds=0.5, warm_up_s=0.2, groups=groups))
+        'topics', executor, topics=5, rate_hz=40.0, seconds=0.5, warm_up_s=0.2))
     check_messages(result)
     assert result['callbacks'] <= result['received']
     dds = result['middleware_cpu_us_per_callback']

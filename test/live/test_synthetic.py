@@ -20,7 +20,7 @@ from mddag_executor.live.execution import (
     spinner,
 )
 from mddag_executor.live.executor import MultiDeadlineExecutor
-from mddag_executor.live.session import run_synthetic, Session
+from mddag_executor.live.session import measured, run_and_note, Session
 from mddag_executor.live.synthetic import SyntheticWorkload
 from mddag_executor.simulate import draw_execution_times
 from msg_graph import load, loads, TaskSet
@@ -296,10 +296,11 @@ def test_every_release_reaches_every_sink(task_set: TaskSet, ros_context: Any) -
     for node in workload.nodes:
         executor.add_node(node)
     with Session(executor) as session:
-        result = run_synthetic(session, workload, 1.0, warm_up_s=0.5)
+        books = run_and_note(session, workload, 1.0, warm_up_s=0.5)
     assert session.error is None
     assert session.clean
-    assert result is not None
+    assert books is not None
+    result = measured(books, workload.plan, 0.5)
     names = {n for dag in result['dags'].values() for n in dag['sinks']}
     assert names == {
         '/filter/left:again', '/sink:cb@fast', '/sink:cb@slow', '/tracker:cb', '/gate:cb'}
@@ -345,7 +346,7 @@ def test_groups_keep_their_callbacks_apart(task_set: TaskSet, ros_context: Any) 
     for node in workload.nodes:
         executor.add_node(node)
     with Session(executor) as session:
-        run_synthetic(session, workload, 0.5, warm_up_s=0.1)
+        run_and_note(session, workload, 0.5, warm_up_s=0.1)
     assert len(most) > 10
     assert max(most) == 1
     workload.destroy()

@@ -174,7 +174,7 @@ def combine(spec: Spec, runs: Sequence[dict[str, Any]], repeat: int = 1) -> dict
         result['bodies'] = spec.bodies
     else:
         result.update(
-            topics=spec.topics, rate_hz=spec.rate_hz, idle=spec.idle, groups=spec.groups,
+            topics=spec.topics, rate_hz=spec.rate_hz, idle=spec.idle,
             phases=spec.phases)
     result['utilisation'] = _median(run.get('utilisation') for run in runs)
     for name in _VERDICTS:

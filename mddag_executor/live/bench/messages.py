@@ -10,7 +10,6 @@ middleware, interpreter, and reading the clock.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import os
 from pathlib import Path
 import time
@@ -22,11 +21,6 @@ from mddag_executor.live.bench.latency import Starts
 from mddag_executor.live.bench.publisher import PublisherProcess
 from mddag_executor.live.bench.spec import Spec
 from mddag_executor.live.synthetic import QOS, quiet_node
-from rclpy.callback_groups import (
-    CallbackGroup,
-    MutuallyExclusiveCallbackGroup,
-    ReentrantCallbackGroup,
-)
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from std_msgs.msg import Header
@@ -53,10 +47,9 @@ def run_messages(spec: Spec) -> dict[str, Any]:
     topics = [f'{prefix}/topic_{i}' for i in range(spec.topics)]
     node = quiet_node('/mddag_bench')
     starts = Starts()
-    group = _groups(spec, node)
-    active = [_subscribe(node, topic, starts, group()) for topic in topics]
+    active = [_subscribe(node, topic, starts) for topic in topics]
     for i in range(spec.idle):
-        _subscribe(node, f'{prefix}/idle_{i}', starts, group())
+        _subscribe(node, f'{prefix}/idle_{i}', starts)
     executor.add_node(node)
     session = UnfinishedSession(executor, spec)
     seed = None if spec.phases == 'together' else spec.seed
@@ -109,18 +102,8 @@ def _middleware_cpu_ns() -> int | None:
     return sum(times) if times else None
 
 
-def _groups(spec: Spec, node: Node) -> Callable[[], CallbackGroup]:
-    """Return what gives the next subscription its callback group."""
-    if spec.groups == 'own':
-        return MutuallyExclusiveCallbackGroup
-    reentrant = spec.groups == 'reentrant'
-    shared = ReentrantCallbackGroup() if reentrant else node.default_callback_group
-    return lambda: shared
-
-
-def _subscribe(node: Node, topic: str, starts: Starts, group: CallbackGroup) -> Subscription:
-    return node.create_subscription(
-        Header, topic, starts.noting(), QOS, callback_group=group)
+def _subscribe(node: Node, topic: str, starts: Starts) -> Subscription:
+    return node.create_subscription(Header, topic, starts.noting(), QOS)
 
 
 def _drain(session: UnfinishedSession, starts: Starts, published: int) -> None:

@@ -14,9 +14,9 @@ from importlib.util import module_from_spec, spec_from_file_location
 import time
 from typing import Any
 
-from mddag_executor.core.tally import SinkTally
 from mddag_executor.live.bench.executors import make_executor, UnfinishedSession
 from mddag_executor.live.bench.spec import BenchError, Spec
+from mddag_executor.live.measure import judge_sink
 from mddag_executor.resources import find
 from msg_graph import load, TaskSet
 
@@ -86,14 +86,6 @@ def judge(
                 done.setdefault(stamp, at)
             first = min(done, default=begin)
             first += -((first - begin) // dag.period_ns) * dag.period_ns
-            tally, due = SinkTally(deadline, None), 0
-            for stamp in range(first, end - deadline + 1, dag.period_ns):
-                due += 1
-                if stamp in done:
-                    response = done[stamp] - stamp
-                    tally.done(response, response > deadline)
-            sinks[vertex.name] = {
-                'relative_deadline_ns': deadline, 'due': due,
-                'on_time': tally.completed - tally.late, 'late': tally.late,
-                'missing': due - tally.completed, 'response_ns': tally.result()['response_ns']}
+            sinks[vertex.name] = judge_sink(
+                deadline, range(first, end - deadline + 1, dag.period_ns), done)
     return sinks

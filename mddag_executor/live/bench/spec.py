@@ -28,11 +28,6 @@ DECLARED = {
     'autoware': 'config/autoware.yaml', 'reference-system': 'config/reference_system.yaml'}
 """The loads that are synthetic nodes, and the declarations that ship for them."""
 ROBOT_GRAPH = 'examples/robot/graph.yaml'
-GROUPS = ('shared', 'own', 'reentrant')
-"""
-The callback groups of message loads: the node's default one, in which one callback runs at a time;
-a mutually exclusive one for each subscription; one for all in which callbacks overlap freely.
-"""
 PHASES = ('drawn', 'together')
 """When the topics of a message load are published: each at a phase of its own, or all in a row."""
 
@@ -56,7 +51,6 @@ class Spec:
     :ivar topics: how many topics are published, each with one subscription.
     :ivar rate_hz: how often each is.
     :ivar idle: how many subscriptions there are besides, whose topics nobody publishes.
-    :ivar groups: the callback groups of the subscriptions, one of ``GROUPS``.
     :ivar phases: when the topics are published, one of ``PHASES``.
     :ivar scale: of how much the robot's nodes compute.
     :ivar process: which of the declared processes it is of; None: of all that there are.
@@ -75,7 +69,6 @@ class Spec:
     topics: int = 1
     rate_hz: float = 100.0
     idle: int = 0
-    groups: str = 'shared'
     phases: str = 'drawn'
     scale: float = 1.0
     process: str | None = None
