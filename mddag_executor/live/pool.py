@@ -37,6 +37,7 @@ from time import monotonic_ns, thread_time_ns
 from typing import Any
 
 from mddag_executor.clocks import TraceClock
+from mddag_executor.core import NEVER
 from mddag_executor.live.compat import UNKNOWN
 from mddag_executor.live.cpu_order import CpuOrder
 from mddag_executor.live.engine import Engine
@@ -387,6 +388,7 @@ class Pool:
                 engine.ask_again()
             seat.work = None
             if seat.thread is None:
+                seat.began_ns = NEVER
                 if engine.has_waiting or engine.is_shared or self.interpreter.rings_at:
                     self._hand_out(now)
             elif self._closed or not self.running or seat.worker < 0:

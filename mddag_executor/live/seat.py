@@ -15,6 +15,7 @@ from time import monotonic_ns
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.clocks import TraceClock
+from mddag_executor.core import NEVER
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.jobs import NO_ORIGIN, PublisherState
 from mddag_executor.live.thread_clock import Reading, ThreadClock
@@ -70,7 +71,7 @@ class Seat:
         # read when its execution began, where it is measured; when that was, on the trace's clock
         self.cpu_clock: ThreadClock | None = None
         self.reading: Reading | None = None
-        self.began_ns = 0
+        self.began_ns = NEVER
         self.others_before = 0
         self.engine = engine
         self._clock = clock
