@@ -71,6 +71,7 @@ from mddag_executor.live.upkeep import Upkeep
 from mddag_executor.live.verdicts import DeadlineMiss
 from mddag_executor.live.work import QuickCallback, Work
 from msg_graph import TaskSet
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, TimeoutObject
 from rclpy.logging import get_logger
 from rclpy.task import Future, Task
@@ -622,9 +623,12 @@ class MultiDeadlineExecutor(BareExecutor):
         self._upkeep.refresh()
         found = [] if self._announcements is None else self._announcements.unmatched()
         others = self._engine.other_processes
-        if others is not None:
-            found += others.unmatched(
-                [*self._registry.subscriptions()], self._groups.served_nodes())
+        try:
+            if others is not None:
+                found += others.unmatched(
+                    [*self._registry.subscriptions()], self._groups.served_nodes())
+        except InvalidHandle:
+            pass  # destroyed meanwhile
         return found
 
     def statistics(self) -> dict[str, Any]:

@@ -49,7 +49,6 @@ from mddag_executor.live.entity import Entity
 from mddag_executor.live.jobs import Jobs, Origin
 from mddag_executor.live.verdicts import Record
 from msg_graph import Dag, TaskSet, Vertex
-from rclpy.exceptions import InvalidHandle
 
 KEEP = 4096
 """The jobs of so many stamps are remembered."""
@@ -143,16 +142,12 @@ class OtherProcesses:
     def unmatched(self, entities: Iterable[Entity], nodes: Iterable[Any]) -> list[str]:
         """Return the topics by which jobs leave or enter, and nobody else has been met on."""
         here = Counter(entity.label for entity in entities)
-        found = []
-        try:
-            found = [e.label for e in entities if (e.awaits or e.remote_publishers)
-                     and not e.rclpy.get_publisher_count()]
-            for publisher in (p for node in nodes for p in node.publishers):
-                topic = publisher.topic_name
-                if topic in self._leaving and publisher.get_subscription_count() <= here[topic]:
-                    found.append(topic)
-        except InvalidHandle:
-            pass  # destroyed meanwhile
+        found = [e.label for e in entities if (e.awaits or e.remote_publishers)
+                 and not e.rclpy.get_publisher_count()]
+        for publisher in (p for node in nodes for p in node.publishers):
+            topic = publisher.topic_name
+            if topic in self._leaving and publisher.get_subscription_count() <= here[topic]:
+                found.append(topic)
         return found
 
     @staticmethod
