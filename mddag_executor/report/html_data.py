@@ -85,14 +85,23 @@ class Line(NamedTuple):
     heading: bool
 
 
-class Miss(NamedTuple):
-    """A missed deadline; times in ns since the origin, ``completed`` None where it never was."""
+class SinkJob(NamedTuple):
+    """
+    What came of a job at a sink; ``sink`` is its global vertex.
+
+    Times are ns since the origin; ``completed`` is None where it never was.
+    """
 
     sink: int
     job: int
     deadline: int
     completed: int | None
     kind: int
+
+    @property
+    def missed(self) -> bool:
+        """Return whether the deadline was missed."""
+        return self.completed is None or self.completed > self.deadline
 
     @property
     def shown(self) -> int:
@@ -105,7 +114,7 @@ class Prepared(NamedTuple):
     A report's data, ready to be drawn.
 
     :ivar executions: the columns of the executions; ``marks`` those of the missed deadlines.
-    :ivar misses: in the order of ``Miss.shown``.
+    :ivar misses: in the order of ``SinkJob.shown``.
     :ivar worst: of these the worst ones, in the order of their releases.
     :ivar steps: for the page's script: start, deadline and end of each miss (s), and its text.
     """
@@ -116,7 +125,7 @@ class Prepared(NamedTuple):
     worker_lines: list[int]
     gaps: list[tuple[float, float]]
     origin: int
-    misses: list[Miss]
+    misses: list[SinkJob]
     worst: list[int]
     steps: list[tuple[float, float, float, str]]
 
@@ -126,27 +135,26 @@ def prepare(data: ReportData) -> Prepared:
     columns = data.timeline.columns()
     origin = _origin(columns.releases, columns.executions)
     lines, ys = _lines(data.task_set, data.timeline.undeclared_names())
-    verdicts = {(v, job): Miss(v, job, deadline - origin,
-                               None if done < 0 else done - origin, kind)
-                for v, job, deadline, done, kind in columns.verdicts.T.tolist()}
-    misses = sorted((each for each in verdicts.values()
-                     if each.completed is None or each.completed > each.deadline),
+    verdicts = {
+        (v, job): SinkJob(v, job, deadline - origin, None if done < 0 else done - origin, kind)
+        for v, job, deadline, done, kind in columns.verdicts.T.tolist()}
+    misses = sorted((each for each in verdicts.values() if each.missed),
                     key=lambda miss: miss.shown)
+    releases = [miss.deadline - data.tables.sink_deadline[miss.sink] for miss in misses]
+    worst = sorted(range(len(misses)), key=lambda i: _badness(misses[i]))[:MOST_MISSES]
+    worst.sort(key=lambda i: (releases[i], misses[i].sink))
     words = _Words(data, verdicts, {
         (dag, job): release - origin for dag, job, release in columns.releases.T.tolist()})
-    worst = sorted(range(len(misses)), key=lambda i: _badness(misses[i]))[:MOST_MISSES]
-    deadline_of = data.tables.sink_deadline
+    steps = [(release / 1e9, miss.deadline / 1e9, miss.shown / 1e9,
+              f'{words.job(miss.sink, miss.job)}: {words.verdict(miss)}')
+             for release, miss in zip(releases, misses)]
     return Prepared(
         words.executions(columns.executions, origin, ys), words.marks(misses, ys), lines,
-        words.worker_lines,
-        [((a - origin) / 1e9, (b - origin) / 1e9) for a, b in data.timeline.gaps()], origin,
-        misses, sorted(worst, key=lambda i: (
-            misses[i].deadline - deadline_of[misses[i].sink], misses[i].sink)),
-        [((miss.deadline - deadline_of[miss.sink]) / 1e9, miss.deadline / 1e9, miss.shown / 1e9,
-          f'{words.job(miss.sink, miss.job)}: {words.verdict(miss)}') for miss in misses])
+        words.worker_lines, [((a - origin) / 1e9, (b - origin) / 1e9)
+                             for a, b in data.timeline.gaps()], origin, misses, worst, steps)
 
 
-def _badness(miss: Miss) -> tuple[int, int, int]:
+def _badness(miss: SinkJob) -> tuple[int, int, int]:
     """Return what misses are ordered by: first those that never completed, then the latest."""
     if miss.completed is None:
         return 0, 0, miss.deadline
@@ -157,7 +165,7 @@ class _Words:
     """What is known of executions and jobs, in words."""
 
     def __init__(
-        self, data: ReportData, verdicts: Mapping[tuple[int, int], Miss],
+        self, data: ReportData, verdicts: Mapping[tuple[int, int], SinkJob],
         releases: Mapping[tuple[int, int], int],
     ) -> None:
         self._data = data
@@ -194,7 +202,7 @@ class _Words:
             'workers': np.array(lines, dtype=np.int32),
             'callbacks': np.array(ys, dtype=np.int32)[rows], 'colour': colours, **_lines_of(texts)}
 
-    def marks(self, misses: list[Miss], ys: list[int]) -> dict[str, Any]:
+    def marks(self, misses: list[SinkJob], ys: list[int]) -> dict[str, Any]:
         """Return the columns of missed deadlines."""
         return {
             'x': [miss.shown / 1e9 for miss in misses], 'workers': [0] * len(misses),
@@ -209,7 +217,7 @@ class _Words:
         text = f'job {job} of {printable(self._data.task_set.dags[dag].name)}'
         return text if release is None else f'{text}, released at {_instant(release)}'
 
-    def verdict(self, miss: Miss) -> str:
+    def verdict(self, miss: SinkJob) -> str:
         """Return what came of a job at a sink."""
         relative = self._data.tables.sink_deadline[miss.sink]
         name, due = printable(self._short[self._names[miss.sink]]), format_ns(relative)
@@ -220,13 +228,13 @@ class _Words:
         return (f'{"MISSED" if slack < 0 else "in time"} at {name}: response '
                 f'{format_ns(relative - slack)}, {how} (deadline {due})')
 
-    def _least(self, row: int, job: int) -> Miss | None:
+    def _least(self, row: int, job: int) -> SinkJob | None:
         """Return the verdict with the least slack of those that an execution leads to."""
         found = [verdict for sink in self._leads_to[row]
                  if (verdict := self._verdicts.get((sink, job))) is not None]
         return min(found, key=_slack, default=None)
 
-    def _colour(self, verdict: Miss | None) -> str:
+    def _colour(self, verdict: SinkJob | None) -> str:
         if verdict is None:
             return UNKNOWN
         share = _slack(verdict) / max(1, self._data.tables.sink_deadline[verdict.sink])
@@ -239,7 +247,7 @@ class _Words:
         return f'on {printable(names[worker]) if worker < len(names) else f"worker {worker}"}'
 
 
-def _slack(verdict: Miss) -> float:
+def _slack(verdict: SinkJob) -> float:
     return float('-inf') if verdict.completed is None else verdict.deadline - verdict.completed
 
 
