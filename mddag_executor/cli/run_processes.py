@@ -71,15 +71,14 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         Part.make(folder, task_set.text)
         names = [process.name for process in task_set.processes]
         _warn_of_contested(task_set)
-        traces = _Traces(args.trace)
         for name in names:
-            common.check_output(traces.of(name, 1))
+            common.check_output(_trace(args.trace, name))
         if plan is not None:
             warn_of(plan, args.ros_args, len(names))
 
         def command(name: str, nth: int, since: float) -> list[str]:
             Part.starts(folder, name)
-            trace = traces.of(name, nth)
+            trace = _trace(args.trace, name, nth)
             return [*_command(args, folder, specs.get(name, ()), since), '--process', name,
                     *(() if trace is None else ('--trace', trace)), *ros_arguments(args.ros_args)]
 
@@ -104,7 +103,8 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
                 p.nodes for p in task_set.processes if p.name == run.name),
             'pid': run.process.pid, 'status': run.status, 'died': run.died, 'how': run.how,
             'said': run.said if run.died else None,
-            'trace': traces.result(run.name, run.nth) if part is None else part['trace']}
+            'trace': _trace_of_dead(_trace(args.trace, run.name, run.nth)) if part is None
+            else part['trace']}
             for run, part in zip(supervisor.runs, parts)]}
     if common.write_result(args, result):
         print(sink_table(result['dags']))
@@ -230,25 +230,18 @@ def _command(
     return command
 
 
-class _Traces:
-    """Where each process records to."""
+def _trace(given: str | None, name: str, nth: int = 1) -> str | None:
+    """Return where a process records to; one that was started again has a trace of its own."""
+    if given is None:
+        return None
+    path, label = Path(given), name if nth == 1 else f'{name}.{nth}'
+    if path.is_dir():
+        return str(path / f'{label}.mcap')
+    return str(path.with_name(f'{path.stem}.{label}{path.suffix}'))
 
-    def __init__(self, given: str | None) -> None:
-        self._given = given
 
-    def of(self, name: str, nth: int) -> str | None:
-        """Return the path of a process' trace; of one that was started again it is another."""
-        if self._given is None:
-            return None
-        path = Path(self._given)
-        label = name if nth == 1 else f'{name}.{nth}'
-        if path.is_dir():
-            return str(path / f'{label}.mcap')
-        return str(path.with_name(f'{path.stem}.{label}{path.suffix}'))
-
-    def result(self, name: str, nth: int) -> dict[str, Any] | None:
-        """Return what there is to say of the trace of a process that has left no result."""
-        path = self.of(name, nth)
-        if path is None or not Path(path).exists():
-            return None
-        return {'path': path, 'lost': 0, 'error': 'the process has died'}
+def _trace_of_dead(path: str | None) -> dict[str, Any] | None:
+    """Return what there is to say of the trace of a process that has left no result."""
+    if path is None or not Path(path).exists():
+        return None
+    return {'path': path, 'lost': 0, 'error': 'the process has died'}

@@ -34,13 +34,10 @@ import uuid
 import weakref
 
 from mddag_executor.rerun.loop import Loop
-from mddag_executor.rerun.replacing import Replacements
 from mddag_executor.rerun.strands import is_library, Strand
-from mddag_executor.rerun.timers import Timers
 from rclpy.clock import Clock, ROSClock
 from rclpy.clock_type import ClockType
 from rclpy.time import Time
-from rclpy.timer import Timer
 
 _READS = ('time', 'time_ns', 'monotonic', 'monotonic_ns', 'perf_counter', 'perf_counter_ns')
 
@@ -234,24 +231,3 @@ def _wait_for_notify(condition: Any, wait: Callable[[Callable[[], bool]], bool])
                 condition._waiters.remove(waiter)
             except ValueError:
                 pass
-
-
-def replace_timers(replacements: Replacements, timers: Timers) -> None:
-    """Have what nodes do with their timers count in virtual time."""
-    replace = replacements.replace
-
-    def then(tell: Callable[[Timer], None]) -> Callable[[Any], Any]:
-        def make(original: Callable[[Timer], None]) -> Callable[[Timer], None]:
-            def method(timer: Timer) -> None:
-                original(timer)
-                tell(timer)
-
-            return method
-
-        return make
-
-    replace(Timer, 'reset', then(timers.reset))
-    replace(Timer, 'cancel', then(timers.cancelled))
-    replace(Timer, 'time_until_next_call', lambda original: lambda timer: timers.until_next(timer))
-    replace(Timer, 'time_since_last_call', lambda original: lambda timer: timers.since_last(timer))
-    replace(Timer, 'is_ready', lambda original: lambda timer: timers.until_next(timer) == 0)

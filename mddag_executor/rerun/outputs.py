@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Container
 import hashlib
+import itertools
 import struct
 from typing import Any, BinaryIO, NamedTuple
 
 from mddag_executor.rerun.types import definition, type_name
 
 _HEAD = struct.Struct('<qII')
-PROFILE = 'ros2'
 
 
 class Output(NamedTuple):
@@ -33,7 +33,7 @@ class Outputs:
     """
     Collects what is published.
 
-    :param file: gets it as a bag, where one is wanted.
+    :param file: gets it as a bag, as rosbag2 writes it, where one is wanted.
     :param keep: which topics' messages to keep; None: those of all.
     :ivar messages: what was kept.
     :ivar counts: how many messages were published, by topic.
@@ -45,7 +45,14 @@ class Outputs:
         self._keep = keep
         self._heads: dict[tuple[str, Any], bytes] = {}
         self._hash = hashlib.sha256()
-        self._bag = None if file is None else _Bag(file)
+        self._numbers = itertools.count(1)
+        self._bag: Any = None
+        self._schemas: dict[Any, int] = {}
+        self._channels: dict[tuple[str, Any], int] = {}
+        if file is not None:
+            from mcap.writer import CompressionType, Writer
+            self._bag = Writer(file, compression=CompressionType.ZSTD)
+            self._bag.start(profile='ros2', library='mddag_executor rerun')
 
     def add(self, time: int, topic: str, kind: Any, data: bytes, publisher: Any) -> None:
         """Add a message."""
@@ -55,9 +62,20 @@ class Outputs:
         head = self._heads.get((topic, kind))
         if head is None:
             head = self._heads[topic, kind] = f'{topic}\n{type_name(kind)}\n'.encode()
+            if self._bag is not None:
+                self._channels[topic, kind] = self._bag.register_channel(
+                    topic, 'cdr', self._schema(kind),
+                    {'offered_qos_profiles': _qos(publisher.qos_profile)})
         self._hash.update(_HEAD.pack(time, len(head), len(data)) + head + data)
         if self._bag is not None:
-            self._bag.add(time, topic, kind, data, publisher)
+            self._bag.add_message(
+                self._channels[topic, kind], time, data, time, next(self._numbers))
+
+    def _schema(self, kind: Any) -> int:
+        if kind not in self._schemas:
+            self._schemas[kind] = self._bag.register_schema(
+                type_name(kind), 'ros2msg', definition(kind).encode())
+        return self._schemas[kind]
 
     @property
     def digest(self) -> str:
@@ -68,38 +86,6 @@ class Outputs:
         """Complete the bag."""
         if self._bag is not None:
             self._bag.finish()
-
-
-class _Bag:
-    """An MCAP file as rosbag2 writes it."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        from mcap.writer import CompressionType, Writer
-        self._writer: Any = Writer(file, compression=CompressionType.ZSTD)
-        self._writer.start(profile=PROFILE, library='mddag_executor rerun')
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[tuple[str, str], int] = {}
-        self._sequence = 0
-
-    def add(self, time: int, topic: str, kind: Any, data: bytes, publisher: Any) -> None:
-        name = type_name(kind)
-        channel = self._channels.get((topic, name))
-        if channel is None:
-            channel = self._channels[topic, name] = self._writer.register_channel(
-                topic, 'cdr', self._schema(name, kind),
-                {'offered_qos_profiles': _qos(publisher.qos_profile)})
-        self._sequence += 1
-        self._writer.add_message(channel, time, data, time, self._sequence)
-
-    def _schema(self, name: str, kind: Any) -> int:
-        schema = self._schemas.get(name)
-        if schema is None:
-            schema = self._schemas[name] = self._writer.register_schema(
-                name, 'ros2msg', definition(kind).encode())
-        return schema
-
-    def finish(self) -> None:
-        self._writer.finish()
 
 
 def _qos(profile: Any) -> str:

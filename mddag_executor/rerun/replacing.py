@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
 
@@ -13,11 +14,8 @@ def instead(function: Callable[..., Any]) -> Callable[[Any], Any]:
     return lambda original: lambda *args, **more: function(*args, **more)
 
 
-class Replacements:
-    """What has been replaced, so that it can be put back."""
-
-    def __init__(self) -> None:
-        self._saved: list[tuple[Any, str, Any]] = []
+class Replacements(ExitStack):
+    """What has been replaced; ``close`` puts it back."""
 
     def replace(self, owner: Any, name: str, make: Callable[[Any], Any]) -> None:
         """
@@ -26,14 +24,8 @@ class Replacements:
         :param make: returns what stands there from now on, given what stood there.
         """
         original = vars(owner)[name]
-        self._saved.append((owner, name, original))
         replacement = make(original)
         if callable(original) and replacement.__doc__ is None:
             replacement.__doc__ = original.__doc__
+        self.callback(setattr, owner, name, original)
         setattr(owner, name, replacement)
-
-    def undo(self) -> None:
-        """Put everything back."""
-        while self._saved:
-            owner, name, original = self._saved.pop()
-            setattr(owner, name, original)

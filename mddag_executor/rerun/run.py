@@ -35,7 +35,7 @@ from mddag_executor.live.registry import Registry
 from mddag_executor.live.shutdown import is_over
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.actions import Actions
-from mddag_executor.rerun.clocks import replace_timers, VirtualTime
+from mddag_executor.rerun.clocks import VirtualTime
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.computing import Computing
 from mddag_executor.rerun.discovery import Discovery
@@ -238,7 +238,7 @@ class Rerun:
                 raise self._blocked(stuck) from None
             finally:
                 self._virtual.uninstall()
-                self._replacements.undo()
+                self._replacements.close()
                 gc.unfreeze()
                 sys.argv = arguments
                 if self._recorder is not None:
@@ -256,7 +256,7 @@ class Rerun:
             self._loop, self._settings.all_clocks, CLOCK in self._source.topics,
             self._settings.seed, self._warn)
         virtual.install(replace)
-        replace_timers(self._replacements, self._timers)
+        self._timers.install(self._replacements)
         self._services.install(self._replacements)
         self._actions.install(self._replacements)
         self._discovery.install(self._replacements)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+from typing import NamedTuple
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.errors import UsageError
@@ -20,7 +21,7 @@ from msg_graph import TaskSet
 RECORDED, DECLARED = 'recorded', 'declared'
 
 
-class Source:
+class Source(NamedTuple):
     """
     What a run takes from recordings.
 
@@ -28,14 +29,11 @@ class Source:
     :ivar times: how long callbacks and messages take.
     """
 
-    def __init__(
-        self, name: str, start: int, end: int, messages: Recording | None, times: Times
-    ) -> None:
-        self.name = name
-        self.start = start
-        self.end = end
-        self.messages = messages
-        self.times = times
+    name: str
+    start: int
+    end: int
+    messages: Recording | None
+    times: Times
 
     def first_release(self, dag: int) -> int | None:
         """Return when the first job of a DAG was released in the recorded run; None: unknown."""
@@ -67,16 +65,22 @@ def open_source(
         raise UsageError(
             f'--times recorded: {name} is a bag, which does not say how long callbacks took: give '
             '--times declared, or a trace or a file of execution times')
-    run: _Recorded | None = None
-    if not bag:
-        run = _Recorded(path, task_set, name)
-    taken = _times(path, times, task_set, seed, run)
+    run = None if bag else _recorded(path, task_set, name)
+    if times == DECLARED:
+        taken: Times = SameInEachJob(draw_execution_times(task_set, seed, undeclared=0))
+    elif times == RECORDED and run is not None:
+        taken = run.times
+    elif os.path.isdir(times) or _begins_as_mcap(times):
+        taken = _recorded(times, task_set, times).times
+    else:
+        with open(times, encoding='utf-8') as file:
+            taken = SameInEachJob(read_execution_times(task_set, file.read(), times))
     messages = _messages(path, name)
     if messages is not None and messages.start is not None and messages.end is not None:
         return Source(name, messages.start, messages.end, messages, taken)
     if run is None:
         raise UsageError(f'{name}: no message is recorded in it: record it with ros2 bag record')
-    return Source(name, run.start, run.end, None, taken)
+    return run._replace(times=taken)
 
 
 def _messages(path: str, name: str) -> Recording | None:
@@ -88,35 +92,18 @@ def _messages(path: str, name: str) -> Recording | None:
     return recording
 
 
-def _times(
-    path: str, times: str, task_set: TaskSet, seed: int, run: _Recorded | None
-) -> Times:
-    if times == DECLARED:
-        return SameInEachJob(draw_execution_times(task_set, seed, undeclared=0))
-    if times == RECORDED:
-        assert run is not None
-        return run.times
-    if os.path.isdir(times) or _begins_as_mcap(times):
-        return _Recorded(times, task_set, times).times
-    with open(times, encoding='utf-8') as file:
-        return SameInEachJob(read_execution_times(task_set, file.read(), times))
-
-
 def _begins_as_mcap(path: str) -> bool:
     with open(path, 'rb') as file:
         return file.read(5) == b'\x89MCAP'
 
 
-class _Recorded:
-    """A recorded run: from when to when it was, and its times."""
-
-    def __init__(self, path: str, task_set: TaskSet, name: str) -> None:
-        run = open_run(path, task_set, name)
-        tables = Tables.build(task_set, max_active_jobs=NEVER)
-        head = run.head
-        builder = LoadBuilder(task_set, tables, run.who, head.workers, max(0, head.cpus))
-        Replay(run, more=lambda replay: [builder], paths=False)
-        self.times = AsRecorded(tables, builder.build())
-        start = run.end if run.start is None else run.start
-        self.start = min(start, head.time or start)
-        self.end = run.end
+def _recorded(path: str, task_set: TaskSet, name: str) -> Source:
+    """Return what a recorded run has: from when to when it was, and its times."""
+    run = open_run(path, task_set, name)
+    tables = Tables.build(task_set, max_active_jobs=NEVER)
+    head = run.head
+    builder = LoadBuilder(task_set, tables, run.who, head.workers, max(0, head.cpus))
+    Replay(run, more=lambda replay: [builder], paths=False)
+    start = run.end if run.start is None else run.start
+    return Source(
+        name, min(start, head.time or start), run.end, None, AsRecorded(tables, builder.build()))

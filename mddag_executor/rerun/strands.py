@@ -86,19 +86,20 @@ class Strands:
 
     :param step: does the next thing in virtual time; False: the run is over.
     :param at_end: called then, before the strands end that still wait.
+    :ivar owner: the strand that has the turn; ``turns``: grows while the run goes on.
     """
 
     def __init__(self, step: Callable[[], bool], at_end: Callable[[], None]) -> None:
         self._step = step
         self._at_end = at_end
-        self._owner: Strand | None = None
+        self.owner: Strand | None = None
         self._idle: list[Strand] = []
         self._ready: deque[Strand] = deque()
         self.waiting: list[Strand] = []
         self._here = threading.local()
         self._done = threading.Lock()
         self._done.acquire()
-        self._turns = 0
+        self.turns = 0
         self.over = False
         self.error: BaseException | None = None
 
@@ -107,7 +108,7 @@ class Strands:
     def mine(self) -> Strand | None:
         """Return the strand that calls, if it has the turn; None for threads of others."""
         strand: Strand | None = getattr(self._here, 'strand', None)
-        return strand if strand is not None and strand is self._owner else None
+        return strand if strand is not None and strand is self.owner else None
 
     @contextmanager
     def set_aside(self) -> Iterator[None]:
@@ -119,8 +120,8 @@ class Strands:
             self._here.strand = strand
 
     def _give(self, strand: Strand) -> None:
-        self._turns += 1
-        self._owner = strand
+        self.turns += 1
+        self.owner = strand
         strand.lock.release()
 
     def _pass_on(self) -> None:
@@ -129,8 +130,8 @@ class Strands:
             self._give(self._idle.pop())
             return
         driver = Strand('driver')
-        self._turns += 1
-        self._owner = driver
+        self.turns += 1
+        self.owner = driver
         driver.lock.release()
         threading.Thread(
             target=self._run_driver, args=(driver,), daemon=True, name='mddag-rerun').start()
@@ -172,7 +173,7 @@ class Strands:
                 self._finish(me)
             elif not self._step():
                 self._end()
-            self._turns += 1
+            self.turns += 1
 
     def _next(self) -> Strand | None:
         """Return a strand that goes on now."""
@@ -192,7 +193,7 @@ class Strands:
             each.leaves = True
             each.lock.release()
         self._idle.clear()
-        self._owner = None
+        self.owner = None
         self._done.release()
 
     # --- what strands do -------------------------------------------------------------------------
@@ -211,7 +212,7 @@ class Strands:
         finally:
             self._here.strand = None
             strand.ended = True
-            if not self.over or self._owner is strand:
+            if not self.over or self.owner is strand:
                 self._pass_on()
 
     def wait(self, until: Callable[[], bool] | None, deadline: int | None, place: str) -> bool:
@@ -276,16 +277,6 @@ class Strands:
             self.over = True
         if self.error is not None:
             raise self.error
-
-    @property
-    def turns(self) -> int:
-        """Return a number that grows while the run goes on."""
-        return self._turns
-
-    @property
-    def owner(self) -> Strand | None:
-        """Return the strand that has the turn."""
-        return self._owner
 
 
 class _Watch:

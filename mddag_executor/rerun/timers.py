@@ -22,6 +22,7 @@ from mddag_executor.live.entity import Entity
 from mddag_executor.live.intake.timers import ZERO_PERIOD_NS
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.loop import Loop, TIMER
+from mddag_executor.rerun.replacing import instead, Replacements
 from rclpy.exceptions import InvalidHandle
 from rclpy.timer import Timer
 
@@ -48,6 +49,25 @@ class Timers:
         self._loop = loop
         self._first_release = first_release
         self._known: dict[int, _Known] = {}
+
+    def install(self, replacements: Replacements) -> None:
+        """Have what nodes do with their timers count in virtual time."""
+        def then(tell: Callable[[Timer], None]) -> Callable[[Any], Any]:
+            def make(original: Callable[[Timer], None]) -> Callable[[Timer], None]:
+                def method(timer: Timer) -> None:
+                    original(timer)
+                    tell(timer)
+
+                return method
+
+            return make
+
+        replace = replacements.replace
+        replace(Timer, 'reset', then(self.reset))
+        replace(Timer, 'cancel', then(self.cancelled))
+        replace(Timer, 'time_until_next_call', instead(self.until_next))
+        replace(Timer, 'time_since_last_call', instead(self.since_last))
+        replace(Timer, 'is_ready', instead(lambda timer: self.until_next(timer) == 0))
 
     def refresh(self, entities: Iterable[Entity]) -> None:
         """Take in which timers there are."""
