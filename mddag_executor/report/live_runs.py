@@ -69,8 +69,8 @@ def _absent(dags: dict[str, Any]) -> Iterator[str]:
             absent = dag['jobs'] - counts(verdicts).due
             if absent > 1:
                 yield printable(
-                    f'{absent} of {counted(dag["jobs"], "job")} of {name} did not come to {sink}: '
-                    'skipped, lost, or still under way; a replay of the traces tells')
+                    f'{absent} of {counted(dag["jobs"], "job")} of {name} did not come to {sink}, '
+                    'or its process died with the count: a replay of the traces tells why')
 
 
 def ended_line(process: dict[str, Any]) -> str:
