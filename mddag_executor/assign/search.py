@@ -27,8 +27,8 @@ from typing import Any
 
 from mddag_executor.assign.proportional import scaled
 from mddag_executor.errors import MddagError
-from mddag_executor.simulate.acceptance import wilson, Z_95
 from mddag_executor.simulate.evaluate import evaluate, Experiment, uses_compiled
+from mddag_executor.simulate.evaluation import wilson, Z_95
 from msg_graph.deadlines import with_deadlines
 
 PRECISION = 0.01

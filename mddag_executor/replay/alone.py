@@ -126,18 +126,21 @@ def _ends(ran: Recorded, took: Ints, cpus: int) -> Ints:
     ended = np.searchsorted(np.sort(ran.could + took), times, 'right')
     most = int((np.arange(1, len(times) + 1) - ended).max(initial=1))
     n = int(ran.interpreter.max(initial=1))
-    load = Load(
-        times.tolist(), (ran.interpreter[order] - 1).tolist(), list(range(len(times))),
-        took[order].tolist(), [0] * n, [1] * n, holds=[0] * len(times) if ran.locks.any() else [],
-        computed=ran.cpu[order].tolist(), locks=ran.locks[order].astype(np.int64).tolist())
+    columns: dict[str, Any] = {
+        'times': times, 'dags': ran.interpreter[order] - 1, 'jobs': np.arange(len(times)),
+        'costs': took[order], 'computed': ran.cpu[order],
+        'holds': np.zeros(len(times) * int(ran.locks.any()), dtype=np.int64),
+        'locks': ran.locks[order].astype(np.int64)}
+    load = Load(cost_base=[0] * n, cost_stride=[1] * n, **columns)
     # those that stand still are more than those that ran
     settings = Settings(
         'fifo', 2 * most + 2, int(times.max(initial=0) + took.sum() + 1),
         cpus=cpus or len(times) + 1)
+    log = np.asarray(
+        schedule(_interpreters(n), load, settings, log=True).log, dtype=np.int64).reshape(-1, 6)
+    log = log[log[:, 1] == END]
     ends = np.zeros(len(times), dtype=np.int64)
-    for now, kind, _, _, _, job in schedule(_interpreters(n), load, settings, log=True).log:
-        if kind == END:
-            ends[order[job]] = now
+    ends[order[log[:, 5]]] = log[:, 0]
     return ends
 
 

@@ -88,8 +88,6 @@ class Bag:
     :ivar stamps: by topic that was asked for and is in it.
     :ivar stretches: from when to when messages came, of any topic, without a gap (``times``).
     :ivar warnings: what is missing or doubtful, one line each.
-    :raises BagError: where there is no bag, or nothing of it can be used.
-    :raises mddag_executor.trace.TraceError: where a file of it cannot be read.
     """
 
     def __init__(
@@ -186,7 +184,7 @@ class Bag:
                          if _absolute(c.topic) in topics}
                 wanted = [c for c in reader.connections if c.id in known]
                 for connection, time, data in reader.messages(wanted) if wanted else ():
-                    self._add(known[connection.id], time, UNKNOWN, bytes(data))
+                    self._add(known[connection.id], time, UNKNOWN, memoryview(data))
                     used += 1
             finally:
                 reader.close()
@@ -235,7 +233,7 @@ class Bag:
         """Return the last arrival of any message, ns; None without any."""
         return self.stretches[-1][1] if self.stretches else None
 
-    def _add(self, topic: Topic, arrival: int, published: int, data: bytes) -> None:
+    def _add(self, topic: Topic, arrival: int, published: int, data: memoryview) -> None:
         if not 0 <= arrival < NEVER:
             return
         name = _absolute(topic.name)
@@ -244,23 +242,25 @@ class Bag:
             stamps = self.stamps[name] = Stamps()
             stamps.type = topic.message_type
         if self._keep is not None:
-            content = _unpacked_message(data, _SPARE) if data.startswith(_ZSTD) else data
+            content = bytes(data)
+            if content.startswith(_ZSTD):
+                content = _unpacked_message(content, _SPARE)
             self._keep(topic._replace(name=name), arrival, published, content)
         stamps.arrival.append(arrival)
         different = 0 < published < NEVER and published != arrival
         stamps.published.append(published if different else UNKNOWN)
         stamps.header.append(self._header(topic, data))
 
-    def _header(self, topic: Topic, data: bytes) -> int:
+    def _header(self, topic: Topic, data: memoryview) -> int:
         key = (topic.message_type, topic.definition)
         stamped = self._stamped.get(key)
         if stamped is None:
             stamped = self._stamped[key] = topic.encoding == 'cdr' and _is_stamped(topic)
         if not stamped:
             return UNKNOWN
-        head = data[:_STAMP]
+        head = bytes(data[:_STAMP])
         if head.startswith(_ZSTD):      # compressed message by message
-            head = _unpacked_message(data, _STAMP)
+            head = _unpacked_message(bytes(data), _STAMP)
         if len(head) < _STAMP or head[0] or head[1] > 1:
             return UNKNOWN
         seconds, nanoseconds = struct.unpack('<iI' if head[1] else '>iI', head[4:])

@@ -187,11 +187,7 @@ def reschedule_bag(
     :param times: execution times by DAG and vertex, ns; None: drawn from the declared ones.
     :param dispatch_overhead: added to each execution, ns.
     :param skip: how long after the bag's first message jobs are not judged (a warm-up), ns.
-    :param name: what messages call the bag, where that is not its path.
     :param cpus: that those who compute share; None: enough for all.
-    :raises BagError: where there is no bag, or none of the sources is in it.
-    :raises mddag_executor.simulate.SimulationError: where an execution time is not known.
-    :raises mddag_executor.errors.MddagError: on a policy that cannot be.
     """
     policy = policy or 'rad'
     find_policy(policy).mode(preemptive)

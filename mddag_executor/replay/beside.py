@@ -48,8 +48,6 @@ def play_beside(
     Feed observers a run that another process reads; return that run, and who observed there.
 
     :param waits: is fed there, too, and then what was found by it.
-    :raises mddag_executor.errors.MddagError: as ``OwnRun.play``, and where that
-        process ends early.
     """
     with subprocess.Popen(
             [sys.executable, '-c', _PROGRAM], env=import_environment(),

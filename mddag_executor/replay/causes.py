@@ -55,7 +55,7 @@ from mddag_executor.replay.chains import (
     Misses,
 )
 from mddag_executor.replay.happenings import Ints
-from mddag_executor.replay.spans import Spans
+from mddag_executor.replay.stalls import Spans
 import numpy as np
 
 CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',

@@ -42,9 +42,6 @@ class System:
     What a trace shows of the system that was recorded.
 
     :param path: a trace of this executor, or an imported recording of CARET or ros2_tracing.
-    :param name: what messages call it.
-    :raises mddag_executor.trace.TraceError: when it is no trace.
-    :raises InputError: when no callback is in it.
     :ivar warnings: what is missing of the trace, one line each.
     """
 

@@ -59,9 +59,8 @@ from mddag_executor.replay.happenings import (
 from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.own import OwnRun, STOP
 from mddag_executor.replay.run import Run
-from mddag_executor.replay.spans import crowded, Spans
+from mddag_executor.replay.stalls import crowded, Spans, Stretch
 from mddag_executor.replay.stalls import find as find_stalls
-from mddag_executor.replay.stalls import Seen
 import numpy as np
 
 BLOCK = 65_536
@@ -216,7 +215,7 @@ class Explainer(Observer):
         more = np.where(
             pieces[:, _VERTEX] >= 0,
             pieces[:, _END] - pieces[:, _START] - usual.runs[pieces[:, _VERTEX]], 0)
-        self.stalls += find_stalls(Seen(
+        self.stalls += find_stalls(Stretch(
             times[:, 0], released[self._is_timer[released[:, 0]], 1:],
             self._table(_STARTED)[:, 2:],
             np.column_stack((pieces[:, [_START, _END]], more)), self._table(_STOPS),

@@ -76,10 +76,7 @@ class ImportedRun(LinkObserver):
     A recorded run of another executor.
 
     :param reader: of the trace, which no declaration is in.
-    :param name: what messages call the trace.
     :param task_set: the declaration that judges; None: there is none.
-    :raises mddag_executor.trace.TraceError: when it can no longer be read.
-    :raises ReplayError: when no callback runs in it, or none of the declaration's callbacks.
     """
 
     declared = False
@@ -169,11 +166,7 @@ class ImportedRun(LinkObserver):
     def play(
         self, observers: Sequence[Observer], progress: Function[[int], None] | None = None
     ) -> None:
-        """
-        Give the observers everything, with the numbers of callbacks in place of addresses.
-
-        :param progress: called now and then with the number of events so far.
-        """
+        """Give the observers everything, with the numbers of callbacks in place of addresses."""
         self._batches = Batches(observers)
         self._tell = self._batches.add
         self._links = [each for each in observers if isinstance(each, LinkObserver)]

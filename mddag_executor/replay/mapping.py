@@ -33,10 +33,8 @@ class Mapping:
     """
     Where the recorded DAGs and vertices are in the declaration that judges.
 
-    :param name: what messages call the trace.
     :param recorded: the declaration that it was recorded with.
     :param judge: the declaration that judges; None: the recorded one.
-    :raises ReplayError: when none of its callbacks is in the trace.
     """
 
     def __init__(self, name: str, recorded: TaskSet, judge: TaskSet | None) -> None:

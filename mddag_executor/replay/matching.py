@@ -46,11 +46,9 @@ class Matching:
     """
     Which declared callbacks those of a recording are.
 
-    :param name: what messages call the recording.
     :param entities: who is who in it.
     :param threads: the processes and threads that ran callbacks.
     :param judge: the declaration that judges; None: there is none.
-    :raises ReplayError: when none of its callbacks is in the recording.
     """
 
     def __init__(

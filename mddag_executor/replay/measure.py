@@ -63,11 +63,7 @@ def write_long_trace(
     path: str, task_set: TaskSet, events: int, workers: int = 7, utilisation: float = 0.6,
     progress: Callable[[int], None] | None = None,
 ) -> int:
-    """
-    Write a trace of at least so many events and return how many it has.
-
-    :raises mddag_executor.errors.MddagError: when the declaration has no execution times
-    """
+    """Write a trace of at least so many events and return how many it has."""
     times = scale_execution_times(
         task_set, draw_execution_times(task_set, 0), workers, utilisation)
     load = periodic_load(task_set, times, _TILE)
@@ -225,7 +221,6 @@ def measure(name: str, path: str, limit: int) -> Speed:
     Run one of ``READERS`` over a file in a process of its own.
 
     :param limit: events after which another's reader stops.
-    :raises mddag_executor.errors.MddagError: when it cannot
     """
     context = multiprocessing.get_context('spawn')
     ours, theirs = context.Pipe(duplex=False)

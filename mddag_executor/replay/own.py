@@ -84,10 +84,7 @@ class OwnRun:
     A recorded run of this executor.
 
     :param reader: of the trace.
-    :param name: what messages call the trace.
     :param task_set: the declaration that judges; None: the one in the trace.
-    :raises mddag_executor.replay.ReplayError: when nothing is in it to replay, or none of the
-        declaration's callbacks.
     """
 
     declared = True
@@ -129,17 +126,13 @@ class OwnRun:
         self.dropped: Counter[str] = Counter()
         self._strange: Counter[str] = Counter()
         self._newest = [-1] * len(mapping.dag)
-        self._places = _Places(mapping)
-        self._threads = _Threads(self, self._places)
+        self._targets = _Targets(mapping)
+        self._threads = _Threads(self, self._targets)
 
     def play(
         self, observers: Sequence[Observer], progress: Callable[[int], None] | None = None
     ) -> None:
-        """
-        Give the observers everything.
-
-        :param progress: called now and then with the number of events so far.
-        """
+        """Give the observers everything."""
         self._observers = observers
         who = merged([dict.fromkeys(self.who.who, self.who.take),
                       *(observer.handlers() for observer in observers)])
@@ -268,13 +261,13 @@ class OwnRun:
             self._released(*numbers[_RELEASE], add)
         if _FAIL in numbers:
             where, of = numbers[_FAIL]
-            dag, vertex = self._places.of(of[:, FIELD], of[:, FIELD + 1])
+            dag, vertex = self._targets.of(of[:, FIELD], of[:, FIELD + 1])
             known = dag >= 0
             add(FAILED, where[known], dag[known], vertex[known], of[known, FIELD + 2],
                 of[known, NOW])
         if _DEADLINE in numbers:
             where, of = numbers[_DEADLINE]
-            add(MISSED, where, *self._places.of(of[:, FIELD], of[:, FIELD + 1]),
+            add(MISSED, where, *self._targets.of(of[:, FIELD], of[:, FIELD + 1]),
                 *of[:, FIELD + 2:FIELD + 5].T)
         self._job_ends(numbers, add)
         if _LOST in numbers:
@@ -399,7 +392,7 @@ class OwnRun:
                 observer.hosted(dag, vertices)
 
 
-class _Places:
+class _Targets:
     """Where recorded vertices are in the declaration that judges, for columns."""
 
     def __init__(self, mapping: Mapping) -> None:
@@ -440,9 +433,9 @@ class _Places:
 class _Threads:
     """What threads ran."""
 
-    def __init__(self, run: OwnRun, places: _Places) -> None:
+    def __init__(self, run: OwnRun, targets: _Targets) -> None:
         self._run = run
-        self._of = places
+        self._of = targets
         # of what threads run: the columns of its dispatch, and when it started
         self._running = np.empty((0, _WIDTH + 1), dtype=np.int64)
         # of the executions whose pieces ended last in threads: the thread, and columns as below

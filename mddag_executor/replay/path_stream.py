@@ -39,7 +39,16 @@ from __future__ import annotations
 import copy
 from typing import Any
 
-from mddag_executor.replay.path_forest import Bounds, Column, FlowColumns, NEVER, NONE
+from mddag_executor.replay.happenings import Ints
+from mddag_executor.replay.path_forest import (
+    Bounds,
+    F_ARRIVAL,
+    F_BEGIN,
+    F_END,
+    F_FIRST,
+    NEVER,
+    NONE,
+)
 from mddag_executor.replay.spread import KEEP_EXACT, Spread
 import numpy as np
 
@@ -58,7 +67,7 @@ class CaseBook:
         self._least: int | None = None          # the earliest output
         self._before: tuple[int, int] | None = None     # the last input, and its output
 
-    def add(self, start: Column, end: Column, least_start: int, least_end: int) -> None:
+    def add(self, start: Ints, end: Ints, least_start: int, least_end: int) -> None:
         """
         Add flows, and count what is complete.
 
@@ -74,7 +83,7 @@ class CaseBook:
         start, end = start[order], end[order]
         self._count(start, end, least_start, least_end)
 
-    def _count_ages(self, start: Column, end: Column, least_end: int) -> None:
+    def _count_ages(self, start: Ints, end: Ints, least_end: int) -> None:
         arrived = end != NONE
         start = np.concatenate((self._input, start[arrived]))
         end = np.concatenate((self._output, end[arrived]))
@@ -86,7 +95,7 @@ class CaseBook:
         newest = np.flatnonzero(np.r_[end[1:] != end[:-1], True]) if len(end) else order
         self.data_age.add((end - start)[newest])
 
-    def _count(self, start: Column, end: Column, least_start: int, least_end: int) -> None:
+    def _count(self, start: Ints, end: Ints, least_start: int, least_end: int) -> None:
         """Count inputs up to the last possible cut, keep the others."""
         self._start, self._end = start, end
         if not len(start):
@@ -112,7 +121,7 @@ class CaseBook:
             inputs, own = inputs[counted], own[counted]
         self._count_inputs(inputs, own)
 
-    def _count_inputs(self, start: Column, end: Column) -> None:
+    def _count_inputs(self, start: Ints, end: Ints) -> None:
         if not len(start):
             return
         times = end - start
@@ -150,12 +159,13 @@ class PathFigures:
         self.inner = CaseBook(keep)     # from the first publication to the last start
         self.whole = CaseBook(keep)     # from the first begin to the last end
 
-    def add(self, flows: FlowColumns, to_come: Bounds) -> None:
+    def add(self, flows: Ints, to_come: Bounds) -> None:
         """Count flows of the path that are over; `to_come` bounds those that are not."""
-        self.flows += len(flows.path)
-        self.arrived += int((flows.arrival != NONE).sum())
-        self.inner.add(flows.first, flows.arrival, to_come.start, to_come.arrival)
-        self.whole.add(flows.begin, flows.end, to_come.start, to_come.end)
+        start, arrival, end = to_come
+        self.flows += len(flows)
+        self.arrived += int((flows[:, F_ARRIVAL] != NONE).sum())
+        self.inner.add(flows[:, F_FIRST], flows[:, F_ARRIVAL], start, arrival)
+        self.whole.add(flows[:, F_BEGIN], flows[:, F_END], start, end)
 
     def result(self) -> dict[str, Any]:
         """Return the figures, once all flows are in."""

@@ -38,7 +38,7 @@ from __future__ import annotations
 from typing import Any, Literal, NamedTuple
 
 from mddag_executor.replay.happenings import Ints
-from mddag_executor.replay.path_forest import Bounds, bounds, NEVER, NONE, settle, Steps
+from mddag_executor.replay.path_forest import END, F_PATH, Forest, NEVER, NONE, PARENT
 from mddag_executor.replay.path_stream import PathFigures
 from msg_graph import Callback, Path, TaskSet
 import numpy as np
@@ -58,8 +58,6 @@ S_RUN, S_TIME, S_TOPIC, S_MESSAGE, S_VERTEX, _N_STARTED = range(2, 8)
 _E_RUN, _E_TIME, _N_ENDED = range(2, 5)
 _U_NODE, _U_RUN, _U_TOPIC, _U_MESSAGE, _U_TIME, _N_PUBLISHED = range(2, 8)
 _T_RUN, _T_MESSAGE, _N_TOOK = range(2, 5)
-# Columns of a step.
-_PARENT, _PATH, _POSITION, _IS_RUN, _TIME, _END, _MARKS, _N_STEP = range(8)
 
 
 class Hop(NamedTuple):
@@ -116,8 +114,7 @@ class PathBook:
         self._told: list[list[Ints]] = [[], [], [], []]
         self._order = 1     # 0: in a round before
         self._waiting = 0
-        self._steps = np.empty((1024, _N_STEP), dtype=np.int64)
-        self._n = 0
+        self._forest = Forest([len(path.callbacks) - 1 for path in self.paths])
         self._results: dict[str, Any] | None = None
 
     def __bool__(self) -> bool:
@@ -221,7 +218,8 @@ class PathBook:
             else:
                 which = int(place.hop.kind == 'topic')
                 parent = _as_of(*before[which], rows[:, 0])
-        steps = self._add(place, parent, True, rows[:, S_TIME])
+        steps = self._forest.add(
+            place.number, place.position, parent, True, rows[:, S_TIME])
         begun = _timeline(place, 0, rows[:, 0], steps)
         place.runs = np.concatenate([place.runs, np.column_stack((rows[:, S_RUN], steps))])
         order = np.argsort(place.runs[:, 0], kind='stable')
@@ -230,12 +228,12 @@ class PathBook:
             rows, = took
             step = _step_of(runs, rows[:, _T_RUN])
             rows, step = rows[step != NONE], step[step != NONE]
-            self._steps[step, _PARENT] = _message(
+            self._forest.rows[step, PARENT] = _message(
                 self._places[number - 1].messages, rows[:, _T_MESSAGE], rows[:, 0])
 
         rows, = ended
         step = _step_of(runs, rows[:, _E_RUN])
-        self._steps[step[step != NONE], _END] = rows[step != NONE, _E_TIME]
+        self._forest.rows[step[step != NONE], END] = rows[step != NONE, _E_TIME]
         counts = (step != NONE) | (not place.sync)
         done = _timeline(place, 1, rows[counts, 0], step[counts])
 
@@ -249,61 +247,33 @@ class PathBook:
         parent = np.where(rows[:, 1] == NONE, NONE, _step_of(runs, rows[:, _U_RUN]))
         latest = (parent == NONE) & (place.sync | (rows[:, 1] == NONE))
         parent[latest] = _as_of(*begun, rows[latest, 0])
-        steps = self._add(place, parent, False, rows[:, _U_TIME])
+        steps = self._forest.add(
+            place.number, place.position, parent, False, rows[:, _U_TIME])
         sent = _timeline(place, 2, rows[:, 0], steps)
         known = (steps != NONE) & (rows[:, _U_MESSAGE] != NONE)
         place.messages = np.concatenate([place.messages, np.column_stack(
             (rows[known, _U_MESSAGE], rows[known, 0], steps[known]))])
         return [done, sent]
 
-    def _add(self, place: _Place, parent: Ints, is_run: bool, times: Ints) -> Ints:
-        """Add steps, where there is a parent or the path begins; return their numbers."""
-        wanted = (parent != NONE) | (place.position == 0)
-        count = int(wanted.sum())
-        while self._n + count > len(self._steps):
-            self._steps = np.concatenate([self._steps, np.empty_like(self._steps)])
-        rows = self._steps[self._n:self._n + count]
-        rows[:, _PARENT], rows[:, _TIME] = parent[wanted], times[wanted]
-        rows[:, _PATH], rows[:, _POSITION] = place.number, place.position
-        rows[:, _IS_RUN], rows[:, _END], rows[:, _MARKS] = is_run, NONE, 0
-        numbers = np.where(wanted, self._n + np.cumsum(wanted) - 1, NONE)
-        self._n += count
-        return numbers
-
     # --- flows -----------------------------------------------------------------------------------
 
     def _settle(self, at_end: bool) -> None:
         """Count the flows that are over, and forget their steps."""
-        table = self._steps[:self._n]
-        if not len(table) and not at_end:
+        forest, n_paths = self._forest, len(self.paths)
+        if not len(forest) and not at_end:
             return
-        length = np.array([len(path.callbacks) - 1 for path in self.paths])
-        steps = Steps(
-            table[:, _PARENT].copy(), table[:, _PATH].copy(), table[:, _POSITION] == 0,
-            table[:, _POSITION] == length[table[:, _PATH]], table[:, _IS_RUN] != 0,
-            table[:, _TIME].copy(), table[:, _END].copy(), table[:, _MARKS].astype(np.uint8))
-        held = np.zeros(len(table), dtype=np.bool_)
+        held = np.zeros(len(forest), dtype=np.bool_)
         if not at_end:
             for place in self._places:
                 place.runs = place.runs[-self._kept:]
                 place.messages = place.messages[-self._kept:]
                 for numbers in (place.last, place.runs[:, 1], place.messages[:, 2]):
                     held[numbers[numbers != NONE]] = True
-        found = settle(steps, held)
-        to_come = [Bounds(NEVER, NEVER, NEVER)] * len(self.paths)
-        if not at_end:
-            now = max(0, int(max(steps.time.max(), steps.end.max())) - LAG_NS)
-            to_come[:] = bounds(steps, found.keep, now) + [Bounds(0, 0, 0)] * len(self.paths)
+        now = max(0, forest.latest - LAG_NS)
+        flows, numbers = forest.settle(held)
+        to_come = [(NEVER, NEVER, NEVER)] * n_paths if at_end else forest.bounds(now)
         for number, figures in enumerate(self._figures):
-            mine = found.flows.path == number
-            figures.add(found.flows._replace(**{
-                name: column[mine] for name, column in found.flows._asdict().items()}),
-                to_come[number])
-        numbers = np.r_[found.numbers(), NONE]      # the last is of no step
-        rest = table[found.keep]
-        rest[:, _PARENT], rest[:, _MARKS] = numbers[rest[:, _PARENT]], found.marks[found.keep]
-        self._steps[:len(rest)] = rest
-        self._n = len(rest)
+            figures.add(flows[flows[:, F_PATH] == number], to_come[number])
         for place in self._places:
             place.last = numbers[place.last]
             place.runs[:, 1] = numbers[place.runs[:, 1]]

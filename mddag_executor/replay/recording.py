@@ -40,11 +40,7 @@ class Head(NamedTuple):
 
 
 def read_head(reader: TraceReader) -> Head | None:
-    """
-    Return what the executor wrote at the beginning; None where the trace is not of this executor.
-
-    :raises ReplayError: when it is, but nothing of it can be used.
-    """
+    """Return what the executor wrote at the beginning; None where it did not write the trace."""
     if not reader.may_have(TASK_SET):
         return None
     of_this = False
@@ -60,11 +56,7 @@ def read_head(reader: TraceReader) -> Head | None:
 
 
 def declared(head: Head, name: str) -> TaskSet:
-    """
-    Return the declaration that a run was recorded with.
-
-    :raises ReplayError: when there is none, or it is wrong.
-    """
+    """Return the declaration that a run was recorded with."""
     if not head.yaml.strip():
         raise ReplayError(
             name, 'it was recorded without a declaration, so there are no jobs', _RECORD)

@@ -63,11 +63,7 @@ def open_run(
     Open a recorded run, of this executor or of another one.
 
     :param task_set: the declaration that judges; None: the one in the trace, if it has one.
-    :param name: what messages call the trace, where that is not its path.
     :param needs_declaration: whether there must be one.
-    :raises mddag_executor.trace.TraceError: when it is no trace.
-    :raises ReplayError: when no run is recorded in it, or none of the declaration's callbacks.
-    :raises msg_graph.GraphError: when the recorded declaration is wrong.
     """
     if not isinstance(path, (str, os.PathLike)):
         return _joined(path if isinstance(path, Traces) else Traces(path), task_set)
@@ -111,10 +107,6 @@ def _joined(traces: Traces, task_set: TaskSet | None) -> OwnRun:
 
 
 def is_own(path: str | os.PathLike[str], name: str | None = None) -> bool:
-    """
-    Return whether a trace was recorded by this executor.
-
-    :raises mddag_executor.trace.TraceError: when it is no trace.
-    """
+    """Return whether a trace was recorded by this executor."""
     with named_errors(os.fspath(path), name or os.fspath(path)):
         return read_head(TraceReader(path)) is not None

@@ -34,11 +34,7 @@ _MOST = 2 ** 31 - 1
 def write_trace(
     path: str | os.PathLike[str], task_set: TaskSet, load: Load, run: Run
 ) -> None:
-    """
-    Write the trace of a run that was simulated with its log.
-
-    :raises mddag_executor.trace.TraceError: when the file cannot be written.
-    """
+    """Write the trace of a run that was simulated with its log."""
     with TraceFile(path) as file:
         write_events(task_set, load, run, lambda *event: file.extend((event,), PROCESS))
         assert file.rejected == 0, file.rejection

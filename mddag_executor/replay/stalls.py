@@ -24,16 +24,57 @@ from __future__ import annotations
 
 from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.replay.happenings import Ints
-from mddag_executor.replay.spans import Spans
 import numpy as np
 
 _UNNOTICED_NS = 10_000_000
 _MOST, _ABOUT = 0.75, 1.25
+_FAR_NS = 1 << 40
 
 
-class Seen:
+class Spans:
     """
-    What was seen of a run for some time.
+    Spans from starts to ends, ns.
+
+    :param origin: a time near all of them; what is further away than 18 minutes is cut there.
+    """
+
+    def __init__(self, starts: Ints, ends: Ints, origin: int) -> None:
+        self._origin = origin
+        self._starts, self._ends = (np.sort(self._near(each)) for each in (starts, ends))
+        self._sums = [np.r_[0, np.cumsum(each)] for each in (self._starts, self._ends)]
+
+    def _near(self, times: Ints) -> Ints:
+        near: Ints = np.clip(times - self._origin, -_FAR_NS, _FAR_NS)
+        return near
+
+    def within(self, begins: Ints, ends: Ints) -> Ints:
+        """Return how long they lasted within each span of time, added up, ns."""
+        found: Ints = np.maximum(0, self._before(ends) - self._before(begins))
+        return found
+
+    def _before(self, times: Ints) -> Ints:
+        near = self._near(times)
+        total = np.zeros(len(near), dtype=np.int64)
+        for sign, each, sums in zip((1, -1), (self._starts, self._ends), self._sums):
+            number = np.searchsorted(each, near, 'right')
+            total += sign * (near * number - sums[number])
+        return total
+
+
+def crowded(starts: Ints, ends: Ints, least: int) -> tuple[Ints, Ints]:
+    """Return the starts and ends of the times at which at least so many spans last."""
+    times = np.concatenate([starts, ends])
+    step = np.repeat([1, -1], len(starts))
+    order = np.lexsort((step, times))       # at one instant what ends goes first
+    times, count = times[order], np.cumsum(step[order])
+    full = count >= least
+    before = np.r_[False, full[:-1]]
+    return times[full & ~before], times[~full & before]
+
+
+class Stretch:
+    """
+    What is known of a stretch of a run.
 
     :ivar times: of all events.
     :ivar timers: releases of timers, and when they were noticed.
@@ -60,22 +101,22 @@ class Seen:
         return Spans(starts, ends, int(self.times[0]))
 
 
-def find(seen: Seen, since: int, until: int) -> list[tuple[int, int]]:
+def find(stretch: Stretch, since: int, until: int) -> list[tuple[int, int]]:
     """Return begin and end of the stalls that ended within a time, in order."""
-    stops, times = seen.stops[seen.stops[:, 0] < seen.stops[:, 1]], seen.times
+    stops, times = stretch.stops[stretch.stops[:, 0] < stretch.stops[:, 1]], stretch.times
     found = [_widened(times, begin, end) for begin, end in stops.tolist()
              if since < end <= until and end - begin >= LEAST_NS]
     gaps = np.flatnonzero(np.diff(times) >= LEAST_NS)
     gaps = gaps[(times[gaps + 1] > since) & (times[gaps + 1] <= until)]
     if len(gaps):
-        gaps = gaps[seen.suspicious().within(times[gaps], times[gaps + 1]) > 0]
+        gaps = gaps[stretch.suspicious().within(times[gaps], times[gaps + 1]) > 0]
     for gap in gaps.tolist():
         begin, end = int(times[gap]), int(times[gap + 1])
         if any(first < end and begin < last for first, last in found):
             continue
-        if seen.noticed <= begin and not ((stops[:, 0] < end) & (stops[:, 1] > begin)).any():
+        if stretch.noticed <= begin and not ((stops[:, 0] < end) & (stops[:, 1] > begin)).any():
             continue
-        stalled = _begin(seen, begin, end)
+        stalled = _begin(stretch, begin, end)
         if stalled is not None and end - stalled >= LEAST_NS:
             found.append((stalled, end))
     return sorted(found)
@@ -88,11 +129,11 @@ def _widened(times: Ints, begin: int, end: int) -> tuple[int, int]:
     return (last if begin - last <= LEAST_NS else begin), end
 
 
-def _begin(seen: Seen, begin: int, end: int) -> int | None:
+def _begin(stretch: Stretch, begin: int, end: int) -> int | None:
     """Return when the stall began that a time without any event was, None if it was none."""
-    release, noticed = seen.timers.T
+    release, noticed = stretch.timers.T
     due = release[(release > begin) & (release <= end - _UNNOTICED_NS) & (noticed >= end)]
-    start, ended, more = seen.ran.T
+    start, ended, more = stretch.ran.T
     ran = (start <= begin) & (ended >= end)
     length = end - begin
     if ran.any():
@@ -101,7 +142,7 @@ def _begin(seen: Seen, begin: int, end: int) -> int | None:
             return None
         several = ran.sum() > 1 and bool((more[ran] <= _ABOUT * length).all())
         return begin if len(due) or several else None
-    ready, begun = seen.started.T
+    ready, begun = stretch.started.T
     if ((ready <= begin) & (begun >= end)).any():
         return begin
     return int(due.min()) if len(due) else None

@@ -55,7 +55,6 @@ class Checkpoint:
         """
         Read what was done before, if there is such a file.
 
-        :raises InputError: it is damaged, or from another evaluation.
         :raises OSError: it cannot be read.
         """
         if not os.path.exists(self.path):

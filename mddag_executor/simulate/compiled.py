@@ -1,12 +1,19 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Runs in the compiled core: what ``kernel`` does, over lent memory (see ``compiling``)."""
+"""
+Runs in the compiled core: what ``kernel`` does (see ``compiling``), over memory that it is lent.
+
+A structure has three words for each field, those of a vector (address, length, capacity; see
+``vectors``), or an integer in the first of them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
+import ctypes
 from functools import cache
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core.policies import POLICIES
 from mddag_executor.core.policies import policy as find_policy
@@ -22,7 +29,6 @@ from mddag_executor.simulate.compiling import (
 from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.draws import Times
 from mddag_executor.simulate.engine import LogEntry, Orders
-from mddag_executor.simulate.lending import EmptyMemory, LentTuple
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.machine import Machine
 from mddag_executor.simulate.workload import periodic_load
@@ -129,3 +135,80 @@ def run_once(
                 busy.words(0, 1)[:, 0].tolist())
     finally:
         _entries()['free_run'](*addresses)
+
+
+class LentTuple:
+    """A named tuple of integers and lists, as a structure in numpy's memory."""
+
+    def __init__(self, row: NamedTuple, *more: int) -> None:
+        self._columns: list[npt.NDArray[np.int64]] = []  # keeps the memory
+        words = []
+        for value in (*row, *more):
+            if isinstance(value, int):
+                words += [value, 0, 0]
+                continue
+            column = np.ascontiguousarray(value, dtype=np.int64)
+            self._columns.append(column)
+            words += [column.ctypes.data, len(column), len(column)]
+        self._words = np.array(words, dtype=np.int64)
+
+    @property
+    def address(self) -> int:
+        """Return where the structure is, as long as this object lives."""
+        return int(self._words.ctypes.data)
+
+    def copy(self) -> LentTuple:
+        """Return a structure of its own over the same columns."""
+        copied = copy(self)
+        copied._words = self._words.copy()
+        return copied
+
+
+class EmptyMemory:
+    """Memory for a structure or a vector that is all empty."""
+
+    def __init__(self, fields: int = 1) -> None:
+        self._words = np.zeros(3 * fields, dtype=np.int64)
+
+    @property
+    def address(self) -> int:
+        """Return where it is, as long as this object lives."""
+        return int(self._words.ctypes.data)
+
+    def words(self, field: int, width: int) -> npt.NDArray[np.int64]:
+        """Return a copy of a field, which is a vector of elements with so many words."""
+        address, length = self._words[3 * field:3 * field + 2].tolist()
+        if length == 0:
+            return np.empty((0, width), dtype=np.int64)
+        data = (ctypes.c_int64 * (length * width)).from_address(address)
+        return np.ctypeslib.as_array(data).reshape(length, width).copy()
+
+    def rows(self, field: int, width: int) -> Rows:
+        """Return the same as tuples."""
+        return Rows(self.words(field, width))
+
+
+class Rows(Sequence[tuple[int, ...]]):
+    """Tuples of integers that are made when they are asked for: as numbers they take a sixth."""
+
+    _SOME = 8192
+
+    def __init__(self, words: npt.NDArray[np.int64]) -> None:
+        self._words = words
+
+    def __len__(self) -> int:
+        return len(self._words)
+
+    def __getitem__(self, place: Any) -> Any:
+        found = self._words[place].tolist()
+        return list(map(tuple, found)) if isinstance(place, slice) else tuple(found)
+
+    def __iter__(self) -> Iterator[tuple[int, ...]]:
+        for first in range(0, len(self), self._SOME):
+            yield from self[first:first + self._SOME]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[np.int64]:
+        return self._words
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)

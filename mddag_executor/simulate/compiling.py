@@ -57,7 +57,7 @@ _NOT_COMPILED = frozenset({
     # for plain lists
     'empty', 'as_object', 'new_state', 'add_queue', 'rad_offsets', 'latest_starts', 'policy',
     'new_machine', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers'})
-_OWN = ('compiling', 'kernel', 'lending', 'structures', 'vectors')
+_OWN = ('compiled', 'compiling', 'kernel', 'structures', 'vectors')
 _REPLACED = ('add_queue', 'heapify', 'heappop', 'heappush')
 _KEEP_S = 90 * 86400
 

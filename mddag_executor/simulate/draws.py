@@ -34,6 +34,7 @@ Times = npt.NDArray[np.int64]
 """Execution times, ns: a row for each run, a column for each vertex, DAG by DAG."""
 
 Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
 Samples = Mapping[str, Times]
 
 _REMEDY = "write one array of measured ns for each 'node:callback' with numpy.savez"
@@ -45,7 +46,6 @@ def read_samples(task_set: TaskSet, path: Path, name: str) -> dict[str, Times]:
 
     :param name: what to call the file in messages.
     :return: for each callback in a DAG its values in ns, rounded up to whole us, at least 1 us.
-    :raises InputError: on anything that is not that, or a callback without values.
     """
     try:
         archive = np.load(path, allow_pickle=False)
@@ -88,7 +88,6 @@ class Draws:
 
     :param seed: 0 to 2**64 - 1.
     :param samples: measured values of each callback, ns; None draws from the quantile tables.
-    :raises InputError: when a callback declares no execution time, or none above zero.
     """
 
     def __init__(self, task_set: TaskSet, seed: int, samples: Samples | None = None) -> None:

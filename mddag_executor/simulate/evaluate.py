@@ -122,7 +122,6 @@ def uses_compiled(core: str, experiments: Sequence[Experiment], runs: int, jobs:
     Return whether to use the compiled core.
 
     :param runs: number of runs of all experiments together.
-    :raises SimulationError: there is no such core, here or at all.
     """
     if core not in CORES:
         raise SimulationError(

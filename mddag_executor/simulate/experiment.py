@@ -27,8 +27,15 @@ from mddag_executor import defaults
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Tables
 from mddag_executor.core.jobs import is_miss
-from mddag_executor.simulate.acceptance import Bools
-from mddag_executor.simulate.draws import Draws, feasible, Floats, Samples, Times, utilisations
+from mddag_executor.simulate.draws import (
+    Bools,
+    Draws,
+    feasible,
+    Floats,
+    Samples,
+    Times,
+    utilisations,
+)
 from mddag_executor.simulate.run import check
 from mddag_executor.simulate.schedule import schedule, Settings
 from mddag_executor.simulate.workload import declared_holds, periodic_load
@@ -101,8 +108,6 @@ class Evaluator:
     Evaluates chunks of experiments; each worker process has one, its threads share it.
 
     :param runs: of each experiment.
-    :raises SimulationError: on settings that make no sense.
-    :raises mddag_executor.core.PolicyError: when there is no such policy.
     """
 
     def __init__(
@@ -117,11 +122,7 @@ class Evaluator:
         return _One(self._experiments[index], self._compiled)
 
     def check(self) -> None:
-        """
-        Find out whether all experiments can be done.
-
-        :raises InputError: when a callback declares no execution time.
-        """
+        """Find out whether all experiments can be done."""
         for experiment in self._experiments:
             for name in experiment.policies:
                 check(experiment.settings(name))

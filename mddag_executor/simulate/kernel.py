@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Entry points of the compiled core: whole runs, over memory that they are lent (``lending``).
+Entry points of the compiled core: whole runs, over memory that they are lent (``compiled``).
 
 They are compiled and never called as they stand here: the names of the core that they use are then
 bound to its compiled functions (see ``compiling``).  Structures are handed over as addresses.

@@ -20,8 +20,7 @@ from mddag_executor.text import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from mddag_executor.simulate.acceptance import Acceptance
-    from mddag_executor.simulate.evaluation import Evaluation
+    from mddag_executor.simulate.evaluation import Acceptance, Evaluation
 
 FORMATS = ('.png', '.svg', '.pdf')
 
@@ -36,11 +35,7 @@ _SHIFT = 0.003
 
 
 def check_plot(path: str) -> None:
-    """
-    Find out whether a figure can be drawn into this file, before the work starts.
-
-    :raises InputError: on an ending that is not of ``FORMATS``, or without matplotlib.
-    """
+    """Find out whether a figure can be drawn into this file, before the work starts."""
     if os.path.splitext(path)[1].lower() not in FORMATS:
         raise InputError(
             path, 'the ending names no kind of picture', f'use one of {", ".join(FORMATS)}')

@@ -47,11 +47,7 @@ class Pool:
         return None
 
     def check(self) -> None:
-        """
-        Look after the pool; called about every second.
-
-        :raises SimulationError: when nobody is left to do the chunks.
-        """
+        """Look after the pool; called about every second."""
 
 
 class _LocalPool(Pool):

@@ -77,11 +77,7 @@ def simulate(
 
 
 def check(settings: Settings) -> None:
-    """
-    Check that settings make sense.
-
-    :raises SimulationError: when they do not.
-    """
+    """Check that settings make sense."""
     if settings.workers < 1:
         raise SimulationError(f'workers: {settings.workers} is too few: give at least 1')
     if settings.duration_ns < 1:

@@ -55,11 +55,7 @@ class Settings:
 
     @property
     def preempts(self) -> bool:
-        """
-        Return whether what is more urgent takes the worker of what runs.
-
-        :raises mddag_executor.core.PolicyError: there is no such policy, or it cannot do that.
-        """
+        """Return whether what is more urgent takes the worker of what runs."""
         return find_policy(self.policy).mode(self.preemptive, self.processes)
 
     @property
@@ -95,7 +91,6 @@ def schedule(
     :param log: keep the log of every worker.
     :param progress: gets the virtual time (ns) now and then, by plain Python.
     :param compiled: whether compiled, which gives the same; None: what is sooner done.
-    :raises mddag_executor.core.PolicyError: as ``Settings.preempts``.
     """
     orders = settings.orders._replace(keep_log=int(log))
     if compiled is None:

@@ -90,11 +90,7 @@ class Summary:
 
 
 def open_data(stream: BinaryIO, path: str) -> tuple[int, str]:
-    """
-    Check the beginning of a file and return where its data section starts, and what wrote it.
-
-    :raises TraceError: where it is no MCAP file, or nothing is in it
-    """
+    """Check a file's beginning and return where its data section starts, and what wrote it."""
     magic = stream.read(len(records.MAGIC))
     if not magic:
         raise TraceError(path, 'is empty', _REMEDY)

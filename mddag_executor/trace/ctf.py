@@ -169,11 +169,7 @@ def _rows(path: str) -> Iterator[Row]:
 
 
 def _rows_of(interpreter: str, path: str) -> Generator[Row, None, None]:
-    """
-    Yield the rows of a helper process.
-
-    :raises TraceError: where it does not come to the end
-    """
+    """Yield the rows of a helper process."""
     # A home that is set for one Python breaks another. Bytecode would be the only thing written.
     environment = {name: value for name, value in os.environ.items() if name != 'PYTHONHOME'}
     environment['PYTHONDONTWRITEBYTECODE'] = '1'

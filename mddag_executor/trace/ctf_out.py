@@ -76,8 +76,6 @@ def export_ctf(
     Write all events of a trace as a session; return what is missing of the trace.
 
     :param folder: the session; there must be none yet.
-    :param name: what messages call the trace, where that is not its path.
-    :raises TraceError: when it is no trace, or the session cannot be written.
     """
     reader = TraceReader(path)
     with CtfSession(folder) as session:
@@ -95,11 +93,7 @@ def export_dicts(
     events: Iterator[dict[str, Any]], folder: str | os.PathLike[str],
     progress: Callable[[int], None] | None = None,
 ) -> None:
-    """
-    Write events as ``trace.read_events`` has them as a session.
-
-    :raises TraceError: when it cannot be written.
-    """
+    """Write events as ``trace.read_events`` has them as a session."""
     with CtfSession(folder) as session:
         for number, event in enumerate(events):
             key = event['_name']
@@ -114,11 +108,7 @@ def export_dicts(
 
 
 class CtfSession:
-    """
-    A session being written; the folder appears when the block ends well.
-
-    :raises TraceError: when it is there already, or cannot be written
-    """
+    """A session being written; the folder appears when the block ends well."""
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self._target = Path(os.fspath(folder))

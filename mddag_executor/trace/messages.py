@@ -4,8 +4,7 @@
 The messages of any MCAP recording, of the topics that are asked for.
 
 Theory of operation: as in `reading`, in the order of the file: block by block, and nothing after
-damage. mcap takes the blocks apart. Messages are not decoded; whoever wants a part of one gets its
-bytes.
+damage. Messages are not decoded; whoever wants a part of one gets its bytes.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ from collections.abc import Collection, Iterator
 import os
 from typing import NamedTuple
 
-from mcap.records import Channel, Chunk, Message, Schema
-from mcap.stream_reader import breakup_chunk
+from mcap.opcode import Opcode
 from mddag_executor.text import counted
+from mddag_executor.trace import records
 from mddag_executor.trace.blocks import (
     Block,
     Damage,
@@ -28,6 +27,7 @@ from mddag_executor.trace.blocks import (
     used_once,
     what_was_used,
 )
+from mddag_executor.trace.channels import DEFINITIONS_LIMIT
 from mddag_executor.trace.reader import open_trace
 
 
@@ -39,6 +39,15 @@ class Topic(NamedTuple):
     message_type: str
     definition_encoding: str
     definition: str
+
+
+class Message(NamedTuple):
+    """A message: its channel, its times (ns) and its bytes."""
+
+    topic: Topic
+    log_time: int
+    publish_time: int
+    data: memoryview
 
 
 class MessageReader:
@@ -57,18 +66,13 @@ class MessageReader:
         self.count = 0
         self.topics: set[str] = set()
         self.times = array('Q')
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
-        self._topics: dict[int, Topic] = {}
+        self._schemas: dict[int, tuple[str, str, str]] = {}
+        self._channels: dict[int, Topic] = {}
+        self._wanted: dict[int, Topic] = {}
+        self._size = 0
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[Topic, int, int, bytes]]:
-        """
-        Yield the messages of some topics: topic, log time, publish time (ns), bytes.
-
-        They come in the order of the file.
-
-        :raises TraceError: where the file cannot be read or is no MCAP file
-        """
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Yield the messages of some topics, in the order of the file."""
         twice: list[int] = []
         with open_trace(self.path) as (stream, size):
             start, _ = open_data(stream, self.path)
@@ -89,32 +93,58 @@ class MessageReader:
 
     def _messages(
         self, data: bytes, block: Block, topics: Collection[str]
-    ) -> Iterator[tuple[Topic, int, int, bytes]]:
-        try:
-            records = breakup_chunk(Chunk('', data, 0, 0, 0, len(data)))
-        except Exception:   # whatever mcap's readers raise on damage
-            raise Damage('the records of a chunk do not fit into it', block.offset) from None
-        for record in records:
-            if isinstance(record, Message):
-                topic = self._topics.get(record.channel_id)
-                if topic is None:
-                    raise Damage('a message is of no channel', block.offset)
-                self.count += 1
-                self.times.append(record.log_time)
-                if topic.name in topics:
-                    yield topic, record.log_time, record.publish_time, record.data
-            elif isinstance(record, (Schema, Channel)):
-                self._define(record, block)
+    ) -> Iterator[Message]:
+        view = memoryview(data)
+        position, end = 0, len(data)
+        wanted = self._wanted
+        head_size = records.RECORD.size + records.MESSAGE_HEAD.size
+        while position < end:
+            if position + records.RECORD.size > end:
+                raise Damage('the records of a chunk do not fit into it', block.offset)
+            opcode, length = records.RECORD.unpack_from(data, position)
+            content = position + records.RECORD.size
+            after = content + length
+            if after > end:
+                raise Damage('the records of a chunk do not fit into it', block.offset)
+            if opcode == Opcode.MESSAGE:
+                if position + head_size > after:
+                    raise Damage('a message is shorter than its head', block.offset)
+                channel, _, log_time, publish_time = records.MESSAGE_HEAD.unpack_from(
+                    data, content)
+                self._note(channel, log_time, block)
+                topic = wanted.get(channel)
+                if topic is not None:
+                    yield Message(topic, log_time, publish_time, view[position + head_size:after])
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                try:
+                    self._define(opcode, data[content:after], topics)
+                except ValueError as error:
+                    raise Damage(str(error), block.offset) from None
+            position = after
 
-    def _define(self, record: Schema | Channel, block: Block) -> None:
-        if isinstance(record, Schema):
-            same = self._schemas.setdefault(record.id, record) == record
-        else:
-            same = self._channels.setdefault(record.id, record) == record
-            schema = self._schemas.get(record.schema_id, Schema(0, b'', '', ''))
-            self._topics[record.id] = Topic(
-                record.topic, record.message_encoding, schema.name, schema.encoding,
-                schema.data.decode(errors='replace'))
-            self.topics.add(record.topic)
-        if not same:
-            raise Damage('a schema or channel changes its meaning', block.offset)
+    def _note(self, channel: int, log_time: int, block: Block) -> None:
+        if channel not in self._channels:
+            raise Damage('a message is of no channel', block.offset)
+        self.count += 1
+        self.times.append(log_time)
+
+    def _define(self, opcode: int, content: bytes, topics: Collection[str]) -> None:
+        self._size += len(content)
+        if self._size > DEFINITIONS_LIMIT:
+            raise ValueError('the schemas are too large')
+        cursor = records.Cursor(content)
+        number = cursor.uint16()
+        if opcode == Opcode.SCHEMA:
+            name, encoding = cursor.string(), cursor.string()
+            schema = (name, encoding, cursor.block().decode(errors='replace'))
+            if self._schemas.setdefault(number, schema) != schema:
+                raise ValueError('a schema or channel changes its meaning')
+            return
+        schema = self._schemas.get(cursor.uint16(), ('', '', ''))
+        name = cursor.string()
+        topic = Topic(name, cursor.string(), *schema)
+        if self._channels.setdefault(number, topic) != topic:
+            raise ValueError('a schema or channel changes its meaning')
+        self.topics.add(name)
+        if name in topics:
+            self._wanted[number] = topic

@@ -37,11 +37,7 @@ _REMEDY = 'check its name, that you may read it, and the disk it is on'
 
 @contextmanager
 def open_trace(path: str) -> Iterator[tuple[BinaryIO, int]]:
-    """
-    Open a file and give it with its size.
-
-    :raises TraceError: where that cannot be, and for errors of the system inside of the block
-    """
+    """Open a file and give it with its size."""
     if '\0' in path:
         raise TraceError(path, 'is no file name', 'give the .mcap file')
     try:
@@ -85,11 +81,7 @@ class TraceReader:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        """
-        Check that there is a trace.
-
-        :raises TraceError: where there is no file, no MCAP file, or nothing in it
-        """
+        """Check that there is a trace."""
         self.path = os.fspath(path)
         self.warnings: list[str] = []
         self.fields: dict[str, tuple[str, ...]] = {}
@@ -115,11 +107,7 @@ class TraceReader:
         return self._summary is None or topic in self._summary.topics
 
     def has_events(self) -> bool:
-        """
-        Return whether there are channels of events, not only of other messages.
-
-        :raises TraceError: where the file can no longer be read
-        """
+        """Return whether there are channels of events, not only of other messages."""
         if self._summary:
             return any(topic.startswith('/trace/') for topic in self._summary.topics)
         return next(self.events(), None) is not None

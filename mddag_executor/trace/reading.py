@@ -94,11 +94,7 @@ class Reading:
             self._keep(damage)
 
     def by_time(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Events]:
-        """
-        Yield the events in the order of time.
-
-        :raises TraceError: where too many chunks overlap in time
-        """
+        """Yield the events in the order of time."""
         known = self._scan(blocks)
         order = sorted(range(len(known)), key=lambda number: known[number].start_time)
         sound = 0                       # blocks before this one have been found sound,

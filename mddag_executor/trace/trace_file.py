@@ -157,7 +157,6 @@ class TraceFile:
         Open the file, over what was there.
 
         :param extra_events: events beyond the table, or other fields for one of the table
-        :raises TraceError: where the file cannot be written
         """
         self.path = os.fspath(path)
         #: Events that are in the file, in whole chunks.

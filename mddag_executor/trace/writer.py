@@ -61,7 +61,6 @@ class TraceWriter:
         :param flush_interval_s: how often what was recorded goes to the operating system
         :param capacity: how many events may wait for the writer thread
         :param extra_events: events beyond the table
-        :raises TraceError: where the file cannot be written
         """
         if clock_offset is None:
             clock_offset = epoch_offset_ns()

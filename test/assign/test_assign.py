@@ -15,8 +15,8 @@ from mddag_executor.assign import (
     Search,
 )
 from mddag_executor.assign.search import PRECISION
-from mddag_executor.simulate.acceptance import wilson
 from mddag_executor.simulate.evaluate import Experiment
+from mddag_executor.simulate.evaluation import wilson
 from msg_graph import loads
 import pytest
 

@@ -21,9 +21,10 @@ class Flow(NamedTuple):
 def flows(book: PathBook) -> list[Flow]:
     """Return the flows along the first path, of which nothing has been forgotten."""
     book._round()
-    steps = [row for row in book._steps[:book._n].tolist() if row[1] == 0]
+    steps = [row for row in book._forest.rows[:len(book._forest)].tolist() if row[1] == 0]
     parents = {row[0] for row in steps}
-    numbers = [i for i, row in enumerate(book._steps[:book._n].tolist()) if row[1] == 0]
+    every = book._forest.rows[:len(book._forest)].tolist()
+    numbers = [i for i, row in enumerate(every) if row[1] == 0]
     table = dict(zip(numbers, steps))
     # executions that another one reads which went on
     went_on = {row[0] for i, row in table.items() if i in parents and row[3]}
@@ -56,7 +57,7 @@ def note_steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     def note(book: PathBook, at_end: bool) -> None:
         settle(book, at_end)
         if not at_end:
-            left.append(book._n)
+            left.append(len(book._forest))
 
     monkeypatch.setattr(PathBook, '_settle', note)
     return left

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from mddag_executor.simulate.acceptance import Acceptance, BINS, bins_of, WIDE_BINS, wilson
+from mddag_executor.simulate.evaluation import Acceptance, BINS, bins_of, WIDE_BINS, wilson
 import numpy as np
 import pytest
 

@@ -24,9 +24,9 @@ from mddag_executor.simulate import (
     SimulationError,
 )
 from mddag_executor.simulate import evaluate as module
-from mddag_executor.simulate.acceptance import BINS, WIDE_BINS
 from mddag_executor.simulate.draws import Draws
 from mddag_executor.simulate.evaluate import evaluate, Evaluation, Experiment
+from mddag_executor.simulate.evaluation import BINS, WIDE_BINS
 from msg_graph import load, loads, TaskSet
 import numpy as np
 import pytest
