@@ -9,10 +9,11 @@ m workers; len and vol are the longest path and the sum of the budgets; a releas
 at least T_i after the one before. Work is never idle: a worker is free only if nothing is ready.
 Nothing is preempted, as an executor of callbacks cannot. No test looks at overheads.
 
-1. *Response time under any work-conserving policy*, after Graham (Bounds on multiprocessing timing
-   anomalies, SIAM J. Appl. Math. 1969) and Melani, Bertogna, Bonifaci, Marchetti-Spaccamela and
-   Buttazzo (ECRTS 2015). Walk back from sink v: whenever no vertex of that chain runs, all workers
-   are busy with other vertices. W(x) is what other jobs can do in a window of
+1. *Graham* (Bounds on multiprocessing timing anomalies, SIAM J. Appl. Math. 1969). Walk back
+   from sink v: whenever no vertex of that chain runs, all workers are busy with other vertices. So
+   v is done by len_v + (vol - len_v) / m, if nothing else runs: no other DAG and no other job.
+2. *Response time under any work-conserving policy*, after Melani, Bertogna, Bonifaci, Marchetti-
+   Spaccamela and Buttazzo (ECRTS 2015). The same walk, with what other jobs can do in a window of
    length x from the release on: v is done by x if len_v + (vol - len_v + W(x)) / m <= x. Let the
    first miss be that of v; then every job released D_i (its latest deadline) before the window or
    earlier is done. Of task i the most fits in if one job ends as late as it may and the others
@@ -20,7 +21,7 @@ Nothing is preempted, as an executor of callbacks cannot. No test looks at overh
    + min(vol_i, m (y mod T_i)), and never more than m x. (vol_i <= m T_i and vol_i <= m D_i are
    necessary anyhow.) Jobs of the own task before and after count the same way, T apart. Nothing
    here asks for priorities, so it holds for several deadlines, with preemption and without.
-2. *Response time under RAD*: the same walk once more. Vertices on the chain to v have a RAD of at
+3. *Response time under RAD*: the same walk once more. Vertices on the chain to v have a RAD of at
    most d_v = release + D_v, the first deadline that is missed. Whenever none of them runs, one is
    ready and all workers are busy, with vertices of two kinds:
 
@@ -37,7 +38,7 @@ Nothing is preempted, as an executor of callbacks cannot. No test looks at overh
      release + x, so its RAD offset is more than D_v - x. (Blocking at each vertex is the idea of
      limited preemption: Serrano, Melani, Bertogna and Quinones, DATE 2016.)
 
-   All of this is also work of some job, so it is no more than what test 1 counts.
+   All of this is also work of some job, so it is no more than what test 2 counts.
 """
 
 from __future__ import annotations
@@ -62,8 +63,16 @@ class Bound(NamedTuple):
     response: int | None
 
 
+def graham(task: Task, workers: int) -> list[Bound]:
+    """Return the bounds of test 1; None for all where the DAG is not done within its period."""
+    responses = [length + (task.volume - length) // workers for _, _, length in task.sinks]
+    alone = max(responses) <= task.period
+    return [Bound(task, sink, deadline, response if alone and response <= deadline else None)
+            for (sink, deadline, _), response in zip(task.sinks, responses)]
+
+
 def work_conserving(tasks: Sequence[Task], workers: int) -> list[Bound]:
-    """Return the bounds of test 1, up to the first sink that has none."""
+    """Return the bounds of test 2, up to the first sink that has none."""
     def work_of(task: Task, _: int, __: int, length: int) -> Callable[[int], int]:
         return lambda window: _all_work(task, length, _workloads(tasks, task, window, workers),
                                         window, workers)
@@ -72,7 +81,7 @@ def work_conserving(tasks: Sequence[Task], workers: int) -> list[Bound]:
 
 
 def rad(tasks: Sequence[Task], workers: int) -> list[Bound]:
-    """Return the bounds of test 2, up to the first sink that has none."""
+    """Return the bounds of test 3, up to the first sink that has none."""
     blocking = _Blocking(tasks, workers)
     known: dict[tuple[int, int], int] = {}  # many sinks have the same deadline
 
@@ -131,12 +140,12 @@ def _workloads(tasks: Sequence[Task], task: Task, window: int, workers: int) -> 
 
 
 def _all_work(task: Task, length: int, loads: list[int], window: int, workers: int) -> int:
-    """Return what test 1 counts beside the longest path, ns."""
+    """Return what test 2 counts beside the longest path, ns."""
     return task.volume - length + own_jobs(task, window, workers) + sum(loads)
 
 
 def workload(task: Task, window: int, workers: int) -> int:
-    """Return the most that the jobs of a task work in a window (test 1), ns."""
+    """Return the most that the jobs of a task work in a window (test 2), ns."""
     scaled = workers * (window + task.deadline) - task.volume
     whole, rest = divmod(max(0, scaled), workers * task.period)
     return min(workers * window, whole * task.volume + min(task.volume, rest))

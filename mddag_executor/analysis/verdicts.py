@@ -17,12 +17,13 @@ preemption: of the schedulers they are about, the live executor's is one.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
 
 from mddag_executor.analysis import necessary, sufficient
 from mddag_executor.analysis.model import AnalysisError, Task, tasks_of
+from mddag_executor.analysis.sag import Answer, JobSet
 from mddag_executor.analysis.sufficient import Bound
 from mddag_executor.text import counted
 from msg_graph import format_duration, TaskSet
@@ -103,6 +104,27 @@ def analyse(
     return Analysis(workers, budget, sum(task.utilisation for task in tasks), tuple(found))
 
 
+def with_sag(analysis: Analysis, tasks: Sequence[Task], jobs: JobSet, answer: Answer) -> Analysis:
+    """Return the analysis with the verdict of a schedule-abstraction analysis in addition."""
+    why = _obstacle(tasks)
+    verdict = NOTHING
+    if why is None and answer.timed_out:
+        why = 'it ran out of time'
+    elif why is None and not answer.schedulable:
+        why = 'it found no proof'
+    elif why is None and not jobs.for_ever:
+        why = (f'proven only for the releases before {format_duration(jobs.horizon)}, as '
+               'a job may go on beyond that, or beyond its period')
+    elif why is None:
+        verdict, why = HOLDS, 'no order in which the jobs can run misses a deadline'
+    return replace(analysis, verdicts=(*analysis.verdicts, Verdict(
+        'schedule abstraction', 'sufficient', 'Nasri et al. 2019', RAD_LIVE,
+        'all first releases together, later ones exactly periodic', verdict,
+        f'{counted(answer.jobs, "job")}, {counted(answer.states, "state")}', why,
+        {'schedulable': answer.schedulable, 'timed_out': answer.timed_out,
+         'horizon_ns': jobs.horizon})))
+
+
 def _sink(task: Task, sink: int) -> str:
     return f'{task.dag.name}: {task.dag.vertices[sink].name}'
 
@@ -172,6 +194,25 @@ def _obstacle(tasks: Sequence[Task]) -> str | None:
     return None
 
 
+def _graham(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
+    bounds = [bound for task in tasks for bound in sufficient.graham(task, workers)]
+    within = {task.dag.name: all(b.response is not None for b in bounds if b.task is task)
+              for task in tasks}
+    good = sum(within.values())
+    verdict, reason = NOTHING, obstacle
+    if obstacle is None and len(tasks) > 1:
+        reason = 'the bound is for a DAG that has all workers for itself, and there are several'
+    elif obstacle is None and good:
+        verdict, reason = HOLDS, 'the bound of each sink is within deadline and period'
+    elif obstacle is None:
+        reason = 'a bound is beyond the deadline or the period'
+    return Verdict(
+        "Graham's bound", 'sufficient', 'Graham 1969', WORK_CONSERVING,
+        'one DAG alone, done within its period', verdict,
+        f'{good} of {counted(len(tasks), "DAG")} in time, each alone', reason or '',
+        {name: {'alone': HOLDS if ok else NOTHING} for name, ok in within.items()})
+
+
 _Bounds = Callable[[Sequence[Task], int], list[Bound]]
 
 
@@ -205,6 +246,7 @@ def _response_times(
 
 
 _SUFFICIENT: tuple[Callable[[Sequence[Task], int, str | None], Verdict], ...] = (
+    _graham,
     partial(_response_times, 'response time, any policy', 'after Melani et al. 2015',
             WORK_CONSERVING, sufficient.work_conserving),
     partial(_response_times, 'response time, RAD without preemption',

@@ -15,6 +15,7 @@ from mddag_executor.analysis import (
 )
 from mddag_executor.analysis.necessary import largest_demand
 from mddag_executor.analysis.sufficient import (
+    graham,
     own_jobs,
     own_urgent,
     rad,
@@ -113,6 +114,19 @@ def test_demand() -> None:
     demand = largest_demand(tasks_of(loads(FORK)), 2)
     assert (demand.time, demand.work, demand.complete) == (1 * MS, 1 * MS, True)
     assert verdicts(FORK, 1)['demand bound'].verdict == HOLDS
+
+
+def test_graham() -> None:
+    task, = tasks_of(loads(FORK))
+    assert [bound.response for bound in graham(task, 2)] == [None, 42 * MS]  # 3 + 40 / 2 > 3
+    slower, = tasks_of(loads(FORK.replace('deadline: 3ms', 'deadline: 23ms')))
+    assert [bound.response for bound in graham(slower, 2)] == [23 * MS, 42 * MS]
+    often, = tasks_of(loads(FORK.replace('deadline: 3ms', 'deadline: 23ms').replace(
+        '100ms', '41ms')))
+    assert [bound.response for bound in graham(often, 2)] == [None, None]  # jobs overlap
+    assert verdicts(timers('10ms 10ms 1ms'), 1)["Graham's bound"].verdict == HOLDS
+    two = verdicts(timers('10ms 10ms 1ms', '10ms 10ms 1ms'), 1)["Graham's bound"]
+    assert (two.verdict, two.figure) == (NOTHING, '2 of 2 DAGs in time, each alone')
 
 
 def test_workload() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import json
 from pathlib import Path
 import subprocess
+import sys
 
 Mddag = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -42,7 +43,7 @@ def test_json(mddag: Mddag) -> None:
     assert (result['workers'], result['budget']) == (5, 'mean')
     assert (round(result['load'], 3), round(result['utilisation'], 3)) == (5.102, 1.02)
     tests = {test['name']: test for test in result['tests']}
-    assert len(tests) == 5
+    assert len(tests) == 6
     assert 'no execution takes longer' in result['assumptions']
     assert tests['longest path']['verdict'] == 'holds'
     assert tests['utilisation']['verdict'] == 'fails'
@@ -50,6 +51,28 @@ def test_json(mddag: Mddag) -> None:
         'says nothing'}
     assert all(test['reason'] and test['source'] and test['assumption']
                for test in result['tests'])
+
+
+def test_schedule_abstraction(mddag: Mddag, tmp_path: Path) -> None:
+    stand_in = Path(__file__).resolve().parents[1] / 'analysis' / 'stand_in_nptest.py'
+    program = tmp_path / 'nptest'
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} {stand_in} "$@"\n')
+    program.chmod(0o755)
+    done = mddag('graph', 'analyse', '-', '--budget', 'mean', '--sag', 'jobs', '--sag-binary',
+                 './nptest', input=GRAPH, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    line = next(line for line in done.stdout.splitlines() if line.startswith('schedule abs'))
+    assert 'holds' in line and '1 job, 2 states' in line
+    assert sorted(path.name for path in (tmp_path / 'jobs').iterdir()) == [
+        'edges.csv', 'jobs.csv', 'tasks.csv']
+    done = mddag('graph', 'analyse', '-', '--sag-binary', './nptest', '--json', '-', input=GRAPH,
+                 cwd=tmp_path)
+    assert json.loads(done.stdout)['tests'][-1]['verdict'] == 'says nothing'
+    done = mddag('graph', 'analyse', '-', '--sag-binary', './none', input=GRAPH, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith('error: ./none: it cannot be run (No such file or directory): ')
+    done = mddag('graph', 'analyse', '-', '--horizon', '1s', input=GRAPH)
+    assert done.returncode == 2
 
 
 def test_bad_input(mddag: Mddag) -> None:
