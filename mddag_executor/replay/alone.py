@@ -161,10 +161,11 @@ def _theirs(ran: Recorded, took: Ints) -> Ints:
     beside = _beside(ran.could, ran.could + ran.took)
     waited = took - ran.least
     theirs: Ints = np.minimum(waited, 0)
-    for which in _by_callback(ran.callback, computing(ran.callback, ran.took, ran.cpu)):
+    computes = computing(ran.callback, ran.took, ran.cpu)
+    for which in _by_callback(ran.callback, ran.cpu >= 0):
         by_itself = which[beside[which] <= HARDLY * ran.took[which]]
         usual = (np.median(waited[by_itself]) if len(by_itself) >= ENOUGH
-                 else np.quantile(np.maximum(0, waited - beside)[which], LEAST))
+                 else np.quantile(np.maximum(0, waited - beside * computes)[which], LEAST))
         more = waited[which] - max(0, int(usual))
         theirs[which] += np.minimum(np.maximum(0, more), beside[which])
     return theirs

@@ -161,10 +161,10 @@ def begins(s: State, m: Machine, x: int, cost: int, cpu: int, locks: bool) -> No
     elif m.scalars[PYTHON] == 0:
         _set_parts(m, x, -NEVER, cpu, cost)
     elif 2 * cpu >= cost:
-        brief = min(cpu, BRIEF_NS)
-        _set_parts(m, x, -NEVER, cpu - brief, cost - brief)
+        brief = min(cpu // 2, BRIEF_NS)
+        _set_parts(m, x, brief, cpu - brief, cost - brief)
     else:
-        _set_parts(m, x, cpu // 4, cpu // 4, cost - cpu + cpu // 4)
+        _set_parts(m, x, cpu // 2, cpu // 2, cost - cpu + cpu // 2)
 
 
 def _set_parts(m: Machine, x: int, first: int, second: int, third: int) -> None:
