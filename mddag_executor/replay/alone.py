@@ -58,6 +58,7 @@ class Recorded(NamedTuple):
     locks: Flags
     interpreter: Ints
     callback: Ints
+    warm: Flags
 
     @property
     def least(self) -> Ints:
@@ -69,7 +70,7 @@ class Recorded(NamedTuple):
         """Return some of them."""
         return Recorded(
             self.could[which], self.took[which], self.cpu[which], self.locks[which],
-            self.interpreter[which], self.callback[which])
+            self.interpreter[which], self.callback[which], self.warm[which])
 
 
 def alone(ran: Recorded, cpus: int = 0, beside: float = 1.0) -> Ints:
@@ -85,6 +86,24 @@ def alone(ran: Recorded, cpus: int = 0, beside: float = 1.0) -> Ints:
     if beside < 1.0:
         took -= np.rint((1.0 - beside) * _theirs(ran, took)).astype(np.int64)
     return took
+
+
+def colder(callback: Ints, warm: Flags, took: Ints) -> Ints:
+    """
+    Return what executions take more than if their workers had not slept, or would if they had.
+
+    Those take more: a thread has to be woken, and finds cold caches.  It is the difference of the
+    medians of a callback, or where that is not known the median one; below 0 for what was warm.
+    """
+    found = np.full(len(took), -1)
+    for which in _by_callback(callback, np.ones(len(took), dtype=np.bool_)):
+        times = [took[which][warm[which] == how] for how in (True, False)]
+        if min(map(len, times)) >= ENOUGH:
+            found[which] = max(0, np.median(times[1]) - np.median(times[0]))
+    known = found[found >= 0]
+    found[found < 0] = np.median(known) if len(known) else 0
+    more: Ints = np.where(warm, -found, np.minimum(found, took // 2))
+    return more
 
 
 def computing(callback: Ints, took: Ints, cpu: Ints) -> Flags:
@@ -160,15 +179,19 @@ def _theirs(ran: Recorded, took: Ints) -> Ints:
     """Return what executions that take so long waited for others that ran beside them."""
     beside = _beside(ran.could, ran.could + ran.took)
     waited = took - ran.least
-    theirs: Ints = np.minimum(waited, 0)
     computes = computing(ran.callback, ran.took, ran.cpu)
-    for which in _by_callback(ran.callback, ran.cpu >= 0):
-        by_itself = which[beside[which] <= HARDLY * ran.took[which]]
-        usual = (np.median(waited[by_itself]) if len(by_itself) >= ENOUGH
-                 else np.quantile(np.maximum(0, waited - beside * computes)[which], LEAST))
-        more = waited[which] - max(0, int(usual))
-        theirs[which] += np.minimum(np.maximum(0, more), beside[which])
-    return theirs
+    usual = np.zeros(len(took), dtype=np.int64)
+    for kinds in (ran.callback, 2 * ran.callback + ran.warm):
+        for which in _by_callback(kinds, ran.cpu >= 0):
+            by_itself = which[beside[which] <= HARDLY * ran.took[which]]
+            if len(by_itself) >= ENOUGH:
+                usual[which] = np.median(waited[by_itself])
+            elif kinds is ran.callback:
+                least = np.where(computes, waited - beside, ran.took - ran.least)
+                usual[which] = np.quantile(np.maximum(0, least)[which], LEAST)
+    theirs: Ints = np.where(
+        ran.cpu >= 0, np.clip(waited - np.maximum(0, usual), 0, beside), 0)
+    return theirs + np.minimum(waited, 0)
 
 
 def _beside(begins: Ints, ends: Ints) -> Ints:

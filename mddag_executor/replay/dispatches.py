@@ -23,6 +23,8 @@ from __future__ import annotations
 from array import array
 from typing import Any
 
+from mddag_executor.simulate.machine import WARM_NS
+
 
 class Dispatches:
     """
@@ -38,7 +40,7 @@ class Dispatches:
         # from when it was free, and from when its worker was, too
         self._free, self._worker = array('q'), array('q')
         self._start, self._end = array('q'), array('q')
-        self._process = array('q')
+        self._process, self._warm = array('q'), array('b')
 
     def add(
         self, worker: int, group: int | None, ready: int, start: int, end: int,
@@ -51,19 +53,26 @@ class Dispatches:
         :param group: what identifies its mutually exclusive callback group, or None.
         :return: its number.
         """
-        could = ready
+        could, ended = ready, 0
         if group is not None:
             could = max(could, self._group_free.get(group, 0))
             self._group_free[group] = end
         self._free.append(could)
         if worker >= 0:
-            could = max(could, self._worker_free.get(worker, 0))
+            ended = self._worker_free.get(worker, 0)
+            could = max(could, ended)
             self._worker_free[worker] = end
         self._worker.append(could)
         self._start.append(start)
         self._end.append(end)
         self._process.append(process)
+        self._warm.append(start - ended <= WARM_NS)
         return len(self._start) - 1
+
+    def warm(self) -> Any:
+        """Return by number whether its worker had only just ended another, as an array."""
+        import numpy as np
+        return np.array(self._warm, dtype=np.bool_)
 
     def late(self, holding: Any = ()) -> Any:
         """

@@ -43,7 +43,7 @@ from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any, NamedTuple
 
-from mddag_executor.core import legs_of, quantile, Tables
+from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.replay.dispatches import Dispatches
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.simulate import Load
@@ -52,6 +52,8 @@ from mddag_executor.simulate.load import edge_numbers, edges_of, FAILS, RUNS, SK
 from mddag_executor.trace.census import Census
 from msg_graph import Dag, TaskSet
 
+ENOUGH = 20
+"""So many rounds of timers tell how late they are."""
 _UNKNOWN = -1
 _NO_GROUP, _UNTOLD = -1, -2
 
@@ -263,7 +265,9 @@ class LoadBuilder(Observer):
             self._others.append(self._leg[1])
             self._leg = None
         locks = self._locks()
-        every, usual = self._alone(locks, beside)
+        every, usual, warmth = self._alone(locks, beside)
+        if beside < 1.0:
+            self._notice_sooner(locks, beside)
         process = process or self._process
         typical = self._typical()
         unknown: dict[str, None] = {}
@@ -303,12 +307,14 @@ class LoadBuilder(Observer):
         all_holds: Any = np.concatenate(holds)
         all_computed: Any = np.concatenate(computed)
         all_locks: Any = np.concatenate([locks, holds[-1]]).astype(np.int64)
+        all_warmth: Any = np.concatenate([warmth, holds[-1]])
         delays, transport = self._transports(overheads, process)
         load = self._load(
             np.concatenate(costs), bases, [ready for ready, _, _ in others], overheads)._replace(
             holds=all_holds if all_holds.any() else [],
             computed=all_computed if (all_computed >= 0).any() else [],
-            locks=all_locks, fates=self._fates(bases, executions + len(others)),
+            locks=all_locks, warmth=all_warmth if all_warmth.any() else [],
+            fates=self._fates(bases, executions + len(others)),
             delays=delays, delay_stride=[jobs.n_edges for jobs in self._jobs],
             delay_base=[0, *accumulate(len(jobs.arrived) for jobs in self._jobs[:-1])])
         return RecordedLoad(
@@ -352,15 +358,16 @@ class LoadBuilder(Observer):
             np.tile(by_vertex[first:first + jobs.size], len(jobs.numbers))
             for first, jobs in zip(self._first, self._jobs)])
 
-    def _alone(self, locks: Any, beside: float) -> tuple[Any, int | None]:
+    def _alone(self, locks: Any, beside: float) -> tuple[Any, int | None, Any]:
         """
         Make times those that executions would have taken alone (see ``alone``).
 
         ``took`` becomes what their callbacks take, ``late`` what the executor does.
 
-        :return: how late executions were, by number, the last one what is usual; and that.
+        :return: how late executions were, by number, the last one what is usual; that; and by
+            execution what it takes more since its worker had slept (see ``Load.warmth``).
         """
-        from mddag_executor.replay.alone import alone, Recorded
+        from mddag_executor.replay.alone import alone, colder, Recorded
         import numpy as np
         number, took, start, cpu = (
             self._all(name) for name in ('dispatch', 'took', 'start', 'cpu'))
@@ -370,11 +377,15 @@ class LoadBuilder(Observer):
         every = np.append(every, usual)     # number -1
         late = every[number]
         ran = np.flatnonzero((took >= 0) & (start >= 0))
+        warmth = np.zeros(len(took), dtype=np.int64)
         if (cpu[ran] >= 0).any():
+            callback = self._by_execution(self._callbacks)[ran]
+            warm = np.append(self._dispatches.warm(), True)[number[ran]]
             recorded = Recorded(
                 start[ran] - late[ran], took[ran] + late[ran], cpu[ran], locks[ran],
-                self._by_execution(self._process)[ran], self._by_execution(self._callbacks)[ran])
+                self._by_execution(self._process)[ran], callback, warm)
             cost = alone(recorded, self._cpus, beside)
+            warmth[ran] = colder(callback, warm, cost)
             # what is less than recorded: it began late, or it stood still later
             began = np.minimum(recorded.took - cost, np.maximum(0, late[ran] - usual))
             took[ran] = np.maximum(0, cost - late[ran] + began)
@@ -382,7 +393,41 @@ class LoadBuilder(Observer):
         ends = np.cumsum([len(jobs.took) for jobs in self._jobs])[:-1]
         for jobs, *columns in zip(self._jobs, np.split(took, ends), np.split(late, ends)):
             jobs.took, jobs.late = (array('q', column.tobytes()) for column in columns)
-        return every, usual if len(known) else None
+        return every, usual if len(known) else None, warmth
+
+    def _notice_sooner(self, locks: Any, beside: float) -> None:
+        """
+        Take off rounds what they waited for since several executions ran when they were due.
+
+        One that does not compute with Python's lock, alone, delays none; of those that do, one
+        does.  So they are as late as where nothing ran, or only such a one: rank by rank.
+        """
+        import numpy as np
+        number, noticed, release = (self._all(name) for name in ('round', 'noticed', 'release'))
+        of = np.flatnonzero(number >= 0)
+        if not len(of):
+            return
+        ends = np.array(self._rounds, dtype=np.int64)
+        due = np.full(len(ends), NEVER)
+        np.minimum.at(due, number[of], release[of])
+        start, end = self._all('start'), self._all('end')
+        running = [np.searchsorted(np.sort(start[which]), due, 'right')
+                   - np.searchsorted(np.sort(end[which]), due, 'right')
+                   for which in ((start >= 0) & (end >= 0) & how for how in (locks, ~locks))]
+        late = ends - due
+        for how in (running[0] == 0, running[0] > 0):
+            alone = np.sort(late[how & (running[1] == 0)])
+            others = np.flatnonzero(how & (running[1] > 0))
+            if len(alone) >= ENOUGH and len(others):
+                others = others[np.argsort(late[others], kind='stable')]
+                ranks = (np.arange(len(others)) + 0.5) / len(others)
+                more = np.maximum(0, late[others] - np.quantile(alone, ranks))
+                ends[others] -= np.rint((1.0 - beside) * more).astype(np.int64)
+        self._rounds = array('q', ends.tobytes())
+        noticed[of] = np.minimum(noticed[of], ends[number[of]])
+        for jobs, column in zip(self._jobs, np.split(
+                noticed, np.cumsum([len(jobs.noticed) for jobs in self._jobs])[:-1])):
+            jobs.noticed = array('q', column.tobytes())
 
     def _computing(
         self, dag: Dag, jobs: _Jobs, took: Any, missing: Any, computed: list[Any],

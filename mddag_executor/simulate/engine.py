@@ -174,6 +174,8 @@ def run(
                 if log is not None:
                     running[w] = -1
                     _note(t, s, log, now, END, w, x)
+                if machine is not None:
+                    machine.ended_at[w] = now
                 if deliveries is not None:
                     ends_sending(t, s, key, load, deliveries, machine, x, now)
                 else:
@@ -251,7 +253,7 @@ def _dispatch(
             running[worker] = x
             _note(t, s, log, now, START, worker, x)
         if machine is not None:
-            starts(s, load, machine, x)
+            starts(s, load, machine, x, now)
         if deliveries is not None:
             sends_at_start(t, s, load, deliveries, machine, x, now)
         if machine is not None:

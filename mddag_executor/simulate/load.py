@@ -27,6 +27,8 @@ class Load(NamedTuple):
     * ``computed``: its CPU time; -1: it waits, as far as is known.  Empty: it computes all the
       time;
     * ``locks``: whether it computes with Python's lock, as those do that hold the interpreter;
+    * ``warmth``: how much longer it takes, since its worker had slept before, than on one that has
+      only just ended another; below 0: it takes so much longer on one that has slept, ns;
     * ``fates``: what becomes of it (``RUNS``, …; ``SKIPPED`` stands at a source).
 
     ``delays[delay_base[d] + k * delay_stride[d] + e]`` is how long after a vertex's completion its
@@ -44,6 +46,7 @@ class Load(NamedTuple):
     holds: list[int] = []
     computed: list[int] = []
     locks: list[int] = []
+    warmth: list[int] = []
     fates: list[int] = []
     delays: list[int] = []
     delay_base: list[int] = []

@@ -41,6 +41,8 @@ SLICE_NS = 3_000_000
 """How long the operating system lets a thread compute while others wait for a CPU."""
 BRIEF_NS = 100_000
 """What one that computes without the lock takes in Python at its end, at most."""
+WARM_NS = 100_000
+"""A worker is warm for so long after an execution has ended: its thread does not sleep yet."""
 HARDLY = 8
 """One that holds the interpreter and waits for less than this part of it keeps it meanwhile."""
 
@@ -78,6 +80,8 @@ class Machine(NamedTuple):
     lock_queue: list[list[int]]
     lock_had: list[int]
     switch_at: list[int]
+    # by worker: when it ended an execution, and has not begun another since; or -NEVER
+    ended_at: list[int]
 
 
 def new_machine(t: Tables, s: State, cpus: int | None = None, python: bool = False) -> Machine:
@@ -103,6 +107,8 @@ def fill_machine(t: Tables, s: State, m: Machine, cpus: int, python: int) -> Non
         add_queue(m.lock_queue)
         m.lock_had.append(-1)
         m.switch_at.append(NEVER)
+    for _ in range(len(s.worker_x)):
+        m.ended_at.append(-NEVER)
 
 
 def settle(s: State, m: Machine, now: int) -> None:
@@ -132,8 +138,23 @@ def decide(t: Tables, s: State, now: int) -> None:
                 s.scalars[PREEMPTIVE] != 0))
 
 
-def starts(s: State, load: Load, m: Machine, x: int) -> None:
+def _is_warm(s: State, m: Machine, worker: int, now: int) -> bool:
+    """Tell whether a worker of the same process has only just ended another: it goes on."""
+    for w in range(len(s.worker_x)):
+        if (now - m.ended_at[w] <= WARM_NS and (w == worker or s.worker_x[w] < 0)
+                and (len(s.pool) == 0 or s.pool[w] == s.pool[worker])):
+            m.ended_at[w] = -NEVER
+            return True
+    return False
+
+
+def starts(s: State, load: Load, m: Machine, x: int, now: int) -> None:
     """Take in that an execution has been dispatched."""
+    if len(load.warmth) > 0 and s.scalars[PREEMPTIVE] == 0:
+        more = load.warmth[place_of(s, load, x)]
+        if _is_warm(s, m, s.x_worker[x], now) == (more > 0):
+            s.x_cost[x] -= more
+            s.x_left[x] -= more
     cost = s.x_cost[x]
     cpu, locks = cost, False
     if len(load.computed) > 0:
@@ -161,10 +182,10 @@ def begins(s: State, m: Machine, x: int, cost: int, cpu: int, locks: bool) -> No
     elif m.scalars[PYTHON] == 0:
         _set_parts(m, x, -NEVER, cpu, cost)
     elif 2 * cpu >= cost:
-        brief = min(cpu // 2, BRIEF_NS)
-        _set_parts(m, x, brief, cpu - brief, cost - brief)
+        brief = min(cpu, BRIEF_NS)
+        _set_parts(m, x, -NEVER, cpu - brief, cost - brief)
     else:
-        _set_parts(m, x, cpu // 2, cpu // 2, cost - cpu + cpu // 2)
+        _set_parts(m, x, cpu // 4, cpu // 4, cost - cpu + cpu // 4)
 
 
 def _set_parts(m: Machine, x: int, first: int, second: int, third: int) -> None:
