@@ -188,8 +188,8 @@ def native() -> Emulate:
     """
     Make a function that takes about that much CPU time in C, without the interpreter lock.
 
-    How much C does in a time is measured first (some milliseconds), and then goes by what it lately
-    did: the speed of a virtual machine changes by a tenth.
+    How much C does in a time is measured first (some milliseconds), and then goes by what it did
+    lately: the speed of a virtual machine changes by a tenth.
     """
     def compute(iterations: int) -> None:
         hashlib.pbkdf2_hmac('sha256', b'password', b'salt', iterations)

@@ -15,10 +15,12 @@ What the model does not explain stays in the time, so that a schedule like the r
 the recorded response times.
 
 That is right where as many run beside one another as in the recording.  Where fewer do, what the
-model leaves over has to be divided:  a callback *computes* if its executions that wait least
-wait for less than they compute; what such a callback waits for itself is told by its executions
-that hardly any other ran beside: the median; where there are too few, by those that waited least
-beyond what others explain.  What one waited for more than that, while others ran, is *theirs*.
+model leaves over has to be told apart.  What a callback waits for itself is told by its executions
+that hardly any other ran beside: the median, of those whose worker went on and of those whose
+worker had slept.  Where there are too few, those that waited least tell it: of a callback that
+*computes* (its executions that wait least wait for less than they compute) beyond what others
+explain, else of all that was recorded.  What one waited for more than that, while others ran, is
+*theirs*.
 """
 
 from __future__ import annotations
@@ -189,9 +191,9 @@ def _theirs(ran: Recorded, took: Ints) -> Ints:
             elif kinds is ran.callback:
                 least = np.where(computes, waited - beside, ran.took - ran.least)
                 usual[which] = np.quantile(np.maximum(0, least)[which], LEAST)
-    theirs: Ints = np.where(
+    theirs: Ints = np.minimum(waited, 0) + np.where(
         ran.cpu >= 0, np.clip(waited - np.maximum(0, usual), 0, beside), 0)
-    return theirs + np.minimum(waited, 0)
+    return theirs
 
 
 def _beside(begins: Ints, ends: Ints) -> Ints:

@@ -52,8 +52,6 @@ from mddag_executor.simulate.load import edge_numbers, edges_of, FAILS, RUNS, SK
 from mddag_executor.trace.census import Census
 from msg_graph import Dag, TaskSet
 
-ENOUGH = 20
-"""So many rounds of timers tell how late they are."""
 _UNKNOWN = -1
 _NO_GROUP, _UNTOLD = -1, -2
 
@@ -313,7 +311,8 @@ class LoadBuilder(Observer):
             np.concatenate(costs), bases, [ready for ready, _, _ in others], overheads)._replace(
             holds=all_holds if all_holds.any() else [],
             computed=all_computed if (all_computed >= 0).any() else [],
-            locks=all_locks, warmth=all_warmth if all_warmth.any() else [],
+            # where as many run beside one another, workers go on as they did
+            locks=all_locks, warmth=all_warmth if overheads and beside < 1.0 else [],
             fates=self._fates(bases, executions + len(others)),
             delays=delays, delay_stride=[jobs.n_edges for jobs in self._jobs],
             delay_base=[0, *accumulate(len(jobs.arrived) for jobs in self._jobs[:-1])])
@@ -397,36 +396,42 @@ class LoadBuilder(Observer):
 
     def _notice_sooner(self, locks: Any, beside: float) -> None:
         """
-        Take off rounds what they waited for since several executions ran when they were due.
+        Take off rounds what they were late since several executions ran when they were due.
 
-        One that does not compute with Python's lock, alone, delays none; of those that do, one
-        does.  So they are as late as where nothing ran, or only such a one: rank by rank.
+        One that does not compute with Python's lock delays none; of those that do, one does.  So
+        they are as late as where nothing ran, or only such a one: rank by rank.
         """
+        from mddag_executor.replay.alone import ENOUGH
         import numpy as np
-        number, noticed, release = (self._all(name) for name in ('round', 'noticed', 'release'))
+        number, noticed, release, start, end = (
+            self._all(name) for name in ('round', 'noticed', 'release', 'start', 'end'))
         of = np.flatnonzero(number >= 0)
-        if not len(of):
-            return
         ends = np.array(self._rounds, dtype=np.int64)
-        due = np.full(len(ends), NEVER)
+        due, home = np.full(len(ends), NEVER), np.zeros(len(ends), dtype=np.int64)
         np.minimum.at(due, number[of], release[of])
-        start, end = self._all('start'), self._all('end')
-        running = [np.searchsorted(np.sort(start[which]), due, 'right')
-                   - np.searchsorted(np.sort(end[which]), due, 'right')
-                   for which in ((start >= 0) & (end >= 0) & how for how in (locks, ~locks))]
+        home[number[of]] = np.repeat(
+            [self._process[source] for source in self._tables.source[:-1]],
+            [len(jobs.round) for jobs in self._jobs])[of]
+        process = self._by_execution(self._process)
         late = ends - due
-        for how in (running[0] == 0, running[0] > 0):
-            alone = np.sort(late[how & (running[1] == 0)])
-            others = np.flatnonzero(how & (running[1] > 0))
-            if len(alone) >= ENOUGH and len(others):
-                others = others[np.argsort(late[others], kind='stable')]
-                ranks = (np.arange(len(others)) + 0.5) / len(others)
-                more = np.maximum(0, late[others] - np.quantile(alone, ranks))
-                ends[others] -= np.rint((1.0 - beside) * more).astype(np.int64)
+        for here in np.unique(home):
+            mine = (start >= 0) & (end >= 0) & (process == here)
+            computing, others = (
+                np.searchsorted(np.sort(start[mine & how]), due, 'right')
+                - np.searchsorted(np.sort(end[mine & how]), due, 'right')
+                for how in (locks, ~locks))
+            for how in (computing == 0, computing > 0):
+                usual = late[how & (others == 0) & (home == here)]
+                those = np.flatnonzero(how & (others > 0) & (home == here))
+                those = those[np.argsort(late[those], kind='stable')]
+                if len(usual) >= ENOUGH and len(those):
+                    ranks = (np.arange(len(those)) + 0.5) / len(those)
+                    more = np.maximum(0, late[those] - np.quantile(usual, ranks))
+                    ends[those] -= np.rint((1.0 - beside) * more).astype(np.int64)
         self._rounds = array('q', ends.tobytes())
         noticed[of] = np.minimum(noticed[of], ends[number[of]])
-        for jobs, column in zip(self._jobs, np.split(
-                noticed, np.cumsum([len(jobs.noticed) for jobs in self._jobs])[:-1])):
+        lengths = np.cumsum([len(jobs.noticed) for jobs in self._jobs])
+        for jobs, column in zip(self._jobs, np.split(noticed, lengths[:-1])):
             jobs.noticed = array('q', column.tobytes())
 
     def _computing(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mddag_executor.replay.alone import alone, computing, Recorded
+from mddag_executor.replay.alone import alone, colder, computing, Recorded
 import numpy as np
 from pytest import approx
 
@@ -26,7 +26,8 @@ def of(
     cpu = np.where(cpu < 0, -1, np.rint(cpu * 1e6)).astype(np.int64)
     interpreter = np.array(here) if here is not None else np.maximum(held, 1)
     callback = np.arange(len(ran)) if callbacks is None else np.array(callbacks)
-    found = alone(Recorded(*times, cpu, held > 0, interpreter, callback), cpus, beside)
+    warm = np.zeros(len(ran), dtype=np.bool_)
+    found = alone(Recorded(*times, cpu, held > 0, interpreter, callback, warm), cpus, beside)
     return [float(each) for each in np.round(found / 1e6, 1)]
 
 
@@ -67,6 +68,24 @@ def test_what_others_did_that_nobody_explains() -> None:
     for beside, expected in ((1.0, 20), (0.5, 16), (0.0, 12)):
         found = of(*executions, callbacks=callbacks, beside=beside)
         assert found == approx([expected, *[12] * 5, 20], abs=0.15)
+
+
+def test_one_that_waits_is_delayed_by_others_too() -> None:
+    """It sleeps for 5 ms, and was twice as long where others ran beside it."""
+    by_itself = [(100 * i, 5, 0.1, 0) for i in range(1, 6)]
+    executions = [(0, 10, 0.1, 0), *by_itself, (0, 20, 0.1, 0)]
+    callbacks = [0, 0, 0, 0, 0, 0, 1]
+    for beside, expected in ((1.0, 10), (0.0, 5)):
+        found = of(*executions, callbacks=callbacks, beside=beside)
+        assert found == approx([expected, *[5] * 5, 20], abs=0.15)
+
+
+def test_what_takes_more_where_the_worker_had_slept() -> None:
+    """Of the second callback too little is known: the difference is that of the first."""
+    callback = np.array([0] * 10 + [1, 1])
+    warm = np.array([True, False] * 6)
+    took = np.array([100, 130] * 5 + [500, 10])
+    assert colder(callback, warm, took).tolist() == [-30, 30] * 5 + [-30, 5]
 
 
 def test_who_computes() -> None:

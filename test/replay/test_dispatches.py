@@ -22,6 +22,13 @@ def test_all_busy_it_waits_for_its_worker() -> None:
     assert late(1, (0, None, 0, 0, 400), (0, None, 100, 430, 500)) == [0, 30]
 
 
+def test_a_worker_is_warm_that_has_only_just_ended_another() -> None:
+    found = Dispatches(2)
+    for worker, start, end in ((0, 500, 510), (0, 600, 700), (1, 710, 720), (0, 801, 810)):
+        found.add(worker, None, *(1000 * time for time in (start, start, end)))
+    assert found.warm().tolist() == [False, True, False, False]
+
+
 def test_left_to_a_busy_worker_although_another_was_idle() -> None:
     # the first one's worker takes what it started itself: the second one has nothing to do
     assert late(2, (0, None, 0, 0, 400), (0, None, 350, 430, 500)) == [0, 80]

@@ -53,7 +53,7 @@ class Job:
 
 def times(
     jobs: Sequence[Job], workers: int, cpus: int | None = None, python: bool = False,
-    preemptive: bool = False, divided: bool = False,
+    preemptive: bool = False, divided: bool = False, warmth: Sequence[int] = (),
 ) -> list[tuple[int, int]]:
     """Return when each job starts first, and when it ends."""
     task_set = declaration([
@@ -65,7 +65,8 @@ def times(
     n = len(jobs)
     load = Load([jobs[i].release for i in order], order, [0] * n, [job.cost for job in jobs],
                 list(range(n)), [0] * n, holds=[job.interpreter * job.holds for job in jobs],
-                computed=[job.cost if job.cpu is None else job.cpu for job in jobs])
+                computed=[job.cost if job.cpu is None else job.cpu for job in jobs],
+                warmth=list(warmth))
     state = new_state(tables, workers * (1 + divided), preemptive=preemptive)
     if divided:
         divide(state, [workers, workers])
@@ -123,6 +124,14 @@ def test_each_process_has_its_workers() -> None:
     jobs = of_ms(Job(0, 50, 4), Job(0, 60, 1, interpreter=2), Job(1, 70, 3))
     assert in_ms(times(jobs, 1, divided=True)) == [(0, 4), (0, 1), (4, 7)]
     assert in_ms(times(jobs, 2)) == [(0, 4), (0, 1), (1, 4)]
+
+
+def test_a_worker_that_goes_on_is_warm() -> None:
+    """The second goes on, the third does not; all three take what they take otherwise."""
+    jobs = of_ms(Job(0, 50, 4, True), Job(1, 60, 4, True), Job(20, 70, 4, True))
+    ms = [1 * MS, 1 * MS, -2 * MS]
+    assert in_ms(times(jobs, 1, warmth=ms)) == [(0, 4), (4, 7), (20, 26)]
+    assert in_ms(times(jobs, 3, warmth=ms)) == [(0, 4), (4, 7), (20, 26)]
 
 
 def test_cpus_are_shared_by_slices() -> None:
