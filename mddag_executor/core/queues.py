@@ -191,6 +191,13 @@ def overtaking_pays(
     return first < 0 or PATIENCE * left >= t.rad_offset[s.x_vertex[first]]
 
 
+def overtaking_pays_from(t: Tables, s: State, process: int, usual: int) -> int:
+    """Return how long one has held its process' interpreter when overtaking pays once more, ns."""
+    first = first_waiting(t, s, process)
+    wait = 0 if first < 0 else -(-t.rad_offset[s.x_vertex[first]] // PATIENCE)
+    return max(LONGER * usual + LONG_NS, TURN_NS, wait)
+
+
 def wait_for_poll(t: Tables, s: State, entry: QueueEntry) -> None:
     """Let an execution wait at its entity for a poll (rule 9)."""
     x = entry[4]

@@ -238,7 +238,7 @@ def _dispatch(
 ) -> None:
     """Dispatch what is to run now; ``running`` is kept for the log, which wants the preempted."""
     if machine is not None:
-        decide(t, s, now)
+        decide(t, s, machine, now)
     x = rules.schedule(t, s, key, now)
     while x >= 0:
         worker = s.x_worker[x]
@@ -257,7 +257,7 @@ def _dispatch(
         if deliveries is not None:
             sends_at_start(t, s, load, deliveries, machine, x, now)
         if machine is not None:
-            decide(t, s, now)
+            decide(t, s, machine, now)
         x = rules.schedule(t, s, key, now)
 
 

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from mddag_executor.core.queues import first_waiting, overtaking_pays
+from mddag_executor.core.queues import first_waiting, overtaking_pays, overtaking_pays_from
 from mddag_executor.core.rules import progress
 from mddag_executor.core.state import add_queue, empty, N_HOLDING, PREEMPTIVE, State
 from mddag_executor.core.tables import NEVER, Tables
@@ -52,8 +52,8 @@ _LOCK, _CPU, _NOTHING = range(3)
 # Columns of ``Machine.scalars``: how many CPUs there are; whether executions that do not hold the
 # interpreter need it at their end; up to when time has been taken in; when CPUs change hands, if
 # nothing happens before; when somebody needs something else, or must wait; how often it was found
-# out who goes on.
-CPUS, PYTHON, SETTLED, SLICE_AT, NEXT_TIME, SHARES = range(6)
+# out who goes on; when overtaking pays that does not pay now.
+CPUS, PYTHON, SETTLED, SLICE_AT, NEXT_TIME, SHARES, OVERTAKE_AT = range(7)
 
 
 class Machine(NamedTuple):
@@ -98,7 +98,7 @@ def new_machine(t: Tables, s: State, cpus: int | None = None, python: bool = Fal
 
 def fill_machine(t: Tables, s: State, m: Machine, cpus: int, python: int) -> None:
     """Fill the columns of a machine that is all empty; see ``new_machine``."""
-    for value in (cpus, python, 0, NEVER, NEVER, 1):
+    for value in (cpus, python, 0, NEVER, NEVER, 1, NEVER):
         m.scalars.append(value)
     for vertex in range(len(t.process)):
         while len(s.overtaking) <= t.process[vertex]:
@@ -119,8 +119,9 @@ def settle(s: State, m: Machine, now: int) -> None:
     m.scalars[SETTLED] = now
 
 
-def decide(t: Tables, s: State, now: int) -> None:
+def decide(t: Tables, s: State, m: Machine, now: int) -> None:
     """Decide by process whether what waits first may overtake who began last to hold it."""
+    m.scalars[OVERTAKE_AT] = NEVER
     if s.scalars[N_HOLDING] == 0 or (len(s.ready) == 0 and len(s.held_back) == 0):
         return
     for process in range(1, len(s.overtaking)):
@@ -136,6 +137,9 @@ def decide(t: Tables, s: State, now: int) -> None:
             s.overtaking[process] = int(overtaking_pays(
                 t, s, process, now - s.x_started[last], s.x_cost[last],
                 s.scalars[PREEMPTIVE] != 0))
+            pays_at = s.x_started[last] + overtaking_pays_from(t, s, process, s.x_cost[last])
+            if s.overtaking[process] == 0 and now < pays_at < m.scalars[OVERTAKE_AT]:
+                m.scalars[OVERTAKE_AT] = pays_at
 
 
 def _is_warm(s: State, m: Machine, worker: int, now: int) -> bool:
@@ -207,7 +211,7 @@ def share(t: Tables, s: State, m: Machine, now: int, finish_at: list[int]) -> No
         if len(m.lock_queue[process]) > 0:
             _pass_lock(s, m, process, now)
     _pass_cpus(s, m, now)
-    next_time = m.scalars[SLICE_AT]
+    next_time = min(m.scalars[SLICE_AT], m.scalars[OVERTAKE_AT])
     for process in range(1, len(m.switch_at)):
         next_time = min(next_time, m.switch_at[process])
     m.still.clear()

@@ -110,6 +110,14 @@ def test_one_that_is_more_urgent_overtakes_and_they_take_turns() -> None:
     assert in_ms(times(jobs, 2)) == [(0, 10), (10, 13)]
 
 
+def test_one_is_overtaken_once_it_takes_much_longer_than_usual() -> None:
+    """Others have the CPU meanwhile; nothing happens at 11 ms, three times as long and 5 ms."""
+    others = [Job(MS, 100 * MS, 30 * MS) for _ in range(4)]
+    urgent = Job(1_500_000, 20 * MS, MS, True)
+    found = times([Job(0, 50 * MS, 2 * MS, True), *others, urgent], 6, 1)
+    assert found[-1][0] == 11 * MS
+
+
 def test_each_process_has_its_interpreter() -> None:
     """The second of each waits for the first of its own; what goes first of all is held back."""
     jobs = of_ms(Job(0, 50, 4, True), Job(0, 60, 6, True, interpreter=2),
