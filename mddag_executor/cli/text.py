@@ -5,14 +5,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-import subprocess
 import sys
 import time
 from types import TracebackType
-from typing import TextIO
+from typing import TextIO, TYPE_CHECKING
 
 from mddag_executor import progress
 from mddag_executor.report.text import Cell, format_ns, printable, table
+
+if TYPE_CHECKING:
+    import subprocess
 
 __all__ = [
     'Cell', 'Progress', 'format_ns', 'one_line', 'printable', 'run_program', 'table', 'warn']
@@ -110,6 +112,7 @@ def run_program(
     :param seconds: how long it will take, where that is known.
     :param given: its standard input.
     """
+    import subprocess
     begin = time.monotonic()
     with Progress(what, seconds) as line, subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
