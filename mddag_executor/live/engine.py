@@ -43,6 +43,7 @@ from mddag_executor.core.state import (
     N_HOLDING,
     N_IDLE,
     OPEN,
+    POLLING,
     SUSPENDED,
 )
 from mddag_executor.live.entity import Entity, TIMER
@@ -180,11 +181,12 @@ class Engine:
         """
         Let an undeclared callback run past the core, if that would dispatch it now.
 
-        :return: False where it would not, or where what runs is recorded.
+        :return: False where it would not, where what runs is recorded, or where the policy polls:
+            a poll, which finds it late, could take another one in its place.
         """
         entity, state = work.entity, self._state
         if (self.alone is not None or self.record is not None or state.ready or state.held_back
-                or state.unpolled or not state.scalars[N_IDLE]
+                or state.scalars[POLLING] or not state.scalars[N_IDLE]
                 or entity.removed or entity.gate is not None or self._finished
                 or entity.group >= 0 and state.group_owner[entity.group] >= 0
                 or entity.habit.holds and state.scalars[N_HOLDING]):

@@ -137,13 +137,15 @@ def decide(t: Tables, s: State, m: Machine, now: int) -> None:
             s.overtaking[process] = int(overtaking_pays(
                 t, s, process, now - s.x_started[last], s.x_cost[last],
                 s.scalars[PREEMPTIVE] != 0))
-            pays_at = s.x_started[last] + overtaking_pays_from(t, s, process, s.x_cost[last])
-            if s.overtaking[process] == 0 and now < pays_at < m.scalars[OVERTAKE_AT]:
-                m.scalars[OVERTAKE_AT] = pays_at
+            if s.overtaking[process] == 0:
+                pays_at = s.x_started[last] + overtaking_pays_from(
+                    t, s, process, s.x_cost[last])
+                if now < pays_at < m.scalars[OVERTAKE_AT]:
+                    m.scalars[OVERTAKE_AT] = pays_at
 
 
 def _is_warm(s: State, m: Machine, worker: int, now: int) -> bool:
-    """Tell whether a worker of the same process has only just ended another: it goes on."""
+    """Return whether a worker of the process has only just ended another and goes on, once."""
     for w in range(len(s.worker_x)):
         if (now - m.ended_at[w] <= WARM_NS and (w == worker or s.worker_x[w] < 0)
                 and (len(s.pool) == 0 or s.pool[w] == s.pool[worker])):

@@ -14,6 +14,7 @@ from mddag_executor.live.entity import Entity
 from mddag_executor.live.jobs import Origin
 from mddag_executor.live.work import Work
 from msg_graph import TaskSet
+import pytest
 
 from ..core.task_sets import Case, cases, Event, examples, TICK
 
@@ -160,3 +161,24 @@ def test_nothing_runs_past_the_core_that_this_would_not_dispatch() -> None:
     assert not engine.begins_alone(works[2])    # one at a time
     engine.finished(works[1], 3, 4, 4, 0, works[1].worker)
     assert engine.dispatch(4) is None and engine.idle_workers == 1
+
+
+@pytest.mark.parametrize('policy', POLICIES)
+def test_what_runs_past_the_core_is_in_nobodys_place(policy: str) -> None:
+    engine = Engine(None, 2, policy, default_deadline=1, max_active_jobs=NEVER, expire_after=NEVER)
+    alone, *works = (Work(None, print, entity=entity_without_job(engine)) for _ in range(3))
+    if not engine.begins_alone(alone):
+        assert policy not in PLAIN
+        engine.ready(alone, 0)
+        assert engine.dispatch(0) is alone
+    for work in works:
+        engine.ready(work, 1)
+    first = engine.dispatch(2)
+    assert first in works and first.worker != alone.worker
+    assert engine.dispatch(2) is None
+    engine.finished(alone, 0, 3, 3, 0, alone.worker)
+    second = engine.dispatch(3)
+    assert second in works and second is not first
+    for work in (first, second):
+        engine.finished(work, 2, 4, 4, 0, work.worker)
+    assert engine.idle_workers == 2 and not engine.has_waiting
