@@ -1,16 +1,16 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Who is told of work that takes long and that nobody asked for, as compiling does."""
+"""Reports of work that takes long and that nobody asked for, as compiling."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 LISTENERS: list[Callable[[str], None]] = []
-"""The last one is told; whoever shows progress adds itself."""
+"""The last one gets the reports; whoever shows progress adds itself."""
 
 
-def tell(what: str) -> None:
+def report(what: str) -> None:
     """Show what is being done; call it now and then meanwhile."""
     if LISTENERS:
         LISTENERS[-1](what)

@@ -50,7 +50,7 @@ class Releases:
     last: int = 0
 
     def add(self, release: int) -> None:
-        """Take in a release."""
+        """Note a release."""
         self.first = min(self.first, release) if self.count else release
         self.last = max(self.last, release)
         self.count += 1

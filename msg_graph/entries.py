@@ -222,7 +222,7 @@ def numbers(**bounds: int) -> Kind:
             number = float(each.text) if is_number else math.nan
             if not math.isfinite(number):
                 raise entry.value_error(
-                    key, each, f'{_told(each)} is not a number', 'write a finite number')
+                    key, each, f'{_described(each)} is not a number', 'write a finite number')
             found.append(number)
         return found
 
@@ -247,7 +247,7 @@ def whole(least: int, most: int) -> Kind:
     """Return the kind of a whole number within bounds."""
     def read(entry: Entry, key: str, value: Tree) -> int:
         if not (isinstance(value, Scalar) and value.plain and _INTEGER.fullmatch(value.text)):
-            raise entry.error(key, f'{shown(key)} is {_told(value)}', 'write a whole number')
+            raise entry.error(key, f'{shown(key)} is {_described(value)}', 'write a whole number')
         if not least <= int(value.text) <= most:
             raise entry.error(key, f'{shown(key)} is {value.text}',
                               f'write a number from {least} to {most}')
@@ -261,7 +261,7 @@ def truth() -> Kind:
     """Return the kind of true and false."""
     def read(entry: Entry, key: str, value: Tree) -> bool:
         if not (isinstance(value, Scalar) and value.plain and value.text in ('true', 'false')):
-            raise entry.error(key, f'{shown(key)} is {_told(value)}', 'write true or false')
+            raise entry.error(key, f'{shown(key)} is {_described(value)}', 'write true or false')
         return value.text == 'true'
 
     return Kind(read, {'anyOf': [{'type': 'boolean'}, _USE]})
@@ -286,5 +286,5 @@ def kind_of(tree: Tree) -> str:
     return 'a list' if isinstance(tree, Sequence) else 'a mapping'
 
 
-def _told(tree: Tree) -> str:
+def _described(tree: Tree) -> str:
     return shown(tree.text) if isinstance(tree, Scalar) else kind_of(tree)

@@ -122,13 +122,13 @@ def cost_of(tally: Tally) -> Cost:
 
 def improve(
     placing: Placing, place: dict[int, int], cost: Callable[[tuple[Process, ...]], Cost],
-    tell: Callable[[int], None] = lambda tried: None, most: int = MOST_TRIES,
+    report: Callable[[int], None] = lambda tried: None, most: int = MOST_TRIES,
 ) -> tuple[dict[int, int], int]:
     """
     Return a placement at least as good, and how many were simulated.
 
     :param cost: simulates one.
-    :param tell: told now and then how many have been.
+    :param report: called now and then with how many have been tried.
     """
     best, tried = cost(placing.processes(place)), 1
     seen = {tuple(sorted(place.items()))}
@@ -136,7 +136,7 @@ def improve(
         for other in _next(placing, place, seen):
             seen.add(tuple(sorted(other.items())))
             tried += 1
-            tell(tried)
+            report(tried)
             found = cost(placing.processes(other))
             if found < best:
                 place, best = other, found

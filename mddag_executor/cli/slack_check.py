@@ -75,9 +75,9 @@ def check_slack(
                 'callback': key, 'factor': factor, 'breaks': task_set.vertices[breaks].name,
                 'missed_below': missed[0][0], 'missed_above': missed[1][0],
                 'disturbed_below': missed[0][1], 'disturbed_above': missed[1][1],
-                'as_told': missed[0][0] == 0 and missed[1][0] > 0})
+                'as_predicted': missed[0][0] == 0 and missed[1][0] > 0})
     return {'seconds': args.seconds, 'utilisation': args.utilisation[0], 'callbacks': rows,
-            'as_told': sum(row['as_told'] for row in rows)}
+            'as_predicted': sum(row['as_predicted'] for row in rows)}
 
 
 def _times(task_set: TaskSet, utilisation: float, workers: int) -> dict[str, int]:
@@ -130,5 +130,5 @@ def show(result: dict[str, Any]) -> None:
                  f'missed at {BREAKS:g}', 'disturbed', 'as predicted'), [
         [short[row['callback']], f'{row["factor"]:.2f} times', row['missed_below'],
          row['disturbed_below'], row['missed_above'], row['disturbed_above'],
-         'yes' if row['as_told'] else 'no'] for row in result['callbacks']]))
-    print(f'{result["as_told"]} of {len(result["callbacks"])} callbacks behave as predicted')
+         'yes' if row['as_predicted'] else 'no'] for row in result['callbacks']]))
+    print(f'{result["as_predicted"]} of {len(result["callbacks"])} callbacks behave as predicted')

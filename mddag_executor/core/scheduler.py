@@ -113,7 +113,7 @@ class Scheduler:
         return self.state.job_base[slot]
 
     def start(self, x: int, worker: int, now: int) -> None:
-        """Start what began on an idle worker before all that waits, and is told of only now."""
+        """Start what began on an idle worker before all that waits, and is known of only now."""
         state = self.state
         waiting = [(queue, queue[:]) for queue in (state.ready, state.held_back)]
         for queue, _ in waiting:

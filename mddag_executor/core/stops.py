@@ -31,7 +31,7 @@ class Stops:
 
     def stopped(self, begin: int, end: int) -> list[Any]:
         """
-        Take in a stop; each begins after the one before has ended.
+        Note a stop; each begins after the one before has ended.
 
         Return what `missed` got of the misses that turn out to fall into it.
         """
@@ -47,7 +47,7 @@ class Stops:
 
     def missed(self, release: int, deadline: int, what: Any = None) -> bool:
         """
-        Take in a miss of a job that was to run between these times.
+        Note a miss of a job that was to run between these times.
 
         Return whether it falls into a stop that is known.
         """

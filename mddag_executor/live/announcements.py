@@ -158,7 +158,7 @@ class Announcements:
         return name, release - self._clock.offset_ns
 
     def _hear(self, message: UInt8MultiArray) -> None:
-        """Take in what another process announces, and give on what has waited for it."""
+        """Handle what another process announces, and give on what has waited for it."""
         if len(message.data) % _ENTRY.size:
             return
         with self._lock:

@@ -260,10 +260,10 @@ class Diagnostics:
         for dag in task_set.dags if task_set is not None else ():
             sinks = tables.sinks[tables.first_sink[dag.index]:tables.first_sink[dag.index + 1]]
             # one that several processes share is reported where its source and its sinks are
-            told_by = dag.vertices if process is None else [
+            reported_by = dag.vertices if process is None else [
                 dag.vertices[i] for i in (dag.source, *dag.sinks)]
             self._dags.append((
-                {vertex.callback.key for vertex in told_by},
+                {vertex.callback.key for vertex in reported_by},
                 DagWatch(tally, dag.index, dag.name, dag.period_ns,
                          [tally.sinks[v] for v in sinks],
                          [tally.vertex_name(v) for v in sinks], thresholds, period_ns,

@@ -23,8 +23,8 @@ lock, so that times never decrease.  Nobody but the engine and its parts (``jobs
 4.  *What the core decides beside* (verdicts, ends of jobs, what an abort drops) is counted,
     recorded and reported to the user (``verdicts``).
 5.  *What no DAG declares and ends at once runs past the core* (``begins_alone``) where an idle
-    worker would take it anyway.  Only if something is to be dispatched meanwhile the core is told
-    of it (``tell_of_alone``).
+    worker would take it anyway.  Only if something is to be dispatched meanwhile the core hears
+    of it (``report_alone``).
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Engine:
     # --- what became ready -----------------------------------------------------------------------
 
     def timer_due(self, work: Work, due: int, now: int) -> None:
-        """Take in a timer that became due at ``due``."""
+        """Handle a timer that became due at ``due``."""
         entity = work.entity
         if entity.removed or self._finished:
             return
@@ -127,7 +127,7 @@ class Engine:
 
     def timer_missed(self, entity: Entity, due: int, period: int, count: int, now: int) -> None:
         """
-        Take in that ``count`` periods after that of ``due`` were missed: they are late.
+        Note that ``count`` periods after that of ``due`` were missed: they are late.
 
         But not those before the executor began to look after the timer.
         """
@@ -144,7 +144,7 @@ class Engine:
         self, work: Work, origin: Origin | Announced | None, release: int, stamp: int, now: int
     ) -> None:
         """
-        Take in a message.
+        Handle a message.
 
         :param origin: the publication that it comes from, where one was found.
         :param release: the release of the job that it starts or enters with, if it does.
@@ -173,7 +173,7 @@ class Engine:
             self._start_undeclared(work, now)
 
     def ready(self, work: Work, now: int) -> None:
-        """Take in anything that no DAG declares: requests, guard conditions, waitables, tasks."""
+        """Handle anything that no DAG declares: requests, guard conditions, waitables, tasks."""
         if not work.entity.removed and not self._finished:
             self._start_undeclared(work, now)
 
@@ -197,7 +197,7 @@ class Engine:
         self.alone = work
         return True
 
-    def tell_of_alone(self, now: int) -> None:
+    def report_alone(self, now: int) -> None:
         """Give the core what runs past it, if anything does."""
         work, self.alone = self.alone, None
         if work is None:
@@ -383,7 +383,7 @@ class Engine:
             self.has_more = False
             return None
         if self.alone is not None:
-            self.tell_of_alone(now)
+            self.report_alone(now)
         self.has_more = True
         if worker < 0:
             if not state.scalars[N_IDLE]:
@@ -477,7 +477,7 @@ class Engine:
             self.scheduler.resume(work.x)
 
     def leave_group(self, work: Work) -> None:
-        """Take in that an execution's callback group has let it run (see ``gates``)."""
+        """Note that an execution's callback group has let it run (see ``gates``)."""
         self.scheduler.leave_group(work.x)
 
     def ask_again(self) -> None:

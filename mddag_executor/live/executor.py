@@ -322,7 +322,7 @@ class MultiDeadlineExecutor(BareExecutor):
         task, work = make_task(
             self._task_entity, self, self._pool.resume, self._unclaimed, callback, args, kwargs)
         if self._spinning.locked():
-            self._pool.tell(self._engine.ready, work)
+            self._pool.report(self._engine.ready, work)
         else:
             self._new_tasks.append(work)
         if not self._pool.running:
@@ -333,7 +333,7 @@ class MultiDeadlineExecutor(BareExecutor):
         """Have the tasks run that were created while nobody spun, in rclpy's order."""
         take = self._new_tasks.pop if TASKS_NEWEST_FIRST else self._new_tasks.popleft
         while self._new_tasks:
-            self._pool.tell(self._engine.ready, take())
+            self._pool.report(self._engine.ready, take())
 
     # --- spinning --------------------------------------------------------------------------------
 
@@ -616,7 +616,7 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         if since is not None:
             since += self._trace_clock.offset_ns
-        self._pool.tell(self._engine.set_judging, judging, since)
+        self._pool.report(self._engine.set_judging, judging, since)
 
     def unmatched(self) -> list[str]:
         """Return the topics on which it has not met the other processes of its DAGs yet."""

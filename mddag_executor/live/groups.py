@@ -31,7 +31,7 @@ import threading
 from typing import Any, TYPE_CHECKING
 import weakref
 
-from mddag_executor.live.compat import tell_of_changes
+from mddag_executor.live.compat import on_changes
 from rclpy.executors import Executor
 from rclpy.node import Node
 
@@ -193,7 +193,7 @@ def _hook_nodes() -> None:
         if _hooked:
             return
         _hooked = True
-    tell_of_changes(_wake_sharers)
+    on_changes(_wake_sharers)
 
 
 def _wake_sharers(node: Node) -> None:

@@ -109,7 +109,7 @@ class OtherProcesses:
 
     def update(self, hosted: set[str], entities: Iterable[Entity]) -> list[tuple[int, list[int]]]:
         """
-        Take in which callbacks are here now (rules 1 and 3).
+        Update which callbacks are here now (rules 1 and 3).
 
         :param hosted: the keys of the callbacks.
         :return: for each DAG of which that has changed, which vertices are here.
@@ -159,7 +159,7 @@ class OtherProcesses:
     def host(
         self, hosted: set[str], entities: Iterable[Entity], record: Record | None, now: int
     ) -> None:
-        """Take in which callbacks are here now, as ``update`` does, and record what changes."""
+        """Update which callbacks are here now, as ``update`` does, and record what changes."""
         for dag, here in self.update(hosted, entities):
             if record is not None:
                 vertices = ','.join(str(i) for i, is_here in enumerate(here) if is_here)

@@ -102,9 +102,9 @@ class Pool:
         self.interpreter = Interpreter(
             engine, self.lock, self._seats, self._hand_out_now, self.preemption)
 
-    # --- telling the engine ----------------------------------------------------------------------
+    # --- reports to the engine -------------------------------------------------------------------
 
-    def tell(self, event: Callable[..., None], *args: Any) -> None:
+    def report(self, event: Callable[..., None], *args: Any) -> None:
         """
         Give the engine an event, and have run what is ready then.
 
@@ -174,7 +174,7 @@ class Pool:
             self._hand_out(self.tick())
 
     def leave_group(self, work: Work) -> None:
-        """Take in that an execution may run: its callback group has let it through."""
+        """Note that an execution may run: its callback group has let it through."""
         with self.lock:
             self.engine.leave_group(work)
             self._hand_out(self.tick())
@@ -383,7 +383,7 @@ class Pool:
                 entity.busy_ns += end - start
                 engine.finished(work, start, end, now, seat.vtid, seat.worker)
             else:
-                self._tell_outcome(seat, work, waits_for, raised, start, end, now)
+                self._report_outcome(seat, work, waits_for, raised, start, end, now)
             if engine.to_ask_again and type(raised) is not Refused:
                 engine.ask_again()
             seat.work = None
@@ -410,7 +410,7 @@ class Pool:
             engine.verdicts.report_misses()
         return let_run
 
-    def _tell_outcome(
+    def _report_outcome(
         self, seat: Seat, work: Work, waits_for: Any, raised: BaseException | None, start: int,
         end: int, now: int,
     ) -> None:
@@ -419,7 +419,7 @@ class Pool:
         if isinstance(raised, Refused):
             engine.refused(work, now)
             return
-        engine.tell_of_alone(now)
+        engine.report_alone(now)
         work.entity.busy_ns += end - start
         if waits_for is not None:
             engine.suspended(work, start, end, seat.vtid, seat.worker)
@@ -506,7 +506,7 @@ class Pool:
     def _lend(self, seat: Seat) -> Iterator[None]:
         """Lend the worker of a running callback to a spare thread."""
         with self.lock:
-            self.engine.tell_of_alone(self.tick())
+            self.engine.report_alone(self.tick())
             if seat.worker >= 0:  # else it has lent its place before, and goes on without
                 self._give_place(seat)
                 assert seat.work is not None

@@ -81,12 +81,12 @@ class RateWatch:
                 continue
             skipped, ran = entity.skipped - known.skipped, entity.ran - known.ran
             if skipped >= max(FEWEST, LEAST * (skipped + ran)):
-                self._tell(entity, known, now)
+                self._report(entity, known, now)
             elif now - known.at >= AGAIN_S and skipped + ran >= 2 * FEWEST:
                 known.begin(entity, now)
         return True
 
-    def _tell(self, entity: Entity, known: _Known, now: float) -> None:
+    def _report(self, entity: Entity, known: _Known, now: float) -> None:
         skipped = entity.skipped - known.skipped
         ran, busy = entity.ran - known.ran, entity.busy_ns - known.busy_ns
         try:

@@ -42,7 +42,7 @@ class Receiver:
         self.announcements: Announcements | None = None
 
     def take_in(self, arrivals: Sequence[Work]) -> None:
-        """Take in what became ready at one instant."""
+        """Handle what became ready at one instant."""
         if len(arrivals) == 1:
             self.take(arrivals[0])
             return
@@ -51,7 +51,7 @@ class Receiver:
                 self.take(each)
 
     def take(self, work: Work) -> None:
-        """Take in what became ready."""
+        """Handle what became ready."""
         entity = self._registry.by_id.get(id(work.rclpy_entity))
         if entity is None:
             return
@@ -83,10 +83,10 @@ class Receiver:
                 release, stamp = self._stamp(work)
         elif entity.callback is None and not entity.is_brief.debt and self._pool.runs_alone(work):
             return
-        self._pool.tell(engine.arrived, work, origin, release, stamp)
+        self._pool.report(engine.arrived, work, origin, release, stamp)
 
     def _take_other(self, work: Work, entity: Entity) -> None:
-        """Take in what is no message, or one of the executor's own."""
+        """Handle what is no message, or one of the executor's own."""
         pool, engine = self._pool, self._engine
         if entity.is_own:
             work.function(*work.args)
@@ -96,9 +96,9 @@ class Receiver:
             else:
                 self._timer_due(work)
         elif entity.source >= 0:
-            pool.tell(engine.arrived, work, None, self._clock.now(), -1)
+            pool.report(engine.arrived, work, None, self._clock.now(), -1)
         else:
-            pool.tell(engine.ready, work)
+            pool.report(engine.ready, work)
 
     def give(self, work: Work, origin: Origin | Announced | None) -> None:
         """Hand a message over that has waited, or could have, for its announcement."""
@@ -107,7 +107,7 @@ class Receiver:
             release = origin.release + self._clock.offset_ns
         elif origin is None and work.entity.remote_publishers:
             release, stamp = self._stamp(work)
-        self._pool.tell(self._engine.arrived, work, origin, release, stamp)
+        self._pool.report(self._engine.arrived, work, origin, release, stamp)
 
     def _stamp(self, work: Work) -> tuple[int, int]:
         """Return release and stamp of a message from another process."""
@@ -120,16 +120,16 @@ class Receiver:
             self._engine.ran_at_once(work.entity)
 
     def _timer_due(self, work: Work) -> None:
-        """Take in a timer, and that periods were skipped since nobody was there to look at it."""
+        """Handle a timer, and periods that were skipped since nobody was there to look at it."""
         assert work.due is not None
         due = work.due + self._clock.offset_ns
-        self._pool.tell(self._engine.timer_due, work, due)
+        self._pool.report(self._engine.timer_due, work, due)
         if work.missed:
             try:
                 period = work.rclpy_entity.timer_period_ns
             except InvalidHandle:
                 return  # destroyed meanwhile
-            self._pool.tell(self._engine.timer_missed, work.entity, due, period, work.missed)
+            self._pool.report(self._engine.timer_missed, work.entity, due, period, work.missed)
 
     def on_intake_error(self, error: BaseException) -> None:
         """Take an error of the intake: it comes out of spin."""

@@ -18,7 +18,7 @@ import time
 from typing import Any, Protocol
 import weakref
 
-from mddag_executor.live.compat import tell_of_end
+from mddag_executor.live.compat import on_end
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 
@@ -45,7 +45,7 @@ _Kept = dict[weakref.ref[Any], Any]
 _started: _Kept = {}
 _executors: _Kept = {}
 _by_context: weakref.WeakKeyDictionary[Context, _Kept] = weakref.WeakKeyDictionary()
-_told: weakref.WeakKeyDictionary[Context, object] = weakref.WeakKeyDictionary()
+_kept: weakref.WeakKeyDictionary[Context, object] = weakref.WeakKeyDictionary()
 _ended: weakref.WeakSet[Context] = weakref.WeakSet()
 """Contexts that are shut down, or just going to be."""
 
@@ -132,7 +132,7 @@ def call_at_shutdown(context: Context, method: Any) -> None:
     methods = _by_context.get(context)
     if methods is None:
         methods = _by_context[context] = {}
-        _told[context] = tell_of_end(context, partial(_call_all, weakref.ref(context), methods))
+        _kept[context] = on_end(context, partial(_call_all, weakref.ref(context), methods))
     _keep(methods, method.__self__, method.__func__)
 
 

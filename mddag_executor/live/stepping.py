@@ -40,7 +40,7 @@ class Stepper:
 
     def step(self, deadline: float | None, done: Callable[[], bool]) -> bool:
         """
-        Take in what is ready, waiting where nothing is; run one callback if there is one.
+        Handle what is ready, waiting where nothing is; run one callback if there is one.
 
         :param deadline: when to wait no longer (monotonic, s); None: never.
         :param done: whether there is nothing to wait for any more.

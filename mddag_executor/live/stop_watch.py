@@ -15,7 +15,7 @@ ran.  The CPU time of the process shows which: in a stop it does not grow.
 * What the spinning thread does between two waits belongs to the slice after it: it may be stopped
   there as well.
 * What is shorter than ``SHORT_NS`` is not reported.  A stop may begin up to a slice before what is
-  told of it, so what is told as too short for a stop is recorded, too, for `mddag explain`.
+  given it, so what is reported as too short for a stop is recorded, too, for `mddag explain`.
 * When it starts it reports a stop of no length: from then on stops are noticed.
 
 Nothing is added to the way of a message or a timer.  If a callback waits while it keeps the

@@ -106,18 +106,18 @@ class Supervisor:
         since the run's begin.
     :param on_exit: ``end``, ``continue`` or ``restart``.
     :param out: where standard output goes; ``err``: standard error.
-    :param tell: told of each that has ended.
+    :param on_end: called with each that has ended.
     """
 
     def __init__(
         self, command: Callable[[str, int, float], Sequence[str]], on_exit: str, out: TextIO,
-        err: TextIO, tell: Callable[[Run], None],
+        err: TextIO, on_end: Callable[[Run], None],
     ) -> None:
         self.runs: list[Run] = []
         self._command = command
         self._on_exit = on_exit
         self._out, self._err = out, err
-        self._tell = tell
+        self._on_end = on_end
         self._lock = threading.Lock()
         self._stop = False
         self._asked_at: float | None = None
@@ -202,7 +202,7 @@ class Supervisor:
         self._reap(run)
         if run.status == _BAD_INPUT and not run.asked:
             raise ProcessError(f'process {run.name}: {run.said.removeprefix("error: ")}')
-        self._tell(run)
+        self._on_end(run)
         if self._stop or (is_over and not run.died):
             return
         if self._on_exit == 'restart':

@@ -57,11 +57,11 @@ class ObservedTask(BareTask):
 
     def give_out(self) -> None:
         """Report an exception that was put by, unless somebody has taken care of it."""
-        tell, self.put_by = self.put_by, None
+        report, self.put_by = self.put_by, None
         error = self.unclaimed()
-        if error is not None and tell is not None:
+        if error is not None and report is not None:
             self.mark_fetched()
-            tell(error)
+            report(error)
 
     def add_done_callback(self, callback: Callable[[Future], None]) -> None:
         """Add a callback for when the task is done."""
@@ -83,7 +83,7 @@ class Unclaimed:
 
     def ended(self, task: ObservedTask) -> None:
         """
-        Take in that a task has ended.
+        Note that a task has ended.
 
         :raises BaseException: what it has raised, if nobody can take care of that.
         """

@@ -119,7 +119,7 @@ class Upkeep:
         for entity in added:
             entity.since = since
         for entity in gone:
-            pool.tell(engine.remove, entity)
+            pool.report(engine.remove, entity)
         if self._recorder is not None:
             self._recorder.entities(nodes, added)
 

@@ -89,7 +89,7 @@ class Verdicts:
         self._aborted: dict[tuple[int, int], None] = {}
 
     def add(self, decisions: list[Decision], now: int, state: State) -> list[int]:
-        """Take in decisions of a core; return the executions that it dropped."""
+        """Count decisions of a core; return the executions that it dropped."""
         self.tally.add(decisions)
         dropped = []
         for kind, dag, vertex, job, deadline, time in decisions:
@@ -145,7 +145,7 @@ class Verdicts:
                 self._fail(error)
 
     def released(self, dag: int, job: int, release: int, now: int, judged: bool) -> None:
-        """Take in that a job was released."""
+        """Note that a job was released."""
         if judged:
             self.tally.released(dag)
         if self.on_release is not None:
@@ -154,7 +154,7 @@ class Verdicts:
             self.record('job_release', now, threading.get_native_id(), dag, job, release)
 
     def stopped(self, begin: int, end: int) -> None:
-        """Take in that no thread of the process ran for a while, which has just ended."""
+        """Note that no thread of the process ran for a while, which has just ended."""
         for dag, cause in self.stops.stopped(begin, end) if end - begin >= LEAST_NS else ():
             self.causes[dag][cause] -= 1
             self.causes[dag][MACHINE] += 1
@@ -162,7 +162,7 @@ class Verdicts:
             self.record('stop', end, threading.get_native_id(), begin, end)
 
     def dropped(self, entity: Entity, origin: Origin, reason: str, now: int) -> None:
-        """Take in that an execution was dropped."""
+        """Note that an execution was dropped."""
         entity.dropped += 1
         if self.record is not None:
             _, dag, job, vertex = origin

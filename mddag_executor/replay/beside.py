@@ -6,7 +6,7 @@ A long trace of this executor, read and linked in a process beside this one.
 Theory of operation
 -------------------
 Python computes on one CPU.  Where there is another one and the trace is long, a second process
-reads and links it, and feeds the observers that need no verdicts.  What it tells of the run it
+reads and links it, and feeds the observers that need no verdicts.  What it reports of the run it
 sends here, where the judge is, and at the end what has become of the run and its observers.
 """
 

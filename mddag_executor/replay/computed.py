@@ -75,7 +75,7 @@ class ComputedRun(NamedTuple):
 
     def play(self, observers: Sequence[Observer]) -> None:
         """Give the observers everything."""
-        _Teller(self, observers).run()
+        _Player(self, observers).run()
 
 
 class _Running(NamedTuple):
@@ -87,7 +87,7 @@ class _Running(NamedTuple):
     busy: int
 
 
-class _Teller:
+class _Player:
     """Goes through a schedule once."""
 
     def __init__(self, schedule: ComputedRun, observers: Sequence[Observer]) -> None:
@@ -95,7 +95,7 @@ class _Teller:
         self._schedule = schedule
         self._load = as_lists(schedule.load)
         self._batches = Batches(observers)
-        self._tell = self._batches.add
+        self._add = self._batches.add
         self._vertices = task_set.vertices
         self._last_leg = [
             max(1, len(legs_of(vertex, task_set.dags[vertex.dag].vertices))) - 1
@@ -119,7 +119,7 @@ class _Teller:
             # what ends at an instant does so before anything is released or given up there
             self._until(entry[0] - 1 if entry[1] == END else entry[0])
             self._change(entry)
-            self._batches.tell_if_full()
+            self._batches.flush_if_full()
         self._until(schedule.end)
         self._batches.finish(schedule.end, schedule.judged)
 
@@ -141,7 +141,7 @@ class _Teller:
                 release = now + 1
             end = self._next_end
             if end is not None and end[0] <= min(now, release):
-                self._tell(ENDED, end[1], self._number(end[1], end[2]), int(end[3]), end[0])
+                self._add(ENDED, end[1], self._number(end[1], end[2]), int(end[3]), end[0])
                 self._next_end = next(self._ends, None)
             elif release <= now:
                 self._release(self._next, release)
@@ -157,7 +157,7 @@ class _Teller:
             return
         self._ready[dag, self._sources[dag], job] = now
         release = load.releases[i] if load.releases else now
-        self._tell(RELEASED, dag, self._number(dag, job), release, now)
+        self._add(RELEASED, dag, self._number(dag, job), release, now)
 
     def _change(self, entry: LogEntry) -> None:
         now, kind, worker, dag, v, job = entry
@@ -171,17 +171,17 @@ class _Teller:
                 before = _Running(now, ready, now, 0)
             self._running[what] = before._replace(since=now)
             if declared:
-                self._tell(STARTED, dag, v, number, before.ready, now, self._callback[v], worker)
+                self._add(STARTED, dag, v, number, before.ready, now, self._callback[v], worker)
             return
         assert before is not None, 'what ends has begun'
         busy = before.busy + now - before.since
         self._running[what] = before._replace(busy=busy)
         if kind == END and declared and self._fails(dag, v, job):
-            self._tell(FAILED, dag, v, number, now)
+            self._add(FAILED, dag, v, number, now)
         last = self._last_leg[v] if kind == END and declared else 0
         for leg in range(last):     # they took no time: the execution is the last one's
-            self._tell(COMPLETED, dag, v, number, leg, 0, now, -1, -1, -1, -1, -1, -1, 0)
-        self._tell(
+            self._add(COMPLETED, dag, v, number, leg, 0, now, -1, -1, -1, -1, -1, -1, 0)
+        self._add(
             RAN, self._callback[v] if declared else 0, dag if declared else -1,
             v if declared else -1, number, worker, before.ready, before.since, now,
             int(before.busy == 0))
@@ -199,7 +199,7 @@ class _Teller:
         dag, v, job = what
         vertex, number = self._vertices[v], self._number(dag, job)
         self._finished += 1
-        self._tell(COMPLETED, dag, v, number, leg, 1, now, ran.ready, ran.first, now, busy,
+        self._add(COMPLETED, dag, v, number, leg, 1, now, ran.ready, ran.first, now, busy,
                    self._finished, -1, 0)
         delay = self._schedule.delay
         for local in vertex.successors:

@@ -130,13 +130,13 @@ class Observer:
 
     def take(self, batch: Batch) -> None:
         """Look at a batch; here: one thing after the other."""
-        tell: list[Any] = [None] * len(KINDS)
+        taking: list[Any] = [None] * len(KINDS)
         for kind, name in enumerate(KINDS):
             if getattr(type(self), name) is not getattr(Observer, name):
-                tell[kind] = getattr(self, name), iter(batch.rows(kind))
+                taking[kind] = getattr(self, name), iter(batch.rows(kind))
         at, decided = 0, batch.decided_at
         wants = type(self).decided is not Observer.decided
-        if not wants and not any(tell):
+        if not wants and not any(taking):
             return
         for place, kind in enumerate(batch.order.tolist()):
             if wants and at < len(decided) and decided[at] == place:
@@ -144,8 +144,8 @@ class Observer:
                 while at < len(decided) and decided[at] == place:
                     at += 1
                 self.decided(batch.decisions[first:at])
-            if tell[kind] is not None:
-                method, rows = tell[kind]
+            if taking[kind] is not None:
+                method, rows = taking[kind]
                 method(*next(rows))
         if wants and at < len(decided):
             self.decided(batch.decisions[at:])
@@ -228,12 +228,12 @@ class Batches:
         self._order.append(kind)
         self._rows.setdefault(kind, []).append(row)
 
-    def tell_if_full(self) -> None:
+    def flush_if_full(self) -> None:
         """Feed the observers if there is much; the caller is between two happenings."""
         if len(self._order) >= BATCH:
-            self.tell()
+            self.flush()
 
-    def tell(self) -> None:
+    def flush(self) -> None:
         """Feed the observers what happened so far."""
         batch = Batch(self._order, self._rows)
         self._order, self._rows = [], {}
@@ -242,7 +242,7 @@ class Batches:
 
     def finish(self, now: int, judged: bool = True) -> None:
         """Pass on the rest and, where what is open is judged, the end of the run."""
-        self.tell()
+        self.flush()
         if judged:
             batch = Batch((), {})
             for observer in self._observers:
@@ -256,15 +256,15 @@ def merged(several: Sequence[Handlers]) -> Handlers:
     for handlers in several:
         for name, handler in handlers.items():
             every.setdefault(name, []).append(handler)
-    return {name: told[0] if len(told) == 1 else _teller(told) for name, told in every.items()}
+    return {name: each[0] if len(each) == 1 else _call_all(each) for name, each in every.items()}
 
 
-def _teller(told: list[Callable[[Event], None]]) -> Callable[[Event], None]:
-    def tell(event: Event) -> None:
-        for handler in told:
+def _call_all(handlers: list[Callable[[Event], None]]) -> Callable[[Event], None]:
+    def call(event: Event) -> None:
+        for handler in handlers:
             handler(event)
 
-    return tell
+    return call
 
 
 def different(values: Ints) -> list[int]:

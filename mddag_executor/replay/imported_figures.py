@@ -135,23 +135,23 @@ class ImportedPaths(LinkObserver):
         self.book = PathBook(run.task_set, kept=KEEP)
         self._target = run.targets
         self._order = 0
-        self._told: list[list[tuple[int, ...]]] = [[], [], [], []]
+        self._rows: list[list[tuple[int, ...]]] = [[], [], [], []]
         self._number = 0
 
     def take(self, batch: Batch) -> None:
         """Hand over what came since the last batch."""
-        self.book.tell(self._order + 1, *(
+        self.book.add(self._order + 1, *(
             np.array(rows, dtype=np.int64).reshape(len(rows), width)
-            for rows, width in zip(self._told, (7, 4, 7, 4))))
-        self._order, self._told = 0, [[], [], [], []]
+            for rows, width in zip(self._rows, (7, 4, 7, 4))))
+        self._order, self._rows = 0, [[], [], [], []]
 
-    def _tell(self, what: int, run: Execution | None, *row: int) -> None:
+    def _add(self, what: int, run: Execution | None, *row: int) -> None:
         """Note what a callback did, if it is on a path."""
         target = None if run is None else self._target.get(run.callback.number)
         if run is None or target is None or target.callback.key not in self.book.on_path:
             return
         self._order += 1
-        self._told[what].append(
+        self._rows[what].append(
             (self._order, self.book.callbacks[target.callback.key], *row))
 
     def began(self, run: Execution, message: Publication | None) -> None:
@@ -160,13 +160,13 @@ class ImportedPaths(LinkObserver):
         run.number = self._number
         target = self._target.get(run.callback.number)
         topic = '' if target is None else target.topic
-        self._tell(0, run, run.number, run.start,
+        self._add(0, run, run.number, run.start,
                    self.book.topics.get(topic, -2) if topic else -1,
                    -1 if message is None else message.number, -1)
 
     def over(self, run: Execution) -> None:
         """Note the end of an execution."""
-        self._tell(1, run, run.number, run.end)
+        self._add(1, run, run.number, run.end)
 
     def sent(self, message: Publication) -> None:
         """Note a publication."""
@@ -179,16 +179,16 @@ class ImportedPaths(LinkObserver):
         node, topic = publisher.node.name, self.book.topics[publisher.topic]
         target = None if run is None else self._target.get(run.callback.number)
         if target is not None and run is not None and target.callback.node == node:
-            self._tell(2, run, -1, run.number, topic, message.number, message.time)
+            self._add(2, run, -1, run.number, topic, message.number, message.time)
         else:
             self._order += 1
-            self._told[2].append((
+            self._rows[2].append((
                 self._order, -1, self.book.nodes.get(node, -1), -1, topic, message.number,
                 message.time))
 
     def took(self, run: Execution, message: Publication) -> None:
         """Note a message that a callback took itself."""
-        self._tell(3, run, run.number, message.number)
+        self._add(3, run, run.number, message.number)
 
 
 class ImportedDrift(LinkObserver):

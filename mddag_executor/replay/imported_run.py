@@ -168,7 +168,7 @@ class ImportedRun(LinkObserver):
     ) -> None:
         """Give the observers everything, with the numbers of callbacks in place of addresses."""
         self._batches = Batches(observers)
-        self._tell = self._batches.add
+        self._add = self._batches.add
         self._links = [each for each in observers if isinstance(each, LinkObserver)]
         more = merged([observer.raw_handlers() for observer in self._links])
         count = 0
@@ -184,7 +184,7 @@ class ImportedRun(LinkObserver):
                 count += 1
                 if event[1] > self.end:
                     self.end = event[1]
-                self._batches.tell_if_full()
+                self._batches.flush_if_full()
                 if progress is not None and count % _PROGRESS_STEP == 0:
                     progress(count)
         self._linker.finish()
@@ -208,7 +208,7 @@ class ImportedRun(LinkObserver):
         if target is not None and run.of is not None:
             dag, vertex, job = run.of
             self._active[(dag, job)] += 1
-            self._tell(STARTED, dag, vertex, job, run.ready, run.start, run.callback.number, -1)
+            self._add(STARTED, dag, vertex, job, run.ready, run.start, run.callback.number, -1)
 
     def _ready(self, run: Execution, message: Publication | None) -> int:
         if run.callback.kind == 'timer':
@@ -233,7 +233,7 @@ class ImportedRun(LinkObserver):
             self._open[dag].append((release, job))
             if self.start is None or release < self.start:
                 self.start = release
-            self._tell(RELEASED, dag, job, release, run.start)
+            self._add(RELEASED, dag, job, release, run.start)
         elif message is None or message.run is None:
             self._doubts.ran_for_unknown(key, run.start, message is not None or run.stamp != 0)
         elif message.run.of is not None:
@@ -264,7 +264,7 @@ class ImportedRun(LinkObserver):
             observer.over(run)
         dag, vertex, job = run.of if run.of is not None else (-1, -1, -1)
         worker = self._workers.setdefault(run.thread, len(self._workers))
-        self._tell(RAN, run.callback.number, dag, vertex, job, worker, run.ready, run.start,
+        self._add(RAN, run.callback.number, dag, vertex, job, worker, run.ready, run.start,
                    run.end, 1)
         if run.callback.number not in self.targets or dag < 0:
             return
@@ -273,7 +273,7 @@ class ImportedRun(LinkObserver):
         if whole:
             self._doubts.done(dag, vertex, job)
         self._number += 1
-        self._tell(COMPLETED, dag, vertex, job, run.leg, int(whole), run.end, run.ready,
+        self._add(COMPLETED, dag, vertex, job, run.leg, int(whole), run.end, run.ready,
                    run.start, run.end, run.end - run.start, self._number, -1, 0)
 
     def _is_whole(self, vertex: int, job: int, leg: int) -> bool:
@@ -299,14 +299,14 @@ class ImportedRun(LinkObserver):
                     continue
                 del self._active[(dag, job)]
                 if not self._close(dag, job, release):
-                    self._tell(ENDED, dag, job, 0, now)
+                    self._add(ENDED, dag, job, 0, now)
             jobs.extendleft(reversed(running))
 
     def _close(self, dag: int, job: int, release: int) -> bool:
         """Take a job that cannot be judged out of the run; return whether it is one."""
         doubted = self._doubts.close(dag, job, release)
         if doubted:
-            self._tell(WITHDRAWN, dag, job)
+            self._add(WITHDRAWN, dag, job)
         return doubted
 
     def lost_sight(self, callback: Callback | None, run: Execution | None, time: int) -> None:

@@ -264,10 +264,10 @@ class Joined:
                 if event[0] == _SHUTDOWN:
                     judged = max(judged, event[4])
                 elif event[0] not in (TASK_SET, _INIT, _JUDGE_FROM, clocks.HOST):
-                    told = self._told(part, event)
-                    if told is not None:
+                    joined = self._of_whole_run(part, event)
+                    if joined is not None:
                         end = max(end, event[1])
-                        file.add(*told)
+                        file.add(*joined)
             if any(part.end is not None for part in self._parts):
                 file.add(_SHUTDOWN, max(end, judged), 0, 0, judged)
         self._check_run()
@@ -314,7 +314,7 @@ class Joined:
                 for dag, vertex in part.ran)))
             for part in self._parts]
 
-    def _told(self, part: _Part, event: Event) -> Event | None:
+    def _of_whole_run(self, part: _Part, event: Event) -> Event | None:
         """Return an event as it is in the joined trace, None where it is not."""
         name = event[0]
         if name == _HOSTED:
@@ -355,19 +355,19 @@ class Joined:
         if release < event[1]:      # else that of a stamp which was still to come there
             release = self._by_source(self.task_set.dags[dag], release, part)
         found = self._find(self.task_set.dags[dag], release, part.place)
-        told = None
+        joined = None
         if found is None:
             number = self._next[dag]
             self._next[dag] += 1
             self._releases[dag].append((release, number, {part.place}))
-            told = (*event[:5], number, release)
+            joined = (*event[:5], number, release)
         else:
             number = found[1]
             found[2].add(part.place)
         part.numbers[dag, job] = number
         here = part.hosted.get(dag, range(len(self._legs[dag])))
         part.open[dag, number] = sum(self._legs[dag][v] for v in here if v < len(self._legs[dag]))
-        return told
+        return joined
 
     def _by_source(self, dag: Dag, release: int, part: _Part) -> int:
         """Return a release from a stamp of another machine, by the clock of that."""

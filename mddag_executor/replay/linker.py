@@ -168,7 +168,7 @@ class Losses:
         self.starts: Counter[str] = Counter()
         self.messages: Counter[str] = Counter()
         self.unlinked: Counter[str] = Counter()
-        self.untold: Counter[str] = Counter()
+        self.without_message: Counter[str] = Counter()
         self.partial: Counter[str] = Counter()
         self.ambiguous: Counter[str] = Counter()
         self.overwritten: Counter[str] = Counter()
@@ -185,8 +185,8 @@ class Losses:
              'and no path'),
             (self.unlinked, 'execution', 'for a message whose publication is not known (not all '
              'of its topic have a source timestamp in it): of no job and no path'),
-            (self.untold, 'execution', 'of a subscription without a message in it (its taking is '
-             'not recorded): of no job and no path'),
+            (self.without_message, 'execution', 'of a subscription without a message in it (its '
+             'taking is not recorded): of no job and no path'),
             (self.partial, 'publication', 'without the tracepoint rclcpp_publish that others of '
              'the publisher have: counted from rcl_publish on'),
             (self.ambiguous, 'execution', 'for a message with the topic and source timestamp of '
@@ -271,8 +271,8 @@ class Linker:
         layout, now, pid, tid = event[:4]
         queue = self._queue
         while queue and queue[0][0] < now - LAG_NS:
-            _, tell, arguments = queue.popleft()
-            tell(*arguments)
+            _, report, arguments = queue.popleft()
+            report(*arguments)
         thread = (pid, tid)
         state = self._threads.get(thread)
         if state is None:
@@ -290,8 +290,8 @@ class Linker:
             if run.inner:
                 self._without_end(run, run.inner)
         while self._queue:
-            _, tell, arguments = self._queue.popleft()
-            tell(*arguments)
+            _, report, arguments = self._queue.popleft()
+            report(*arguments)
         for publisher in self._by_rclcpp & set(self._by_rcl):
             self.losses.partial[publisher.topic] += self._by_rcl.pop(publisher)
 
@@ -333,9 +333,9 @@ class Linker:
         state.stack.append(run)
         state.fresh = False
         state.last = None
-        self._queue.append((now, self._tell_start, (run,)))
+        self._queue.append((now, self._report_start, (run,)))
 
-    def _tell_start(self, run: Execution) -> None:
+    def _report_start(self, run: Execution) -> None:
         message, run.message = run.message, None
         if message is None and run.stamp:
             topic = run.callback.start
@@ -343,7 +343,7 @@ class Linker:
             if message is None:
                 self._not_found(run, topic)
         elif message is None and run.callback.kind == 'subscription' and not run.taken:
-            self.losses.untold[run.callback.label] += 1
+            self.losses.without_message[run.callback.label] += 1
         self._observer.began(run, message)
 
     def _not_found(self, run: Execution, topic: str) -> None:
@@ -394,10 +394,10 @@ class Linker:
         run = state.stack[-1] if state.stack else None
         message = Publication(publisher, run, self._get(event, 'message'))
         state.last = message
-        self._queue.append((event[1], self._tell_published, (message,)))
+        self._queue.append((event[1], self._report_published, (message,)))
         return message
 
-    def _tell_published(self, message: Publication) -> None:
+    def _report_published(self, message: Publication) -> None:
         if not message.stamp and not message.within:
             self._unstamped.add(message.topic)
         self._observer.sent(message)
@@ -491,10 +491,10 @@ class Linker:
             thread[0], self._get(event, 'rmw_subscription_handle'), event[1])
         if state.stack and callbacks:
             topic = callbacks[0].start
-            self._queue.append((event[1], self._tell_take, (state.stack[-1], topic, stamp)))
+            self._queue.append((event[1], self._report_take, (state.stack[-1], topic, stamp)))
         state.take = None, callbacks, stamp, 0, None, event[1]
 
-    def _tell_take(self, run: Execution, topic: str, stamp: int) -> None:
+    def _report_take(self, run: Execution, topic: str, stamp: int) -> None:
         message = self._find(topic, stamp)
         if message is not None:
             self._observer.took(run, message)

@@ -205,7 +205,7 @@ class OwnRun:
                 self._one(others[at][1], who)
                 at += 1
             if part:
-                self._tell(part, cut - first)
+                self._pass_on(part, cut - first)
             if at < len(others) and others[at][0] == cut:
                 self._one(others[at][1], who)
                 at += 1
@@ -245,7 +245,7 @@ class OwnRun:
             numbers[name] = parts[0]
         return numbers, others
 
-    def _tell(self, numbers: dict[str, Numbers], length: int) -> None:
+    def _pass_on(self, numbers: dict[str, Numbers], length: int) -> None:
         """Give the observers what some events say; their places are below the length."""
         rows: dict[int, Ints] = {}
         places: dict[int, Ints] = {}
@@ -458,11 +458,11 @@ class _Threads:
         ready = dispatch[:, FIELD + 5]
         good = (ready >= 0) & (ready <= dispatch[:, NOW])
         self._run.left_out(_DISPATCH, 'before it was ready', ~good)
-        told = good & (dag >= 0)
-        told[:n_running] = False
-        add(STARTED, where[_IS_DISPATCH][told[n_running:]], dag[told], vertex[told],
-            dispatch[told, FIELD + 3], ready[told], dispatch[told, NOW],
-            *dispatch[told][:, [FIELD, FIELD + 4]].T)
+        declared = good & (dag >= 0)
+        declared[:n_running] = False
+        add(STARTED, where[_IS_DISPATCH][declared[n_running:]], dag[declared], vertex[declared],
+            dispatch[declared, FIELD + 3], ready[declared], dispatch[declared, NOW],
+            *dispatch[declared][:, [FIELD, FIELD + 4]].T)
         line = _Line(length, self._last[:, 0], self._running, where, of)
 
         # dispatches and ends change what a thread runs
@@ -538,20 +538,20 @@ class _Threads:
         self._run.left_out(_COMPLETE, 'of an end that is still to come', to_come)
         dag, vertex, leg = self._of.of_legs(
             complete[:, FIELD + 1], complete[:, FIELD + 2], complete[:, FIELD + 6])
-        told = known & ~to_come & (dag >= 0)
+        declared = known & ~to_come & (dag >= 0)
         last = line.before(is_end)[events]
         found = np.where(last >= 0, execution[last], -1)
         of_job = np.column_stack((dag, vertex, complete[:, FIELD + 3]))
-        found[~told] = -1
+        found[~declared] = -1
         matched = found >= 0
         matched[matched] = (executions[found[matched], :X_READY] == of_job[matched]).all(axis=1)
         found[~matched] = -1
         first = self._join(executions, ended, found, line.place[events])
         times = np.full((len(found), 5), -1, dtype=np.int64)
         times[matched] = executions[found[matched], X_READY:]
-        add(COMPLETED, where[_IS_COMPLETE][told], *of_job[told].T, leg[told],
-            complete[told, FIELD + 4], end[told], *times[told].T,
-            *complete[told, FIELD + 7:FIELD + 9].T)
+        add(COMPLETED, where[_IS_COMPLETE][declared], *of_job[declared].T, leg[declared],
+            complete[declared, FIELD + 4], end[declared], *times[declared].T,
+            *complete[declared, FIELD + 7:FIELD + 9].T)
         return first
 
     def _join(self, executions: Ints, ended: Ints, found: Ints, places: Ints) -> Ints:

@@ -75,7 +75,7 @@ class OwnPaths(Observer):
             sent = self._at_ends(ended, ran)
         else:
             sent = self._published(batch)
-        self.book.tell(len(batch.order) + 1, begun, ended, sent)
+        self.book.add(len(batch.order) + 1, begun, ended, sent)
 
     def _run(self, vertex: Ints, job: Ints, ready: Ints) -> Ints:
         """Return the numbers of executions: nearly ascending, which is quick to sort."""

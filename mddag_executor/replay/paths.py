@@ -111,7 +111,7 @@ class PathBook:
                         for number, path in enumerate(self.paths)
                         for position in range(len(path.callbacks))]
         self._kept = kept
-        self._told: list[list[Ints]] = [[], [], [], []]
+        self._new_rows: list[list[Ints]] = [[], [], [], []]
         self._order = 1     # 0: in a round before
         self._waiting = 0
         self._forest = Forest([len(path.callbacks) - 1 for path in self.paths])
@@ -135,7 +135,7 @@ class PathBook:
 
     # --- input -----------------------------------------------------------------------------------
 
-    def tell(
+    def add(
         self, length: int, started: Ints, ended: Ints, published: Ints,
         took: Ints | None = None,
     ) -> None:
@@ -152,11 +152,11 @@ class PathBook:
         """
         if took is None:
             took = np.empty((0, _N_TOOK), dtype=np.int64)
-        for told, rows in zip(self._told, (started, ended, published, took)):
+        for new_rows, rows in zip(self._new_rows, (started, ended, published, took)):
             if len(rows):
                 rows = rows.copy()
                 rows[:, 0] += self._order
-                told.append(rows)
+                new_rows.append(rows)
                 self._waiting += len(rows)
         self._order += length
         if self._waiting >= SETTLE:
@@ -171,18 +171,18 @@ class PathBook:
 
     def _round(self) -> None:
         """Make steps of the input."""
-        told = [np.concatenate(each) if each else np.empty((0, width), dtype=np.int64)
+        new_rows = [np.concatenate(each) if each else np.empty((0, width), dtype=np.int64)
                 for each, width in zip(
-                    self._told, (_N_STARTED, _N_ENDED, _N_PUBLISHED, _N_TOOK))]
-        self._told = [[], [], [], []]
+                    self._new_rows, (_N_STARTED, _N_ENDED, _N_PUBLISHED, _N_TOOK))]
+        self._new_rows = [[], [], [], []]
         self._order, self._waiting = 1, 0
         columns = (1, 1, _U_TOPIC, 1)
-        sorted_out = [by_column(rows, column) for rows, column in zip(told, columns)]
+        sorted_out = [by_column(rows, column) for rows, column in zip(new_rows, columns)]
         before: list[tuple[Ints, Ints]] = []
         for number, place in enumerate(self._places):
             before = self._at(number, place, before, *(
                 [rows.get(key, none[:0]) for key in keys] for rows, none, keys in zip(
-                    sorted_out, told, ([place.callback], [place.callback], place.topics,
+                    sorted_out, new_rows, ([place.callback], [place.callback], place.topics,
                                        [place.callback]))))
 
     def _at(

@@ -42,7 +42,7 @@ class Reschedule:
 
     :param work: the load, made from a run or from a bag.
     :param start: when the recording began, ns.
-    :param about: what the result tells of the recording.
+    :param about: what the result says of the recording.
     :param recorded: the same run as it was; None: it was a bag.
     :param notes: what was assumed, one line each.
     :ivar processes: which nodes run in which process; empty: all in one.

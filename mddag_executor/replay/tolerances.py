@@ -54,10 +54,10 @@ class Runs:
 
     def _fold(self) -> None:
         """Make runs of what is new, and join those that touch."""
-        told = sorted([*self._runs, *((number, number) for number in set(self._new))])
+        runs = sorted([*self._runs, *((number, number) for number in set(self._new))])
         del self._new[:]
         self._runs = []
-        for first, last in told:
+        for first, last in runs:
             if self._runs and first <= self._runs[-1][1] + 1:
                 first, before = self._runs.pop()
                 last = max(last, before)

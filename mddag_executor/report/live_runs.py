@@ -70,7 +70,7 @@ def _absent(dags: dict[str, Any]) -> Iterator[str]:
             if absent > 1:
                 yield printable(
                     f'{absent} of {counted(dag["jobs"], "job")} of {name} did not come to {sink}, '
-                    'or its process died with the count: a replay of the traces tells why')
+                    'or its process died with the count: a replay of the traces shows why')
 
 
 def ended_line(process: dict[str, Any]) -> str:

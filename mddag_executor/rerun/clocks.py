@@ -8,7 +8,7 @@ Theory of operation
 ====================================  =============================================================
 a node's clock (ROS time)             is virtual; but where the recording has ``/clock`` and the
                                       node uses simulated time, it tells what that said last
-steady and system clocks, ``time``    virtual if asked for; else what they always tell, and the
+steady and system clocks, ``time``    virtual if asked for; else what they always say, and the
                                       first use of each by code of a node is warned of
 ``Clock.sleep_until``                 waits in virtual time, of a virtual clock
 ``Condition.wait``                    waits in virtual time in a strand; all that Python builds on

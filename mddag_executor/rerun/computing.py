@@ -43,7 +43,7 @@ class Computing:
         self._places: dict[int, list[tuple[int, Callable[[], None]]]] = {}
 
     def waits(self, work: Work) -> None:
-        """Take in that an execution has a worker and, for now, needs nothing."""
+        """Note that an execution has a worker and, for now, needs nothing."""
         begins(self._state, self._machine, work.x, 0, -1, False)
 
     def begin(
@@ -73,7 +73,7 @@ class Computing:
         return min(self._machine.scalars[NEXT_TIME], *self._finish_at)
 
     def settle(self, now: int) -> None:
-        """Take in that time has passed."""
+        """Note that time has passed."""
         settle(self._state, self._machine, now)
 
     def share(self, now: int) -> None:

@@ -390,7 +390,7 @@ class Loop:
 
     def looked(self) -> None:
         """
-        Take in that the calling strand has looked at the time, or whether something has come.
+        Note that the calling strand has looked at the time, or whether something has come.
 
         Who does so all the time waits for time to pass, and so it does.
         """

@@ -115,7 +115,7 @@ class Messages:
     # --- who is there ----------------------------------------------------------------------------
 
     def refresh(self, nodes: Iterable[Any], subscriptions: Iterable[Entity]) -> None:
-        """Take in which subscriptions and publishers there are."""
+        """Update which subscriptions and publishers there are."""
         known, self._known = self._known, {}
         new = []
         self._inlets = {}

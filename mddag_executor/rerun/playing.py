@@ -55,11 +55,11 @@ class Playing:
         self._play()
 
     def refresh(self) -> None:
-        """Take in which topics nodes subscribe to now."""
+        """Note which topics nodes subscribe to now."""
         if not self._clocked and self._messages.inlets(CLOCK) and (
                 CLOCK not in self._topics and CLOCK not in self._messages.offered):
             self._clocked = True
-            self._tell_time()
+            self._publish_time()
         if self._playing is not None and self._load():
             self._play()
 
@@ -100,9 +100,9 @@ class Playing:
             self._messages.recorded(message.topic, message.data, message.published)
         self._next(playing)
 
-    def _tell_time(self) -> None:
+    def _publish_time(self) -> None:
         now = self._loop.now
         stamp = Time(nanoseconds=now).to_msg()
         self._messages.recorded(CLOCK, serialize_message(Clock(clock=stamp)), now)
         if now + CLOCK_EVERY_NS < self._loop.end:
-            self._loop.at(now + CLOCK_EVERY_NS, RECORDED, self._tell_time)
+            self._loop.at(now + CLOCK_EVERY_NS, RECORDED, self._publish_time)

@@ -312,7 +312,7 @@ class Rerun:
                         'recorded: record it, or run the node that publishes it with --node')
 
     def _refresh(self) -> None:
-        """Take in which entities there are."""
+        """Update which entities there are."""
         nodes = self._holder.ordered_nodes()
         registry, engine, now = self._registry, self._engine, self._loop.now
         added, gone = registry.refresh(nodes)

@@ -46,7 +46,7 @@ class Services:
         self._numbers = itertools.count(1)
 
     def refresh(self, entities: Iterable[Entity]) -> None:
-        """Take in which services there are."""
+        """Update which services there are."""
         self._offered = {e.label: e for e in entities if e.kind == SERVICE}
 
     def install(self, replacements: Replacements) -> None:

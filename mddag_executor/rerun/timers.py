@@ -52,11 +52,11 @@ class Timers:
 
     def install(self, replacements: Replacements) -> None:
         """Have what nodes do with their timers count in virtual time."""
-        def then(tell: Callable[[Timer], None]) -> Callable[[Any], Any]:
+        def then(after: Callable[[Timer], None]) -> Callable[[Any], Any]:
             def make(original: Callable[[Timer], None]) -> Callable[[Timer], None]:
                 def method(timer: Timer) -> None:
                     original(timer)
-                    tell(timer)
+                    after(timer)
 
                 return method
 
@@ -70,7 +70,7 @@ class Timers:
         replace(Timer, 'is_ready', instead(lambda timer: self.until_next(timer) == 0))
 
     def refresh(self, entities: Iterable[Entity]) -> None:
-        """Take in which timers there are."""
+        """Update which timers there are."""
         before, self._known = self._known, {}
         now = self._loop.now
         for entity in entities:
@@ -124,14 +124,14 @@ class Timers:
     # --- what nodes do with them -----------------------------------------------------------------
 
     def reset(self, timer: Timer) -> None:
-        """Take in that a timer was reset."""
+        """Note that a timer was reset."""
         known = self._known.get(id(timer))
         if known is not None:
             known.last = self._loop.now
             self._aim(known, self._loop.now + _period(timer))
 
     def cancelled(self, timer: Timer) -> None:
-        """Take in that a timer was cancelled."""
+        """Note that a timer was cancelled."""
         known = self._known.get(id(timer))
         if known is not None:
             known.due = -1

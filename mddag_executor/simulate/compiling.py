@@ -203,7 +203,7 @@ def compile_elsewhere(call: str) -> None:
         return
     try:
         while process.poll() is None:
-            progress.tell('the core is being compiled, once')
+            progress.report('the core is being compiled, once')
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(0.2)
     finally:  # after Ctrl-C, too

@@ -19,7 +19,7 @@ class Load(NamedTuple):
 
     Times are in ns.  The execution time of vertex v in job k of DAG d is ``costs[cost_base[d] +
     k * cost_stride[d] + local index of v]``: a stride of zero gives every job the same times, the
-    number of vertices of the DAG a row for each job.  Columns beside it tell as ``costs`` does,
+    number of vertices of the DAG a row for each job.  Columns beside it are as ``costs`` is,
     and may be empty:
 
     * ``releases``: by release, where a source becomes ready later (``times``) than it is released;

@@ -112,7 +112,7 @@ def fill_machine(t: Tables, s: State, m: Machine, cpus: int, python: int) -> Non
 
 
 def settle(s: State, m: Machine, now: int) -> None:
-    """Take in that time has passed."""
+    """Advance the machine: time has passed."""
     passed = now - m.scalars[SETTLED]
     for i in range(len(m.still)):
         s.x_left[m.still[i]] += passed
@@ -155,7 +155,7 @@ def _is_warm(s: State, m: Machine, worker: int, now: int) -> bool:
 
 
 def starts(s: State, load: Load, m: Machine, x: int, now: int) -> None:
-    """Take in that an execution has been dispatched."""
+    """Note that an execution has been dispatched."""
     if len(load.warmth) > 0 and s.scalars[PREEMPTIVE] == 0:
         more = load.warmth[place_of(s, load, x)]
         if _is_warm(s, m, s.x_worker[x], now) == (more > 0):
@@ -171,7 +171,7 @@ def starts(s: State, load: Load, m: Machine, x: int, now: int) -> None:
 
 
 def begins(s: State, m: Machine, x: int, cost: int, cpu: int, locks: bool) -> None:
-    """Take in what an execution that has been dispatched takes, and what it computes of it."""
+    """Note what an execution that has been dispatched takes, and what it computes of it."""
     while len(m.at) <= x:
         for column in (m.locked_until, m.computes_until, m.waits_until, m.publishes_at, m.at,
                        m.need, m.until, m.share):

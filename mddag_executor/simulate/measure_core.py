@@ -7,10 +7,10 @@ Theory of operation
 -------------------
 Two drivers, the same core.  *Simulated*: ``engine.run`` over a periodic load in virtual time, with
 as many workers and as much waiting as the workload makes; whatever the engine takes is counted in.
-*Live calls*: what the live executor tells the core for each callback (release, ready, take,
+*Live calls*: the live executor's calls of the core for each callback (release, ready, take,
 complete), leg by leg, one callback after the other and without clock, threads and messages.
 
-An *event* is something that the core is told or decides: a release, a completion, a start or a
+An *event* is something that the core gets or decides: a release, a completion, a start or a
 preemption.  Times are CPU time of the thread, medians over repetitions; the garbage collector is
 off meanwhile, as its share depends on what else the process holds.
 """

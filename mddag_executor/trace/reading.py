@@ -6,7 +6,7 @@ One pass over a trace file, in the order of the file or of time.
 Theory of operation:
 
 1. The file is read block by block (`blocks`).  Where a block's messages begin, its message indexes
-   tell, if they fit what is there; else the records are walked over.  What is in memory is some
+   are used, if they fit what is there; else the records are walked over.  In memory are some
    chunks, whatever the file's length.
 2. In the order of the file the events of one thread are in order, those of different threads are
    not: each thread appends an event after it took its time, whenever it gets to run.

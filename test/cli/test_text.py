@@ -8,7 +8,7 @@ import io
 
 from hypothesis import given, strategies
 from mddag_executor.cli.text import format_ns, one_line, printable, Progress, table, warn
-from mddag_executor.progress import tell
+from mddag_executor.progress import report
 from msg_graph import errors
 import pytest
 
@@ -121,14 +121,14 @@ def test_progress_is_quiet_where_nobody_looks() -> None:
 def test_progress_of_what_nobody_asked_for() -> None:
     stream, clock = Terminal(), Clock()
     with Progress('replaying', stream=stream, clock=clock) as progress:
-        tell('the core is being compiled, once')
+        report('the core is being compiled, once')
         assert stream.getvalue() == ''
         clock.now += 3
-        tell('the core is being compiled, once')
+        report('the core is being compiled, once')
         assert '\rreplaying: the core is being compiled, once' in stream.getvalue()
         clock.now += 3
         progress.update(1500)
-    tell('nobody hears it')
+    report('nobody hears it')
     assert 'nobody' not in stream.getvalue()
 
 

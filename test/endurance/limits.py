@@ -189,7 +189,7 @@ class GcWatch:
         self._begun = 0
 
     def __call__(self, phase: str, info: dict[str, int]) -> None:
-        """Take in what the collector tells."""
+        """Note what the collector reports."""
         if phase == 'start':
             self._begun = time.monotonic_ns()
         else:

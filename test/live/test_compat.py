@@ -264,7 +264,7 @@ def test_the_end_of_a_context_is_told_before_its_nodes_are_gone():
     rclpy.init(context=context)
     node = rclpy.node.Node('told', context=context)
     told: list[bool] = []
-    kept = compat.tell_of_end(context, lambda: told.append(alive(node)))
+    kept = compat.on_end(context, lambda: told.append(alive(node)))
     context.shutdown()
     assert told and told[0]
     del kept
@@ -293,7 +293,7 @@ def test_who_is_called_by_spin_knows(ros_context, make_node):
 def test_changes_of_a_node_are_told(make_node, monkeypatch):
     monkeypatch.setattr(rclpy.node.Node, '_wake_executor', rclpy.node.Node._wake_executor)
     told = []
-    compat.tell_of_changes(told.append)
+    compat.on_changes(told.append)
     node = make_node()
     told.clear()
     timer = node.create_timer(1.0, print)

@@ -43,17 +43,17 @@ class Driver:
         self.book = PathBook(loads(text, 'graph.yaml'))
         self._number = 0
 
-    def _tell(self, what: int, *row: int) -> int:
+    def _add(self, what: int, *row: int) -> int:
         rows = [np.empty((0, width), dtype=np.int64) for width in (7, 4, 7, 4)]
         rows[what] = np.array([(0, *row)], dtype=np.int64)
-        self.book.tell(1, *rows)
+        self.book.add(1, *rows)
         self._number += 1
         return self._number
 
     def run(self, key: str, start: int, message: int = NONE, topic: str = '') -> int:
         """Begin an execution; return its number."""
         number = self._number
-        self._tell(0, self.book.callbacks[key], number, start,
+        self._add(0, self.book.callbacks[key], number, start,
                    self.book.topics.get(topic, -2) if topic else NONE, message, NONE)
         return number
 
@@ -61,17 +61,17 @@ class Driver:
         """Publish; return the message's number."""
         number = self._number
         node = node or (key or '').partition(':')[0]
-        self._tell(2, NONE if key is None else self.book.callbacks[key], self.book.nodes[node],
+        self._add(2, NONE if key is None else self.book.callbacks[key], self.book.nodes[node],
                    run, self.book.topics.get(topic, -2), number, time)
         return number
 
     def end(self, key: str, run: int, time: int) -> None:
         """End an execution."""
-        self._tell(1, self.book.callbacks[key], run, time)
+        self._add(1, self.book.callbacks[key], run, time)
 
     def took(self, key: str, run: int, message: int) -> None:
         """Let a running callback take a message."""
-        self._tell(3, self.book.callbacks[key], run, message)
+        self._add(3, self.book.callbacks[key], run, message)
 
     def starts(self) -> list[list[int | None]]:
         """Return for each flow its first publication and the start of each later callback."""

@@ -134,11 +134,11 @@ def run_all(
     made = 0
     for _ in range(repeat):
         for spec, results in zip(specs, runs):
-            def tell(passed: float, spec: Spec = spec, made: int = made) -> None:
+            def report(passed: float, spec: Spec = spec, made: int = made) -> None:
                 tick(spec, made, passed)
 
             try:
-                results.append(measure(spec, tell))
+                results.append(measure(spec, report))
             except CrashError as error:
                 warn(str(error))
             made += 1

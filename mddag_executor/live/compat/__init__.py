@@ -292,11 +292,11 @@ class BareExecutor(Executor):
 class _FirstNode:
     """Stands first among a context's nodes, to notice that they are destroyed."""
 
-    def __init__(self, tell: Callable[[], None]) -> None:
-        self.destroy_node = tell
+    def __init__(self, call: Callable[[], None]) -> None:
+        self.destroy_node = call
 
 
-def tell_of_end(context: Any, tell: Callable[[], None]) -> object:
+def on_end(context: Any, call: Callable[[], None]) -> object:
     """
     Have a function called when a context is shut down, before its nodes are gone.
 
@@ -305,8 +305,8 @@ def tell_of_end(context: Any, tell: Callable[[], None]) -> object:
 
     :return: what is to be kept for as long as that is wanted.
     """
-    context.on_shutdown(tell)
-    first = _FirstNode(tell)
+    context.on_shutdown(call)
+    first = _FirstNode(call)
     nodes = getattr(context, '_Context__node_weak_ref_list', None)
     if nodes is not None:
         nodes.insert(0, weakref.ref(first))
@@ -322,16 +322,16 @@ def is_called_by_spin() -> bool:
     return sys._getframe(2).f_code is rclpy.spin.__code__
 
 
-def tell_of_changes(listener: Callable[[Any], None]) -> None:
+def on_changes(listener: Callable[[Any], None]) -> None:
     """Call a function with each node whose entities come, go or change, after its executor."""
     wake: Any = Node._wake_executor
 
-    def wake_and_tell(self: Any) -> None:
+    def wake_and_call(self: Any) -> None:
         wake(self)
         listener(self)
 
-    wake_and_tell.__doc__ = wake.__doc__
-    Node._wake_executor = wake_and_tell  # type: ignore[method-assign]
+    wake_and_call.__doc__ = wake.__doc__
+    Node._wake_executor = wake_and_call  # type: ignore[method-assign]
 
 
 def keeps_time(subscription: Any) -> bool:

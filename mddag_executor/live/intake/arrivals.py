@@ -22,10 +22,10 @@ class Receiver(Protocol):
     executor: Any
 
     def take(self, work: Work) -> None:
-        """Take in what became ready."""
+        """Handle what became ready."""
 
     def take_in(self, arrivals: Sequence[Work]) -> None:
-        """Take in what became ready at one instant: it is to be chosen among all of it."""
+        """Handle what became ready at one instant: it is to be chosen among all of it."""
 
     def on_intake_error(self, error: BaseException) -> None:
-        """Take in an exception of a take or of ``take_in``."""
+        """Handle an exception of a take or of ``take_in``."""

@@ -146,17 +146,17 @@ def exceptions_of_the_intake_swallowed() -> None:
     replace(Receiver, 'on_intake_error', lambda on_error: lambda self, error: None)
 
 
-@mutation('A task of a spinning executor is there, and nobody is told.')
+@mutation('A task of a spinning executor is there, and nobody notices.')
 def create_task_does_not_wake_workers() -> None:
-    def make(tell: Any) -> Any:
+    def make(report: Any) -> Any:
         def broken(self: Pool, event: Any, *args: Any) -> None:
             if event == self.engine.ready and args[0].entity.kind == TASK:
                 with self.lock:
                     event(*args, self.tick())
             else:
-                tell(self, event, *args)
+                report(self, event, *args)
         return broken
-    replace(Pool, 'tell', make)
+    replace(Pool, 'report', make)
 
 
 @mutation('A task does not end the wait of a spin_once.')
@@ -164,7 +164,7 @@ def create_task_does_not_wake_spin_once() -> None:
     _wakes_nobody(executor.MultiDeadlineExecutor, 'create_task')
 
 
-@mutation('A node that is added is noted, and whoever spins is not told.')
+@mutation('A node that is added is noted, and whoever spins does not notice.')
 def add_node_does_not_wake() -> None:
     _wakes_nobody(executor.MultiDeadlineExecutor, 'add_node')
 
