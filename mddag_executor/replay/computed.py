@@ -200,7 +200,7 @@ class _Player:
         vertex, number = self._vertices[v], self._number(dag, job)
         self._finished += 1
         self._add(COMPLETED, dag, v, number, leg, 1, now, ran.ready, ran.first, now, busy,
-                   self._finished, -1, 0)
+                  self._finished, -1, 0)
         delay = self._schedule.delay
         for local in vertex.successors:
             after = (dag, self._first[dag] + local, job)

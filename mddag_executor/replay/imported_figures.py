@@ -161,8 +161,8 @@ class ImportedPaths(LinkObserver):
         target = self._target.get(run.callback.number)
         topic = '' if target is None else target.topic
         self._add(0, run, run.number, run.start,
-                   self.book.topics.get(topic, -2) if topic else -1,
-                   -1 if message is None else message.number, -1)
+                  self.book.topics.get(topic, -2) if topic else -1,
+                  -1 if message is None else message.number, -1)
 
     def over(self, run: Execution) -> None:
         """Note the end of an execution."""

@@ -265,7 +265,7 @@ class ImportedRun(LinkObserver):
         dag, vertex, job = run.of if run.of is not None else (-1, -1, -1)
         worker = self._workers.setdefault(run.thread, len(self._workers))
         self._add(RAN, run.callback.number, dag, vertex, job, worker, run.ready, run.start,
-                   run.end, 1)
+                  run.end, 1)
         if run.callback.number not in self.targets or dag < 0:
             return
         self._active[(dag, job)] -= 1
@@ -274,7 +274,7 @@ class ImportedRun(LinkObserver):
             self._doubts.done(dag, vertex, job)
         self._number += 1
         self._add(COMPLETED, dag, vertex, job, run.leg, int(whole), run.end, run.ready,
-                   run.start, run.end, run.end - run.start, self._number, -1, 0)
+                  run.start, run.end, run.end - run.start, self._number, -1, 0)
 
     def _is_whole(self, vertex: int, job: int, leg: int) -> bool:
         """Return whether an execution completes its vertex: of a sync's legs the last one does."""

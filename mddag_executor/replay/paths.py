@@ -172,8 +172,8 @@ class PathBook:
     def _round(self) -> None:
         """Make steps of the input."""
         new_rows = [np.concatenate(each) if each else np.empty((0, width), dtype=np.int64)
-                for each, width in zip(
-                    self._new_rows, (_N_STARTED, _N_ENDED, _N_PUBLISHED, _N_TOOK))]
+                    for each, width in zip(
+                        self._new_rows, (_N_STARTED, _N_ENDED, _N_PUBLISHED, _N_TOOK))]
         self._new_rows = [[], [], [], []]
         self._order, self._waiting = 1, 0
         columns = (1, 1, _U_TOPIC, 1)
@@ -183,7 +183,7 @@ class PathBook:
             before = self._at(number, place, before, *(
                 [rows.get(key, none[:0]) for key in keys] for rows, none, keys in zip(
                     sorted_out, new_rows, ([place.callback], [place.callback], place.topics,
-                                       [place.callback]))))
+                                           [place.callback]))))
 
     def _at(
         self, number: int, place: _Place, before: list[tuple[Ints, Ints]],

@@ -54,7 +54,7 @@ class Driver:
         """Begin an execution; return its number."""
         number = self._number
         self._add(0, self.book.callbacks[key], number, start,
-                   self.book.topics.get(topic, -2) if topic else NONE, message, NONE)
+                  self.book.topics.get(topic, -2) if topic else NONE, message, NONE)
         return number
 
     def send(self, key: str | None, run: int, topic: str, time: int, node: str = '') -> int:
@@ -62,7 +62,7 @@ class Driver:
         number = self._number
         node = node or (key or '').partition(':')[0]
         self._add(2, NONE if key is None else self.book.callbacks[key], self.book.nodes[node],
-                   run, self.book.topics.get(topic, -2), number, time)
+                  run, self.book.topics.get(topic, -2), number, time)
         return number
 
     def end(self, key: str, run: int, time: int) -> None:
