@@ -9,7 +9,7 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.memory import no_garbage
 from mddag_executor.replay.beside import pays, play_beside
-from mddag_executor.replay.drift import OwnDrift
+from mddag_executor.replay.drift import DriftObserver
 from mddag_executor.replay.explain import Explainer
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.judge import Judge
@@ -22,7 +22,7 @@ from msg_graph import TaskSet
 from msg_graph.drift import Drift
 
 if TYPE_CHECKING:
-    from mddag_executor.replay.imported_figures import Communications, ImportedDrift, ImportedPaths
+    from mddag_executor.replay.imported_figures import Communications, ImportedPaths
 
 Progress = Callable[[int], None]
 
@@ -52,7 +52,7 @@ class Replay:
         self.tally = self.judge.tally
         self._seen: Communications | None = None
         self._paths: ImportedPaths | OwnPaths | None = None
-        self._drift: ImportedDrift | OwnDrift | None = None
+        self._drift: DriftObserver | None = None
         self.explainer = Explainer(run, self.judge, jobs) if paths else None
         with no_garbage():
             if paths and not jobs and more is None and isinstance(run, OwnRun) and pays(run):
@@ -61,10 +61,13 @@ class Replay:
                     progress)
             else:
                 if not isinstance(run, OwnRun):
-                    from mddag_executor.replay.imported_figures import observers_of
-                    self._seen, self._paths, self._drift = observers_of(run, paths)
+                    from mddag_executor.replay import imported_figures
+                    self._seen = imported_figures.Communications()
+                    self._paths = imported_figures.ImportedPaths(run) if paths else None
                 elif paths:
-                    self._paths, self._drift = OwnPaths(run), OwnDrift(run)
+                    self._paths = OwnPaths(run)
+                if paths:
+                    self._drift = DriftObserver(run)
                 observers = [waits, self.judge, self.usage, self._paths, self._drift, self._seen,
                              self.explainer, *(more(self) if more is not None else ())]
                 run.play([each for each in observers if each is not None], progress)

@@ -22,7 +22,7 @@ from typing import Any
 
 from mddag_executor.defaults import processors
 from mddag_executor.errors import MddagError
-from mddag_executor.replay.drift import OwnDrift
+from mddag_executor.replay.drift import DriftObserver
 from mddag_executor.replay.happenings import Batch, KINDS, Observer
 from mddag_executor.replay.own import OwnRun, STOP
 from mddag_executor.replay.own_paths import OwnPaths
@@ -31,7 +31,7 @@ from mddag_executor.replay.usage import GroupWaits
 from mddag_executor.resources import import_environment
 
 LEAST_EVENTS = 1_000_000
-Played = tuple[OwnRun, OwnPaths, OwnDrift]
+Played = tuple[OwnRun, OwnPaths, DriftObserver]
 _PROGRAM = 'from mddag_executor.replay.beside import serve; serve()'
 
 
@@ -127,7 +127,7 @@ def serve() -> None:
             run = open_run(*pickle.load(sys.stdin.buffer))
             assert isinstance(run, OwnRun)
             waits = GroupWaits(run.who)
-            paths, drift = OwnPaths(run), OwnDrift(run)
+            paths, drift = OwnPaths(run), DriftObserver(run)
             run.play([waits, _Sender(send, waits), paths, drift],
                      lambda events: send('progress', events))
             paths.book.results()

@@ -5,7 +5,7 @@ Drafts of systems from traces: nodes, callbacks, what each publishes, rates, exe
 
 Theory of operation
 -------------------
-1. ``Census`` lists what there is. What every node has anyway (parameter services and their like)
+1. ``Entities`` knows what there is. What every node has anyway (parameter services and their like)
    is left out, and with it nodes that have nothing else.
 2. A callback that the recorded declaration names keeps its name, and what was declared of it that
    a trace does not show: deadline, queue edges, period, sync, group, name of the DAG.  Others have
@@ -20,21 +20,50 @@ Theory of operation
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 import os
 
 from mddag_executor.core import quantile
 from mddag_executor.errors import InputError
+from mddag_executor.replay.entities import (
+    Address,
+    as_table,
+    Callback,
+    Entities,
+    Event,
+    INIT_EVENTS,
+    KINDS,
+)
 from mddag_executor.trace import TraceReader
-from mddag_executor.trace.census import Address, Census, Entity, Event, KEEP_TIMES
-from msg_graph import Callback, ExecutionTime, GraphError, loads, TaskSet
+from msg_graph import Callback as Declared
+from msg_graph import ExecutionTime, GraphError, loads, TaskSet
 from msg_graph.binding import function_of
 from msg_graph.draft import Draft, DraftCallback, DraftNode
 from msg_graph.names import CALLBACK, is_background, NODE, SERVICE, TOPIC
 
 PERCENT = (0.0, 50.0, 90.0, 99.0, 100.0)
 _STEP = 4096
+_KEEP_TIMES = 100_000
+_START, _END = 'ros2:callback_start', 'ros2:callback_end'
+_PUBLISH = ('ros2:rclcpp_publish', 'ros2:rcl_publish')
 _TASK_SET, _DISPATCH, _COMPLETE = 'mddag:task_set', 'mddag:dispatch', 'mddag:complete'
+
+
+@dataclass
+class Runs:
+    """What a callback did; of the times that runs took, the first ``_KEEP_TIMES`` are kept, ns."""
+
+    count: int = 0
+    first: int = 0
+    last: int = 0
+    times: array[int] = field(default_factory=lambda: array('q'))
+    publishers: dict[Address, None] = field(default_factory=dict)
+
+    @property
+    def interval_ns(self) -> int | None:
+        """Return the mean time between two of its starts; None with fewer than two."""
+        return (self.last - self.first) // (self.count - 1) if self.count > 1 else None
 
 
 class System:
@@ -50,30 +79,80 @@ class System:
         progress: Callable[[int], None] | None = None,
     ) -> None:
         self.name = name or os.fspath(path)
-        self.census = Census()
         self.task_set: TaskSet | None = None
         self.workers: int | None = None
-        self._declared: dict[Address, Callback] = {}
+        self._declared: dict[Address | None, Declared] = {}
         self._whole: dict[str, array[int]] = {}     # by sync callback: how long these took
+        self._runs: dict[Address | None, Runs] = {}
+        # by process and thread what runs, and since when; what ended last, and how long it took
+        self._running: dict[tuple[int, int], list[tuple[Address, int]]] = {}
+        self._took: dict[tuple[int, int], tuple[Address, int]] = {}
         reader = TraceReader(path)
-        wanted = {*self.census.handlers, _TASK_SET, _DISPATCH, _COMPLETE}
-        for count, event in enumerate(reader.events(wanted, sorted=True)):
-            if event[0] == _DISPATCH:
-                self._dispatch(event)
-            elif event[0] == _COMPLETE:
-                self._complete(event)
-            elif event[0] == _TASK_SET:
-                self._recorded(event)
-            else:
-                self.census.take(event)
-            if progress is not None and count % _STEP == 0:
-                progress(count)
+        who = Entities()
+        who.read(self._others(reader, progress))
         self.warnings = list(reader.warnings)
-        self._entities = [entity for entity in self.census.entities() if _is_shown(entity)]
+        self._entities = [entity for entity in sorted(
+            who.made, key=lambda e: (e.made, KINDS.index(e.kind))) if _is_shown(entity)]
         if not self._entities:
             raise InputError(
                 self.name, 'no timer, subscription or service of a node is recorded in it',
                 'record the start of the nodes, too')
+        #: By node the topics that it publishes, and whether a callback was seen to do so.
+        self._publishers: dict[str, dict[str, bool]] = {
+            name: {} for name in who.names_of_nodes}
+        for publisher in who.every_publisher.values():
+            if publisher.node is not None:
+                self._publishers[publisher.node.name][publisher.topic] = False
+        #: By callback's address the topics that it was seen to publish.
+        self._publishes: dict[Address | None, list[str]] = {}
+        for callback, runs in self._runs.items():
+            for address in runs.publishers:
+                found = who.publishers.latest(*address, runs.last)
+                if found is not None and found.node is not None:
+                    self._publishes.setdefault(callback, []).append(found.topic)
+                    self._publishers[found.node.name][found.topic] = True
+
+    def _others(
+        self, reader: TraceReader, progress: Callable[[int], None] | None
+    ) -> Iterator[Event]:
+        """Yield the events that say who is who; note what the others say."""
+        handlers = {
+            _DISPATCH: self._dispatch, _COMPLETE: self._complete, _TASK_SET: self._recorded,
+            _START: self._start, _END: self._end, **dict.fromkeys(_PUBLISH, self._publish)}
+        for count, event in enumerate(reader.layout_events({*INIT_EVENTS, *handlers})):
+            handler = handlers.get(event[0].name)
+            if handler is None:
+                yield event
+            else:
+                handler(as_table(event))
+            if progress is not None and count % _STEP == 0:
+                progress(count)
+
+    def _start(self, event: Event) -> None:
+        callback = event[2], event[4]
+        if event[4] is None:
+            return
+        self._running.setdefault(event[2:4], []).append((callback, event[1]))
+        runs = self._runs.setdefault(callback, Runs(first=event[1]))
+        runs.count += 1
+        runs.last = event[1]
+
+    def _end(self, event: Event) -> None:
+        stack = self._running.get(event[2:4], [])
+        while stack and event[4] is not None:
+            callback, start = stack.pop()
+            if callback == (event[2], event[4]):
+                self._took[event[2:4]] = callback, event[1] - start
+                times = self._runs[callback].times
+                if len(times) < _KEEP_TIMES:
+                    times.append(event[1] - start)
+                return
+
+    def _publish(self, event: Event) -> None:
+        """Note what publishes: runs nest in a thread, as a callback may spin."""
+        stack = self._running.get(event[2:4])
+        if stack and event[4] is not None:
+            self._runs[stack[-1][0]].publishers[event[2], event[4]] = None
 
     def _recorded(self, event: Event) -> None:
         if None in event or self.task_set is not None or not event[4].strip():
@@ -95,21 +174,21 @@ class System:
 
     def _complete(self, event: Event) -> None:
         declared = self._declared.get((event[2], event[4]))
-        took = self.census.took.get((event[2], event[3]))
+        took = self._took.get(event[2:4])
         if declared is None or declared.kind != 'sync' or not event[8] or took is None:
             return
         times = self._whole.setdefault(declared.key, array('q'))
-        if took[0] == (event[2], event[4]) and len(times) < KEEP_TIMES:
+        if took[0] == (event[2], event[4]) and len(times) < _KEEP_TIMES:
             times.append(took[1])
 
     def draft(self) -> Draft:
         """Return the whole system."""
         nodes: dict[str, DraftNode] = {}
         for entity in self._entities:
-            node = nodes.setdefault(entity.node, DraftNode(entity.node))
+            node = nodes.setdefault(entity.node_name, DraftNode(entity.node_name))
             callback = self._callback(entity, node)
             node.callbacks.setdefault(callback.name, callback)
-        for name, topics in self.census.publishers.items():
+        for name, topics in self._publishers.items():
             unseen = [t for t, seen in topics.items()
                       if not seen and not is_background(t, name) and TOPIC.check(t) is None]
             if unseen and name not in nodes and NODE.check(name) is None:
@@ -133,24 +212,23 @@ class System:
             found[-1].callbacks[callback.name] = callback
         return found
 
-    def _callback(self, entity: Entity, node: DraftNode) -> DraftCallback:
-        declared = None if entity.callback is None else self._declared.get(entity.callback)
-        if declared is not None and declared.node == entity.node:
+    def _callback(self, entity: Callback, node: DraftNode) -> DraftCallback:
+        declared = self._declared.get(entity.address)
+        if declared is not None and declared.node == entity.node_name:
             known = node.callbacks.get(declared.name)
             callback = known or _from_declared(declared)
         else:
             callback = DraftCallback(
-                entity.node, self._free_name(entity, node), entity.kind,
-                [entity.start] if entity.start else [], entity.period_ns)
-            if entity.group is not None:
-                callback.group = self._group_name(entity)
-        self._measure(callback, [entity])
+                entity.node_name, self._free_name(entity, node), entity.kind,
+                [entity.start] if entity.start else [], entity.period or None)
+            callback.group = self._group_name(entity)
+        self._measure(callback, entity)
         return callback
 
-    def _free_name(self, entity: Entity, node: DraftNode) -> str:
+    def _free_name(self, entity: Callback, node: DraftNode) -> str:
         """Return a name for a callback that nobody has named."""
         declared = () if self.task_set is None else self.task_set.callbacks
-        taken = {*node.callbacks, *(c.name for c in declared if c.node == entity.node)}
+        taken = {*node.callbacks, *(c.name for c in declared if c.node == entity.node_name)}
         name = function_of(entity.symbol)
         if name is None or CALLBACK.check(name) is not None:
             names = [f'callback_{number}' for number in range(len(taken), 2 * len(taken) + 1)]
@@ -158,25 +236,22 @@ class System:
             names = [name, *(f'{name}_{number}' for number in range(2, len(taken) + 2))]
         return next(each for each in names if each not in taken)
 
-    def _group_name(self, entity: Entity) -> str | None:
+    def _group_name(self, entity: Callback) -> str | None:
         """Return a name for a group that several callbacks of the node share."""
-        groups = [e.group for e in self._entities if e.node == entity.node]
-        if groups.count(entity.group) < 2:
+        groups = [e.group for e in self._entities
+                  if e.node_name == entity.node_name and e.group not in (None, -1)]
+        if entity.group is None or groups.count(entity.group) < 2:
             return None
-        known = [group for group in dict.fromkeys(groups) if group is not None]
-        return f'callback_group_{known.index(entity.group)}' if entity.group in known else None
+        return f'callback_group_{list(dict.fromkeys(groups)).index(entity.group)}'
 
-    def _measure(self, callback: DraftCallback, entities: Iterable[Entity]) -> bool:
+    def _measure(self, callback: DraftCallback, entity: Callback) -> bool:
         """Fill in what was measured of a callback; return whether anything was."""
-        found = [self.census.runs[e.callback] for e in entities
-                 if e.callback is not None and e.callback in self.census.runs]
-        if not found:
+        runs = self._runs.get(entity.address)
+        if runs is None:
             return False
-        runs = found[0]
-        for each in found:
-            callback.publishes.extend(
-                t for t in each.publishes if t not in callback.publishes
-                and not is_background(t, callback.node) and TOPIC.check(t) is None)
+        callback.publishes.extend(
+            t for t in self._publishes.get(entity.address, ()) if t not in callback.publishes
+            and not is_background(t, callback.node) and TOPIC.check(t) is None)
         callback.maybe = [t for t in callback.maybe if t not in callback.publishes]
         if callback.kind == 'sync':
             callback.times = execution_time(self._whole.get(callback.key, ()))
@@ -192,16 +267,16 @@ class System:
         Callbacks are the same if node and what starts them are; of several that are started
         alike the first is the one that was made first.
         """
-        waiting: dict[tuple[str, str, str], list[Entity]] = {}
+        waiting: dict[tuple[str, str, str], list[Callback]] = {}
         for entity in self._entities:
-            start = str(entity.period_ns) if entity.kind == 'timer' else entity.start
-            waiting.setdefault((entity.node, entity.kind, start), []).append(entity)
+            start = str(entity.period) if entity.kind == 'timer' else entity.start
+            waiting.setdefault((entity.node_name, entity.kind, start), []).append(entity)
         count = 0
         for callback in draft.callbacks():
             start = callback.starts[0] if callback.starts else str(callback.period_ns)
             fits = waiting.get((callback.node, callback.kind, start))
             if fits:
-                count += self._measure(callback, [fits.pop(0)])
+                count += self._measure(callback, fits.pop(0))
         return count
 
 
@@ -214,16 +289,16 @@ def execution_time(took: Iterable[int]) -> tuple[ExecutionTime, int] | None:
     return ExecutionTime(quantiles, PERCENT), len(times)
 
 
-def _is_shown(entity: Entity) -> bool:
-    if NODE.check(entity.node) is not None:
+def _is_shown(entity: Callback) -> bool:
+    if NODE.check(entity.node_name) is not None:
         return False
     if entity.kind == 'timer':
-        return entity.period_ns is not None and entity.period_ns >= 1_000
+        return entity.period >= 1_000
     name = TOPIC if entity.kind == 'subscription' else SERVICE
-    return not is_background(entity.start, entity.node) and name.check(entity.start) is None
+    return not is_background(entity.start, entity.node_name) and name.check(entity.start) is None
 
 
-def _from_declared(declared: Callback) -> DraftCallback:
+def _from_declared(declared: Declared) -> DraftCallback:
     starts = [declared.service] if declared.service else list(declared.topics)
     also = {key: str(value).lower() for key, value, usual in (
         ('on_miss', declared.on_miss, 'continue'),

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Who is who in a recording of CARET or ros2_tracing: nodes, publishers, callbacks, groups.
+Who is who in a recording: nodes, publishers, callbacks and their groups, by address.
 
 Theory of operation
 -------------------
@@ -20,35 +20,45 @@ The events of the initialisation say which address is what.
 4. A callback is described by its node and what starts it: timer and period, subscription and
    topic, service and its name.  Several in one node that look the same are distinguished by the
    order in which they were made.
+5. In an imported recording these events may be anywhere, so all of them are read first
+   (``read``), and callbacks are numbered.  This executor records them before it refers to them:
+   there they are taken one by one (``take``), and a callback's number is its address.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable
-from itertools import count
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from mddag_executor.trace import EVENTS
 from msg_graph import format_duration
+from msg_graph.binding import Entity, entity_name
+from msg_graph.duration import exact_duration
 
 _T = TypeVar('_T')
+KINDS = ('timer', 'subscription', 'service')
+# In the order in which they refer to one another.
 _INIT = (
-    'rcl_node_init', 'rcl_publisher_init', 'rcl_subscription_init', 'rclcpp_subscription_init',
-    'rclcpp_subscription_callback_added', 'rcl_service_init', 'rclcpp_service_callback_added',
-    'rcl_timer_init', 'rclcpp_timer_callback_added', 'rclcpp_timer_link_node',
-    'rclcpp_callback_register')
+    'rcl_node_init', 'rcl_publisher_init', 'rcl_subscription_init', 'rcl_service_init',
+    'rcl_timer_init', 'rclcpp_timer_link_node', 'rclcpp_subscription_init',
+    'rclcpp_subscription_callback_added', 'rclcpp_timer_callback_added',
+    'rclcpp_service_callback_added', 'rclcpp_callback_register')
 _GROUPS = (
     'add_callback_group', 'add_callback_group_static_executor',
-    'callback_group_to_executor_entity_collector', 'callback_group_add_timer',
-    'callback_group_add_subscription', 'callback_group_add_service')
+    'callback_group_to_executor_entity_collector',
+    *(f'callback_group_add_{kind}' for kind in KINDS))
 _CARET_INIT = 'ros2_caret:caret_init'
-#: Full names of the events that say who is who.
-INIT_EVENTS = frozenset([
-    *(f'{provider}:{name}' for name in _INIT for provider in ('ros2', 'ros2_caret')),
-    *(f'ros2_caret:{name}' for name in _GROUPS), _CARET_INIT, 'ros2_caret:rmw_implementation'])
+#: Full names of the events that say who is who, as this executor records them; and all of them.
+OWN_INIT_EVENTS = frozenset([
+    *(f'ros2:{name}' for name in _INIT), *(f'ros2_caret:{name}' for name in _GROUPS)])
+INIT_EVENTS = OWN_INIT_EVENTS | {
+    *(f'ros2_caret:{name}' for name in _INIT), _CARET_INIT, 'ros2_caret:rmw_implementation'}
 
+Event = tuple[Any, ...]
 Fields = dict[str, Any]
+Address = tuple[int, int]
+"""Process and address."""
 
 
 class Node(NamedTuple):
@@ -69,23 +79,25 @@ class Publisher(NamedTuple):
 
 class Callback:
     """
-    A callback of a recording.
+    A timer, subscription or service of a recording, with its callback.
 
-    :ivar number: its number among all, from 1.
+    :ivar number: identifies the callback; 0: it has none that is recorded.
     :ivar kind: ``timer``, ``subscription``, ``service`` or ``unknown``.
     :ivar start: topic or name of the service; empty for the others.
     :ivar period: of its timer, ns; 0 for the others.
     :ivar made: when its timer, subscription or service was made, ns.
     :ivar grid: from when on its timer's periods count, ns; None where that is not recorded.
     :ivar group: number of its mutually exclusive group; -1 for another one, None: not known.
+    :ivar symbol: of its function; empty where that is not recorded.
+    :ivar address: process and address of its callback.
     """
 
     __slots__ = ('number', 'node', 'kind', 'start', 'period', 'made', 'grid', 'group', 'symbol',
-                 'label')
+                 'label', 'address', 'rmw')
 
-    def __init__(self, number: int, node: Node | None, kind: str, start: str = '',
-                 period: int = 0, made: int = 0, grid: int | None = None) -> None:
-        self.number = number
+    def __init__(self, node: Node | None, kind: str, start: str = '', period: int = 0,
+                 made: int = 0, grid: int | None = None) -> None:
+        self.number = 0
         self.node = node
         self.kind = kind
         self.start = start
@@ -95,22 +107,35 @@ class Callback:
         self.group: int | None = None
         self.symbol = ''
         self.label = ''
+        self.address: Address | None = None
+        self.rmw: Address | None = None
+
+    @property
+    def node_name(self) -> str:
+        """Return the name of its node, empty where that is not known."""
+        return '' if self.node is None else self.node.name
 
     @property
     def description(self) -> str:
         """Return its node and what starts it."""
-        node = self.node.name if self.node is not None else 'a node that is not recorded'
+        node = self.node_name or 'a node that is not recorded'
         if self.kind == 'timer':
             return f'{node} timer {format_duration(self.period)}'
         return f'{node} {self.kind} {self.start}'.rstrip()
+
+    @property
+    def entity(self) -> Entity | None:
+        """Return what a declaration may bind to it; None: nothing, as its node is not known."""
+        return None if self.node is None else Entity(
+            self.node.name, self.kind, self.start, self.period or None)
 
 
 class Addresses(Generic[_T]):
     """What is under the addresses of all processes, over time (rule 1)."""
 
     def __init__(self) -> None:
-        self._times: dict[tuple[int, int], list[int]] = {}
-        self._things: dict[tuple[int, int], list[_T]] = {}
+        self._times: dict[Address, list[int]] = {}
+        self._things: dict[Address, list[_T]] = {}
 
     def add(self, pid: int, address: int, time: int, thing: _T) -> None:
         """Register a thing; times may come in any order."""
@@ -138,175 +163,159 @@ class Addresses(Generic[_T]):
         return things[place]
 
 
-class _Entity(NamedTuple):
-    """A timer, subscription or service, by its handle."""
-
-    kind: str
-    node: Node | None
-    start: str
-    period: int
-    time: int
-    number: int     # no two are the same
-
-
 class Entities:
     """
     Who is who.
 
-    :param events: those of the initialisation, as pairs of full name and fields, with
-        ``_timestamp`` and ``_vpid`` among the fields.
+    :param by_address: whether callbacks and publishers are numbered by their addresses.
+    :ivar every: the callbacks; ``made``: all timers, subscriptions and services.
     """
 
-    def __init__(self, events: Iterable[tuple[str, Fields]]) -> None:
+    def __init__(self, by_address: bool = False) -> None:
+        self._by_address = by_address
         self.nodes: Addresses[Node] = Addresses()
         self.publishers: Addresses[Publisher] = Addresses()
         self.callbacks: Addresses[Callback] = Addresses()
         #: By the handle that `rmw_take` names: the subscription's callbacks.
         self.taken: Addresses[list[Callback]] = Addresses()
         self.every: list[Callback] = []
+        self.made: list[Callback] = []
+        self.every_publisher: dict[int, Publisher] = {}
+        #: The names of the nodes.
+        self.names_of_nodes: dict[str, None] = {}
         #: When the first of the events was recorded, ns.
         self.begin = 0
         #: Events that lack what they should say, and are left out.
         self.incomplete = 0
-        self._entities: dict[str, Addresses[_Entity]] = {
-            kind: Addresses() for kind in ('timer', 'subscription', 'service')}
-        self._holders: Addresses[_Entity] = Addresses()
-        self._rmw: dict[_Entity, tuple[int, int]] = {}
-        self._made: dict[tuple[str, int, _Entity], Callback] = {}
+        #: By a callback's number its mutually exclusive group, or -1 for another one.
+        self.groups: dict[int, int] = {}
+        self._entities: dict[str, Addresses[Callback]] = {kind: Addresses() for kind in KINDS}
+        self._holders: Addresses[Callback] = Addresses()
         self._groups: Addresses[tuple[int, bool]] = Addresses()
-        self._numbers = count(1)
-        self._read(events)
-        self._label()
+        self._n_groups = 0
+        self._by_number: dict[int, Callback] = {}
+        self._symbols: dict[int, str] = {}      # of callbacks of which nothing else is known
 
     # --- reading ---------------------------------------------------------------------------------
 
-    def _read(self, events: Iterable[tuple[str, Fields]]) -> None:
+    def take(self, event: Event) -> None:
+        """Note what an event says, as ``TraceReader.events`` has it."""
+        name = event[0].partition(':')[2]
+        fields = _as_dict([field for field, _ in EVENTS[event[0]].fields], event)
+        if _complete(name, fields):
+            self._one(name, fields)
+
+    def read(self, events: Iterable[Event]) -> None:
+        """Note what all events of a recording say, as ``TraceReader.layout_events`` has them."""
         by_kind: dict[str, list[Fields]] = {}
         seen: set[tuple[Any, ...]] = set()
         waiting: list[tuple[str, Fields]] = []
         offsets: dict[int, int] = {}
-        for name, fields in events:
+        for event in events:
+            fields = _as_dict(event[0].fields, event)
             self.begin = min(self.begin or fields['_timestamp'], fields['_timestamp'])
-            if name == _CARET_INIT:
-                if fields.get('clock_offset'):
-                    offsets.setdefault(
-                        fields['_vpid'], fields['_timestamp'] - fields['clock_offset'])
-                continue
-            waiting.append((name.partition(':')[2], fields))
+            if event[0].name != _CARET_INIT:
+                waiting.append((event[0].name.partition(':')[2], fields))
+            elif fields.get('clock_offset'):
+                offsets.setdefault(fields['_vpid'], fields['_timestamp'] - fields['clock_offset'])
         waiting.sort(key=lambda item: 'init_timestamp' in item[1])
         for name, fields in waiting:
             if not _complete(name, fields):
                 self.incomplete += 1
                 continue
-            pid = fields['_vpid']
             if fields.get('init_timestamp') and offsets:
-                offset = offsets.get(pid, next(iter(offsets.values())))
+                offset = offsets.get(fields['_vpid'], next(iter(offsets.values())))
                 fields = {**fields, '_timestamp': fields['init_timestamp'] + offset}
             same = (name, *sorted((k, v) for k, v in fields.items()
                                   if k not in ('_timestamp', 'init_timestamp', '_vtid')))
-            repeated = 'init_timestamp' in fields
-            if same in seen and repeated:
-                continue
+            if same not in seen or 'init_timestamp' not in fields:
+                by_kind.setdefault(name, []).append(fields)
             seen.add(same)
-            by_kind.setdefault(name, []).append(fields)
-        self._build(by_kind)
+        for name in (*_INIT, *_GROUPS):
+            for fields in sorted(by_kind.get(name, ()), key=lambda f: f['_timestamp']):
+                self._one(name, fields)
+        self._label()
 
-    def _build(self, by_kind: dict[str, list[Fields]]) -> None:
-        """Register things in the order in which they refer to one another."""
-        def each(name: str) -> list[Fields]:
-            return sorted(by_kind.get(name, ()), key=lambda fields: fields['_timestamp'])
-
-        for f in each('rcl_node_init'):
-            name = f'{f["namespace"].rstrip("/")}/{f["node_name"]}'
-            self.nodes.add(f['_vpid'], f['node_handle'], f['_timestamp'],
-                           Node(f['_vpid'], name, f['_timestamp']))
-        for f in each('rcl_publisher_init'):
-            publisher = Publisher(next(self._numbers), self._node(f), f['topic_name'])
-            self.publishers.add(f['_vpid'], f['publisher_handle'], f['_timestamp'], publisher)
-        for f in each('rcl_subscription_init'):
-            entity = self._entity('subscription', f, f['subscription_handle'], f['topic_name'])
-            self._rmw[entity] = f['_vpid'], f['rmw_subscription_handle']
-        for f in each('rcl_service_init'):
-            self._entity('service', f, f['service_handle'], f['service_name'])
-        self._timers(each('rcl_timer_init'), each('rclcpp_timer_link_node'))
-        for f in each('rclcpp_subscription_init'):
-            found = self._entities['subscription'].nearest(
-                f['_vpid'], f['subscription_handle'], f['_timestamp'])
+    def _one(self, name: str, f: Fields) -> None:
+        """Note what an event says, which lacks nothing."""
+        pid, time = f['_vpid'], f['_timestamp']
+        if name == 'rcl_node_init':
+            node = Node(pid, f'{f["namespace"].rstrip("/")}/{f["node_name"]}', time)
+            self.nodes.add(pid, f['node_handle'], time, node)
+            self.names_of_nodes[node.name] = None
+        elif name == 'rcl_publisher_init':
+            handle = f['publisher_handle']
+            number = signed(handle) if self._by_address else len(self.every_publisher) + 1
+            publisher = Publisher(number, self._node(f), f['topic_name'])
+            self.every_publisher[number] = publisher
+            self.publishers.add(pid, handle, time, publisher)
+        elif name == 'rcl_subscription_init':
+            self._made('subscription', f, f['topic_name']).rmw = pid, f['rmw_subscription_handle']
+        elif name == 'rcl_service_init':
+            self._made('service', f, f['service_name'])
+        elif name == 'rcl_timer_init':
+            self._made('timer', f)
+        elif name == 'rclcpp_timer_link_node':
+            timer = self._entities['timer'].nearest(pid, f['timer_handle'], time)
+            if timer is not None:
+                timer.node = self._node(f)
+        elif name == 'rclcpp_subscription_init':
+            found = self._entities['subscription'].nearest(pid, f['subscription_handle'], time)
             if found is not None:
-                self._holders.add(f['_vpid'], f['subscription'], f['_timestamp'], found)
-        for f in each('rclcpp_subscription_callback_added'):
-            self._callback('subscription', f, f['subscription'])
-        for kind in ('timer', 'service'):
-            for f in each(f'rclcpp_{kind}_callback_added'):
-                self._callback(kind, f, f[f'{kind}_handle'])
-        for f in each('rclcpp_callback_register'):
-            callback = self.callbacks.nearest(f['_vpid'], f['callback'], f['_timestamp'])
-            if callback is not None and not callback.symbol:
+                self._holders.add(pid, f['subscription'], time, found)
+        elif name == 'rclcpp_subscription_callback_added':
+            self._callback('subscription', f, self._holders, f['subscription'])
+        elif name == 'rclcpp_callback_register':
+            callback = self.callbacks.nearest(pid, f['callback'], time)
+            if callback is None:
+                self._symbols[signed(f['callback'])] = f['symbol']
+            elif not callback.symbol:
                 callback.symbol = f['symbol']
-        self._add_groups(each)
+        elif name.endswith('_callback_added'):
+            kind = name.split('_')[1]
+            self._callback(kind, f, self._entities[kind], f[f'{kind}_handle'])
+        elif name.startswith('callback_group_add_'):
+            self._add_to_group(f, name.rpartition('_')[2])
+        elif name in _GROUPS and self._groups.nearest(
+                pid, f['callback_group_addr'], time) is None:
+            self._n_groups += 1
+            self._groups.add(pid, f['callback_group_addr'], time, (
+                self._n_groups, f['group_type_name'] == 'mutually_exclusive'))
 
     def _node(self, f: Fields) -> Node | None:
         return self.nodes.nearest(f['_vpid'], f['node_handle'], f['_timestamp'])
 
-    def _entity(self, kind: str, f: Fields, handle: int, start: str) -> _Entity:
-        entity = _Entity(
-            kind, self._node(f), start, 0, f['_timestamp'], next(self._numbers))
-        self._entities[kind].add(f['_vpid'], handle, f['_timestamp'], entity)
+    def _made(self, kind: str, f: Fields, start: str = '') -> Callback:
+        time, is_timer = f['_timestamp'], kind == 'timer'
+        entity = Callback(
+            None if is_timer else self._node(f), kind, start, f['period'] if is_timer else 0,
+            time, time if is_timer else None)
+        self._entities[kind].add(f['_vpid'], f[f'{kind}_handle'], time, entity)
+        self.made.append(entity)
         return entity
 
-    def _timers(self, timers: list[Fields], links: list[Fields]) -> None:
-        nodes: Addresses[Node | None] = Addresses()
-        for f in links:
-            nodes.add(f['_vpid'], f['timer_handle'], f['_timestamp'], self._node(f))
-        for f in timers:
-            node = nodes.nearest(f['_vpid'], f['timer_handle'], f['_timestamp'])
-            entity = _Entity(
-                'timer', node, '', f['period'], f['_timestamp'], next(self._numbers))
-            self._entities['timer'].add(
-                f['_vpid'], f['timer_handle'], f['_timestamp'], entity)
+    def _callback(self, kind: str, f: Fields, of: Addresses[Callback], holder: int) -> None:
+        pid, time, address = f['_vpid'], f['_timestamp'], f['callback']
+        callback = of.nearest(pid, holder, time) or Callback(None, kind, made=time)
+        callback.address = pid, address
+        self.callbacks.add(pid, address, time, callback)
+        if not callback.number:
+            self._number(callback, address)
+            if callback.rmw is not None:
+                self.taken.add(*callback.rmw, callback.made, [callback])
 
-    def _callback(self, kind: str, f: Fields, holder: int) -> None:
+    def _number(self, callback: Callback, address: int) -> None:
+        self.every.append(callback)
+        callback.number = signed(address) if self._by_address else len(self.every)
+        self._by_number[callback.number] = callback
+
+    def _add_to_group(self, f: Fields, kind: str) -> None:
         pid, time = f['_vpid'], f['_timestamp']
-        entity = (self._holders if kind == 'subscription' else self._entities[kind]).nearest(
-            pid, holder, time)
-        if entity is None:
-            callback = Callback(len(self.every) + 1, None, kind, made=time)
-            self.every.append(callback)
-        else:
-            made = self._made.get((kind, pid, entity))
-            if made is None:
-                made = Callback(
-                    len(self.every) + 1, entity.node, kind, entity.start, entity.period,
-                    entity.time, entity.time if kind == 'timer' else None)
-                self._made[(kind, pid, entity)] = made
-                self.every.append(made)
-                if entity in self._rmw:
-                    self.taken.add(*self._rmw[entity], entity.time, [made])
-            callback = made
-        self.callbacks.add(pid, f['callback'], time, callback)
-
-    # --- groups ----------------------------------------------------------------------------------
-
-    def _add_groups(self, each: Any) -> None:
-        number = 0
-        for name in _GROUPS[:3]:
-            for f in each(name):
-                number += 1
-                known = self._groups.nearest(f['_vpid'], f['callback_group_addr'], f['_timestamp'])
-                if known is None:
-                    exclusive = f.get('group_type_name') == 'mutually_exclusive'
-                    self._groups.add(f['_vpid'], f['callback_group_addr'], f['_timestamp'],
-                                     (number, exclusive))
-        for kind in ('timer', 'subscription', 'service'):
-            for f in each(f'callback_group_add_{kind}'):
-                pid, time = f['_vpid'], f['_timestamp']
-                entity = self._entities[kind].nearest(pid, f[f'{kind}_handle'], time)
-                group = self._groups.nearest(pid, f['callback_group_addr'], time)
-                callback = None if entity is None else self._made.get((kind, pid, entity))
-                if callback is not None and group is not None:
-                    callback.group = group[0] if group[1] else -1
-
-    # --- looking up ------------------------------------------------------------------------------
+        callback = self._entities[kind].nearest(pid, f[f'{kind}_handle'], time)
+        group = self._groups.nearest(pid, f['callback_group_addr'], time)
+        if callback is not None and callback.number and group is not None:
+            callback.group = group[0] if group[1] else -1
+            self.groups[callback.number] = callback.group
 
     def _label(self) -> None:
         """Give callbacks labels that are different."""
@@ -316,15 +325,37 @@ class Entities:
             number = used[description] = used.get(description, 0) + 1
             callback.label = description if number == 1 else f'{description} #{number}'
 
+    # --- looking up ------------------------------------------------------------------------------
+
     def callback(self, pid: int, address: int, time: int) -> Callback:
         """Return the callback that an event at run time means, if need be a new, unknown one."""
         found = self.callbacks.latest(pid, address, time)
         if found is None:
-            found = Callback(len(self.every) + 1, None, 'unknown', made=time)
+            found = Callback(None, 'unknown', made=time)
+            self._number(found, address)
             found.label = f'callback {found.number} of process {pid}, whose start is not recorded'
-            self.every.append(found)
             self.callbacks.add(pid, address, time, found)
         return found
+
+    def topic(self, number: int) -> str:
+        """Return the topic that a callback subscribes to, empty for others."""
+        callback = self._by_number.get(number)
+        return callback.start if callback is not None and callback.kind == 'subscription' else ''
+
+    def name(self, number: int) -> str:
+        """Return what a callback is called that no declaration names."""
+        callback = self._by_number.get(number)
+        if callback is None:
+            return self._symbols.get(number, 'a callback whose start is not recorded')
+        if callback.label or callback.node is None:
+            return callback.label or callback.symbol
+        what = exact_duration(callback.period) if callback.period else callback.start
+        return entity_name(callback.node.name, callback.symbol, f'{callback.kind} {what}')
+
+
+def signed(address: int) -> int:
+    """Return an address as columns have it: with a sign."""
+    return address - 2 ** 64 if address >= 2 ** 63 else address
 
 
 _OPTIONAL = {'queue_depth', 'rmw_handle', 'rmw_publisher_handle', 'rmw_service_handle',
@@ -348,14 +379,13 @@ def _complete(name: str, fields: Fields) -> bool:
     ) and isinstance(fields.get('init_timestamp', 0), int)
 
 
-def fields_of(event: tuple[Any, ...]) -> Fields:
-    """Return an event of ``TraceReader.layout_events`` as a dict, as ``read_events`` has it."""
+def _as_dict(fields: Iterable[str], event: Event) -> Fields:
     return {'_timestamp': event[1], '_vpid': event[2], '_vtid': event[3],
-            **dict(zip(event[0].fields, event[4:]))}
+            **dict(zip(fields, event[4:]))}
 
 
-def as_table(event: tuple[Any, ...]) -> tuple[Any, ...]:
+def as_table(event: Event) -> Event:
     """Return an event of ``layout_events`` with the table's fields; None is one that it lacks."""
-    values = dict(zip(event[0].fields, event[4:]))
-    wanted = EVENTS[event[0].name].fields if event[0].name in EVENTS else ()
-    return (event[0].name, *event[1:4], *(values.get(field) for field, _ in wanted))
+    kind = EVENTS[event[0].name]
+    values = {**kind.defaults, **dict(zip(event[0].fields, event[4:]))}
+    return (event[0].name, *event[1:4], *(values.get(field) for field, _ in kind.fields))

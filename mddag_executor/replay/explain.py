@@ -259,7 +259,7 @@ class Explainer(Observer):
         for callback, vertex in np.unique(declared[:, :2], axis=0).tolist():
             self._vertex_of[callback] = vertex
         of_vertex = {vertex: callback for callback, vertex in self._vertex_of.items()}
-        groups = self._who.groups()
+        groups = self._who.groups
 
         def same_group(vertex: int, callback: int) -> bool:
             return groups.get(of_vertex.get(vertex, 0), -1) == groups.get(callback, -2)

@@ -22,7 +22,7 @@ others.  An observer overrides the methods of ``Observer`` to get one thing afte
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from mddag_executor.core.state import Decision
@@ -30,7 +30,6 @@ import numpy as np
 import numpy.typing as npt
 
 Event = tuple[Any, ...]
-Handlers = dict[str, Callable[[Event], None]]
 Ints = npt.NDArray[np.int64]
 Row = Sequence[Any]
 Numbers = tuple[Ints, Ints]
@@ -123,10 +122,6 @@ class Batch:
 
 class Observer:
     """Gets what happened, and does nothing with it."""
-
-    def handlers(self) -> Handlers:
-        """Return the methods for events that say who is who, by full name."""
-        return {}
 
     def take(self, batch: Batch) -> None:
         """Look at a batch; here: one thing after the other."""
@@ -248,23 +243,6 @@ class Batches:
             for observer in self._observers:
                 observer.finished(now, batch)
                 observer.take(batch)
-
-
-def merged(several: Sequence[Handlers]) -> Handlers:
-    """Return handlers that call all others for an event, in order."""
-    every: dict[str, list[Callable[[Event], None]]] = {}
-    for handlers in several:
-        for name, handler in handlers.items():
-            every.setdefault(name, []).append(handler)
-    return {name: each[0] if len(each) == 1 else _call_all(each) for name, each in every.items()}
-
-
-def _call_all(handlers: list[Callable[[Event], None]]) -> Callable[[Event], None]:
-    def call(event: Event) -> None:
-        for handler in handlers:
-            handler(event)
-
-    return call
 
 
 def different(values: Ints) -> list[int]:

@@ -1,34 +1,21 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What is collected while an imported run is played: counts, communication, paths, drift."""
+"""What is collected while an imported run is played: counts, communication, paths."""
 
 from __future__ import annotations
 
 from array import array
 from typing import Any
 
-from mddag_executor.replay.drift import declared_keys, undeclared
 from mddag_executor.replay.entities import Callback, Publisher
-from mddag_executor.replay.happenings import Batch, Handlers
+from mddag_executor.replay.happenings import Batch
 from mddag_executor.replay.imported_run import ImportedRun
 from mddag_executor.replay.linker import Execution, KEEP, LinkObserver, Publication
 from mddag_executor.replay.paths import PathBook
 from mddag_executor.replay.spread import Spread
-from mddag_executor.trace.census import Census
-from msg_graph import TaskSet
-from msg_graph.drift import Drift, drift, Observed, Releases
 import numpy as np
 
 _BATCH = 1024
-
-
-def observers_of(
-    run: ImportedRun, paths: bool
-) -> tuple[Communications, ImportedPaths | None, ImportedDrift | None]:
-    """Return what collects the figures of a run; paths and drift only where ``paths`` says so."""
-    if not paths:
-        return Communications(), None, None
-    return Communications(), ImportedPaths(run), ImportedDrift(run)
 
 
 class _Executions:
@@ -189,41 +176,3 @@ class ImportedPaths(LinkObserver):
     def took(self, run: Execution, message: Publication) -> None:
         """Note a message that a callback took itself."""
         self._add(3, run, run.number, message.number)
-
-
-class ImportedDrift(LinkObserver):
-    """
-    Collects, while an imported run is played, what shows where it drifted.
-
-    Such a recording has no jobs; the starts of a source's callback count as its releases.
-    """
-
-    def __init__(self, run: ImportedRun) -> None:
-        self._census = Census(keep_times=0)
-        self._declared = bool(run.task_set.dags)
-
-    def raw_handlers(self) -> Handlers:
-        """Return the methods for who there is, and for what callbacks do."""
-        return dict.fromkeys(self._census.handlers, self._census.take) if self._declared else {}
-
-    def drift(self, judge: TaskSet) -> list[Drift]:
-        """Return where the run and a declaration disagree."""
-        if not self._declared:
-            return []
-        observed = Observed(
-            nodes=set(self._census.publishers), undeclared=undeclared(self._census, judge))
-        first, last = [], []
-        sources = {dag.vertices[dag.source].callback.key for dag in judge.dags}
-        for address, key in declared_keys(self._census, judge).items():
-            runs = self._census.runs.get(address)
-            if runs is None:
-                continue
-            observed.ran[key] = observed.ran.get(key, 0) + runs.count
-            observed.got[key] = observed.ran[key]
-            observed.publishes[key] = {*observed.publishes.get(key, ()), *runs.publishes}
-            if key in sources:
-                observed.releases[key] = Releases(runs.count, runs.first, runs.last)
-            first.append(runs.first)
-            last.append(runs.last)
-        observed.duration_ns = max(last) - min(first) if first else 0
-        return drift(judge, observed)

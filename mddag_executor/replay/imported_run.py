@@ -33,17 +33,16 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable as Function
 from collections.abc import Sequence
-from typing import Any
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, legs_of, NEVER
 from mddag_executor.replay.doubts import Doubts
-from mddag_executor.replay.entities import as_table, Callback, Entities, fields_of, INIT_EVENTS
+from mddag_executor.replay.entities import Callback, Entities, Event, INIT_EVENTS
 from mddag_executor.replay.happenings import (
     Batches,
     COMPLETED,
     ENDED,
-    merged,
     Observer,
+    PUBLISHED,
     RAN,
     RELEASED,
     STARTED,
@@ -59,7 +58,6 @@ from mddag_executor.replay.matching import Matching, Target
 from mddag_executor.replay.recording import Head, named_errors, no_run
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
-from mddag_executor.trace.census import Census
 from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
@@ -88,7 +86,7 @@ class ImportedRun(LinkObserver):
         first: int | None = None
         threads: set[tuple[int, int]] = set()
         own = False
-        init: list[tuple[str, dict[str, Any]]] = []
+        init: list[Event] = []
         for event in reader.layout_events(INIT_EVENTS | {_START, *_OWN}):
             name_of_event = event[0].name
             if name_of_event == _START:
@@ -97,17 +95,17 @@ class ImportedRun(LinkObserver):
             elif name_of_event in _OWN:
                 own = True      # of this executor, but what it ran is lost
             else:
-                init.append((name_of_event, fields_of(event)))
+                init.append(event)
         if first is None or own:
             raise no_run(reader)
         #: Who is who in it.
-        self.entities = Entities(init)
-        self.who = _Who(self.entities)
+        self.who = Entities()
+        self.who.read(init)
         # What another executor goes by is not recorded; it takes the place of the pool.
         self.head = Head(first, '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
-        self._matching = Matching(name, self.entities, threads, task_set)
-        #: The declaration that judges.
-        self.task_set = self._matching.task_set
+        self._matching = Matching(name, self.who, threads, task_set)
+        #: The declaration that judges; none is recorded.
+        self.task_set = self.recorded_set = self._matching.task_set
         self.targets = self._matching.target
         #: The first release or the time at which the first execution became ready, ns.
         self.start: int | None = None
@@ -117,7 +115,7 @@ class ImportedRun(LinkObserver):
         self.jobs = 0
         self.dropped: Counter[str] = Counter()
         self._doubts = Doubts(self.task_set.dags)
-        self._linker = Linker(self.entities, self)
+        self._linker = Linker(self.who, self)
         self._workers: dict[tuple[int, int], int] = {}
         self._timers = _Timers()
         self._fallbacks: Counter[str] = Counter()
@@ -170,16 +168,10 @@ class ImportedRun(LinkObserver):
         self._batches = Batches(observers)
         self._add = self._batches.add
         self._links = [each for each in observers if isinstance(each, LinkObserver)]
-        more = merged([observer.raw_handlers() for observer in self._links])
         count = 0
-        take, linked = self._linker.take, self._linker.events
+        take = self._linker.take
         with named_errors(self._reader.path, self.name):
-            for event in self._reader.layout_events({*linked, *more}):
-                name = event[0].name
-                if name in more:
-                    more[name](as_table(event))
-                if name not in linked:
-                    continue
+            for event in self._reader.layout_events(self._linker.events):
                 take(event)
                 count += 1
                 if event[1] > self.end:
@@ -324,6 +316,11 @@ class ImportedRun(LinkObserver):
         of = None if message.run is None else message.run.of
         if of is not None and (message.stamp or message.within):
             self._doubts.sent(of[0], of[2], message.topic)
+        if message.publisher is not None:
+            run = message.run
+            self._add(PUBLISHED, message.publisher.number,
+                      -1 if run is None else run.callback.number, *(of or (-1, -1, -1)),
+                      -1 if run is None else run.ready, message.time)
         for observer in self._links:
             observer.sent(message)
 
@@ -339,9 +336,9 @@ class ImportedRun(LinkObserver):
         """Return what is missing or doubtful, one line each, once it has been played."""
         name, path = self.name, self._reader.path
         lines = [renamed(text, path, name) for text in self._reader.warnings]
-        if self.entities.incomplete:
+        if self.who.incomplete:
             lines.append(
-                f'{name}: left out: {counted(self.entities.incomplete, "event")} of the '
+                f'{name}: left out: {counted(self.who.incomplete, "event")} of the '
                 'initialisation without some of the fields')
         lines += self._matching.warnings
         lines += [f'{name}: {text}' for text in self._linker.losses.lines()]
@@ -360,19 +357,6 @@ class ImportedRun(LinkObserver):
         if self._dags and self.jobs == 0:
             lines.append(f'{name}: no job was released in it')
         return lines
-
-
-class _Who(Census):
-    """Who is who, by the numbers of callbacks."""
-
-    def __init__(self, entities: Entities) -> None:
-        super().__init__(keep_times=0)
-        self._groups = {
-            callback.number: callback.group for callback in entities.every
-            if callback.group is not None
-            and callback.kind in ('timer', 'subscription', 'service')}
-        self._names = {callback.number: callback.label or callback.description
-                       for callback in entities.every}
 
 
 class _Timers:

@@ -49,7 +49,7 @@ from collections.abc import Callable as Function
 from typing import Any
 
 from mddag_executor.replay.entities import Callback, Entities, Publisher
-from mddag_executor.replay.happenings import Handlers, Observer
+from mddag_executor.replay.happenings import Observer
 from mddag_executor.text import counted
 from mddag_executor.trace.channels import Layout
 
@@ -134,10 +134,6 @@ class Publication:
 
 class LinkObserver(Observer):
     """Gets what the linker finds, in the order of time, and does nothing with it."""
-
-    def raw_handlers(self) -> Handlers:
-        """Return the methods for events as they were recorded, by full name."""
-        return {}
 
     def began(self, run: Execution, message: Publication | None) -> None:
         """Note that an execution has begun, with the message that it runs for."""

@@ -45,11 +45,11 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.replay.dispatches import Dispatches
+from mddag_executor.replay.entities import Entities
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.simulate import Load
 from mddag_executor.simulate.deliveries import DELAY_NS
 from mddag_executor.simulate.load import edge_numbers, edges_of, FAILS, RUNS, SKIPPED
-from mddag_executor.trace.census import Census
 from msg_graph import Dag, TaskSet
 
 _UNKNOWN = -1
@@ -119,7 +119,7 @@ class LoadBuilder(Observer):
     """
 
     def __init__(
-        self, task_set: TaskSet, tables: Tables, who: Census, n_workers: int, cpus: int = 0,
+        self, task_set: TaskSet, tables: Tables, who: Entities, n_workers: int, cpus: int = 0,
         recorded: Sequence[int] | None = None,
     ) -> None:
         self._task_set = task_set
@@ -172,7 +172,7 @@ class LoadBuilder(Observer):
         row = -1 if vertex < 0 else self._jobs[dag].row.get(job, -1)
         if row >= 0 and not self._edges_into[vertex]:
             ready = max(ready, self._round_end(self._jobs[dag], row))
-        group: int | None = self._who.groups().get(callback, _UNTOLD)
+        group: int | None = self._who.groups.get(callback, _UNTOLD)
         if group == _UNTOLD and vertex >= 0 and self._declared_group[vertex] >= 0:
             group = _UNTOLD - 1 - self._declared_group[vertex]
         if group in (_NO_GROUP, _UNTOLD):

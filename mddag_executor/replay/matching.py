@@ -28,7 +28,7 @@ from mddag_executor.replay.recording import ReplayError
 from mddag_executor.text import counted, listed
 from msg_graph import Callback as Declared
 from msg_graph import format_duration, TaskSet
-from msg_graph.binding import Entity, is_period
+from msg_graph.binding import is_period
 
 NO_TASK_SET = TaskSet((), (), (), (), None, '', '')
 """The declaration of those who gave none."""
@@ -114,9 +114,8 @@ class Matching:
     ) -> None:
         absent = [c for c in judge.callbacks if c.key not in found]
         missing = [c.key for c in absent]
-        others = [Entity(c.node.name, c.kind, c.start, c.period)
-                  for c in entities.every
-                  if c.node is not None and c.number not in self.target]
+        others = [c.entity for c in entities.every
+                  if c.entity is not None and c.number not in self.target]
         if len(missing) == len(judge.callbacks):
             known = [c.label for c in entities.every if c.kind != 'service']
             has = f'it has {listed(known)}' if known else 'it does not say what its callbacks are'

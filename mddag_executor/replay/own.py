@@ -26,6 +26,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from mddag_executor.core import NEVER
+from mddag_executor.replay.entities import Entities, OWN_INIT_EVENTS
 from mddag_executor.replay.happenings import (
     Batch,
     COMPLETED,
@@ -34,9 +35,7 @@ from mddag_executor.replay.happenings import (
     Event,
     FAILED,
     FIELD,
-    Handlers,
     Ints,
-    merged,
     MISSED,
     NOW,
     Numbers,
@@ -51,7 +50,6 @@ from mddag_executor.replay.mapping import Mapping
 from mddag_executor.replay.recording import declared, Head, named_errors, TASK_SET
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
-from mddag_executor.trace.census import Census
 from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.events import Events
 from mddag_executor.trace.times import FAR_NS
@@ -67,6 +65,7 @@ _NUMBERS = (_START, _END, _PUBLISH, _RELEASE, _DISPATCH, _COMPLETE, _DEADLINE,
             _FAIL, _EXPIRE, _ABORT, _LOST, STOP)
 _DROP, _HOSTED, _SHUTDOWN = 'mddag:drop', 'mddag:hosted', 'mddag:shutdown'
 _JUDGE_FROM = 'mddag:judge_from'
+_CUT = OWN_INIT_EVENTS | {_HOSTED, _JUDGE_FROM, _SHUTDOWN}     # what others mean changes there
 _WIDTH = 10     # of a dispatch
 # Columns of an execution.
 X_DAG, X_VERTEX, X_JOB, X_READY, X_START, X_END, X_BUSY, X_NUMBER, _N_EXECUTION = range(9)
@@ -97,7 +96,7 @@ class OwnRun:
         #: What ``open_run`` is to be given to open it again.
         self.recording = reader.path, task_set, name
         #: Who is who in it.
-        self.who = Census(keep_times=0)
+        self.who = Entities(by_address=True)
         #: The DAG tasks that it was recorded with; its events refer to them by index.
         self.recorded_set = declared(head, name)
         self._mapping = mapping = Mapping(name, self.recorded_set, task_set)
@@ -113,8 +112,6 @@ class OwnRun:
         self.workers_each = head.workers
         #: Which nodes ran in which of them; empty: all in one.
         self.placed: Sequence[Process] = ()
-        #: The greatest time of an event, ns.
-        self.last = 0
         #: Called when it has been played.
         self.when_played: Callable[[], object] | None = None
         #: What is to be said of it beside: of the traces that it was joined from.
@@ -134,13 +131,11 @@ class OwnRun:
     ) -> None:
         """Give the observers everything."""
         self._observers = observers
-        who = merged([dict.fromkeys(self.who.who, self.who.take),
-                      *(observer.handlers() for observer in observers)])
         count = 0
         with named_errors(self._reader.path, self.name):
             for events in self._reader.batches(
-                    {*who, *_NUMBERS, TASK_SET, _DROP, _HOSTED, _JUDGE_FROM, _SHUTDOWN}):
-                self._play(events, who)
+                    {*_NUMBERS, *_CUT, TASK_SET, _DROP}):
+                self._play(events)
                 count += len(events)
                 if progress is not None:
                     progress(count)
@@ -189,11 +184,11 @@ class OwnRun:
 
     # --- batches ---------------------------------------------------------------------------------
 
-    def _play(self, events: Events, who: Handlers) -> None:
+    def _play(self, events: Events) -> None:
         """Report a batch of the trace's events, in parts where it must be cut."""
         numbers, others = self._sorted_out(events)
         cuts = [place for place, event in others
-                if event[0] in who or event[0] in (_HOSTED, _JUDGE_FROM, _SHUTDOWN)]
+                if event[0] in _CUT]
         first, at = 0, 0
         for cut in (*cuts, len(events)):
             part = {}
@@ -202,12 +197,12 @@ class OwnRun:
                 if end > begin:
                     part[name] = places[begin:end] - first, rows[begin:end]
             while at < len(others) and others[at][0] < cut:
-                self._one(others[at][1], who)
+                self._one(others[at][1])
                 at += 1
             if part:
                 self._pass_on(part, cut - first)
             if at < len(others) and others[at][0] == cut:
-                self._one(others[at][1], who)
+                self._one(others[at][1])
                 at += 1
             first = cut + 1
 
@@ -281,7 +276,6 @@ class OwnRun:
 
     def _advance(self, numbers: dict[str, Numbers]) -> None:
         """Move the run's end on to what the executor's core saw last."""
-        self.last = max(self.last, *(int(rows[:, NOW].max()) for _, rows in numbers.values()))
         if not self.shut_down:
             for name in (_RELEASE, _COMPLETE, _DEADLINE, _FAIL, _EXPIRE, _ABORT):
                 if name in numbers:
@@ -342,12 +336,10 @@ class OwnRun:
 
     # --- events that are taken in one by one -----------------------------------------------------
 
-    def _one(self, event: Event, who: Handlers) -> None:
+    def _one(self, event: Event) -> None:
         name = event[0]
-        if name != TASK_SET:
-            self.last = max(self.last, event[1])
-        if name in who:
-            who[name](event)
+        if name in OWN_INIT_EVENTS:
+            self.who.take(event)
         if name in (_DROP, _HOSTED, _JUDGE_FROM) and not self.shut_down:
             self.end = max(self.end, event[1])
         if name == _DROP:

@@ -71,7 +71,7 @@ class OwnPaths(Observer):
         ended = np.column_stack((
             batch.places(RAN)[chosen], self._callback[vertex],
             self._run(vertex, ran[:, 3], ran[:, 5]), ran[:, 7]))
-        if not self._who.published_by():     # what is published is not recorded
+        if not self._who.every_publisher:     # what is published is not recorded
             sent = self._at_ends(ended, ran)
         else:
             sent = self._published(batch)
@@ -84,8 +84,7 @@ class OwnPaths(Observer):
     def _number_of(self, callbacks: Ints) -> Ints:
         """Return the numbers of the topics of callbacks: -2 of one that no path leads over."""
         different, which = np.unique(callbacks, return_inverse=True)
-        topic_of = self._who.topics()
-        topics = [topic_of.get(callback, '') for callback in different.tolist()]
+        topics = [self._who.topic(callback) for callback in different.tolist()]
         return np.array([self.book.topics.get(topic, -2) if topic else NONE
                          for topic in topics], dtype=np.int64)[which]
 
@@ -112,11 +111,12 @@ class OwnPaths(Observer):
         """Return what is published on topics that paths lead over."""
         published = batch.columns(PUBLISHED)
         different, which = np.unique(published[:, 0], return_inverse=True)
-        by = self._who.published_by()
-        known = [by.get(address, ('', '')) for address in different.tolist()]
+        known = [self._who.every_publisher.get(number) for number in different.tolist()]
         topic, node = np.array(
-            [(self.book.topics.get(of, NONE), self.book.nodes.get(name, NONE))
-             for name, of in known], dtype=np.int64).reshape(-1, 2)[which].T
+            [(NONE, NONE) if each is None else (
+                self.book.topics.get(each.topic, NONE),
+                self.book.nodes.get(each.node.name if each.node is not None else '', NONE))
+             for each in known], dtype=np.int64).reshape(-1, 2)[which].T
         vertex = published[:, 3]
         callback = np.where(published[:, 2] < 0, NONE, self._callback[vertex])
         chosen = np.flatnonzero(

@@ -208,7 +208,7 @@ def reschedule(
             f'and no execution_time is declared: {listed(work.unknown)}',
             'give a GRAPH that declares it')
     tables = with_groups(
-        tables, builder.callback_of, run.who.groups(), declared_first=not run.same)
+        tables, builder.callback_of, run.who.groups, declared_first=not run.same)
     builders.clear()    # what it holds, the load has too
     del builder
     give_back()

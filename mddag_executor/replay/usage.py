@@ -8,8 +8,8 @@ from collections import Counter, deque
 from itertools import islice
 from typing import Any
 
+from mddag_executor.replay.entities import Entities
 from mddag_executor.replay.happenings import Batch, COMPLETED, Ints, Observer, RAN, sums
-from mddag_executor.trace.census import Census
 from msg_graph import TaskSet
 import numpy as np
 
@@ -25,7 +25,7 @@ class GroupWaits(Observer):
     :ivar found: of the last batch: by piece, how long its group was busy, ns.
     """
 
-    def __init__(self, who: Census) -> None:
+    def __init__(self, who: Entities) -> None:
         self._who = who
         # by group what ran in it last: start and end
         self._busy: dict[int, deque[tuple[int, int]]] = {}
@@ -35,7 +35,7 @@ class GroupWaits(Observer):
         """Look how long pieces of executions waited."""
         pieces = batch.columns(RAN)
         self.found = np.zeros(len(pieces), dtype=np.int64)
-        number = self._who.groups()
+        number = self._who.groups
         if not len(pieces) or not number:
             return
         callbacks, which = np.unique(pieces[:, 0], return_inverse=True)

@@ -122,10 +122,10 @@ class Planned(VirtualRun):
         for group in set(self.groups.values()):
             self.record('add_callback_group', START_TIME, 1, 1, 900 + group, 'mutually_exclusive')
         for vertex, group in self.groups.items():
-            self.record('callback_group_add_timer', START_TIME, 1, 900 + group, 800 + vertex)
             self.record('rcl_timer_init', START_TIME, 1, 800 + vertex, 1)
             self.record('rclcpp_timer_callback_added', START_TIME, 1, 800 + vertex,
                         self._address(vertex))
+            self.record('callback_group_add_timer', START_TIME, 1, 900 + group, 800 + vertex)
 
 
 BUSY = {FIRST: (30 * MS, 30 * MS), SECOND: (30 * MS, 30 * MS)}

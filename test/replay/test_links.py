@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mddag_executor.replay.drafting import System
 from mddag_executor.replay.imported_run import ImportedRun
 from mddag_executor.replay.linker import Execution, LinkObserver, Publication
 from mddag_executor.replay.run import open_run
@@ -214,9 +215,10 @@ def test_what_was_initialised_before_the_recording(tmp_path: Path) -> None:
     recorded.run(CAMERA, 1, 131 * MS, 132 * MS)
     run = open_run(recorded.write())
     assert isinstance(run, ImportedRun)
-    entities = run.entities
-    assert [(c.label, c.grid) for c in entities.every] == [
+    assert [(c.label, c.grid) for c in run.who.every] == [
         ('/camera timer 100ms', BEGIN + 30 * MS)]
+    drafted, = System(recorded.path).draft().callbacks()
+    assert (drafted.node, drafted.period_ns) == ('/camera', 100 * MS)
 
 
 def test_any_lost_event_is_said_or_changes_nothing(recorded: Recorded) -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.replay import replay
+from mddag_executor.replay.entities import Entities
 from mddag_executor.replay.happenings import Batch, Piece, RAN
 from mddag_executor.replay.usage import GroupWaits, PoolUse
 from mddag_executor.trace import TraceFile
-from mddag_executor.trace.census import Census
 import numpy as np
 
 from .helpers import MS, START_TIME
@@ -48,10 +48,12 @@ def piece(callback: int, ready: int, start: int, end: int) -> Piece:
 
 
 def test_waits_for_the_group() -> None:
-    groups = Census()
+    groups = Entities(by_address=True)
     groups.take(('ros2_caret:add_callback_group', 0, 0, 0, 1, 50, 'mutually_exclusive'))
     groups.take(('ros2_caret:add_callback_group', 0, 0, 0, 1, 60, 'reentrant'))
     for entity, group in ((1, 50), (2, 50), (3, 60)):
+        groups.take(('ros2:rcl_timer_init', 0, 0, 0, entity, 5))
+        groups.take(('ros2:rclcpp_timer_callback_added', 0, 0, 0, entity, entity))
         groups.take(('ros2_caret:callback_group_add_timer', 0, 0, 0, group, entity))
     waits = GroupWaits(groups)
     pieces = [piece(1, 0, 2, 10), piece(2, 4, 12, 20), piece(3, 5, 20, 30),
