@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 import weakref
 
@@ -22,6 +22,7 @@ from mddag_executor.live.entity import (
     WAITABLE,
 )
 from mddag_executor.live.gates import decides_itself, Gate
+from mddag_executor.live.intake.entities import EntitySet
 from mddag_executor.live.work import Work
 from msg_graph import binding, Callback, TaskSet
 from msg_graph.duration import exact_duration
@@ -31,9 +32,8 @@ from rclpy.qos import HistoryPolicy
 
 _MOST_UNDECLARED = 4096
 
-KINDS = (
-    ('timers', TIMER), ('subscriptions', SUBSCRIPTION), ('services', SERVICE),
-    ('clients', CLIENT), ('guards', GUARD), ('waitables', WAITABLE))
+KINDS = (TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE)
+"""In the order of ``entities.LISTS``."""
 
 
 class Registry:
@@ -76,20 +76,21 @@ class Registry:
         return self._task_set.callbacks if self._task_set is not None else ()
 
     def refresh(
-        self, nodes: Iterable[Any], keep: bool = False
+        self, found: EntitySet, keep: bool = False
     ) -> tuple[list[Entity], list[Entity]]:
         """
-        Look which entities the nodes have now.
+        Take over which entities the nodes have now.
 
+        :param found: what the nodes have.
         :param keep: whether entities that are gone stay known for now.
         :return: those that are new, and those that are gone.
         """
         present: dict[int, Entity] = {}
         added: list[Entity] = []
-        for node in nodes:
+        for node, lists in found.by_node.items():
             name = self._name(node)
-            for attribute, kind in KINDS:
-                for rclpy_entity in getattr(node, attribute):
+            for kind, some in zip(KINDS, lists):
+                for rclpy_entity in some:
                     entity = self.by_id.get(id(rclpy_entity))
                     if entity is None or entity.rclpy is not rclpy_entity or self._retimed(entity):
                         entity = self._new_entity(kind, rclpy_entity, name)

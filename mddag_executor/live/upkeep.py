@@ -85,30 +85,35 @@ class Upkeep:
                 return
             start = time.monotonic()
             self.changed = False
-            nodes = self._nodes()
-            self._register(nodes)
+            self._look()
+            self._register()
             self._pool.is_settled = True
             if self.changed:  # meanwhile
                 self._pool.is_settled = False
-            self._inform_intakes(nodes)
+            self._inform_intakes()
             end = time.monotonic()
             self._refresh_at = end + REFRESH_REST * (end - start)
 
     def hand_over(self) -> None:
         """Take nothing more of what another executor gets, and only then forget it."""
         with self._lock:
-            nodes = self._nodes()
-            self._register(nodes, keep=True)
-            self._inform_intakes(nodes)
+            self._look()
+            self._register(keep=True)
+            self._inform_intakes()
             end = time.monotonic() + HAND_OVER_S
             while not all(each.settled() for each in list(self._intakes)):
                 if time.monotonic() > end:
                     break
                 time.sleep(0.001)
-            self._register(nodes)
+            self._register()
 
-    def _register(self, nodes: list[Any], keep: bool = False) -> None:
-        added, gone = self._registry.refresh(nodes, keep)
+    def _look(self) -> None:
+        # Once for all: an intake must not take from what the registry does not know yet.
+        self.entities = snapshot(self._nodes(), self.entities)
+
+    def _register(self, keep: bool = False) -> None:
+        assert self.entities is not None
+        added, gone = self._registry.refresh(self.entities, keep)
         engine, pool = self._pool.engine, self._pool
         if engine.other_processes is not None and (added or gone):
             with pool.lock:
@@ -121,9 +126,9 @@ class Upkeep:
         for entity in gone:
             pool.report(engine.remove, entity)
         if self._recorder is not None:
-            self._recorder.entities(nodes, added)
+            self._recorder.entities(self.entities.nodes, added)
 
-    def _inform_intakes(self, nodes: list[Any]) -> None:
-        self.entities = snapshot(nodes, self.entities)
+    def _inform_intakes(self) -> None:
+        assert self.entities is not None
         for intake in self._intakes:
             intake.update(self.entities)

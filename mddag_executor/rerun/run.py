@@ -27,7 +27,7 @@ from mddag_executor.live import hooks
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import WAITABLE
 from mddag_executor.live.hosting import Guest
-from mddag_executor.live.intake.entities import is_qos_event
+from mddag_executor.live.intake.entities import is_qos_event, snapshot
 from mddag_executor.live.loading import describe, Program, ros_arguments
 from mddag_executor.live.other_processes import OtherProcesses
 from mddag_executor.live.recorder import Recorder
@@ -315,7 +315,7 @@ class Rerun:
         """Update which entities there are."""
         nodes = self._holder.ordered_nodes()
         registry, engine, now = self._registry, self._engine, self._loop.now
-        added, gone = registry.refresh(nodes)
+        added, gone = registry.refresh(snapshot(nodes))
         hosted = registry.hosted()
         self._hosted |= hosted
         if added or gone:

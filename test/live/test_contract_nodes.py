@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 import threading
 import time
 from typing import Any
@@ -14,6 +15,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
+from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
@@ -229,6 +231,87 @@ def test_entities_that_a_callback_makes_run(make_executor, make_node):
     assert spinning.error is None
     for made in kept:
         made.destroy()
+
+
+def test_what_is_made_while_the_executor_looks_is_not_lost(make_executor, make_node):
+    """A guard condition that is triggered before the executor knows of it."""
+    made: list[GuardCondition] = []
+    calls: list[int] = []
+
+    class Listed(Node):
+
+        def make(self) -> None:
+            made.append(self.create_guard_condition(lambda: calls.append(1)))
+            made[-1].trigger()
+
+        @property
+        def waitables(self) -> Any:
+            if len(made) == 1:  # as another thread would do it
+                self.make()
+            return super().waitables
+
+    node = Listed('listed', context=make_node().context, enable_rosout=False)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        executor.create_task(node.make)
+        assert wait_for(lambda: len(calls) == 2), (made, calls)
+    node.destroy_node()
+
+
+class LateSender:
+    """An action client's handle; a request is sent long before its number is returned."""
+
+    def __init__(self, handle: Any) -> None:
+        self._handle = handle
+        self._answered = threading.Event()
+
+    def __getattr__(self, name: str) -> Any:
+        function = getattr(self._handle, name)
+        if name.startswith('send_'):
+            return partial(self._send, function)
+        if name.startswith('take_') and name.endswith('_response'):
+            return partial(self._take, function)
+        return function
+
+    def _send(self, function: Any, *args: Any) -> Any:
+        self._answered.clear()
+        number = function(*args)
+        self._answered.wait(5.0)
+        time.sleep(0.02)
+        return number
+
+    def _take(self, function: Any, *args: Any) -> Any:
+        taken = function(*args)
+        self._answered.set()
+        return taken
+
+
+def test_an_action_that_answers_before_the_request_is_noted(make_executor, make_node):
+    node, group = make_node(), ReentrantCallbackGroup()
+    executor = make_executor()
+    executor.add_node(node)
+
+    def execute(goal: Any) -> Any:
+        goal.succeed()
+        return Fibonacci.Result(sequence=[3])
+
+    server = ActionServer(node, Fibonacci, '/late', execute, callback_group=group)
+    client = ActionClient(node, Fibonacci, '/late', callback_group=group)
+
+    async def ask() -> Any:
+        goal = await client.send_goal_async(Fibonacci.Goal())
+        return await goal.get_result_async()
+
+    with Spinning(executor) as spinning:
+        assert client.wait_for_server(5.0)
+        client._client_handle = LateSender(client._client_handle)
+        task = executor.create_task(ask)
+        assert wait_for(task.done)
+    assert spinning.error is None
+    assert list(task.result().result.sequence) == [3]
+    server.destroy()
+    client.destroy()
 
 
 @pytest.mark.parametrize('stepwise', [False, True])

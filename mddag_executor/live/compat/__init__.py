@@ -138,6 +138,23 @@ def attach_futures(waitable: Any, executor: Any) -> None:
         future._set_executor(executor)
 
 
+_NUMBERS = {
+    'goal': '_goal_sequence_number_to_goal_id', 'cancel': '_pending_cancel_requests',
+    'result': '_pending_result_requests'}
+
+
+def sender_is_behind(waitable: Any, data: Any) -> bool:
+    """
+    Return whether an action client has taken a response to a request that it does not know yet.
+
+    In 7.1.5 it sends a request before it notes its number, and throws away what comes in between:
+    the future would never be done (rclpy issue 1123).
+    """
+    return all(hasattr(waitable, numbers) for numbers in _NUMBERS.values()) and any(
+        name in data and data[name][0] not in getattr(waitable, numbers)
+        for name, numbers in _NUMBERS.items())
+
+
 def feedback_taken(waitable: Any, data: Any, most: int) -> list[tuple[Callable[..., Any], Any]]:
     """
     Return the feedback that an action client has taken, each with the callback that it is for.

@@ -25,7 +25,8 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.waitable import Waitable
 
-_LISTS = ('subscriptions', 'timers', 'clients', 'services', 'guards', 'waitables')
+LISTS = ('timers', 'subscriptions', 'services', 'clients', 'guards', 'waitables')
+"""What a node has, by the names of its properties."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,7 @@ class EntitySet:
     QoS events (rclpy's ``EventHandler``, as it is) are apart from all other ``waitables``: a node
     has a few of them for every publisher and subscription, and they hardly ever become ready.
     ``logged_events`` are those that rclpy makes by itself, which only write to the log.
+    ``by_node`` has all of them, for each of ``LISTS``.
     """
 
     subscriptions: list[Subscription]
@@ -67,12 +69,12 @@ def snapshot(nodes: Iterable[Node], previous: EntitySet | None = None) -> Entity
         further snapshot is taken, as rclpy's nodes do by waking their executor).
     :param previous: an earlier set; returned itself if nothing changed.
     """
-    found = {node: tuple(list(getattr(node, name)) for name in _LISTS) for node in nodes}
+    found = {node: tuple(list(getattr(node, name)) for name in LISTS) for node in nodes}
     if previous is not None and found == previous.by_node:
         return previous
-    subscriptions, timers, clients, services, guards, waitables = (
+    timers, subscriptions, services, clients, guards, waitables = (
         [entity for lists in found.values() for entity in lists[index]]
-        for index in range(len(_LISTS)))
+        for index in range(len(LISTS)))
     events = [w for w in waitables if is_qos_event(w)]
     return EntitySet(
         [s for s in subscriptions if not is_of_wait_for_message(s)],

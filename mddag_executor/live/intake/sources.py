@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+import time
 from typing import Any, ClassVar
 
 from mddag_executor.live import compat
@@ -24,6 +25,7 @@ MOST_AT_ONCE = 64
 """So many are taken from one entity before the others have their turn."""
 
 _SERVICE_DEPTH = 10
+_SENDER_LOOKS, _SENDER_LOOK_S = 500, 0.001
 
 
 class Source:
@@ -197,9 +199,20 @@ class WaitableSource(Source):
         feedback = compat.feedback_taken(waitable, data, MOST_AT_ONCE)
         arrivals = [Work(waitable, callback, (message,)) for callback, message in feedback]
         if data or not arrivals:
-            arrivals.append(Work(waitable, waitable.execute, (data,)))
+            behind = compat.sender_is_behind(waitable, data)
+            execute = partial(_execute_late, waitable) if behind else waitable.execute
+            arrivals.append(Work(waitable, execute, (data,)))
         self._receiver.take_in(arrivals)
         return True
+
+
+def _execute_late(client: Any, data: Any) -> Any:
+    """Execute an action client's work once the thread that has sent the request has noted it."""
+    for _ in range(_SENDER_LOOKS):
+        if not compat.sender_is_behind(client, data):
+            break
+        time.sleep(_SENDER_LOOK_S)
+    return client.execute(data)
 
 
 SOURCES: dict[str, type[Source]] = {
