@@ -69,7 +69,7 @@ def snapshot(nodes: Iterable[Node], previous: EntitySet | None = None) -> Entity
         further snapshot is taken, as rclpy's nodes do by waking their executor).
     :param previous: an earlier set; returned itself if nothing changed.
     """
-    found = {node: tuple(list(getattr(node, name)) for name in LISTS) for node in nodes}
+    found = {node: tuple(_listed(node, name) for name in LISTS) for node in nodes}
     if previous is not None and found == previous.by_node:
         return previous
     timers, subscriptions, services, clients, guards, waitables = (
@@ -81,6 +81,15 @@ def snapshot(nodes: Iterable[Node], previous: EntitySet | None = None) -> Entity
         timers, clients, services, guards,
         [w for w in waitables if not is_qos_event(w)],
         [e for e in events if not only_logs(e)], [e for e in events if only_logs(e)], found)
+
+
+def _listed(node: Node, name: str) -> list[Any]:
+    """List what a node has, until nothing changes meanwhile: else a removal hides the next one."""
+    before: list[Any] | None = None
+    found = list(getattr(node, name))
+    while found != before:
+        before, found = found, list(getattr(node, name))
+    return found
 
 
 def alive(entity: Any) -> bool:

@@ -71,6 +71,23 @@ def test_a_snapshot_is_the_same_while_nothing_changes(ros_context: Context) -> N
     assert snapshot([], first).timers == []
 
 
+def test_a_snapshot_has_what_follows_something_that_is_destroyed_meanwhile(
+    ros_context: Context,
+) -> None:
+    class Busy(Node):
+
+        @property
+        def guards(self) -> Any:
+            for guard in super().guards:
+                yield guard
+                self.destroy_guard_condition(first)  # as another thread would do it
+
+    node = Busy('busy', context=ros_context)
+    first, second = (node.create_guard_condition(nothing) for _ in range(2))
+    assert snapshot([node]).guards == [second]
+    node.destroy_node()
+
+
 def test_comparing_a_thousand_entities_is_cheap(ros_context: Context) -> None:
     nodes = [make_node(ros_context) for _ in range(8)]
     for made in nodes:
