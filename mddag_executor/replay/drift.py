@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Set
 
-from mddag_executor.replay.entities import Entities
 from mddag_executor.replay.happenings import (
     Batch,
     different,
@@ -26,9 +25,9 @@ from mddag_executor.replay.happenings import (
     RELEASED,
     STARTED,
 )
+from mddag_executor.replay.matching import declared_keys
 from mddag_executor.replay.run import Run
 from msg_graph import TaskSet
-from msg_graph.binding import Binder
 from msg_graph.drift import Drift, drift, Observed, Releases
 import numpy as np
 
@@ -99,11 +98,3 @@ class DriftObserver(Observer):
             dict(ran + self._dropped), dict(ran), publishes, set(who.names_of_nodes) or None,
             [each.entity for each in who.made
              if each.entity is not None and each.number not in declared]))
-
-
-def declared_keys(who: Entities, task_set: TaskSet) -> dict[int, str]:
-    """Return the declared keys of callbacks, by what starts them."""
-    binder = Binder(task_set)
-    bound = [(each, binder.bind(each.entity)) for each in who.made if each.entity is not None]
-    return {each.number: callback.key
-            for each, callback in bound if callback is not None and each.number}

@@ -20,12 +20,12 @@ run: its jobs were not released, its sinks not completed.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence, Set
 
 from mddag_executor.core import legs_of
 from mddag_executor.replay.recording import ReplayError
 from mddag_executor.text import counted, listed
-from msg_graph import Callback, Dag, TaskSet, Vertex
+from msg_graph import Dag, TaskSet, Vertex
 from msg_graph.binding import entities_of, Entity, meant
 
 
@@ -76,24 +76,11 @@ class Mapping:
 
     def _compare(self, name: str, recorded: TaskSet, judge: TaskSet) -> None:
         """Find out which callbacks of the graph the trace does not have."""
-        known = {callback.key for callback in recorded.callbacks}
-        absent = [c for c in judge.callbacks if c.key not in known]
-        missing = [c.key for c in absent]
-        if not missing:
-            return
+        known = [callback.key for callback in recorded.callbacks]
         wanted = {callback.key for callback in judge.callbacks}
-        others = [each for callback in recorded.callbacks if callback.key not in wanted
-                  for each in entities_of(callback)]
-        if len(missing) == len(judge.callbacks):
-            raise ReplayError(
-                name, f'none of the callbacks of {judge.file} is in it: it has '
-                f'{listed([c.key for c in recorded.callbacks])}',
-                first_meant(absent, others) or
-                'give the graph of the nodes that were recorded, or none')
-        self.warnings.append(
-            f'{name}: not in it: {len(missing)} of the {len(judge.callbacks)} callbacks '
-            f'of {judge.file}, which count as never completed: {listed(missing)}'
-            + asked(absent, others))
+        self.warnings += report_missing(name, judge, set(known), known, [
+            each for callback in recorded.callbacks if callback.key not in wanted
+            for each in entities_of(callback)])
 
     def _report_unreleased(self) -> None:
         if self.same:
@@ -138,13 +125,26 @@ def _legs(vertex: Vertex, dag: Dag, other: Vertex, target: Dag) -> list[int]:
     return [places[topic].pop(0) for topic in topics]
 
 
-def first_meant(absent: Iterable[Callback], others: Sequence[Entity]) -> str | None:
-    """Return the first question about what is meant by callbacks that are not in a recording."""
+def report_missing(
+    name: str, judge: TaskSet, found: Set[str], known: Sequence[str], others: Sequence[Entity]
+) -> list[str]:
+    """
+    Return the line about callbacks of a declaration that are not in a recording, if any.
+
+    :param found: the keys of those that are.
+    :param known: what is called how in the recording; ``others``: what stands for nothing.
+    :raises ReplayError: when it has none of them.
+    """
+    absent = [callback for callback in judge.callbacks if callback.key not in found]
+    if not absent:
+        return []
     questions = ((c.key, meant(c, others)) for c in absent)
-    return next((f'{key}: {each}' for key, each in questions if each is not None), None)
-
-
-def asked(absent: Iterable[Callback], others: Sequence[Entity]) -> str:
-    """Return the same for the end of a line, empty where there is no question."""
-    question = first_meant(absent, others)
-    return '' if question is None else f': {question}'
+    question = next((f'{key}: {each}' for key, each in questions if each is not None), None)
+    if len(absent) == len(judge.callbacks):
+        has = f'it has {listed(known)}' if known else 'it does not say what its callbacks are'
+        raise ReplayError(
+            name, f'none of the callbacks of {judge.file} is in it: {has}',
+            question or 'give the graph of the nodes that were recorded, or none')
+    return [f'{name}: not in it: {len(absent)} of the {len(judge.callbacks)} callbacks of '
+            f'{judge.file}, which count as never completed: {listed([c.key for c in absent])}'
+            + ('' if question is None else f': {question}')]
