@@ -19,7 +19,7 @@ from mddag_executor.trace import TraceReader
 from msg_graph import load
 import pytest
 
-SMALL = """\
+GRAPH = """\
 mddag: 1
 workers: 2
 nodes:
@@ -30,13 +30,6 @@ nodes:
   - node: /c
     callbacks: [{name: c, sync: [/y, /z], deadline: 90ms, execution_time: 7ms}]
 """
-
-
-@pytest.fixture
-def graph(tmp_path: Path) -> Path:
-    path = tmp_path / 'graph.yaml'
-    path.write_text(SMALL)
-    return path
 
 
 def test_the_long_trace_is_what_an_executor_records(tmp_path: Path) -> None:
@@ -117,7 +110,7 @@ def test_accuracy_on_the_command_line(
 
 def test_a_live_run_is_predicted(tmp_path: Path, graph: Path) -> None:
     """Much nearer than without overheads, which are about as long as these callbacks."""
-    graph.write_text(SMALL.replace('100ms', '20ms').replace('9ms,', '1ms,').replace(
+    graph.write_text(GRAPH.replace('100ms', '20ms').replace('9ms,', '1ms,').replace(
         'execution_time: 9ms', 'execution_time: 200us').replace(
         'execution_time: 8ms', 'execution_time: 200us').replace(
         'execution_time: 7ms', 'execution_time: 200us'))

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import os
 from pathlib import Path
@@ -15,14 +14,6 @@ from mddag_executor.cli import common, options
 from mddag_executor.errors import InputError, UsageError
 import numpy
 import pytest
-
-
-@pytest.fixture
-def stdin(monkeypatch: pytest.MonkeyPatch):
-    """Give a function that sets what standard input holds."""
-    def put(data: bytes) -> None:
-        monkeypatch.setattr('sys.stdin', io.TextIOWrapper(io.BytesIO(data), encoding='utf-8'))
-    return put
 
 
 def test_a_dash_is_standard_input(stdin) -> None:

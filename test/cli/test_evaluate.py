@@ -38,15 +38,6 @@ nodes:
 BATCH = pytest.importorskip('matplotlib', reason='the extra batch is not there')
 
 
-@pytest.fixture
-def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Give a declaration in the working directory: runs of utilisation 0.75 and 0.95."""
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / 'graph.yaml'
-    path.write_text(GRAPH)
-    return path
-
-
 def test_table(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = call(
         capsys, graph, '--runs', 40, '--policies', 'rad,fifo', '--non-preemptive')

@@ -14,13 +14,7 @@ import pytest
 from .helpers import caller
 
 call = caller('generate')
-
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Give the working directory."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+pytestmark = pytest.mark.usefixtures('folder')
 
 
 def test_standard_output(capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,13 +25,6 @@ nodes:
 """
 
 
-@pytest.fixture
-def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / 'graph.yaml').write_text(GRAPH)
-    return tmp_path
-
-
 def test_a_placement_is_written_and_predicted(graph: Path, mddag: Mddag) -> None:
     run = mddag('graph', 'place', 'graph.yaml', '--processes', '2', '--cpus', '2',
                 '-o', 'placed.yaml', '--json', 'out.json')

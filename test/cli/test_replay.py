@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 import sys
@@ -168,14 +167,6 @@ def test_a_truncated_trace_gives_what_is_there(
     assert '3 sink jobs due' in out
     assert err.startswith(f'warning: {cut}: the summary at the end is damaged or missing: ')
     assert err.count('\n') == 1
-
-
-@pytest.fixture
-def stdin(monkeypatch: pytest.MonkeyPatch):
-    """Give a function that sets what standard input holds."""
-    def put(data: bytes) -> None:
-        monkeypatch.setattr('sys.stdin', io.TextIOWrapper(io.BytesIO(data), encoding='utf-8'))
-    return put
 
 
 def test_standard_input(

@@ -38,14 +38,6 @@ nodes:
 """
 
 
-@pytest.fixture
-def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / 'graph.yaml'
-    path.write_text(GRAPH)
-    return path
-
-
 # --- bad input -----------------------------------------------------------------------------------
 
 @pytest.mark.parametrize(('arguments', 'message'), [

@@ -33,13 +33,6 @@ TIMES = {'lidar': {'/sensing/driver:tick': 2000, '/filter:near': 3500.5, '/filte
 
 
 @pytest.fixture
-def graph(tmp_path: Path) -> Path:
-    path = tmp_path / 'graph.yaml'
-    path.write_text(GRAPH, encoding='utf-8')
-    return path
-
-
-@pytest.fixture
 def times(tmp_path: Path) -> Path:
     path = tmp_path / 'times.json'
     path.write_text(json.dumps(TIMES), encoding='utf-8')

@@ -112,20 +112,8 @@ def test_synchronous_calls_from_all_workers_at_once(make_executor, make_node):
     assert executor.statistics()['lent'] == 7
 
 
-def test_synchronous_call_inside_spin_once(make_executor, make_node):
-    """The same one callback at a time (rclpy#1211)."""
-    node, answers = make_node(), []
-    node.create_service(Trigger, '/ask', lambda request, response: response)
-    client = node.create_client(Trigger, '/ask', callback_group=ReentrantCallbackGroup())
-    executor = make_executor()
-    executor.add_node(node)
-    assert client.wait_for_service(5.0)
-    executor.create_task(lambda: answers.append(client.call(Trigger.Request(), timeout_sec=5.0)))
-    executor.spin_once(1.0)
-    assert len(answers) == 1 and answers[0] is not None
-
-
 def test_two_synchronous_calls_in_one_callback_inside_spin_once(make_executor, make_node):
+    """The same one callback at a time (rclpy#1211)."""
     node, answers = make_node(), []
     node.create_service(Trigger, '/ask', lambda request, response: response)
     client = node.create_client(Trigger, '/ask', callback_group=ReentrantCallbackGroup())
@@ -167,17 +155,6 @@ def test_shutdown_does_not_wait_for_the_second_call_of_a_callback(make_executor,
         for future in list(nobody._pending_requests.values()):
             future.set_result(None)
     assert done.wait(5.0)
-
-
-def test_guard_condition(make_executor, make_node):
-    node, calls = make_node(), []
-    guard = node.create_guard_condition(lambda: calls.append(1))
-    executor = make_executor()
-    executor.add_node(node)
-    with Spinning(executor):
-        for count in range(1, 4):
-            guard.trigger()
-            assert wait_for(lambda n=count: len(calls) == n)
 
 
 def test_action_with_feedback_result_and_cancel(make_executor, make_node):

@@ -205,22 +205,6 @@ def test_spinning_twice_is_an_error(make_executor):
     assert not executor.is_spinning
 
 
-def test_external_shutdown_raises_as_with_rclpy(make_executor, ros_context):
-    executor = make_executor()
-    threading.Timer(0.1, ros_context.shutdown).start()
-    with pytest.raises(ExternalShutdownException):
-        executor.spin()
-
-
-def test_shutdown_from_a_callback(make_executor, make_node):
-    """See also ``test_asked_for`` (rclpy#944)."""
-    node = make_node()
-    executor = make_executor()
-    executor.add_node(node)
-    node.create_timer(0.01, lambda: executor.shutdown(0))
-    executor.spin()
-
-
 def test_shutdown_waits_for_a_running_callback(make_executor):
     executor = make_executor()
     begun, done = threading.Event(), []
@@ -299,27 +283,3 @@ def test_wait_for_message_from_a_callback(make_executor, make_node, ros_context)
     with Spinning(executor):
         found, message = wait_for_message(Header, node, '/topic', time_to_wait=5.0)
     assert found and message.frame_id == 'it'
-
-
-def test_rate_sleeps_inside_a_callback(make_executor, make_node):
-    node = make_node()
-    executor = make_executor()
-    executor.add_node(node)
-    rate = node.create_rate(100)
-    task = executor.create_task(lambda: [rate.sleep() for _ in range(3)])
-    with Spinning(executor):
-        assert wait_for(task.done)
-
-
-def test_parameters_of_a_node(make_executor, make_node):
-    from rclpy.parameter_client import AsyncParameterClient
-    node = make_node(start_parameter_services=True)
-    node.declare_parameter('speed', 3)
-    executor = make_executor()
-    executor.add_node(node)
-    client = AsyncParameterClient(node, 'node')
-    with Spinning(executor):
-        assert client.wait_for_services(5.0)
-        future = client.get_parameters(['speed'])
-        assert wait_for(future.done)
-    assert future.result().values[0].integer_value == 3

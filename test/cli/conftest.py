@@ -1,0 +1,34 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What tests of verbs share: a declaration in the working directory, standard input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import io
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give a new folder, which is the working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def graph(folder: Path, request: pytest.FixtureRequest) -> Path:
+    """Give the declaration `GRAPH` of the test's module, graph.yaml in the working directory."""
+    path = folder / 'graph.yaml'
+    path.write_text(request.module.GRAPH)
+    return path
+
+
+@pytest.fixture
+def stdin(monkeypatch: pytest.MonkeyPatch) -> Callable[[bytes], None]:
+    """Give a function that sets what standard input holds."""
+    def put(data: bytes) -> None:
+        monkeypatch.setattr('sys.stdin', io.TextIOWrapper(io.BytesIO(data), encoding='utf-8'))
+    return put
