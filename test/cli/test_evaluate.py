@@ -163,31 +163,6 @@ def test_without_matplotlib(
                    "install 'mddag_executor[batch]' with pip\n")
 
 
-def cpu_seconds(process: int) -> float:
-    """Return the processor time that a process has taken so far."""
-    fields = Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
-
-
-def test_interrupted(graph: Path, tmp_path: Path) -> None:
-    """Ctrl-C: the exit status is 130, and what is done is written as a whole."""
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'mddag_executor', 'evaluate', str(graph), '--runs', '5000000',
-         '--core', 'plain', '--jobs', '1', '--json', 'out.json', '--plot', 'out.png'],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
-    begin = time.monotonic()
-    while cpu_seconds(process.pid) < 2 and time.monotonic() < begin + 60:
-        time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    result = json.loads((tmp_path / 'out.json').read_text())
-    assert process.returncode == 130
-    assert err == f"warning: interrupted: {result['runs']} of 5000000 runs are done\n"
-    assert 0 < result['runs'] < 5000000 and result['interrupted'] is True
-    assert (tmp_path / 'out.png').stat().st_size > 5000
-    assert f"{result['runs']} runs in" in out
-
-
 def test_interrupted_while_the_core_is_compiled(graph: Path, tmp_path: Path) -> None:
     """Nobody waits until it is."""
     pytest.importorskip('numba')
@@ -220,7 +195,7 @@ def group_seconds(group: int) -> float:
     return total
 
 
-def interrupted_after(folder: Path, seconds: float, *arguments: str) -> str:
+def interrupted_after(folder: Path, seconds: float, *arguments: str) -> tuple[str, str]:
     """Press Ctrl-C, which goes to all processes of the terminal; return what was said."""
     process = subprocess.Popen(
         [sys.executable, '-m', 'mddag_executor', 'evaluate', *arguments],
@@ -230,13 +205,25 @@ def interrupted_after(folder: Path, seconds: float, *arguments: str) -> str:
     while group_seconds(process.pid) < seconds and time.monotonic() < begin + 30:
         time.sleep(0.1)
     os.killpg(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=60)
     assert process.returncode == 130
     with pytest.raises(ProcessLookupError):  # nobody of the group is left
         for _ in range(50):
             os.killpg(process.pid, 0)
             time.sleep(0.1)
-    return err
+    return out, err
+
+
+def test_interrupted(graph: Path, tmp_path: Path) -> None:
+    """Ctrl-C: the exit status is 130, and what is done is written as a whole."""
+    out, err = interrupted_after(
+        tmp_path, 2, str(graph), '--runs', '5000000', '--core', 'plain', '--jobs', '1', '--json',
+        'out.json', '--plot', 'out.png')
+    result = json.loads((tmp_path / 'out.json').read_text())
+    assert err == f"warning: interrupted: {result['runs']} of 5000000 runs are done\n"
+    assert 0 < result['runs'] < 5000000 and result['interrupted'] is True
+    assert (tmp_path / 'out.png').stat().st_size > 5000
+    assert f"{result['runs']} runs in" in out
 
 
 @pytest.mark.parametrize(('how', 'seconds'), [
@@ -249,7 +236,7 @@ def test_resumed(graph: Path, tmp_path: Path, how: list[str], seconds: float) ->
     from mddag_executor.simulate.evaluate import evaluate, Evaluation, Experiment
     counts = []
     for name in ('first.json', 'second.json'):
-        err = interrupted_after(
+        _, err = interrupted_after(
             tmp_path, seconds, 'graph.yaml', '--runs', '1000000', '--duration', '200ms',
             '--core', 'plain', '--jobs', '2', '--policies', 'rad,fifo', '--resume', 'kept.npz',
             '--json', name, *how)

@@ -21,6 +21,8 @@ from msg_graph import loads
 import numpy as np
 import pytest
 
+from .test_evaluate import same
+
 GRAPH = """\
 mddag: 1
 workers: 1
@@ -47,13 +49,6 @@ def checkpoint(path: Path) -> Checkpoint:
             yield file
 
     return Checkpoint(str(path), output)
-
-
-def same(first: Evaluation, second: Evaluation) -> bool:
-    return bool(
-        (first.done == second.done).all() and (first.accepted == second.accepted).all()
-        and (first.possible == second.possible).all()
-        and (first.utilisation == second.utilisation).all())
 
 
 def part(whole: Evaluation, done: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Evaluation:

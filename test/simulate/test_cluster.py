@@ -15,9 +15,11 @@ from typing import Any
 
 from mddag_executor.simulate import cluster as module
 from mddag_executor.simulate.cluster import Cluster, ClusterError
-from mddag_executor.simulate.evaluate import evaluate, Evaluation, Experiment
+from mddag_executor.simulate.evaluate import evaluate, Experiment
 from msg_graph import load
 import pytest
+
+from .test_evaluate import same
 
 distributed = pytest.importorskip('distributed', reason='the extra dask is not there')
 dask = pytest.importorskip('dask', reason='the extra dask is not there')
@@ -43,13 +45,6 @@ def scheduler() -> Iterator[Any]:
             n_workers=2, threads_per_worker=1, processes=True, dashboard_address='127.0.0.1:0',
             silence_logs='CRITICAL') as local:
         yield local
-
-
-def same(first: Evaluation, second: Evaluation) -> bool:
-    return bool(
-        first.done.all() and second.done.all() and (first.accepted == second.accepted).all()
-        and (first.possible == second.possible).all()
-        and (first.utilisation == second.utilisation).all())
 
 
 def test_it_changes_nothing(scheduler: Any) -> None:
