@@ -21,15 +21,12 @@ RECORDED = -1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    add = parser.add_argument
-    add('--overheads', type=_overheads, metavar='WHICH',
-        help='with --reschedule: what noticing, dispatch and transport take: recorded (default), '
-        'none, or a time for each dispatch (50us); of a bag: none (default) or a time')
-    add('--execution-times', metavar='FILE', type=options.Input,
-        help="with --reschedule of an ordinary bag: JSON with fixed execution times ('-': "
-        'standard input; default: drawn from the declared ones)')
-    add('--seed', type=int, metavar='N',
-        help='with --reschedule of an ordinary bag: of the draws (default: 0)')
+    parser.add_argument(
+        '--overheads', type=_overheads, metavar='WHICH',
+        help='with --reschedule: the time that noticing, dispatch and transport take: recorded '
+        '(default), none, or a time for each dispatch (50us); of a bag: none (default) or a time')
+    options.add(parser, '--execution-times', '--seed',
+                only='with --reschedule of an ordinary bag: ')
 
 
 def _overheads(text: str) -> int:

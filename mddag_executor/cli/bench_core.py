@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add(parser, '--graph', '--workers', '--duration', '--json')
     parser.add_argument(
         '--policies', default=','.join(POLICIES), metavar='P,P…', help='(default: all)')
-    options.add_seed(parser, 'of the execution times')
+    options.add_seed(parser, 'seed of the drawn execution times')
     options.add_repeat(parser, 5)
 
 

@@ -87,14 +87,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='with --load topics: each topic at a phase of its own, or all published in a row, '
         'as one timer does (default: drawn)')
     add('--scale', type=options.list_of(options.positive_float), metavar='F[,F…]',
-        help='with --load robot: how much more than written its nodes compute (default: 1)')
+        help='with --load robot: factor of the time that its nodes compute (default: 1)')
     add('--workers', type=options.positive_int, default=defaults.WORKERS, metavar='M',
         help='threads of this executor and of MultiThreadedExecutor (default: %(default)s)')
     add('--seconds', type=options.positive_float, default=10.0, metavar='S',
         help='how long each measurement is, after a warm-up of 1 s (default: 10)')
     options.add_seed(
-        parser, 'of the execution times and phases, the same for all; the default is one with '
-        'which every deadline of the Autoware workload can be kept', int,
+        parser, 'seed of the drawn execution times and phases, the same for all executors; with '
+        'the default every deadline of the Autoware workload can be kept', int,
         default=defaults.LIVE_SEED)
     options.add_repeat(parser, 1, 'measure everything R times in turn, and take the medians')
     options.add(parser, '--graph', '--json')

@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--processes', type=options.positive_int, metavar='N',
         help='let callbacks compute in Python, place the nodes in N processes, run them, and '
         'replay their recordings as one run')
-    options.add_seed(parser, 'what the execution times are drawn with', int, DEFAULT_SEED)
+    options.add_seed(parser, 'seed of the drawn execution times', int, DEFAULT_SEED)
     add('--output', default='build/demo', metavar='DIR',
         help='where trace and results are written (default: build/demo)')
     options.add(parser, '--json')

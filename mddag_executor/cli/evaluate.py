@@ -52,13 +52,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f'{_RUNS}; {_RUNS_OF_EACH} if there are several)')
     add('--policies', default=','.join(defaults.POLICIES), metavar='P,P…',
         help=f'any of {", ".join(POLICIES)} (default: %(default)s)')
-    options.add_seed(parser, 'of the draws')
+    options.add_seed(parser, 'seed of the drawn execution times')
     add('--samples', metavar='FILE.npz', type=options.Input,
         help="measured execution times, an array of ns for each 'node:callback' (default: the "
         'quantile tables of the declaration)')
     add('--non-preemptive', action='store_true',
-        help='run all policies as an executor of callbacks can; else '
-        f'{", ".join(name for name, row in POLICIES.items() if row.preemptive)} preempt')
+        help='run all policies without preemption, as an executor of callbacks does (default: '
+        f'{", ".join(name for name, row in POLICIES.items() if row.preemptive)} preempt)')
     add('--judge', choices=('completions', 'horizon'), default='completions',
         help="which deadlines count: those of sinks that completed (the paper's way), or also "
         'those that passed before the end (default: %(default)s)')
@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'uninterrupted evaluation')
     add('--core', choices=('auto', 'compiled', 'plain'), default='auto',
         help="the scheduler core, compiled (by numba, the extra 'batch') or in plain Python: the "
-        'results are the same (default: the one that is sooner done)')
+        'results are the same (default: whichever is faster)')
     add('--plot', metavar='OUT', type=options.NamedFile,
         help="draw the paper's figure (.png, .svg or .pdf)")
     add('--csv', metavar='FILE', type=options.Output,

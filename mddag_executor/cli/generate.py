@@ -51,12 +51,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_pair(add, '--sinks', options.positive_int, _DEFAULT.sinks,
               'number of sinks of each DAG, each with its own deadline')
     add('--edge-probability', type=options.number, default=_DEFAULT.edge_probability, metavar='P',
-        help='of an edge between two callbacks of a DAG (default: %(default)s)')
+        help='probability of an edge between two callbacks of a DAG (default: %(default)s)')
     add('--or-share', type=options.number, default=_DEFAULT.or_share, metavar='P',
-        help='part of the callbacks with several predecessors that run once for each message '
+        help='share of the callbacks with several predecessors that run once for each message '
         '(OR), and so are several vertices; the others join the messages (default: %(default)s)')
     add('--method', choices=METHODS, default=_DEFAULT.method,
-        help='how the utilisation is dealt out to DAGs and callbacks: Dirichlet-rescale or '
+        help='how the utilisation is distributed over DAGs and callbacks: Dirichlet-rescale or '
         'UUniFast(-Discard) (default: %(default)s)')
     add('--max-dag-load', '--max-dag-utilisation', type=options.number,
         default=_DEFAULT.most_per_dag, metavar='L',
@@ -65,14 +65,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--periods', type=_periods, default=_DEFAULT.periods_ns, metavar='TIME,TIME…',
         help='each DAG gets one of these (default: 10ms,20ms,50ms,100ms,200ms)')
     add('--tightness', type=_numbers, default=_DEFAULT.tightness, metavar='F[:F]',
-        help='each deadline by its base, drawn between the bounds (default: 0.5:1.0)')
+        help='each deadline divided by its base, drawn between the bounds (default: 0.5:1.0)')
     add('--deadline-of', choices=BASES, default=_DEFAULT.deadline_of,
-        help="that base: the DAG's period, or the longest path to the sink (default: %(default)s)")
+        help="the base: the DAG's period, or the longest path to the sink (default: %(default)s)")
     add('--spread', type=options.number, default=_DEFAULT.spread, metavar='F',
-        help='execution times are uniform within this part of their mean on either side '
-        '(default: %(default)s, always the same)')
+        help='execution times are uniform within this share of their mean on either side '
+        '(default: %(default)s, constant)')
     options.add_seed(
-        parser, 'the same seed and options give the same files', int, _DEFAULT.seed)
+        parser, 'seed; the same seed and options give the same files', int, _DEFAULT.seed)
 
 
 def _add_pair(

@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="simulate as an executor of callbacks runs them, not in the policy's own mode")
     add('--runs', type=options.positive_int, default=1000, metavar='N',
         help='runs that measure the acceptance of each scale (default: %(default)s)')
-    options.add_seed(parser, 'of the draws')
+    options.add_seed(parser, 'seed of the drawn execution times')
 
 
 def main(args: argparse.Namespace) -> int:

@@ -10,14 +10,14 @@ import sys
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import one_line
 
-HELP = 'lay a declaration out evenly; comments and order stay'
+HELP = 'format a declaration; comments and order stay'
 EXAMPLE = """\
 mddag graph fmt graph.yaml
 mddag graph fmt --check graph.yaml
 """
 DESCRIPTION = """\
-Bring a declaration into its normal form: two more spaces for each level, long lists in brackets
-broken near column 90. Comments, quotes, order and meaning stay. The file is replaced as a whole;
+Format a declaration: two spaces of indentation for each level, and long lists in brackets broken
+near column 90. Comments, quotes, order and meaning stay. The file is replaced as a whole;
 '-' reads standard input and writes standard output."""
 
 

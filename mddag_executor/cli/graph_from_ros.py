@@ -18,10 +18,11 @@ mddag graph from-ros --timeout 10 -o graph.yaml
 DESCRIPTION = """\
 Make a declaration from the nodes that run now in this ROS domain: their subscriptions, services
 and publishers. The ROS graph shows no timers, callback groups and execution times, and not
-which callback publishes what. A node that subscribes and serves nothing is supposed to have one
-timer, of the rate of its topics; elsewhere each callback of the node may publish a topic. All of
+which callback publishes what. A node without subscriptions and services is assumed to have one
+timer, with the rate of its topics; in other nodes each callback may publish each topic. All of
 that is marked 'FILL IN', like deadlines and periods, with a proposal. A recorded run shows more:
-see 'mddag graph from-trace'. What every node has, such as parameter services, is left out."""
+see 'mddag graph from-trace'. Services that every node has, such as those for parameters, are left
+out."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

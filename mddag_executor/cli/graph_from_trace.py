@@ -18,10 +18,10 @@ Make a declaration from a recorded run: a trace of this executor, a CARET or ros
 that was imported, or the folder of one. A trace shows the nodes, their timers, subscriptions and
 services, callback groups, what each callback published, and the quantiles of its execution time
 (0, 50, 90, 99, 100 %). What it cannot show (deadlines, periods of what comes from outside, queue
-edges) stands in comments marked 'FILL IN', with a proposal from the recorded rates; take the
-first '# ' of such a line away once its value is right. What a declaration that the run was
-recorded with says (names, deadlines, queue edges) is kept. What every node has, such as parameter
-services, is left out."""
+edges) stands in comments marked 'FILL IN', with a proposal from the recorded rates; remove the
+first '# ' of such a line once its value is right. If the run was recorded with a declaration, its
+names, deadlines and queue edges are kept. Services that every node has, such as those for
+parameters, are left out."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -42,16 +42,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='how many processes')
     add('-o', '--output', metavar='PLACED.yaml', type=options.Output, required=True,
         help="the declaration to write ('-': to standard output)")
-    options.add_cpus(parser, 'those of this machine')
-    add('--workers', type=options.positive_int, metavar='M',
-        help=f"threads of each process (default: the declaration's, else {defaults.WORKERS})")
+    options.add(parser, '--cpus', otherwise='those of this machine')
+    options.add(parser, '--workers', only='in each process, ')
     options.add_policy(parser)
     add('--trace', metavar='TRACE', action='append', default=[],
         help='take execution times, and who computes in Python, from a recorded run (default: '
         'those that are declared); repeat it for the traces of several processes')
     add('--utilisation', type=options.positive_float, metavar='U',
         help='scale declared execution times to this normalised utilisation, sum(C/T)/workers')
-    options.add_seed(parser, 'draw declared execution times with this', int)
+    options.add_seed(parser, 'seed of the drawn execution times', int)
     add('--together', metavar='NODE,NODE…', action='append', default=[],
         help='nodes that run in one process; repeat it for more groups')
     add('--apart', metavar='NODE,NODE…', action='append', default=[],

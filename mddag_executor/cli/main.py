@@ -64,9 +64,9 @@ VERBS = {
     'generate': Verb('generate', 'make random multi-deadline, multi-rate DAG sets'),
     'graph': Verb('graph', 'check, draw, derive and analyse declarations'),
     'import': Verb('import_', 'turn a CARET or ros2_tracing recording into a trace'),
-    'export': Verb('export', 'turn a trace into a file for Perfetto, spreadsheets or data frames'),
+    'export': Verb('export', 'turn a trace into a file for Perfetto, Foxglove or spreadsheets'),
     'diff': Verb('diff', 'compare two recorded runs sink by sink'),
-    'top': Verb('top', 'show live what running executors say of their deadlines and workers'),
+    'top': Verb('top', 'show the deadlines and workers of running executors, live'),
     'bench': Verb('bench', 'measure the executor, the core, the replayer and the simulator'),
 }
 # What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.

@@ -150,41 +150,66 @@ _SHARED: dict[str, dict[str, Any]] = {
         'help': 'write tables and pictures of the run as one HTML file that needs no network '
         "(needs mddag_executor[report]; '-': to standard output)"},
     '--workers': {
-        'type': positive_int, 'metavar': 'M',
-        'help': "threads that run callbacks (default: the declaration's, else "
-        f'{defaults.WORKERS})'},
+        'type': positive_int, 'metavar': 'M', 'help': 'threads that run callbacks',
+        'otherwise': f"the declaration's, else {defaults.WORKERS}"},
+    '--cpus': {
+        'type': positive_int, 'metavar': 'C',
+        'help': 'CPUs that callbacks which compute share', 'otherwise': 'enough for all'},
+    '--preemptive': {
+        'action': argparse.BooleanOptionalAction,
+        'help': 'a more urgent callback takes the worker of a running one, or does not',
+        'otherwise': 'it does not'},
+    '--execution-times': {
+        'metavar': 'FILE', 'type': Input,
+        'help': 'JSON {"DAG": {"/node:callback": microseconds}} with fixed execution times, '
+        "'-' for standard input", 'otherwise': 'drawn from the declared ones'},
+    '--seed': {
+        'type': int, 'metavar': 'N', 'help': 'seed of the drawn execution times',
+        'otherwise': '0'},
     '--duration': {
         'type': duration, 'default': defaults.DURATION_NS, 'metavar': 'TIME',
-        'help': f'virtual time of each run (default: {defaults.DURATION_NS // 10 ** 9}s)'},
+        'help': 'virtual time of each run',
+        'otherwise': f'{defaults.DURATION_NS // 10 ** 9}s'},
     '--overhead': {
         'type': or_zero(duration), 'default': 0, 'metavar': 'TIME',
-        'help': 'what each dispatch of a callback takes more (default: 0)'},
+        'help': 'time that each dispatch of a callback costs in addition', 'otherwise': '0'},
     '--jobs': {
-        'type': positive_int, 'metavar': 'N',
-        'help': 'runs to simulate at a time (default: the number of processors)'},
+        'type': positive_int, 'metavar': 'N', 'help': 'how many runs to simulate at a time',
+        'otherwise': 'the number of processors'},
     '--utilisation': {
         'type': positive_float, 'metavar': 'U',
         'help': 'scale the execution times to this normalised utilisation, sum(C/T)/workers'},
     '--skip': {
         'type': or_zero(duration), 'default': 0, 'metavar': 'TIME',
-        'help': 'leave out a warm-up: jobs that were released less than this after the first one, '
-        'as 1s, are not judged (default: all are)'},
+        'help': 'leave out a warm-up: jobs released less than this after the first one, for '
+        'instance 1s, are not judged', 'otherwise': 'all jobs are judged'},
     '--offset': {
         'type': _offset, 'action': 'append', 'default': [], 'metavar': 'NAME=TIME',
-        'help': 'of several machines: how far the clock of process NAME (of RUN.NAME.mcap; or '
-        "that trace itself) is ahead of the first trace's, as 2.5ms, or -2.5ms where it is behind "
-        '(default: as messages in both directions show)'},
+        'help': 'for recordings of several machines: how far the clock of process NAME (the one '
+        "of RUN.NAME.mcap, or a trace) is ahead of the first trace's, for instance 2.5ms, or "
+        '-2.5ms if it is behind', 'otherwise': 'estimated from messages in both directions'},
     '--ros-args': {
         'nargs': argparse.REMAINDER, 'metavar': '…',
-        'help': 'the rest of the command line goes to rclpy.init, as -r from:=to'},
+        'help': 'pass the rest of the command line to rclpy.init, for instance -r from:=to'},
 }
 
 
-def add(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Declare some of the arguments that have the same meaning in all verbs."""
+def add(
+    parser: argparse.ArgumentParser, *names: str, only: str = '', otherwise: str | None = None
+) -> None:
+    """
+    Declare some of the arguments that have the same meaning in all verbs.
+
+    :param only: what the help begins with, where an option belongs to another one.
+    :param otherwise: what holds, in words, where an option is left out; its value is None then.
+    """
     for name in names:
-        flags = ('-o', name) if name == '--output' else (name,)
-        parser.add_argument(*flags, **_SHARED[name])
+        kept = dict(_SHARED[name])
+        default = kept.pop('otherwise', None)
+        if otherwise is not None:
+            default, kept['default'] = otherwise, None
+        kept['help'] = only + kept['help'] + ('' if default is None else f' (default: {default})')
+        parser.add_argument(*(('-o', name) if name == '--output' else (name,)), **kept)
 
 
 def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
@@ -195,10 +220,10 @@ def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
     """
     parser.add_argument(
         'trace', metavar='TRACE', nargs='+', type=Input,
-        help=f'{what}; of one run in several processes the traces of all')
+        help=f'{what}; for one run of several processes the traces of all')
     parser.add_argument(
         'graph', metavar='GRAPH', nargs='?', type=Input,
-        help="the declaration that judges, a YAML file ('-': standard input; default: the one "
+        help="the declaration to judge by, a YAML file ('-': standard input; default: the one "
         'that the trace was recorded with)')
     add(parser, '--offset')
 
@@ -212,13 +237,6 @@ def add_policy(
         '--policy', metavar='P', type=lambda text: policy(text).name,
         default=default if default in POLICIES else None,
         help=f'{prefix}one of {", ".join(POLICIES)} (default: {default})')
-
-
-def add_cpus(parser: argparse.ArgumentParser, default: str) -> None:
-    """Declare `--cpus` of what is computed in virtual time."""
-    parser.add_argument(
-        '--cpus', type=positive_int, metavar='C',
-        help=f'CPUs that callbacks which compute share (default: {default})')
 
 
 def add_seed(

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mddag_executor.replay.run import Recording
     from msg_graph import Process, TaskSet
 
+_WITH = 'with --reschedule: '
 _ONLY_RESCHEDULED = (
     'workers', 'cpus', 'processes', 'policy', 'preemptive', 'overheads', 'execution_times', 'seed')
 
@@ -33,19 +34,14 @@ def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
     """Declare `--reschedule` and what goes with it; ``what`` is its help."""
     add = parser.add_argument
     add('--reschedule', action='store_true', help=what)
-    add('--workers', type=options.positive_int, metavar='M',
-        help='with --reschedule: threads that run callbacks, of each process (default: as '
-        'recorded)')
-    add('--cpus', type=options.positive_int, metavar='C',
-        help='with --reschedule: CPUs that callbacks which compute share (default: as recorded, '
-        'else enough for all)')
+    options.add(parser, '--workers', only=f'{_WITH}in each process, ', otherwise='as recorded')
+    options.add(parser, '--cpus', only=_WITH, otherwise='as recorded, else enough for all')
     add('--processes', metavar='N|FILE',
-        help='with --reschedule: the nodes in N processes, packed by the recorded times, or in '
-        'those of a YAML file with `processes:` (default: as recorded)')
-    options.add_policy(parser, 'with --reschedule: ', 'as recorded')
-    add('--preemptive', action=argparse.BooleanOptionalAction,
-        help='with --reschedule: what is more urgent takes the worker of what runs, or not '
-        '(default: as recorded, where the policy can)')
+        help=f'{_WITH}run the nodes in N processes, packed by the recorded times, or in those of '
+        'a YAML file with `processes:` (default: as recorded)')
+    options.add_policy(parser, _WITH, 'as recorded')
+    options.add(
+        parser, '--preemptive', only=_WITH, otherwise='as recorded, where the policy can')
     bags.add_arguments(parser)
     parser.set_defaults(skip=0)     # for verbs without --skip
 

@@ -51,17 +51,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='compare what the nodes publish with this bag, and exit with status 1 where it '
         'differs')
     add('--tolerance', type=options.not_negative, default=0.0, metavar='X',
-        help='with --expect: numbers with a point may differ by so much, or by this share of the '
-        'larger one (default: 0)')
+        help='with --expect: floating-point numbers may differ by this much, or by this share of '
+        'the larger one (default: 0)')
     add('--times', metavar='WHICH',
         help='how long callbacks take: recorded (the default for a trace), declared (the default '
         'for a bag), or a file: a trace, or JSON with execution times')
-    options.add_cpus(parser, 'as many as are needed')
+    options.add(parser, '--cpus', otherwise='as many as are needed')
     options.add_policy(parser)
     options.add_seed(
         parser, "the seed of Python's and numpy's random numbers and of declared times", int)
     add('--all-clocks', action='store_true',
-        help='steady and system clocks and the functions of time are virtual, too')
+        help='make steady and system clocks, and the functions of the module time, virtual, too')
 
 
 def main(args: argparse.Namespace) -> int:

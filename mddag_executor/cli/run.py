@@ -76,25 +76,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='make the nodes from the declaration; for the declared execution times their '
         'callbacks sleep, compute in Python, compute without the interpreter lock, or, drawn for '
         'each callback, do one of the three')
-    add('--utilisation', type=options.positive_float, metavar='U',
-        help='with --synthetic: scale the execution times to this normalised utilisation, '
-        'sum(C/T)/workers')
-    add('--seed', type=int, default=0, metavar='N',
-        help='with --synthetic: draw the execution times with this (default: 0)')
+    options.add(parser, '--utilisation', only='with --synthetic: ')
+    options.add_seed(parser, 'with --synthetic: seed of the drawn execution times', int)
     add('--duration', type=options.duration, metavar='TIME',
-        help='end after this time, as 20s (default: with Ctrl-C); with --synthetic after a '
-        'warm-up of 1 s')
+        help='end after this time, for instance 20s, with --synthetic after a warm-up of 1 s '
+        '(default: run until Ctrl-C)')
     options.add_policy(parser)
     add('--cpu-order', action='store_true',
-        help='give workers the CPUs by the urgency of what they run, as nice levels: for more '
-        'processes than CPUs, where the user may')
+        help='give the CPUs to the workers with the most urgent callbacks, by nice levels: for '
+        'more processes than CPUs, where the user has the permission')
     add('--preempt', action='store_true',
-        help='callbacks that compute in Python pause for more urgent ones (Python 3.12 and newer)')
+        help='pause callbacks that compute in Python for more urgent ones (Python 3.12 and newer)')
     add('--intake', choices=('auto', 'events', 'waitset'), default='auto',
         help='how the executor learns what is ready (default: auto)')
     add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
-        help="publish the executor's state on /diagnostics so often, for mddag top and other "
-        "tools; 'off': not at all (default: 1s)")
+        help="how often to publish the executor's state on /diagnostics, for mddag top and other "
+        "tools; 'off': never (default: 1s)")
     add('--trace', metavar='OUT.mcap',
         help='record the run to this file; of several processes each to OUT.NAME.mcap, or to '
         'NAME.mcap in OUT where that is a directory')
@@ -102,10 +99,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='run the nodes in N processes, or in those of a YAML file with `processes:` '
         "(default: those of the declaration); '1': in this process")
     add('--process', metavar='NAME',
-        help='run only the nodes of this declared process, for a launch file that starts each; '
-        'give those --node that bring them')
+        help='run only the nodes of this declared process, for a launch file that starts each '
+        'process; give the --node options of these nodes only')
     add('--on-exit', choices=('end', 'continue', 'restart'), default='end',
-        help='when one of several processes ends by itself: end the run, go on without it, or '
+        help='if one of several processes ends by itself: end the run, continue without it, or '
         'start it again (default: end)')
     add('--part', help=argparse.SUPPRESS)  # the folder of a run of several processes
     options.add(parser, 'graph', '--workers', '--json', '--ros-args')

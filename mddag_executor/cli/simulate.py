@@ -31,22 +31,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     options.add_policy(parser)
-    options.add_cpus(parser, 'enough for all')
-    add('--preemptive', action='store_true',
-        help='what is more urgent takes the worker of what runs')
-    add('--execution-times', metavar='FILE', type=options.Input,
-        help='JSON {"DAG": {"/node:callback": microseconds}}: the execution time of each vertex '
-        "('-': standard input; default: drawn from the declaration)")
-    options.add_seed(parser, 'draw the execution times with this', int)
+    options.add_seed(parser, 'seed of the drawn execution times', int)
     add('--judge', choices=('horizon', 'completions'), default='horizon',
-        help='what is overdue at the end is late (horizon, the default), or only what completed '
-        'is judged (completions, as in the paper)')
+        help='a job that is overdue at the end is late (horizon, the default), or only completed '
+        'jobs are judged (completions, as in the paper)')
     add('--stop-at-first-miss', action='store_true',
         help='end the run with the first missed deadline')
     add('--trace', metavar='OUT.mcap', type=options.NamedFile, help='record the run to this file')
     add('--fail-on-miss', action='store_true',
         help='exit with status 1 if a deadline was missed, or no job was due')
-    options.add(parser, 'graph', '--workers', '--duration', '--utilisation', '--report', '--json')
+    options.add(
+        parser, 'graph', '--workers', '--cpus', '--preemptive', '--execution-times',
+        '--duration', '--utilisation', '--report', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -57,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
     times = execution_times(args, task_set, workers)
     settings = Settings(
         policy=args.policy, workers=workers, duration_ns=args.duration,
-        preemptive=args.preemptive, judge=args.judge,
+        preemptive=bool(args.preemptive), judge=args.judge,
         stop_at_first_miss=args.stop_at_first_miss, cpus=args.cpus)
     load = periodic_load(task_set, times, args.duration)
     run = _simulate(task_set, load, settings, utilisation(task_set, times, workers),

@@ -37,25 +37,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_recording(
         parser, "a recorded run, an MCAP file ('-': standard input), or a declaration alone, a "
         'YAML file')
-    add('--workers', type=options.positive_int, metavar='M',
-        help='threads that run callbacks, of each process (default: as recorded, or the '
-        "declaration's)")
-    options.add_cpus(parser, 'as recorded, or enough for all')
+    options.add(parser, '--workers', only='in each process, ',
+                otherwise="as recorded, or the declaration's")
+    options.add(parser, '--cpus', otherwise='as recorded, or enough for all')
     options.add_policy(parser, default='as recorded, or rad')
-    add('--preemptive', action=argparse.BooleanOptionalAction,
-        help='what is more urgent takes the worker of what runs, or not (default: as recorded)')
-    add('--duration', type=options.duration, metavar='TIME',
-        help=f'with GRAPH: virtual time (default: {defaults.DURATION_NS // 10 ** 9}s)')
-    add('--execution-times', metavar='FILE', type=options.Input,
-        help='with GRAPH: JSON with fixed execution times (default: drawn from the declared ones)')
-    add('--seed', type=int, metavar='N', help='with GRAPH: of the draws (default: 0)')
-    add('--utilisation', type=options.positive_float, metavar='U',
-        help='with GRAPH: scale the execution times to this normalised utilisation')
+    options.add(parser, '--preemptive', otherwise='as recorded')
+    options.add(parser, '--duration', '--execution-times', '--seed', '--utilisation',
+                only='with GRAPH: ')
+    parser.set_defaults(duration=None)
     add('--jobs', type=options.positive_int, metavar='N',
-        help='processes that search (default: one for each processor)')
+        help='how many processes search (default: one for each processor)')
     add('--fail-under', type=options.positive_float, metavar='FACTOR',
-        help='exit with status 1 if a callback may not take so many times as long, or a deadline '
-        'is missed as things are')
+        help='exit with status 1 if some callback may not take this many times as long, or if a '
+        'deadline is missed already')
     add('--report', metavar='OUT.html', type=options.Output,
         help="write the tables with bars as one HTML file ('-': to standard output)")
     options.add(parser, '--skip', '--json')

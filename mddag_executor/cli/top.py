@@ -37,11 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     add('--topic', default='/diagnostics', help='where to listen (default: /diagnostics)')
-    add('--once', action='store_true', help='print what is there once, as soon as it has come')
+    add('--once', action='store_true', help='print the state once, as soon as it has arrived')
     add('--duration', type=options.duration, metavar='TIME',
-        help='end after this time, as 20s (default: with Ctrl-C)')
+        help='end after this time, for instance 20s (default: run until Ctrl-C)')
     add('--timeout', type=options.duration, default=PATIENCE_NS, metavar='TIME',
-        help='with --once or --duration: give up when nothing has come by then (default: 10s)')
+        help='with --once or --duration: give up if nothing has arrived by then (default: 10s)')
     options.add(parser, '--json')
 
 

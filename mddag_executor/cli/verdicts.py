@@ -23,13 +23,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare `--fail-on-miss` and what goes with it."""
     add = parser.add_argument
     add('--fail-on-miss', action='store_true',
-        help='exit with status 1 if a deadline was missed, beyond what is tolerated, or no job '
-        'was due')
+        help='exit with status 1 if more deadlines were missed than are tolerated, or no job was '
+        'due')
     add('--tolerate-ratio', type=options.ratio, metavar='R',
         help='with --fail-on-miss or --junit: the share of the jobs of a sink that may miss, '
         '0 to 1')
     add('--tolerate-burst', type=options.or_zero(options.positive_int), metavar='B',
-        help='the same: how many jobs of a sink may miss in a row')
+        help='with --fail-on-miss or --junit: how many jobs of a sink may miss in a row')
     add('--junit', metavar='OUT.xml', type=options.Output,
         help="write JUnit XML, a test case for each sink ('-': to standard output)")
 
