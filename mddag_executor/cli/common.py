@@ -21,18 +21,18 @@ import shutil
 import stat
 import sys
 import tempfile
-from typing import Any, BinaryIO, cast, TYPE_CHECKING
+from typing import Any, BinaryIO, cast, TYPE_CHECKING, TypeVar
 
 from mddag_executor.cli.options import Input, NamedFile, Output, Report
 from mddag_executor.errors import InputError, UsageError
 from mddag_executor.resources import find
 
 if TYPE_CHECKING:
-    from mddag_executor.replay.run import Recording, Traces
-    from mddag_executor.report.html import Watch
+    from mddag_executor.replay.run import Traces
     from mddag_executor.report.html_data import ReportData
     from msg_graph import TaskSet
 
+R = TypeVar('R', bound='str | Traces')
 STDIN = '<stdin>'
 _MCAP = b'\x89MCAP'
 MOST_BYTES = 64 << 20
@@ -161,20 +161,10 @@ def _is_trace(path: str) -> bool:
 
 
 @contextmanager
-def input_recording(given: str | Traces) -> Iterator[tuple[Recording, str]]:
-    """Give what `input_trace` gives, or the several traces of one run."""
-    if not isinstance(given, str):
-        yield given, str(given)
-        return
-    with input_trace(given) as found:
-        yield found
-
-
-@contextmanager
-def input_trace(given: str) -> Iterator[tuple[str, str]]:
-    """Give the path of a trace (of a copy, for `-`), and what messages call it."""
+def input_recording(given: R) -> Iterator[tuple[R | str, str]]:
+    """Give the path of a recording (of a copy, for `-`) or its traces, and what to call it."""
     if given != '-':
-        yield given, given  # as the user wrote it: pathlib would change ./a
+        yield given, str(given)  # as the user wrote it: pathlib would change ./a
         return
     with input_file(given) as path:
         yield str(path), STDIN
@@ -319,14 +309,6 @@ def _check_report(path: Report) -> None:
         raise UsageError(f'--report {path}: a report is an HTML file: let its name end in .html')
     from mddag_executor.report.html import check_available
     check_available()
-
-
-def report_watch(path: str | None) -> Watch | None:
-    """Return what collects what a report shows, None where none is wanted."""
-    if path is None:
-        return None
-    from mddag_executor.report.html import Watch
-    return Watch()
 
 
 def write_report(path: str, data: Callable[[], ReportData]) -> None:

@@ -107,7 +107,7 @@ def _export_session(args: argparse.Namespace) -> int:
             '--reschedule and --rows out')
     if not isinstance(args.trace, str):
         raise UsageError(f'-o {args.output}: a session has the events of one trace: name one')
-    with common.input_trace(args.trace) as (path, name), Progress('exporting') as line:
+    with common.input_recording(args.trace) as (path, name), Progress('exporting') as line:
         if args.caret:
             export_dicts(caret_events(path), args.output, line.events)
         else:

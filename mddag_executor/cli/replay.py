@@ -49,7 +49,10 @@ def main(args: argparse.Namespace) -> int:
     verdicts.check(args)
     recorded.check(args)
     with recorded.opened(args) as (path, name, task_set):
-        watch = common.report_watch(args.report)
+        watch = None
+        if args.report is not None:
+            from mddag_executor.report.html import Watch
+            watch = Watch()
         drift: list[Drift] = []
         outcome: Replay | Reschedule
         if args.reschedule or recorded.is_bag(path):

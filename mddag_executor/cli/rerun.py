@@ -110,7 +110,7 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
         defaults.workers(args.workers, task_set), args.cpus, args.policy, args.seed,
         args.all_clocks, ros_args=tuple(args.ros_args))
     with ExitStack() as files:
-        path, name = files.enter_context(common.input_trace(args.recording))
+        path, name = files.enter_context(common.input_recording(args.recording))
         source = open_source(path, task_set, args.times, args.seed, name)
         output: BinaryIO | None = None
         if args.output is not None:

@@ -9,7 +9,7 @@ report's data, ``write`` writes the page.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -100,37 +100,26 @@ def check_available() -> None:
             "--report: Bokeh is not installed: pip install 'mddag_executor[report]'") from None
 
 
-def of_outcome(
-    outcome: Replay | Reschedule, watch: Watch | None
-) -> ReportData:
+def of_outcome(outcome: Replay | Reschedule, watch: Watch | None) -> ReportData:
     """Return the data of a report about a recorded run; ``watch`` was there if as recorded."""
+    result = outcome.result()
+    what, title = 'recording', 'Replay as recorded'
+    notes: Sequence[str] = ()
+    worker_names: Sequence[str]
     if isinstance(outcome, Reschedule):
-        return of_reschedule(outcome)
+        watch = Watch().of_computed(outcome.computed())
+        what, title = ('bag', 'Bag') if outcome.recorded is None else (what, 'Replay')
+        title, notes = f'{title}, rescheduled', outcome.notes
+        worker_names = outcome.worker_names
+    else:
+        worker_names = getattr(outcome.run, 'worker_names', ())
     assert watch is not None
-    return of_replay(outcome, watch)
-
-
-def of_replay(outcome: Replay, watch: Watch) -> ReportData:
-    """Return the data of a report about a recorded run that was replayed with a watch."""
-    result = outcome.result()
-    facts = [('recording', result['recording']['trace']), *_facts(result)]
-    data = watch.data('Replay as recorded', facts, outcome.task_set, result['workers'],
-                      outcome.duration_ns, outcome.warnings)
-    return data._replace(
-        paths=result.get('paths', {}), recorded=result.get('recorded_callbacks', {}),
-        misses=result['misses'], worker_names=getattr(outcome.run, 'worker_names', ()))
-
-
-def of_reschedule(outcome: Reschedule) -> ReportData:
-    """Return the data of a report about a recorded run, or a bag, that was rescheduled."""
-    watch = Watch().of_computed(outcome.computed())
-    result = outcome.result()
-    what, title = ('bag', 'Bag') if outcome.recorded is None else ('recording', 'Replay')
     facts = [(what, result['recording']['trace']), *_facts(result),
-             *(('assumed', note) for note in outcome.notes)]
+             *(('assumed', note) for note in notes)]
     return watch.data(
-        f'{title}, rescheduled', facts, outcome.task_set, outcome.workers, outcome.duration_ns,
-        outcome.warnings)._replace(worker_names=outcome.worker_names)
+        title, facts, outcome.task_set, result['workers'], outcome.duration_ns, outcome.warnings,
+    )._replace(paths=result.get('paths', {}), recorded=result.get('recorded_callbacks', {}),
+               misses=result.get('misses'), worker_names=worker_names)
 
 
 def of_run(task_set: TaskSet, load: Load, run: Run) -> ReportData:

@@ -12,47 +12,16 @@ from typing import Any
 from mddag_executor.trace import TraceFile
 import pytest
 
+from ..report.runs import by_hand, GRAPH, MS, START
 from .helpers import caller
 
 call = caller('replay')
-
-GRAPH = """\
-mddag: 1
-nodes:
-  - node: /driver
-    callbacks:
-      - {name: tick, timer: 10ms, publishes: [/data]}
-  - node: /filter
-    callbacks:
-      - {name: run, subscription: /data, deadline: 8ms}
-"""
-START = 1_732_166_766_000_000_000
-MS = 1_000_000
 
 
 @pytest.fixture
 def trace(tmp_path: Path) -> Path:
     """Give a trace of three jobs; the third is 2 ms late, its first vertex took 6 ms."""
-    path = tmp_path / 'run.mcap'
-    with TraceFile(path) as file:
-        def add(name: str, ms: int, *fields: Any) -> None:
-            file.add(name, START + ms * MS, 1, 9, *fields)
-
-        def run(vertex: int, job: int, ready: int, start: int, end: int) -> None:
-            add('dispatch', start, vertex, 0, vertex, job, 0, START + ready * MS, 0)
-            add('callback_start', start, vertex, False)
-            add('callback_end', end, vertex)
-            add('complete', end, vertex, 0, vertex, job, True, START + end * MS, 0)
-
-        add('task_set', 0, GRAPH, 'graph.yaml', 'rad', 2, 100 * MS, 64, False)
-        for job, first in enumerate((1, 2, 6)):
-            at = 10 + 10 * job
-            add('job_release', at, 0, job, START + at * MS)
-            run(0, job, at, at, at + first)
-            run(1, job, at + first, at + first + 1, at + first + 4)
-        add('deadline', 40, 0, 1, 2, START + 38 * MS, START + 40 * MS)
-        add('shutdown', 50, START + 50 * MS)
-    return path
+    return by_hand(tmp_path / 'run.mcap', undeclared=False)
 
 
 def test_the_tables(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -39,7 +39,9 @@ paths:
 """
 
 
-def by_hand(path: Path, hostile: bool = False, finished: bool = True) -> Path:
+def by_hand(
+    path: Path, hostile: bool = False, finished: bool = True, undeclared: bool = True
+) -> Path:
     """Write a trace of three jobs; the third is 2 ms late; then an undeclared callback runs."""
     with TraceFile(path) as file:
         def add(name: str, ms: int, *fields: Any) -> None:
@@ -53,16 +55,18 @@ def by_hand(path: Path, hostile: bool = False, finished: bool = True) -> Path:
 
         add('task_set', 0, GRAPH, HOSTILE if hostile else 'graph.yaml', 'rad', 2, 100 * MS, 64,
             False)
-        add('rclcpp_callback_register', 0, 77, HOSTILE if hostile else 'extra')
+        if undeclared:
+            add('rclcpp_callback_register', 0, 77, HOSTILE if hostile else 'extra')
         for job, first in enumerate((1, 2, 6)):
             at = 10 + 10 * job
             add('job_release', at, 0, job, START + at * MS)
             run(0, job, at, at, at + first)
             run(1, job, at + first, at + first + 1, at + first + 4)
         add('deadline', 40, 0, 1, 2, START + 38 * MS, START + 40 * MS)
-        add('dispatch', 41, 77, -1, -1, -1, -1, START + 41 * MS, 0)
-        add('callback_start', 41, 77, False)
-        add('callback_end', 43, 77)
+        if undeclared:
+            add('dispatch', 41, 77, -1, -1, -1, -1, START + 41 * MS, 0)
+            add('callback_start', 41, 77, False)
+            add('callback_end', 43, 77)
         if finished:
             add('shutdown', 50, START + 50 * MS)
     return path

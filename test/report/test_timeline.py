@@ -48,7 +48,7 @@ def test_a_schedule_is_told_as_its_trace_says(
     told = html.of_run(task_set, load, run)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     watch = html.Watch()
-    read = html.of_replay(replay(tmp_path / 'run.mcap', more=watch.of), watch)
+    read = html.of_outcome(replay(tmp_path / 'run.mcap', more=watch.of), watch)
     assert told.tally.result() == read.tally.result() == run.tally.result()
     assert told.timeline.n_executions == len(told.timeline.columns().executions[0]) > 100
     for ours, theirs in zip(told.timeline.columns(), read.timeline.columns()):
