@@ -179,8 +179,9 @@ nodes:
     # of what it missed one release may have waited, and nothing more
     after = [b - a for a, b in zip(starts[3:], starts[4:])]
     assert sum(gap < 0.002 for gap in after) <= 1, after
-    for release in releases:
-        assert abs((release - releases[0] + 10 * MS) % (20 * MS) - 10 * MS) < 2 * MS, releases
+    # (the first may have been due before the executor began to look after the timer)
+    for release in releases[1:]:
+        assert abs((release - releases[1] + 10 * MS) % (20 * MS) - 10 * MS) < 2 * MS, releases
     counts = executor.statistics()['callbacks']['/source:tick']
     assert counts['skipped'] >= 4
     jobs = round((releases[-1] - releases[0]) / (20 * MS)) + 1
