@@ -12,8 +12,8 @@ from typing import Any
 from mddag_executor.trace import TraceFile
 import pytest
 
+from ..cli.helpers import caller
 from ..report.runs import by_hand, GRAPH, MS, START
-from .helpers import caller
 
 call = caller('replay')
 

@@ -162,15 +162,15 @@ def record(cause: str, trace: Path, misses: int, scale: float = 1.0) -> None:
 
 
 def causes(trace: Path) -> dict[str, int]:
-    """Return how many misses of each cause are told."""
+    """Return how many misses of each cause are named."""
     explainer = replay(trace).explainer
     assert explainer is not None
     return {cause: n for cause, n in explainer.summary()['causes'].items() if n}
 
 
 def measure(misses: int, scale: float, wanted: list[str]) -> None:
-    """Record a run for each cause, and print what is told of it."""
-    print(f'{"made for":<15}{"misses":>8}{"told right":>12}  told instead')
+    """Record a run for each cause, and print what explain names."""
+    print(f'{"made for":<15}{"misses":>8}{"named so":>12}  other causes named')
     for cause in wanted or list(PERIODS):
         with tempfile.TemporaryDirectory() as folder:
             trace = Path(folder) / 'run.mcap'
