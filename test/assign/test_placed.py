@@ -77,11 +77,11 @@ def test_simulation_finds_what_loads_do_not_show() -> None:
     predictor = Predictor(task_set, 7, 2, 'rad', 1000 * MS)
     bad = {0: 0, 1: 0, 2: 1, 3: 1}
     assert predictor.predict(placing.processes(bad), times).missed
-    told: list[int] = []
+    calls: list[int] = []
     place, tried = improve(
-        placing, bad, lambda processes: cost_of(predictor.predict(processes, times)), told.append)
+        placing, bad, lambda processes: cost_of(predictor.predict(processes, times)), calls.append)
     assert not predictor.predict(placing.processes(place), times).missed
-    assert place[0] != place[1] and told and tried >= max(told)
+    assert place[0] != place[1] and calls and tried >= max(calls)
 
 
 def test_a_few_tries_are_enough_to_stop() -> None:

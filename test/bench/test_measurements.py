@@ -234,13 +234,13 @@ def test_one_crash_does_not_end_the_others(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(campaign, 'measure', crash_or_measure)
     crashing = Spec('topics', 'events')
     fine = Spec('topics', 'single', seconds=0.3, warm_up_s=0.1)
-    told: list[str] = []
-    results = run_all([crashing, fine], 1, lambda *_: None, told.append)
+    errors: list[str] = []
+    results = run_all([crashing, fine], 1, lambda *_: None, errors.append)
     assert [result['crashed'] for result in results] == [1, 0]
-    assert told == ['events: it crashed with signal 11']
+    assert errors == ['events: it crashed with signal 11']
     check_messages(results[1])
     with pytest.raises(BenchError, match='no measurement succeeded'):
-        run_all([crashing], 1, lambda *_: None, told.append)
+        run_all([crashing], 1, lambda *_: None, errors.append)
 
 
 def test_a_measurement_that_cannot_be_made_ends_all() -> None:

@@ -262,11 +262,11 @@ def test_the_bare_executor_has_guards_until_its_end(ros_context):
 def test_the_end_of_a_context_is_told_before_its_nodes_are_gone():
     context = rclpy.context.Context()
     rclpy.init(context=context)
-    node = rclpy.node.Node('told', context=context)
-    told: list[bool] = []
-    kept = compat.on_end(context, lambda: told.append(alive(node)))
+    node = rclpy.node.Node('ended', context=context)
+    calls: list[bool] = []
+    kept = compat.on_end(context, lambda: calls.append(alive(node)))
     context.shutdown()
-    assert told and told[0]
+    assert calls and calls[0]
     del kept
     node.destroy_node()
 
@@ -292,14 +292,14 @@ def test_who_is_called_by_spin_knows(ros_context, make_node):
 
 def test_changes_of_a_node_are_told(make_node, monkeypatch):
     monkeypatch.setattr(rclpy.node.Node, '_wake_executor', rclpy.node.Node._wake_executor)
-    told = []
-    compat.on_changes(told.append)
+    calls = []
+    compat.on_changes(calls.append)
     node = make_node()
-    told.clear()
+    calls.clear()
     timer = node.create_timer(1.0, print)
-    assert told == [node]
+    assert calls == [node]
     node.destroy_timer(timer)
-    assert set(told) == {node} and len(told) >= 1
+    assert set(calls) == {node} and len(calls) >= 1
 
 
 def test_the_subscription_that_keeps_time_is_known(make_node):

@@ -211,8 +211,8 @@ def test_a_publication_here_and_one_elsewhere_at_once_are_a_doubt_unless_it_is_k
 
 def test_publications_that_overlap_are_announced_together_when_all_have_returned():
     bench = Bench()
-    told: list[list[int]] = []
-    bench.jobs.announce = lambda send, topic, several: told.append(
+    announced_to: list[list[int]] = []
+    bench.jobs.announce = lambda send, topic, several: announced_to.append(
         [each.origin.job for each in several])  # type: ignore[union-attr]
     bench.jobs.announce_on({TOPIC})
 
@@ -224,4 +224,4 @@ def test_publications_that_overlap_are_announced_together_when_all_have_returned
     publish(2, 0, lambda: publish(3, 1))
     bench.jobs.announce_on(set())
     publish(4, 0)
-    assert told == [[1], [3, 2]]
+    assert announced_to == [[1], [3, 2]]

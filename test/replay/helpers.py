@@ -58,6 +58,12 @@ nodes:
       - {name: tick, timer: 10ms, publishes: [/twist], execution_time: 1ms}
       - {name: use, subscription: /twist, deadline: 8ms, execution_time: 1ms}
 """
+PATHS = """\
+paths:
+  - {name: a, callbacks: ['/camera:grab', '/left:detect', '/fuse:join']}
+  - {name: b, callbacks: ['/camera:grab', '/right:rectify', '/fuse:join']}
+  - {name: c, callbacks: ['/imu:tick', '/imu:use']}
+"""
 
 
 def small() -> TaskSet:

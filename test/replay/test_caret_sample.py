@@ -76,7 +76,7 @@ def graph() -> TaskSet:
     return loads(GRAPH, 'sample.yaml')
 
 
-class Told(LinkObserver):
+class Links(LinkObserver):
     """Keeps what the linker says."""
 
     def __init__(self) -> None:
@@ -96,13 +96,13 @@ class Told(LinkObserver):
 
 
 @pytest.fixture(scope='module')
-def told(trace: Path, graph: TaskSet) -> tuple[Told, PathBook]:
+def seen(trace: Path, graph: TaskSet) -> tuple[Links, PathBook]:
     run = open_run(trace, graph)
     assert isinstance(run, ImportedRun)
-    told, found = Told(), ImportedPaths(run)
-    run.play([told, found])
+    seen, found = Links(), ImportedPaths(run)
+    run.play([seen, found])
     assert run.warnings == []
-    return told, found.book
+    return seen, found.book
 
 
 def rows(name: str) -> Iterator[tuple[int | None, ...]]:
@@ -113,25 +113,25 @@ def rows(name: str) -> Iterator[tuple[int | None, ...]]:
             yield tuple(int(cell) if cell else None for cell in line)
 
 
-def test_callbacks(told: tuple[Told, PathBook]) -> None:
-    found = [(run.start, run.end) for run in told[0].runs
+def test_callbacks(seen: tuple[Links, PathBook]) -> None:
+    found = [(run.start, run.end) for run in seen[0].runs
              if run.callback.label == '/filter_node subscription /topic1']
     expected = list(rows('cb_filter_node_callback_0.csv'))
     assert found == expected
     assert len(found) == 49
 
 
-def test_communication(told: tuple[Told, PathBook]) -> None:
+def test_communication(seen: tuple[Links, PathBook]) -> None:
     found = [(m.rclcpp, m.rcl, m.dds, m.stamp,
-              told[0].arrived.get((id(m), '/filter_node subscription /topic1')))
-             for m in told[0].messages if m.topic == '/topic1']
+              seen[0].arrived.get((id(m), '/filter_node subscription /topic1')))
+             for m in seen[0].messages if m.topic == '/topic1']
     expected = list(rows('comm_topic1.csv'))
     assert found == expected
     assert len(found) == 49
 
 
-def test_path(told: tuple[Told, PathBook]) -> None:
-    columns = [flow.columns for flow in flows(told[1])]
+def test_path(seen: tuple[Links, PathBook]) -> None:
+    columns = [flow.columns for flow in flows(seen[1])]
     found = [(c[0][0], c[1][1], c[1][0], c[2][1], c[3][0], c[4][1], c[5][0], c[6][1])
              for c in columns]
     # of the three times of each publication the first

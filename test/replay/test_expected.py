@@ -17,27 +17,15 @@ from mddag_executor.core.tally import total
 from msg_graph import loads
 import pytest
 
-from .helpers import Chances, MS, SMALL, VirtualRun
-from .recorded import four_jobs
+from .helpers import Chances, MS, PATHS, SMALL, VirtualRun
+from .recorded import CAMERA, four_jobs
 from .test_ordinary_bags import BY_HEADER, write_bag
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 EXPECTED = Path(__file__).with_name('expected')
-IMPORTED = """\
-mddag: 1
-nodes:
-  - node: /camera
-    callbacks: [{name: grab, timer: 100ms, publishes: [/image]}]
-  - node: /detect
-    callbacks: [{name: run, subscription: /image, deadline: 10ms}]
+IMPORTED = CAMERA + """\
 paths:
   - {name: p, callbacks: ['/camera:grab', '/detect:run']}
-"""
-PATHS = """\
-paths:
-  - {name: a, callbacks: ['/camera:grab', '/left:detect', '/fuse:join']}
-  - {name: b, callbacks: ['/camera:grab', '/right:rectify', '/fuse:join']}
-  - {name: c, callbacks: ['/imu:tick', '/imu:use']}
 """
 RESCHEDULED = '--reschedule --workers 1 --policy fifo --overheads none --skip 50ms'
 

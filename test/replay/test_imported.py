@@ -13,7 +13,7 @@ from mddag_executor.replay.run import open_run
 from msg_graph import loads, TaskSet
 import pytest
 
-from .recorded import BEGIN, MS, Recorded, US
+from .recorded import BEGIN, CAMERA, MS, Recorded, US
 
 GRAB, DETECT, FUSE_BOXES, FUSE_IMU, IMU, PLAN = 11, 12, 13, 14, 15, 16
 IMAGE, BOXES, IMU_OUT, PATH = 100, 101, 102, 103
@@ -375,14 +375,6 @@ def test_a_job_whose_end_is_lost_keeps_no_other_from_expiring(tmp_path: Path) ->
     lost = next(place for place, (name, time) in enumerate(
         zip(recorded.names(), recorded.times()))
         if name == 'ros2:callback_end' and time == 105 * MS)
-    graph = loads("""\
-mddag: 1
-nodes:
-  - node: /camera
-    callbacks: [{name: grab, timer: 100ms, publishes: [/image]}]
-  - node: /detect
-    callbacks: [{name: run, subscription: /image, deadline: 10ms}]
-""", 'g.yaml')
-    result = replay(recorded.write([lost]), graph).result()
+    result = replay(recorded.write([lost]), loads(CAMERA, 'g.yaml')).result()
     sink = result['dags']['/camera']['sinks']['/detect:run']
     assert (sink['expired'], sink['late'], sink['completed']) == (19, 1, 20)

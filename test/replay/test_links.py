@@ -18,7 +18,7 @@ CAMERA, DETECT = 11, 12         # callbacks
 IMAGE = 100                     # publisher
 
 
-class Told(LinkObserver):
+class Links(LinkObserver):
     """Keeps what a linker says."""
 
     def __init__(self) -> None:
@@ -42,12 +42,12 @@ class Told(LinkObserver):
         self.published_at.append((message.topic, rclcpp, rcl, dds))
 
 
-def linked(path: Path) -> tuple[Told, list[str]]:
+def linked(path: Path) -> tuple[Links, list[str]]:
     """Return what the linker says of a recording, and the warnings."""
-    told = Told()
+    got = Links()
     run = open_run(path)
-    run.play([told])
-    return told, [line.removeprefix(f'{path}: ') for line in run.warnings]
+    run.play([got])
+    return got, [line.removeprefix(f'{path}: ') for line in run.warnings]
 
 
 @pytest.fixture
@@ -70,18 +70,18 @@ def test_messages_between_threads(recorded: Recorded, publish: str, receive: str
         recorded.run(CAMERA, 1, at, at + 3 * MS)
         stamp = recorded.publish(IMAGE, 1, at + 1 * MS, style=publish)
         recorded.receive(DETECT, 2, at + 2 * MS, at + 9 * MS, stamp, style=receive)
-    told, warnings = linked(recorded.write())
+    got, warnings = linked(recorded.write())
     assert warnings == []
     sent = 1 * MS if publish != 'rclpy' else 1 * MS + 5 * US
-    assert [link for link in told.links if link[0].startswith('/detector')] == [
+    assert [link for link in got.links if link[0].startswith('/detector')] == [
         ('/detector subscription /image', at + 2 * MS, at + sent)
         for at in (100 * MS, 200 * MS, 300 * MS)]
-    assert told.runs[:2] == [
+    assert got.runs[:2] == [
         ('/camera timer 100ms', 100 * MS, 103 * MS),
         ('/detector subscription /image', 102 * MS, 109 * MS)]
-    assert len(told.runs) == 6
+    assert len(got.runs) == 6
     if publish not in ('tracing', 'rclpy'):
-        assert told.published_at[0] == ('/image', 101 * MS, 101 * MS + 5 * US, 101 * MS + 8 * US)
+        assert got.published_at[0] == ('/image', 101 * MS, 101 * MS + 5 * US, 101 * MS + 8 * US)
 
 
 def test_the_subscriber_may_be_faster_than_the_tracer(recorded: Recorded) -> None:
@@ -89,8 +89,8 @@ def test_the_subscriber_may_be_faster_than_the_tracer(recorded: Recorded) -> Non
     stamp = recorded.publish(IMAGE, 1, 101 * MS)
     # before the stamp is recorded, 20 us after the publication
     recorded.receive(DETECT, 2, 101 * MS + 15 * US, 101 * MS + 18 * US, stamp)
-    told, warnings = linked(recorded.write())
-    assert told.links[-1] == ('/detector subscription /image', 101 * MS + 15 * US, 101 * MS)
+    got, warnings = linked(recorded.write())
+    assert got.links[-1] == ('/detector subscription /image', 101 * MS + 15 * US, 101 * MS)
     assert warnings == []
 
 
@@ -103,10 +103,10 @@ def test_messages_within_a_process_by_address(recorded: Recorded) -> None:
         recorded.add('ros2:dispatch_intra_process_subscription_callback', at + 2 * MS, 2, 0x600,
                      14, 0)
         recorded.run(14, 2, at + 2 * MS + 1, at + 5 * MS, within=True)
-    told, warnings = linked(recorded.write())
+    got, warnings = linked(recorded.write())
     assert warnings == []
     label = '/detector subscription /image #2'      # both callbacks of the subscription are one
-    assert [link for link in told.links if link[0] == label] == [
+    assert [link for link in got.links if link[0] == label] == [
         (label, at + 2 * MS + 1, at + MS) for at in (100 * MS, 200 * MS)]
 
 
@@ -123,10 +123,10 @@ def test_messages_within_a_process_by_buffer_and_index(recorded: Recorded) -> No
         at = 200 * MS + (k + 2) * MS
         recorded.add('ros2:rclcpp_ring_buffer_dequeue', at, 2, 0xB, k, 1)
         recorded.run(DETECT, 2, at + 1, at + 2, within=True)
-    told, warnings = linked(recorded.write())
-    assert [link for link in told.links if link[0] == label] == [
+    got, warnings = linked(recorded.write())
+    assert [link for link in got.links if link[0] == label] == [
         (label, 202 * MS + 1, 101 * MS), (label, 203 * MS + 1, 201 * MS)]
-    assert len(told.published_at) == 4
+    assert len(got.published_at) == 4
     assert warnings == []
 
 
@@ -137,16 +137,16 @@ def test_overwritten_messages_are_said(recorded: Recorded) -> None:
         recorded.add('ros2:rclcpp_ring_buffer_enqueue', at + MS + 1, 1, 0xB, 0, 1, overwritten)
     recorded.add('ros2:rclcpp_ring_buffer_dequeue', 204 * MS, 2, 0xB, 0, 0)
     recorded.run(DETECT, 2, 205 * MS, 206 * MS, within=True)
-    told, warnings = linked(recorded.write())
-    assert told.links[-1][2] == 201 * MS
+    got, warnings = linked(recorded.write())
+    assert got.links[-1][2] == 201 * MS
     assert warnings == ['1 message overwritten in a ring buffer, never taken: /image (1)']
 
 
 def test_a_callback_in_several_threads_at_once(recorded: Recorded) -> None:
     recorded.run(CAMERA, 1, 100 * MS, 130 * MS)
     recorded.run(CAMERA, 2, 110 * MS, 120 * MS)
-    told, warnings = linked(recorded.write())
-    assert [run[1:] for run in told.runs] == [(110 * MS, 120 * MS), (100 * MS, 130 * MS)]
+    got, warnings = linked(recorded.write())
+    assert [run[1:] for run in got.runs] == [(110 * MS, 120 * MS), (100 * MS, 130 * MS)]
     assert not [line for line in warnings if 'have no' in line]
 
 
@@ -155,8 +155,8 @@ def test_a_callback_inside_another(recorded: Recorded) -> None:
     recorded.run(CAMERA, 1, 100 * MS, 130 * MS)
     recorded.run(13, 1, 110 * MS, 120 * MS)
     recorded.publish(IMAGE, 1, 125 * MS)
-    told, warnings = linked(recorded.write())
-    assert sorted(run[1:] for run in told.runs) == [
+    got, warnings = linked(recorded.write())
+    assert sorted(run[1:] for run in got.runs) == [
         (100 * MS, 130 * MS), (110 * MS, 120 * MS)]
     assert warnings == []
 
@@ -170,9 +170,9 @@ def test_addresses_are_used_again(recorded: Recorded) -> None:
     recorded.publisher(IMAGE, 3, '/other', time=402 * MS)
     recorded.publish(IMAGE, 1, 300 * MS + 1)
     recorded.publish(IMAGE, 1, 421 * MS + 1)
-    told, _ = linked(recorded.write())
-    assert [run[0] for run in told.runs] == ['/detector subscription /image', '/late timer 20ms']
-    assert [each[0] for each in told.published_at] == ['/image', '/other']
+    got, _ = linked(recorded.write())
+    assert [run[0] for run in got.runs] == ['/detector subscription /image', '/late timer 20ms']
+    assert [each[0] for each in got.published_at] == ['/image', '/other']
 
 
 def test_processes_have_addresses_of_their_own(recorded: Recorded) -> None:
@@ -181,9 +181,9 @@ def test_processes_have_addresses_of_their_own(recorded: Recorded) -> None:
     recorded.run(CAMERA, 1, 100 * MS, 103 * MS)
     stamp = recorded.publish(IMAGE, 1, 101 * MS)
     recorded.receive(CAMERA, 1, 105 * MS, 106 * MS, stamp, pid=2)
-    told, warnings = linked(recorded.write())
-    assert told.links == [('/camera timer 100ms', 100 * MS, None),
-                          ('/other subscription /image', 105 * MS, 101 * MS)]
+    got, warnings = linked(recorded.write())
+    assert got.links == [('/camera timer 100ms', 100 * MS, None),
+                        ('/other subscription /image', 105 * MS, 101 * MS)]
     assert warnings == []
 
 
@@ -193,11 +193,11 @@ def test_same_stamps_on_other_topics_and_on_the_same(recorded: Recorded) -> None
     recorded.publish(IMAGE, 1, 101 * MS, stamp=50)
     recorded.publish(101, 1, 102 * MS, stamp=50)
     recorded.receive(DETECT, 2, 105 * MS, 106 * MS, 50)
-    told, warnings = linked(recorded.write())
-    assert (told.links[-1][2], warnings) == (101 * MS, [])
+    got, warnings = linked(recorded.write())
+    assert (got.links[-1][2], warnings) == (101 * MS, [])
     recorded.publish(IMAGE, 3, 102 * MS, stamp=50)
-    told, warnings = linked(recorded.write())
-    assert told.links[-1][2] is None
+    got, warnings = linked(recorded.write())
+    assert got.links[-1][2] is None
     assert warnings == ['1 execution for a message with the topic and source timestamp of another '
                         'one: of no job and no path: '
                         '/detector subscription /image (1)']
@@ -238,9 +238,9 @@ def test_any_lost_event_is_said_or_changes_nothing(recorded: Recorded) -> None:
             continue
         if place > len(names) - 10:
             break       # at the end it may be cut off, or still run
-        told, warnings = linked(recorded.write(but=[place]))
-        assert set(told.runs) <= set(whole.runs)
-        if (told.links, told.runs) != (whole.links, whole.runs):
+        got, warnings = linked(recorded.write(but=[place]))
+        assert set(got.runs) <= set(whole.runs)
+        if (got.links, got.runs) != (whole.links, whole.runs):
             assert warnings, (place, name)
             seen.add(name.partition(':')[2])
     assert seen == {'callback_start', 'callback_end', 'dds_bind_addr_to_stamp', 'rclcpp_publish',
@@ -262,9 +262,9 @@ def test_what_else_the_thread_writes_is_not_the_publication(recorded: Recorded) 
     recorded.add('ros2_caret:dds_bind_addr_to_stamp', 301 * MS + 3, 1, 0x60, BEGIN + 88)
     recorded.receive(DETECT, 2, 305 * MS, 306 * MS, 77)
     recorded.receive(DETECT, 2, 307 * MS, 308 * MS, 88)
-    told, warnings = linked(recorded.write())
-    assert told.published_at == [('/image', 101 * MS, 101 * MS + 1, 0), ('/image', 201 * MS, 0, 0)]
-    assert [link[2] for link in told.links if link[0].startswith('/detector')] == [None, None]
+    got, warnings = linked(recorded.write())
+    assert got.published_at == [('/image', 101 * MS, 101 * MS + 1, 0), ('/image', 201 * MS, 0, 0)]
+    assert [link[2] for link in got.links if link[0].startswith('/detector')] == [None, None]
     assert warnings == [
         '2 executions for a message whose publication is not known (not all of its topic have a '
         'source timestamp in it): of no job and no path: /detector subscription /image (2)']

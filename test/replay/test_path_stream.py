@@ -23,19 +23,13 @@ import pytest
 
 from .cases_by_hand import slow_cases
 from .flows import note_steps
-from .helpers import Chances, MS, SMALL, VirtualRun
+from .helpers import Chances, MS, PATHS, SMALL, VirtualRun
 
 Record = tuple[int, int | None]
 RECORDS = st.lists(st.tuples(
     st.integers(0, 15), st.one_of(st.none(), st.integers(0, 25))), max_size=14)
 LONG = st.lists(st.tuples(
     st.integers(0, 60), st.one_of(st.none(), st.integers(0, 80))), max_size=50)
-PATHS = """\
-paths:
-  - {name: a, callbacks: ['/camera:grab', '/left:detect', '/fuse:join']}
-  - {name: b, callbacks: ['/camera:grab', '/right:rectify', '/fuse:join']}
-  - {name: c, callbacks: ['/imu:tick', '/imu:use']}
-"""
 
 
 def statistics(times: list[int]) -> dict[str, Any] | None:

@@ -25,7 +25,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from .helpers import MS, small, VirtualRun
-from .recorded import four_jobs
+from .recorded import CAMERA, four_jobs
 from .test_ordinary_bags import BEGIN, BY_HEADER, GRAPH, header, STORE
 
 S = 1_000 * MS
@@ -158,7 +158,7 @@ def test_any_bit_of_a_trace(tmp_path: Path, kind: str) -> None:
         VirtualRun(sound, small(), 1, duration=200 * MS)
     else:
         four_jobs(sound)
-        graph = loads(IMPORTED, 'g.yaml')
+        graph = loads(CAMERA, 'g.yaml')
     whole = reschedule(sound, graph, policy='rad', workers=2)
     for seed in range(150):
         changed(sound, odd, random.Random(seed))
@@ -170,13 +170,3 @@ def test_any_bit_of_a_trace(tmp_path: Path, kind: str) -> None:
         assert all(a <= b for a, b in zip(sizes(found), sizes(whole.result()))), seed
         assert len(outcome.decisions) <= 2 * len(whole.decisions), seed
         assert len(outcome.log) <= 2 * len(whole.log), seed
-
-
-IMPORTED = """\
-mddag: 1
-nodes:
-  - node: /camera
-    callbacks: [{name: grab, timer: 100ms, publishes: [/image]}]
-  - node: /detect
-    callbacks: [{name: detect, subscription: /image, deadline: 10ms}]
-"""

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Timelines: what is told of a schedule is what its trace says; memory stays bounded."""
+"""Timelines: what is shown of a schedule is what its trace says; memory stays bounded."""
 
 from __future__ import annotations
 
@@ -45,43 +45,43 @@ def test_a_schedule_is_told_as_its_trace_says(
     task_set = runs.autoware()
     load, run = runs.simulated(
         task_set, policy=policy, preemptive=preemptive, utilisation=utilisation, seed=seed)
-    told = html.of_run(task_set, load, run)
+    seen = html.of_run(task_set, load, run)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     watch = html.Watch()
     read = html.of_outcome(replay(tmp_path / 'run.mcap', more=watch.of), watch)
-    assert told.tally.result() == read.tally.result() == run.tally.result()
-    assert told.timeline.n_executions == len(told.timeline.columns().executions[0]) > 100
-    for ours, theirs in zip(told.timeline.columns(), read.timeline.columns()):
+    assert seen.tally.result() == read.tally.result() == run.tally.result()
+    assert seen.timeline.n_executions == len(seen.timeline.columns().executions[0]) > 100
+    for ours, theirs in zip(seen.timeline.columns(), read.timeline.columns()):
         assert np.array_equal(ours, theirs)
-    assert told.timeline.busy_over_time.result() == read.timeline.busy_over_time.result()
-    assert told.usage.callbacks() == read.usage.callbacks()
-    for sink in told.tables.sinks:
-        assert told.chains.result(task_set, sink) == read.chains.result(task_set, sink)
+    assert seen.timeline.busy_over_time.result() == read.timeline.busy_over_time.result()
+    assert seen.usage.callbacks() == read.usage.callbacks()
+    for sink in seen.tables.sinks:
+        assert seen.chains.result(task_set, sink) == read.chains.result(task_set, sink)
 
 
 class Spy(Observer):
-    """Notes all that it is told, but for recorded misses, which only a recording has."""
+    """Notes all that it gets, but for recorded misses, which only a recording has."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[Any, ...]] = []
+        self.seen: list[tuple[Any, ...]] = []
 
     def released(self, *what: Any) -> None:
-        self.told.append(('released', *what))
+        self.seen.append(('released', *what))
 
     def started(self, *what: Any) -> None:
-        self.told.append(('started', *what))
+        self.seen.append(('started', *what))
 
     def ran(self, *what: Any) -> None:
-        self.told.append(('ran', *what))
+        self.seen.append(('ran', *what))
 
     def completed(self, *what: Any) -> None:
-        self.told.append(('completed', *what[:10]))     # executions have other numbers
+        self.seen.append(('completed', *what[:10]))     # executions have other numbers
 
     def ended(self, *what: Any) -> None:
-        self.told.append(('ended', *what))
+        self.seen.append(('ended', *what))
 
     def finished(self, now: int, batch: Batch) -> None:
-        self.told.append(('finished', now))
+        self.seen.append(('finished', now))
 
 
 @pytest.mark.parametrize(('settings', 'utilisation'), [
@@ -93,13 +93,13 @@ def test_observers_are_told_the_same_in_the_same_order(
     task_set = runs.autoware()
     load, run = runs.simulated(task_set, utilisation=utilisation, **settings)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
-    told, read = Spy(), Spy()
+    seen, read = Spy(), Spy()
     ComputedRun(
-        task_set, load, run.log, run.decisions, 300 * runs.MS, run.ended_ns).play([told])
+        task_set, load, run.log, run.decisions, 300 * runs.MS, run.ended_ns).play([seen])
     replay(tmp_path / 'run.mcap', more=lambda _: [read])
-    assert len(told.told) > 100 and {what[0] for what in told.told} >= {
+    assert len(seen.seen) > 100 and {what[0] for what in seen.seen} >= {
         'released', 'started', 'ran', 'completed', 'finished'}
-    assert told.told == read.told
+    assert seen.seen == read.seen
 
 
 def test_an_end_at_the_instant_of_a_release_comes_first(tmp_path: Path) -> None:
@@ -107,13 +107,13 @@ def test_an_end_at_the_instant_of_a_release_comes_first(tmp_path: Path) -> None:
     load = periodic_load(task_set, [[5 * runs.MS, 5 * runs.MS]], 50 * runs.MS)
     run = simulate(task_set, load, Settings(workers=1, duration_ns=50 * runs.MS), log=True)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
-    told, read = Spy(), Spy()
+    seen, read = Spy(), Spy()
     ComputedRun(
-        task_set, load, run.log, run.decisions, 50 * runs.MS, run.ended_ns).play([told])
+        task_set, load, run.log, run.decisions, 50 * runs.MS, run.ended_ns).play([seen])
     replay(tmp_path / 'run.mcap', more=lambda _: [read])
-    at_ten = [what[0] for what in told.told if 10 * runs.MS in what and 'started' != what[0]]
+    at_ten = [what[0] for what in seen.seen if 10 * runs.MS in what and 'started' != what[0]]
     assert at_ten[:3] == ['ran', 'completed', 'released']
-    assert told.told == read.told
+    assert seen.seen == read.seen
 
 
 def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path: Path) -> None:
@@ -123,19 +123,19 @@ def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path: Path) -> No
     load = periodic_load(task_set, [[runs.MS, 30 * runs.MS]], 100 * runs.MS)
     run = simulate(task_set, load, Settings(workers=1, duration_ns=100 * runs.MS), log=True)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
-    told, read = Spy(), Spy()
+    seen, read = Spy(), Spy()
     schedule = ComputedRun(
         task_set, load, run.log, run.decisions, 100 * runs.MS, run.ended_ns,
         numbers=[[10 * job for job in range(10)]])
-    schedule.play([told])
+    schedule.play([seen])
     replay(tmp_path / 'run.mcap', more=lambda _: [read])
     place = {'released': 2, 'started': 3, 'ran': 4, 'completed': 3, 'ended': 2}
     expected = []
-    for what in read.told:
+    for what in read.seen:
         at = place.get(what[0])
         expected.append(what if at is None else (*what[:at], 10 * what[at], *what[at + 1:]))
-    assert told.told == expected
-    assert any(what[0] == 'ended' for what in told.told)
+    assert seen.seen == expected
+    assert any(what[0] == 'ended' for what in seen.seen)
 
 
 @pytest.mark.parametrize('workers', [2, 7])

@@ -269,8 +269,8 @@ def test_raw_messages_and_what_is_told_of_messages(bag: str, graph: Path) -> Non
         node.create_subscription(Header, '/points', publisher.publish, 10, raw=True)
 
     result = rerun(bag, graph, [node_with(fill)])
-    told = [each for each in seen if isinstance(each, tuple)]
-    assert told[2] == ('2', {
+    infos = [each for each in seen if isinstance(each, tuple)]
+    assert infos[2] == ('2', {
         'source_timestamp': START + 200 * MS, 'received_timestamp': START + 200 * MS,
         'publication_sequence_number': 0, 'reception_sequence_number': 3})
     raw = [each for each in seen if isinstance(each, bytes)]

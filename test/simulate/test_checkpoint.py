@@ -72,11 +72,11 @@ def test_any_gaps_are_filled(done: list[bool]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         kept = checkpoint(Path(folder, 'kept.npz'))
         kept.save(part(WHOLE, np.array(done)))
-        told: list[int] = []
-        outcome = evaluate(BASE, RUNS, core='plain', checkpoint=kept, progress=told.append)
+        counts: list[int] = []
+        outcome = evaluate(BASE, RUNS, core='plain', checkpoint=kept, progress=counts.append)
         assert same(outcome, WHOLE)
         assert outcome.resumed == sum(done)
-        assert all(count > sum(done) for count in told)
+        assert all(count > sum(done) for count in counts)
         again = evaluate(BASE, RUNS, core='plain', checkpoint=kept)
         assert same(again, WHOLE) and again.resumed == RUNS
 
