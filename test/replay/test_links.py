@@ -183,7 +183,7 @@ def test_processes_have_addresses_of_their_own(recorded: Recorded) -> None:
     recorded.receive(CAMERA, 1, 105 * MS, 106 * MS, stamp, pid=2)
     got, warnings = linked(recorded.write())
     assert got.links == [('/camera timer 100ms', 100 * MS, None),
-                        ('/other subscription /image', 105 * MS, 101 * MS)]
+                         ('/other subscription /image', 105 * MS, 101 * MS)]
     assert warnings == []
 
 
