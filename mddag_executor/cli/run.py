@@ -55,7 +55,7 @@ mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20
 # SIGINTs within this time are one: who ends a process group sends it to all processes of it, and
 # `ros2 launch`, where it reads from no terminal, then once more to those that it started.
 _SAME_INTERRUPT_S = 1.0
-# A part whose run was killed must not stay for ever, whatever its nodes do.
+# A part must not stay for ever once its end has begun, whatever its nodes do.
 _PART_ENDS_S = 60
 # So long nodes of several processes wait for each other, once the programs have started: where
 # the run has started all of them, and where nobody knows whether the others will come.
@@ -284,7 +284,13 @@ def _run(
     from mddag_executor.live.parts import plain
     from mddag_executor.live.session import measured, Session
     from mddag_executor.live.watch import Watch
-    session = Session(executor, on_end=ends)
+
+    def end_begins() -> None:
+        ends()
+        if args.part is not None:
+            signal.alarm(_PART_ENDS_S)
+
+    session = Session(executor, on_end=end_begins)
     watch = Watch(executor, task_set)
     seconds = None if args.duration is None else args.duration / 1e9
     books: Books | None = None

@@ -15,6 +15,10 @@ error line of one that then ends with status 2 is the supervisor's error.
 A process that ends ahead of the run's end has *died*, unless its status is 0.  What follows is
 said by ``on_exit``: ``end`` ends all, ``continue`` lets the others go on, ``restart`` starts it
 again after ``REST_S``, for what is left of the run then.  The run ends when nothing runs any more.
+
+It does end: what does not end ``END_TIMEOUT_S`` after another one has ended in order, because the
+run was over, is asked to end (SIGTERM); what has not ended as long after it was asked is killed.
+Both are said, in one line that names the process.
 """
 
 from __future__ import annotations
@@ -62,7 +66,7 @@ class Run:
     :ivar name: of the process in the declaration.
     :ivar nth: how many of this name there have been, with this one.
     :ivar status: its exit status, negative for a signal; None while it runs.
-    :ivar asked: it was asked to end.
+    :ivar asked: it was asked to end; ``killed``: it did not, and was killed.
     """
 
     name: str
@@ -70,6 +74,7 @@ class Run:
     process: subprocess.Popen[bytes]
     status: int | None = None
     asked: bool = False
+    killed: bool = False
     _words: deque[str] = field(default_factory=lambda: deque(maxlen=50))
     _errors: list[str] = field(default_factory=list)
     _threads: list[threading.Thread] = field(default_factory=list)
@@ -121,6 +126,7 @@ class Supervisor:
         self._lock = threading.Lock()
         self._stop = False
         self._asked_at: float | None = None
+        self._over_at: float | None = None
         self._to_start: list[tuple[float, str]] = []
 
     def stop(self, hurried: bool = False) -> None:
@@ -180,12 +186,12 @@ class Supervisor:
                     run._errors.append(line)
                     continue
                 run._words.append(line)
-            self._print(run, line, target)
+            self._print(f'[{run.name}] {line}', target)
 
-    def _print(self, run: Run, line: str, target: TextIO) -> None:
+    def _print(self, line: str, target: TextIO) -> None:
         with self._lock:
             try:
-                target.write(f'[{run.name}] {line}\n')
+                target.write(f'{line}\n')
                 target.flush()
             except (OSError, ValueError):
                 pass  # nobody reads it any more: the process goes on
@@ -196,13 +202,15 @@ class Supervisor:
             thread.join(1.0)  # what it has started itself may hold its output open
         if run.status != _BAD_INPUT:
             for line in run._errors:
-                self._print(run, line, self._err)
+                self._print(f'[{run.name}] {line}', self._err)
 
     def _ended(self, run: Run, now: float, is_over: bool) -> None:
         self._reap(run)
         if run.status == _BAD_INPUT and not run.asked:
             raise ProcessError(f'process {run.name}: {run.said.removeprefix("error: ")}')
         self._on_end(run)
+        if is_over and not run.died and self._over_at is None:
+            self._over_at = now
         if self._stop or (is_over and not run.died):
             return
         if self._on_exit == 'restart':
@@ -218,13 +226,22 @@ class Supervisor:
             self._start(name, since)
 
     def _end_if_asked(self, now: float) -> None:
-        """Ask all to end, once; what has not ended long after that is killed."""
+        """Ask all to end, once, also those that should have ended; kill what then does not."""
         running = [run for run in self.runs if run.status is None]
-        if self._stop and self._asked_at is None:
+        late = self._over_at is not None and now - self._over_at > END_TIMEOUT_S
+        if (self._stop or late) and self._asked_at is None:
             self._asked_at = now
             for run in running:
+                if not self._stop:
+                    self._print(f'warning: process {run.name} has not ended with the others: it '
+                                'is asked to', self._err)
                 run.asked = True
                 run.process.terminate()
+            self._stop = True
         elif self._asked_at is not None and now - self._asked_at > END_TIMEOUT_S:
             for run in running:
-                run.process.kill()
+                if not run.killed:
+                    self._print(f'warning: process {run.name} has not ended within '
+                                f'{END_TIMEOUT_S:g} s: it is killed', self._err)
+                    run.killed = True
+                    run.process.kill()

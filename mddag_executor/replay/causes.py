@@ -74,7 +74,8 @@ REMEDIES = {
     'transport': 'let the nodes share a process, or send smaller messages',
     'machine': 'free the CPUs of other work, pin the workers, or take a machine that does not '
                'stand still',
-    'lost': 'a longer queue (QoS depth), reliable QoS, or a publisher that always publishes',
+    'lost': 'if a process ended early (see the warnings), its end; else a longer queue (QoS '
+            'depth), reliable QoS, or a publisher that always publishes',
     'failed': 'mend what the callback raises'}
 _NOTHING_NS = 1_000_000
 _ABOUT_BITS = 4     # up to a 16th more is usual, too

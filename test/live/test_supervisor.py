@@ -129,6 +129,27 @@ def test_all_end_when_asked_and_who_does_not_is_killed(monkeypatch: pytest.Monke
     case.stop_when('[a] waits')
     assert case.run() == [('a', -signal.SIGKILL)]
     assert [run.how for run in case.died] == ['was ended by SIGKILL']
+    assert case.err.getvalue() == (
+        'warning: process a has not ended within 0.1 s: it is killed\n')
+
+
+@pytest.mark.parametrize('is_deaf', [False, True])
+def test_who_does_not_end_when_the_run_is_over_is_asked_then_killed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_deaf: bool
+) -> None:
+    monkeypatch.setattr(module, 'END_TIMEOUT_S', 0.1)
+    mark = tmp_path / 'goes on'
+    how = 'signal.SIG_IGN' if is_deaf else 'signal.SIG_DFL'
+    goes_on = (f'import signal, time\nsignal.signal(signal.SIGTERM, {how})\n'
+               f'open({str(mark)!r}, "w").close()\nwhile True: time.sleep(60)')
+    ends = f'import os, time\nwhile not os.path.exists({str(mark)!r}): time.sleep(0.01)'
+    case = Case(a=goes_on, b=ends)
+    assert case.run(seconds=0.0) == [('a', -signal.SIGKILL if is_deaf else -signal.SIGTERM),
+                                     ('b', 0)]
+    assert [run.name for run in case.died] == ['a'] * is_deaf
+    said = case.err.getvalue().splitlines()
+    assert said[0] == 'warning: process a has not ended with the others: it is asked to'
+    assert said[1:] == ['warning: process a has not ended within 0.1 s: it is killed'] * is_deaf
 
 
 def test_one_that_ends_when_the_run_is_over_takes_no_other_along(tmp_path: Path) -> None:
