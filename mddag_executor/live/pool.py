@@ -354,8 +354,10 @@ class Pool:
             if self.cpu_order is not None:
                 self.cpu_order.starts(seat, start)
             seat.reading = None
-            if entity.habit.is_to_be_measured():
-                self.interpreter.begins(seat, entity.habit)
+            habit = entity.habit
+            habit.runs += 1
+            if habit.runs >= habit.due and habit.is_to_be_measured():
+                self.interpreter.begins(seat, habit)
         work.is_known = self.is_settled
         traced = engine.record is not None
         if traced:

@@ -212,7 +212,8 @@ def learnt(
     """
     habit = habit or Habit()
     for execution in executions:
-        if not habit.is_to_be_measured():
+        habit.runs += 1
+        if habit.runs < habit.due or not habit.is_to_be_measured():
             continue
         duration, computed, process_computed = (int(ms * MS) for ms in execution)
         beside = process_computed - computed
@@ -233,6 +234,29 @@ def test_two_that_fight_for_the_lock_are_both_found_out():
     assert learnt((20, 10, 20)) == 1
     assert learnt((70, 10, 70)) == 1
     assert learnt((20, 0.2, 15)) == 0  # sleeps while others compute
+
+
+def test_who_sleeps_while_others_compute_is_not_thought_to_compute():
+    beside_all_the_time = (1.4, 0.1, 2.9)  # one computes in Python, others without the lock
+    habit = Habit()
+    for _ in range(500):
+        assert learnt(beside_all_the_time, habit=habit) == 0
+    habit = Habit()
+    assert learnt(*[(10, 0.6, 0.7)] * 20, habit=habit) == 0
+    taken_for_one = sum(learnt((10, 0.6, 25), habit=habit) for _ in range(5000))
+    assert 0 < taken_for_one < 50  # for one execution now and then, to find out
+
+
+def test_who_computes_for_less_than_a_turn_is_seldom_interrupted():
+    interrupted = (1.2, 0.1, 1.3)
+    assert learnt(*[*[(0.1, 0.1, 0.1)] * 5, interrupted] * 100) == 1
+
+
+def test_that_the_machine_stood_still_once_changes_nothing():
+    habit = Habit()
+    assert learnt(*[(10, 9.5, 9.6)] * 31, (1000, 9.5, 9.6), habit=habit) == 1
+    for _ in range(50):
+        assert learnt((10, 9.5, 9.6), habit=habit) == 1
 
 
 def test_other_processes_do_not_count():
