@@ -414,8 +414,10 @@ class Engine:
         return x >= 0 and state.x_worker[x] >= 0 and state.x_holds[x] != 0
 
     def _begins_to_hold(self, work: Work, now: int) -> None:
-        self._holders = [w for w in self._holders if self._holds(w)]
-        self._holders.append(work)
+        if self._state.scalars[N_HOLDING] == 1:
+            self._holders = [work]
+        else:
+            self._holders = [*filter(self._holds, self._holders), work]
         self.is_shared = len(self._holders) > 1
         self._holds_since = now
 

@@ -45,14 +45,14 @@ def install() -> None:
 
     def publish(self: Any, msg: Any) -> None:
         state = publisher_state(self)
-        begin = time_ns()
         with state.lock:
             state.count += 1
+            begin = time_ns()
             running = current.running
             if running is None:
                 send(self, msg)
             else:
-                running.publish(send, self, msg, state)
+                running.publish(send, self, msg, state, begin)
         for deliver in state.deliver:  # looked up after it is sent: see ``inline``
             deliver(begin)
 

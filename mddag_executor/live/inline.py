@@ -46,10 +46,10 @@ from dataclasses import replace
 import threading
 from typing import Any
 
-from mddag_executor.live.compat import keeps_time
+from mddag_executor.live.compat import keeps_time, RCL_ERRORS
 from mddag_executor.live.hooks import install, publisher_state
 from mddag_executor.live.intake.arrivals import Receiver
-from mddag_executor.live.intake.entities import EntitySet
+from mddag_executor.live.intake.entities import alive, EntitySet
 from mddag_executor.live.intake.sources import MOST_AT_ONCE, SubscriptionSource
 from mddag_executor.live.jobs import PublisherState
 from mddag_executor.live.work import Work
@@ -93,19 +93,21 @@ class Direct:
         :param arrivals: gets what was taken.
         :return: False when that message was not there, for the first time.
         """
-        take_next = self._source.take_next
-        try:
-            with self._source.handle:
-                for _ in range(MOST_AT_ONCE):
-                    taken = take_next()
-                    if taken is None:
-                        break
-                    stamp: int = taken[1]['source_timestamp']
-                    self._newest = max(stamp, self._newest)
-                    arrivals.append(self._source.arrival(taken))
-                    if stamp >= begin > 0:
-                        break
-        except InvalidHandle:
+        source = self._source
+        try:  # without entering the handle, which takes as long as a tenth of all this
+            for _ in range(MOST_AT_ONCE):
+                taken = source.take_next()
+                if taken is None:
+                    break
+                stamp: int = taken[1]['source_timestamp']
+                if stamp > self._newest:
+                    self._newest = stamp
+                arrivals.append(source.arrival(taken))
+                if stamp >= begin > 0:
+                    break
+        except RCL_ERRORS:
+            if alive(self.subscription):
+                raise
             return True  # destroyed
         if self._newest >= begin or self.refused:
             return True

@@ -153,10 +153,6 @@ class _Topic:
         self.on_header: Callable[[int, Origin], None] | None = None
         self._count = 0
 
-    def begun(self, publication: Publication) -> None:
-        self.open.append(publication)
-        self.publications.append(publication)
-
     def ended(self, publication: Publication, end: int) -> None:
         length = end - publication.begin
         if length > self._longest_lately:
@@ -188,9 +184,13 @@ class Jobs:
 
     def publish(
         self, send: Callable[[Any, Any], None], publisher: Any, msg: Any,
-        state: PublisherState, origin: Origin,
+        state: PublisherState, origin: Origin, begin: int,
     ) -> None:
-        """Send a message and note the publication; the caller holds the publisher's lock."""
+        """
+        Send a message and note the publication; the caller holds the publisher's lock.
+
+        :param begin: system time (ns), since when it holds that.
+        """
         if state.noted_by is not self:
             state.noted_by, state.notes = self, self._topics.get(state.topic)
         topic = state.notes
@@ -199,8 +199,9 @@ class Jobs:
             return
         if topic.on_header is not None:
             topic.on_header(header_stamp(msg), origin)
-        publication = Publication(time_ns(), state, origin, state.count)
-        topic.begun(publication)
+        publication = Publication(begin, state, origin, state.count)
+        topic.open.append(publication)
+        topic.publications.append(publication)
         try:
             send(publisher, msg)
         finally:

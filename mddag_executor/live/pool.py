@@ -41,7 +41,7 @@ from mddag_executor.core import NEVER
 from mddag_executor.live.compat import UNKNOWN
 from mddag_executor.live.cpu_order import CpuOrder
 from mddag_executor.live.engine import Engine
-from mddag_executor.live.entity import BRIEF_NS, SOON_NS
+from mddag_executor.live.entity import BRIEF_NS, MOST_DEBT, SOON_NS
 from mddag_executor.live.gates import Refused
 from mddag_executor.live.interpreter import Interpreter
 from mddag_executor.live.preemption import Preemption
@@ -375,14 +375,15 @@ class Pool:
             if entity.ends_soon.debt or after > SOON_NS:
                 entity.ends_soon.took(after, entity.ran)
             seat.published = 0
-        if entity.is_brief.debt or end - start > BRIEF_NS:
-            entity.is_brief.took(end - start, entity.ran)
+        took, debt = end - start, entity.is_brief.debt
+        if debt < MOST_DEBT if took > BRIEF_NS else debt:
+            entity.is_brief.took(took, entity.ran)
         if seat.reading is not None:
-            self.interpreter.ended(seat, entity.habit, end - start)
+            self.interpreter.ended(seat, entity.habit, took)
         with self.lock:
             now = self._last = end if end > self._last else self._last
             if raised is None and waits_for is None:
-                entity.busy_ns += end - start
+                entity.busy_ns += took
                 engine.finished(work, start, end, now, seat.vtid, seat.worker)
             else:
                 self._report_outcome(seat, work, waits_for, raised, start, end, now)

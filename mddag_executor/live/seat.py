@@ -78,7 +78,9 @@ class Seat:
         self._lend = lend
         self.published = 0
 
-    def publish(self, send: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
+    def publish(
+        self, send: Any, publisher: Any, msg: Any, state: PublisherState, begin: int
+    ) -> None:
         """Publish on behalf of the callback that runs; the caller holds the publisher's lock."""
         work, engine = self.work, self.engine
         assert work is not None
@@ -87,7 +89,7 @@ class Seat:
                 PUBLICATION, self._clock.now(), self.vtid, id(publisher), id(msg))
         if state.topic not in work.entity.publishes:
             work.entity.publishes.add(state.topic)
-        engine.jobs.publish(send, publisher, msg, state, work.origin or NO_ORIGIN)
+        engine.jobs.publish(send, publisher, msg, state, work.origin or NO_ORIGIN, begin)
         if not self.published:
             self.published = monotonic_ns()
 

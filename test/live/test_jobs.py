@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import time
 from typing import Any
 
 from hypothesis import given
@@ -44,7 +45,8 @@ class Bench:
         state = self.publishers[publisher]
         state.count += 1
         publication = Publication(begin, state, Origin(0, 0, job, publisher), state.count)
-        self.topic.begun(publication)
+        self.topic.open.append(publication)
+        self.topic.publications.append(publication)
         if end is not None:
             self.topic.ended(publication, end)
 
@@ -141,7 +143,8 @@ def test_publish_notes_its_window_and_passes_exceptions_on():
     state.count = 1
     sent = []
     bench.jobs.publish(
-        lambda publisher, msg: sent.append((publisher, msg)), 'p', 'm', state, Origin(1, 2, 3, 4))
+        lambda publisher, msg: sent.append((publisher, msg)), 'p', 'm', state, Origin(1, 2, 3, 4),
+        time.time_ns())
     publication = bench.topic.publications[0]
     assert sent == [('p', 'm')] and publication.begin <= publication.end
     assert publication.sequence == 1 and publication.origin.job == 3
@@ -150,7 +153,7 @@ def test_publish_notes_its_window_and_passes_exceptions_on():
         raise TypeError('no such message')
 
     try:
-        bench.jobs.publish(fail, 'p', 'm', state, Origin(1, 2, 3, 4))
+        bench.jobs.publish(fail, 'p', 'm', state, Origin(1, 2, 3, 4), time.time_ns())
     except TypeError:
         pass
     assert bench.topic.publications[1].end < 2 ** 62
@@ -218,7 +221,7 @@ def test_publications_that_overlap_are_announced_together_when_all_have_returned
 
     def publish(job: int, publisher: int, send: Callable[[], None] = lambda: None) -> None:
         bench.jobs.publish(lambda *_: send(), None, None, bench.publishers[publisher],
-                           Origin(0, 0, job, publisher))
+                           Origin(0, 0, job, publisher), time.time_ns())
 
     publish(1, 0)
     publish(2, 0, lambda: publish(3, 1))
