@@ -219,6 +219,12 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     if x < 0:
         return -1
     heappop(s.ready if len(s.ready) > 0 and s.ready[0][4] == x else s.held_back)
+    start_on(s, x, worker, now)
+    return x
+
+
+def start_on(s: State, x: int, worker: int, now: int) -> None:
+    """Start an execution that is ready, and in no queue any more, on this idle worker."""
     s.x_state[x] = RUNNING
     s.x_worker[x] = worker
     s.scalars[N_HOLDING] += s.x_holds[x]
@@ -228,7 +234,6 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     s.scalars[N_IDLE] -= 1
     if s.x_group[x] >= 0:
         s.group_owner[s.x_group[x]] = x
-    return x
 
 
 def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from heapq import heapify
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import policy
@@ -114,14 +115,10 @@ class Scheduler:
 
     def start(self, x: int, worker: int, now: int) -> None:
         """Start what began on an idle worker before all that waits, and is known of only now."""
-        state = self.state
-        waiting = [(queue, queue[:]) for queue in (state.ready, state.held_back)]
-        for queue, _ in waiting:
-            queue.clear()
         self.ready(x, now)
-        self.take(worker, now)
-        for queue, entries in waiting:
-            queue.extend(entries)
+        self.state.ready.remove(self.state.x_key[x])
+        heapify(self.state.ready)
+        rules.start_on(self.state, x, worker, now)
 
     def fail_open(self, slot: int, now: int) -> None:
         """Fail the job in a slot unless it has ended already."""
