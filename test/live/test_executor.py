@@ -32,13 +32,17 @@ def publish_when_matched(publisher: Any, message: Any, count: int = 1) -> None:
 
 def test_timer_runs_at_its_rate(make_executor, make_node):
     node, calls = make_node(), []
+    begin = time.monotonic()
     node.create_timer(0.01, lambda: calls.append(time.monotonic()))
     executor = make_executor()
     executor.add_node(node)
     with Spinning(executor) as spinning:
         assert wait_for(lambda: len(calls) >= 30)
+    end = time.monotonic()
     assert spinning.error is None
-    assert calls[29] - calls[0] == pytest.approx(0.29, abs=0.1)
+    [counts] = executor.statistics()['callbacks'].values()
+    periods = counts['ready'] + counts['skipped']  # a busy machine skips some
+    assert (calls[-1] - calls[0]) / 0.01 - 1 <= periods <= (end - begin) / 0.01
 
 
 def test_subscriptions_of_each_kind(make_executor, make_node):
