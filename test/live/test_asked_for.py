@@ -178,7 +178,8 @@ nodes:
         assert wait_for(lambda: len(starts) >= 10)
     # of what it missed one release may have waited, and nothing more
     after = [b - a for a, b in zip(starts[3:], starts[4:])]
-    assert sum(gap < 0.002 for gap in after) <= 1, after
+    stops = executor.statistics()['stops']['count']  # of the machine
+    assert sum(gap < 0.002 for gap in after) <= 1 + stops, after
     # (the first may have been due before the executor began to look after the timer)
     for release in releases[1:]:
         assert abs((release - releases[1] + 10 * MS) % (20 * MS) - 10 * MS) < 2 * MS, releases
