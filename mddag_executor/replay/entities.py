@@ -200,8 +200,11 @@ class Entities:
 
     def take(self, event: Event) -> None:
         """Note what an event says, as ``TraceReader.events`` has it."""
-        name = event[0].partition(':')[2]
-        fields = _as_dict([field for field, _ in EVENTS[event[0]].fields], event)
+        self.note(event[0], _as_dict([field for field, _ in EVENTS[event[0]].fields], event))
+
+    def note(self, name: str, fields: Fields) -> None:
+        """Note what an event says, as ``read_events`` has it."""
+        name = name.partition(':')[2]
         if _complete(name, fields):
             self._one(name, fields)
 

@@ -30,6 +30,7 @@ from collections.abc import Iterator
 import os
 from typing import Any
 
+from mddag_executor.replay.entities import Entities, OWN_INIT_EVENTS
 from mddag_executor.replay.own import OwnRun
 from mddag_executor.replay.run import open_run
 from mddag_executor.trace import read_events
@@ -59,11 +60,13 @@ CARET_EVENTS = frozenset([
     *(f'ros2:{name}' for name in (*_ROS2, *_RUN_TIME)),
     *(f'ros2_caret:{name}' for name in (*_CARET, *_ROS2))])
 
-_DISPATCH = 'mddag:dispatch'
+_DISPATCH, _PUBLISH, _TAKE = 'mddag:dispatch', 'ros2:rcl_publish', 'ros2:rmw_take'
 _LAG_NS = 1_000_000_000
 _KEEP_JOBS = 4096
 
 Event = dict[str, Any]
+Stamps = dict[str, list[tuple[int, int]]]
+"""By topic the publications' times and source timestamps (0: none is known)."""
 
 
 def caret_events(path: str | os.PathLike[str]) -> Iterator[Event]:
@@ -79,38 +82,41 @@ def caret_events(path: str | os.PathLike[str]) -> Iterator[Event]:
     if not isinstance(run, OwnRun):
         yield from read_events(path, CARET_EVENTS)
         return
-    filler = _Filler(run, _stamps(path))
-    for event in read_events(path, (CARET_EVENTS | {_DISPATCH}) - {'ros2:rmw_take'}):
+    filler = _Filler(run, *_read(path))
+    for event in read_events(path, (CARET_EVENTS | {_DISPATCH}) - {_TAKE}):
         yield from filler.take(event)
 
 
-def _stamps(path: str | os.PathLike[str]) -> dict[str, list[tuple[int, int]]]:
-    """Return by topic the publications' times and source timestamps (0: none is known)."""
-    topic_of: dict[int, str] = {}
+def _read(path: str | os.PathLike[str]) -> tuple[Entities, Stamps]:
+    """Return who is who, and the stamps."""
+    who = Entities(by_address=True)
     sent: dict[str, list[int]] = {}
     taken: dict[str, set[int]] = {}
-    for event in read_events(path, {
-            'ros2:rcl_publisher_init', 'ros2:rcl_subscription_init', 'ros2:rcl_publish',
-            'ros2:rmw_take'}):
-        name = event['_name']
-        if name == 'ros2:rcl_publisher_init':
-            topic_of[event['publisher_handle']] = event['topic_name']
-        elif name == 'ros2:rcl_subscription_init':
-            topic_of[event['rmw_subscription_handle']] = event['topic_name']
-        elif name == 'ros2:rcl_publish':
-            sent.setdefault(topic_of.get(event['publisher_handle'], ''), []).append(
-                event['_timestamp'])
+    for event in read_events(path, {*OWN_INIT_EVENTS, _PUBLISH, _TAKE}):
+        if event['_name'] == _PUBLISH:
+            sent.setdefault(_topic(who, event), []).append(event['_timestamp'])
+        elif event['_name'] == _TAKE:
+            callbacks = who.taken.latest(
+                event['_vpid'], event['rmw_subscription_handle'], event['_timestamp'])
+            taken.setdefault(callbacks[0].start if callbacks else '', set()).add(
+                event['source_timestamp'])
         else:
-            topic = topic_of.get(event['rmw_subscription_handle'], '')
-            taken.setdefault(topic, set()).add(event['source_timestamp'])
-    found: dict[str, list[tuple[int, int]]] = {}
+            who.note(event['_name'], event)
+    found: Stamps = {}
     for topic, times in sent.items():
         stamps = sorted(taken.get(topic, ()))
         for time, after in zip(times, [*times[1:], times[-1] + _LAG_NS]):
             place = bisect_left(stamps, time)
             known = place < len(stamps) and stamps[place] < min(after, time + _LAG_NS)
             found.setdefault(topic, []).append((time, stamps[place] if known else 0))
-    return found
+    return who, found
+
+
+def _topic(who: Entities, event: Event) -> str:
+    """Return the topic of a publication, empty where that is not known."""
+    publisher = who.publishers.latest(
+        event['_vpid'], event['publisher_handle'], event['_timestamp'])
+    return '' if publisher is None else publisher.topic
 
 
 def _head(event: Event) -> Event:
@@ -121,12 +127,9 @@ def _head(event: Event) -> Event:
 class _Filler:
     """Adds what CARET's tracer would have seen."""
 
-    def __init__(
-        self, run: OwnRun, stamps: dict[str, list[tuple[int, int]]]
-    ) -> None:
-        self._stamps = stamps
+    def __init__(self, run: OwnRun, who: Entities, stamps: Stamps) -> None:
+        self._who, self._stamps = who, stamps
         self._dags = run.recorded_set.dags
-        self._topic_of: dict[int, str] = {}     # by handle of publisher, subscription, callback
         self._running: dict[int, tuple[int, int, int]] = {}     # by thread: DAG, vertex, job
         # by job, of what was published: source timestamp and address, by vertex and topic
         self._jobs: OrderedDict[tuple[int, int], dict[tuple[int, str], tuple[int, int]]] = \
@@ -151,25 +154,13 @@ class _Filler:
                 'callback_group_addr': event['callback_group_addr'],
                 'group_type_name': event['group_type_name']}
         yield event
-        if name == 'ros2:rcl_publish':
+        if name == _PUBLISH:
             yield from self._written(event)
         elif name == 'ros2:callback_end':
             self._running.pop(thread, None)
-        elif name == 'ros2:rcl_publisher_init':
-            self._topic_of[event['publisher_handle']] = event['topic_name']
-        elif name == 'ros2:rcl_subscription_init':
-            self._topic_of[event['subscription_handle']] = event['topic_name']
-        elif name == 'ros2:rclcpp_subscription_init':
-            self._pass_on(event['subscription_handle'], event['subscription'])
-        elif name == 'ros2:rclcpp_subscription_callback_added':
-            self._pass_on(event['subscription'], event['callback'])
-
-    def _pass_on(self, known: int, to: int) -> None:
-        if known in self._topic_of:
-            self._topic_of[to] = self._topic_of[known]
 
     def _written(self, event: Event) -> Iterator[Event]:
-        topic = self._topic_of.get(event['publisher_handle'], '')
+        topic = _topic(self._who, event)
         publications = self._stamps.get(topic, [])
         place = bisect_left(publications, (event['_timestamp'], 0))
         if place == len(publications) or publications[place][0] != event['_timestamp']:
@@ -190,16 +181,17 @@ class _Filler:
 
     def _dispatched(self, event: Event) -> Iterator[Event]:
         running = self._running.get(event['_vtid'])
-        topic = self._topic_of.get(event['callback'])
-        if running is None or running[0] < 0 or topic is None:
+        callback = self._who.callbacks.latest(
+            event['_vpid'], event['callback'], event['_timestamp'])
+        if running is None or running[0] < 0 or callback is None:
             return
         dag, vertex, job = running
         if not dag < len(self._dags) or not 0 <= vertex < len(self._dags[dag].vertices):
             return
         messages = self._jobs.get((dag, job), {})
         for before in self._dags[dag].vertices[vertex].predecessors:
-            if (before, topic) in messages:
-                stamp, address = messages[(before, topic)]
+            if (before, callback.start) in messages:
+                stamp, address = messages[(before, callback.start)]
                 yield {
                     **_head(event),
                     '_name': 'ros2:dispatch_subscription_callback', 'message': address,

@@ -9,8 +9,7 @@ a figure is drawn.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib.util import find_spec
 import os
 from typing import Any, BinaryIO, TYPE_CHECKING
@@ -51,26 +50,17 @@ def draw(evaluation: Evaluation, file: BinaryIO, path: str) -> None:
 
     :param path: its name, whose ending says the kind.
     """
-    width = 6.4 if len(evaluation.experiments) == 1 else 8.8  # with the legend beside it
-    with two_plots(file, path, (width, 4.8), (4, 1)) as (above, below):
-        _ratios(above, evaluation)
-        _counts(below, evaluation)
-
-
-@contextmanager
-def two_plots(
-    file: BinaryIO, path: str, size: tuple[float, float], heights: tuple[int, int]
-) -> Iterator[tuple[Axes, Axes]]:
-    """Give two plots, one above the other, and write their figure; ``path`` says the kind."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
     kind = os.path.splitext(path)[1].lower()[1:]
+    width = 6.4 if len(evaluation.experiments) == 1 else 8.8  # with the legend beside it
     # Without these, two figures of the same data would differ.
     metadata: dict[str, Any] = {'png': {}, 'svg': {'Date': None}, 'pdf': {'CreationDate': None}}
     with rc_context({'svg.hashsalt': 'mddag', 'font.size': 9.0}):
-        figure = Figure(figsize=size, layout='constrained')
-        above, below = figure.subplots(2, 1, sharex=True, height_ratios=heights)
-        yield above, below
+        figure = Figure(figsize=(width, 4.8), layout='constrained')
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
+        _ratios(above, evaluation)
+        _counts(below, evaluation)
         figure.savefig(file, format=kind, dpi=150, metadata=metadata[kind])
 
 

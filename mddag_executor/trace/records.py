@@ -29,7 +29,6 @@ FOOTER_CONTENT = struct.Struct('<QQI')      # summary start, summary offset star
 STATISTICS_HEAD = struct.Struct('<QHIIIIQQ')
 
 UINT32 = struct.Struct('<I')
-UINT64 = struct.Struct('<Q')
 
 
 def record(opcode: int, content: bytes) -> bytes:
