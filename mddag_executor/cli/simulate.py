@@ -19,7 +19,7 @@ from mddag_executor.cli.text import format_ns, printable, Progress
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
-    from mddag_executor.simulate import Load, Run, Settings
+    from mddag_executor.simulate import Load, Settings, SimulatedRun
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -98,14 +98,14 @@ def execution_times(
 
 def _simulate(
     task_set: TaskSet, load: Load, settings: Settings, utilisation: float, log: bool
-) -> Run:
+) -> SimulatedRun:
     from mddag_executor.simulate import simulate
     with Progress('simulating', settings.duration_ns) as line:
         return simulate(
             task_set, load, settings, utilisation=utilisation, log=log, progress=line.update)
 
 
-def _result(args: argparse.Namespace, task_set: TaskSet, run: Run) -> dict[str, Any]:
+def _result(args: argparse.Namespace, task_set: TaskSet, run: SimulatedRun) -> dict[str, Any]:
     drawn = args.execution_times is None
     return {
         **run.result(), 'file': task_set.file, 'judge': run.settings.judge,

@@ -10,9 +10,10 @@ when.  Together with the load and with the ends of jobs that the core decided th
 recording has, so every observer finds the same verdicts again and, as with a recording,
 where the time went.
 
-At one instant the ends of executions come first, then jobs that are given up, then releases, then
-starts.  A vertex is ready when the last message that it needs has arrived: at the end of the
-execution that publishes it, or as much later (or earlier) as ``delays`` says.
+At one instant the ends of executions come first, each with the job that it aborts, then other jobs
+that are given up, then releases, then starts.  A vertex is ready when the last message that it
+needs has arrived: at the end of the execution that publishes it, or as much later (or earlier) as
+``delays`` says.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from mddag_executor.core import legs_of, NEVER
-from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END
+from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END, SINK_LATE
 from mddag_executor.replay.happenings import (
     Batches,
     COMPLETED,
@@ -32,7 +33,7 @@ from mddag_executor.replay.happenings import (
     RELEASED,
     STARTED,
 )
-from mddag_executor.simulate import END, Load, LogEntry, Run, START
+from mddag_executor.simulate import END, Load, LogEntry, SimulatedRun, START
 from mddag_executor.simulate.load import as_lists, FAILS
 from msg_graph import TaskSet
 
@@ -66,7 +67,7 @@ class ComputedRun(NamedTuple):
     judge_from: int = -NEVER
 
     @classmethod
-    def of_run(cls, task_set: TaskSet, load: Load, run: Run) -> ComputedRun:
+    def of_run(cls, task_set: TaskSet, load: Load, run: SimulatedRun) -> ComputedRun:
         """Return a run that was simulated with its log."""
         horizon = run.settings.duration_ns
         stopped = run.settings.stop_at_first_miss and run.ended_ns < horizon
@@ -119,6 +120,9 @@ class _Player:
             # what ends at an instant does so before anything is released or given up there
             self._until(entry[0] - 1 if entry[1] == END else entry[0])
             self._change(entry)
+            now, kind, _, dag, v, job = entry
+            if kind == END and self._next_end == (now, dag, job, True, v):
+                self._end_job()     # what else of it ends at that instant comes too late
             self._batches.flush_if_full()
         self._until(schedule.end)
         self._batches.finish(schedule.end, schedule.judged)
@@ -127,10 +131,15 @@ class _Player:
         numbers = self._schedule.numbers
         return job if numbers is None or dag >= self._n_dags else numbers[dag][job]
 
-    def _job_ends(self) -> Iterator[tuple[int, int, int, bool]]:
-        for kind, dag, _, job, how, time in self._schedule.decisions:
-            if kind == JOB_END and how in (ABORTED, EXPIRED) and dag < self._n_dags:
-                yield time, dag, job, how == ABORTED
+    def _job_ends(self) -> Iterator[tuple[int, int, int, bool, int]]:
+        """Yield when jobs end otherwise than by completing, and the vertex that aborts one."""
+        late = (-1, -1, -1), -1
+        for kind, dag, v, job, how, time in self._schedule.decisions:
+            if kind == SINK_LATE:
+                late = (dag, job, time), v
+            elif kind == JOB_END and how in (ABORTED, EXPIRED) and dag < self._n_dags:
+                vertex = late[1] if late[0] == (dag, job, time) else -1
+                yield time, dag, job, how == ABORTED, vertex
 
     def _until(self, now: int) -> None:
         """Report what is released and given up to an instant."""
@@ -141,13 +150,18 @@ class _Player:
                 release = now + 1
             end = self._next_end
             if end is not None and end[0] <= min(now, release):
-                self._add(ENDED, end[1], self._number(end[1], end[2]), int(end[3]), end[0])
-                self._next_end = next(self._ends, None)
+                self._end_job()
             elif release <= now:
                 self._release(self._next, release)
                 self._next += 1
             else:
                 return
+
+    def _end_job(self) -> None:
+        assert self._next_end is not None
+        now, dag, job, aborted, _ = self._next_end
+        self._add(ENDED, dag, self._number(dag, job), int(aborted), now)
+        self._next_end = next(self._ends, None)
 
     def _release(self, i: int, now: int) -> None:
         load = self._load

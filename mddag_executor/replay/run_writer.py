@@ -23,7 +23,7 @@ from mddag_executor.core.state import Decision, DROP, JOB_END, SINK_IN_TIME
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.judge import Judge
-from mddag_executor.simulate import Load, Run
+from mddag_executor.simulate import Load, SimulatedRun
 from mddag_executor.trace import TraceFile
 from msg_graph import TaskSet
 
@@ -32,7 +32,7 @@ _MOST = 2 ** 31 - 1
 
 
 def write_trace(
-    path: str | os.PathLike[str], task_set: TaskSet, load: Load, run: Run
+    path: str | os.PathLike[str], task_set: TaskSet, load: Load, run: SimulatedRun
 ) -> None:
     """Write the trace of a run that was simulated with its log."""
     with TraceFile(path) as file:
@@ -41,12 +41,12 @@ def write_trace(
 
 
 def write_events(
-    task_set: TaskSet, load: Load, run: Run, add: Callable[..., object]
+    task_set: TaskSet, load: Load, run: SimulatedRun, add: Callable[..., object]
 ) -> None:
     """Give out the events of such a trace: name, time, thread, fields."""
     settings = run.settings
     add('task_set', 0, 0, task_set.text, task_set.file, settings.policy, settings.workers,
-        DEFAULT_DEADLINE_NS, _MOST, run.preemptive, settings.cpus or 0)
+        DEFAULT_DEADLINE_NS, _MOST, settings.preempts, settings.cpus or 0)
     for place, callback in enumerate(task_set.callbacks, 1):
         add('rclcpp_callback_register', 0, 0, place, callback.key)
     computed = ComputedRun.of_run(task_set, load, run)

@@ -42,7 +42,7 @@ from mddag_executor.report.html_tables import (
 from mddag_executor.report.tables import never_due_lines, verdicts_line
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import MOST_EXECUTIONS, no_names, Timeline
-from mddag_executor.simulate import Load, Run
+from mddag_executor.simulate import Load, SimulatedRun
 from mddag_executor.text import counted
 from msg_graph import TaskSet
 
@@ -122,7 +122,7 @@ def of_outcome(outcome: Replay | Reschedule, watch: Watch | None) -> ReportData:
                misses=result.get('misses'), worker_names=worker_names)
 
 
-def of_run(task_set: TaskSet, load: Load, run: Run) -> ReportData:
+def of_run(task_set: TaskSet, load: Load, run: SimulatedRun) -> ReportData:
     """Return the data of a report about a run that was simulated with its log."""
     watch = Watch().of_computed(ComputedRun.of_run(task_set, load, run))
     facts = [('declaration', task_set.file), *_facts(run.result())]

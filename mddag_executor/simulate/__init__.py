@@ -5,7 +5,7 @@
 from mddag_executor.simulate.engine import END, LogEntry, PREEMPT, START
 from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.load import Load
-from mddag_executor.simulate.run import JUDGES, Run, simulate
+from mddag_executor.simulate.run import JUDGES, simulate, SimulatedRun
 from mddag_executor.simulate.schedule import schedule, Scheduled, Settings
 from mddag_executor.simulate.workload import (
     draw_execution_times,
@@ -16,7 +16,7 @@ from mddag_executor.simulate.workload import (
 )
 
 __all__ = [
-    'END', 'JUDGES', 'Load', 'LogEntry', 'PREEMPT', 'Run', 'START', 'Scheduled', 'Settings',
-    'SimulationError', 'draw_execution_times', 'periodic_load', 'read_execution_times',
-    'scale_execution_times', 'schedule', 'simulate', 'utilisation',
+    'END', 'JUDGES', 'Load', 'LogEntry', 'PREEMPT', 'START', 'Scheduled', 'Settings',
+    'SimulatedRun', 'SimulationError', 'draw_execution_times', 'periodic_load',
+    'read_execution_times', 'scale_execution_times', 'schedule', 'simulate', 'utilisation',
 ]

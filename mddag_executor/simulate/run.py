@@ -20,7 +20,7 @@ JUDGES = ('horizon', 'completions')
 
 
 @dataclass
-class Run:
+class SimulatedRun:
     """
     Outcome of a run: the tally, when it ended (ns) and, if asked for, the log of every worker.
 
@@ -31,7 +31,6 @@ class Run:
     tally: Tally
     ended_ns: int
     utilisation: float | None
-    preemptive: bool
     log: Sequence[LogEntry] = ()
     decisions: Sequence[Decision] = ()
 
@@ -39,7 +38,7 @@ class Run:
         """Return the result format of ``simulate --json``."""
         return {
             'policy': self.settings.policy, 'workers': self.settings.workers,
-            'preemptive': self.preemptive, 'duration_ns': self.settings.duration_ns,
+            'preemptive': self.settings.preempts, 'duration_ns': self.settings.duration_ns,
             'utilisation': self.utilisation, **self.tally.result(),
             **({} if self.settings.cpus is None else {'cpus': self.settings.cpus})}
 
@@ -53,7 +52,7 @@ def simulate(
     max_active_jobs: int | None = None,
     log: bool = False,
     progress: Callable[[int], None] | None = None,
-) -> Run:
+) -> SimulatedRun:
     """
     Run the core over a load.
 
@@ -73,7 +72,7 @@ def simulate(
         if time < settings.duration_ns and time <= ended:
             tally.released(dag)
     tally.add(decisions)
-    return Run(settings, tally, ended, utilisation, settings.preempts, entries, decisions)
+    return SimulatedRun(settings, tally, ended, utilisation, entries, decisions)
 
 
 def check(settings: Settings) -> None:

@@ -22,9 +22,9 @@ from mddag_executor.simulate import (
     Load,
     periodic_load,
     PREEMPT,
-    Run,
     Settings,
     simulate,
+    SimulatedRun,
     START,
 )
 from msg_graph import loads, TaskSet
@@ -67,7 +67,7 @@ class Case:
         return periodic_load(self.task_set, self.times_ns, ticks * TICK)
 
     def run(self, horizon: int, judge: str = 'horizon', stop: bool = False,
-            last_release: int | None = None) -> Run:
+            last_release: int | None = None) -> SimulatedRun:
         """Simulate it; times in ticks."""
         settings = Settings(
             policy=self.policy, workers=self.workers, duration_ns=horizon * TICK,
@@ -76,7 +76,7 @@ class Case:
             switch_overhead_ns=self.switch_overhead * TICK)
         return simulate(self.task_set, self.load(last_release or horizon), settings, log=True)
 
-    def events(self, run: Run) -> list[Event]:
+    def events(self, run: SimulatedRun) -> list[Event]:
         """Return a run's log in ticks, with each vertex by its index in its DAG."""
         first = [0]
         for dag in self.task_set.dags:

@@ -238,6 +238,6 @@ def test_no_preemption() -> None:
     with pytest.raises(PolicyError, match='preempts no callback'):
         simulate(task_set, of.load(10), settings)
     assert not simulate(
-        task_set, of.load(10), Settings(policy='ros2', preemptive=None)).preemptive
+        task_set, of.load(10), Settings(policy='ros2', preemptive=None)).settings.preempts
     with pytest.raises(SimulationError, match='workers'):
         simulate(task_set, of.load(10), Settings(policy='ros2', workers=0))

@@ -11,10 +11,10 @@ from mddag_executor.simulate import (
     draw_execution_times,
     Load,
     periodic_load,
-    Run,
     scale_execution_times,
     Settings,
     simulate,
+    SimulatedRun,
 )
 from mddag_executor.trace import TraceFile
 import msg_graph
@@ -79,7 +79,7 @@ def autoware(name: str = 'autoware_multi') -> TaskSet:
 def simulated(
     task_set: TaskSet, *, utilisation: float = 0.95, workers: int = 5, ms: int = 300,
     seed: int = 0, **settings: Any,
-) -> tuple[Load, Run]:
+) -> tuple[Load, SimulatedRun]:
     """Simulate with a log."""
     times = scale_execution_times(
         task_set, draw_execution_times(task_set, seed), workers, utilisation)

@@ -15,9 +15,9 @@ from mddag_executor.simulate import (
     END,
     periodic_load,
     PREEMPT,
-    Run,
     Settings,
     simulate,
+    SimulatedRun,
     START,
 )
 from msg_graph import load, TaskSet
@@ -110,7 +110,7 @@ class Auditor:
     def priority(self, each: Id) -> int:
         return self.key(each)[0]
 
-    def audit(self, run: Run, first: list[int]) -> None:
+    def audit(self, run: SimulatedRun, first: list[int]) -> None:
         instants: dict[int, list[tuple[int, int, Id]]] = {}
         for now, kind, worker, d, v, job in run.log:
             instants.setdefault(now, []).append((kind, worker, (d, v - first[d], job)))

@@ -10,7 +10,7 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.run_writer import write_trace
@@ -19,9 +19,9 @@ from mddag_executor.simulate import (
     END,
     periodic_load,
     PREEMPT,
-    Run,
     Settings,
     simulate,
+    SimulatedRun,
     START,
 )
 from mddag_executor.trace import read_events
@@ -32,6 +32,16 @@ from ..core.task_sets import Case, cases, declaration, examples
 
 AUTOWARE = Path(__file__).resolve().parents[2] / 'config' / 'autoware.yaml'
 US = 1_000
+# The first one is late, which aborts the job, so the other comes too late.
+TWO_SINKS_AT_ONCE = Case(loads("""\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: s, timer: 3us, dag: d, on_miss: abort, publishes: [/t]}
+      - {name: a, subscription: /t, deadline: 1us}
+      - {name: b, subscription: /t, deadline: 1us}
+"""), ((1, 1, 1),), 2, 'rad', False, 0, 0)
 
 
 @pytest.fixture(scope='module')
@@ -40,13 +50,14 @@ def trace() -> Iterator[Path]:
         yield Path(folder, 'run.mcap')
 
 
-def record(case: Case, horizon: int, trace: Path, **how: Any) -> Run:
+def record(case: Case, horizon: int, trace: Path, **how: Any) -> SimulatedRun:
     run = case.run(horizon, **how)
     write_trace(trace, case.task_set, case.load(how.get('last_release') or horizon), run)
     return run
 
 
 @examples(150)
+@example(case=TWO_SINKS_AT_ONCE, horizon=5, stop=False)
 @given(case=cases(overheads=True), horizon=st.integers(5, 50), stop=st.booleans())
 def test_the_replayer_counts_the_same(
     trace: Path, case: Case, horizon: int, stop: bool

@@ -124,7 +124,7 @@ def test_a_policy_has_its_own_mode(policy: str, own: bool) -> None:
     assert Settings(policy=policy).preemptive is False
     for asked, got in ((None, own), (True, True), (False, False)):
         run = simulate(two_dags(), load, Settings(policy=policy, preemptive=asked))
-        assert run.preemptive is run.result()['preemptive'] is got
+        assert run.settings.preempts is run.result()['preemptive'] is got
 
 
 # --- execution times -----------------------------------------------------------------------------
