@@ -4,10 +4,17 @@
 
 from __future__ import annotations
 
-from mddag_executor.assign.placed import CALLBACK_NS, cost_of, improve, Predictor
+from mddag_executor.assign.placed import (
+    ARRIVAL_NS,
+    CALLBACK_NS,
+    cost_of,
+    improve,
+    INTAKE_NS,
+    Predictor,
+)
 from mddag_executor.assign.placement import Placing, TRANSPORT_NS
 from mddag_executor.core.tally import total
-from mddag_executor.simulate.deliveries import DELAY_NS
+from mddag_executor.simulate.machine import SWITCH_NS
 from msg_graph import loads, Process, TaskSet
 import pytest
 
@@ -59,8 +66,29 @@ def test_what_leaves_its_process_takes_longer() -> None:
         found: int = tally.result()['dags']['/a']['sinks']['/b:t']['response_ns']['max']
         return found
 
-    assert response(ALL) == 5 * MS + 2 * CALLBACK_NS
-    assert response(EACH) == response(ALL) + 2 * TRANSPORT_NS + DELAY_NS
+    assert response(ALL) == 5 * MS + 2 * CALLBACK_NS + INTAKE_NS
+    assert response(EACH) == response(ALL) + TRANSPORT_NS + ARRIVAL_NS + INTAKE_NS
+
+
+def test_a_timer_is_noticed_a_switch_interval_later_where_a_callback_computes() -> None:
+    urgent = """
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: t, timer: 100ms, deadline: 100ms}]}
+  - {node: /b, callbacks: [{name: t, timer: 10ms, deadline: 10ms, holds_interpreter: false}]}
+"""
+
+    def responses(processes: tuple[Process, ...]) -> tuple[int, int]:
+        dags = Predictor(loads(urgent), 7, 2, 'rad', 1000 * MS).predict(
+            processes, [[50 * MS], [MS]]).result()['dags']
+        long, short = (dags[name]['sinks'][f'{name}:t']['response_ns']['max']
+                       for name in ('/a', '/b'))
+        return long, short
+
+    alone, together = responses(EACH), responses(ALL)
+    assert alone == (50 * MS + CALLBACK_NS + INTAKE_NS, MS + CALLBACK_NS + INTAKE_NS)
+    assert together[1] == alone[1] + SWITCH_NS
+    assert together[0] >= alone[0] + 4 * INTAKE_NS  # it stands still while others are noticed
 
 
 def several(*times: int) -> tuple[TaskSet, list[list[int]]]:
