@@ -26,11 +26,13 @@ explain, else of all that was recorded.  What one waited for more than that, whi
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
-from mddag_executor.core import Tables
+from mddag_executor.core import NEVER, Tables
 from mddag_executor.replay.happenings import Ints
 from mddag_executor.simulate import END, Load, schedule, Settings
+from mddag_executor.simulate.schedule import prepare
 import numpy as np
 import numpy.typing as npt
 
@@ -41,6 +43,8 @@ HARDLY = 0.1
 ENOUGH = 5
 """So many executions that hardly any other ran beside are enough."""
 TURNS = 8
+BLOCK = 50_000
+"""So many executions the model runs at once, or as many as run into one another."""
 
 Flags = npt.NDArray[np.bool_]
 
@@ -68,7 +72,7 @@ class Recorded(NamedTuple):
         least: Ints = np.minimum(np.maximum(0, self.cpu), self.took)
         return least
 
-    def of(self, which: Flags) -> Recorded:
+    def of(self, which: Flags | Ints) -> Recorded:
         """Return some of them."""
         return Recorded(
             self.could[which], self.took[which], self.cpu[which], self.locks[which],
@@ -141,27 +145,49 @@ def _explained(ran: Recorded, cpus: int) -> Ints:
 
 
 def _ends(ran: Recorded, took: Ints, cpus: int) -> Ints:
-    """Return when the model ends executions that take so long alone."""
+    """
+    Return when the model ends executions that take so long alone.
+
+    Block by block, which takes less memory: one begins when nothing of those before it runs.
+    """
     order = np.argsort(ran.could, kind='stable')
-    times = ran.could[order]
-    ended = np.searchsorted(np.sort(ran.could + took), times, 'right')
-    most = int((np.arange(1, len(times) + 1) - ended).max(initial=1))
+    could = ran.could[order]
+    ended = np.searchsorted(np.sort(ran.could + took), could, 'right')
+    most = int((np.arange(1, len(could) + 1) - ended).max(initial=1))
     n = int(ran.interpreter.max(initial=1))
-    columns: dict[str, Any] = {
-        'times': times, 'dags': ran.interpreter[order] - 1, 'jobs': np.arange(len(times)),
-        'costs': took[order], 'computed': ran.cpu[order],
-        'holds': np.zeros(len(times) * int(ran.locks.any()), dtype=np.int64),
-        'locks': ran.locks[order].astype(np.int64)}
-    load = Load(cost_base=[0] * n, cost_stride=[1] * n, **columns)
+    tables = _interpreters(n)
     # those that stand still are more than those that ran
-    settings = Settings(
-        'fifo', 2 * most + 2, int(times.max(initial=0) + took.sum() + 1),
-        cpus=cpus or len(times) + 1)
-    log = np.asarray(
-        schedule(_interpreters(n), load, settings, log=True).log, dtype=np.int64).reshape(-1, 6)
+    settings = Settings('fifo', 2 * most + 2, cpus=cpus or len(could) + 1)
+    holds = int(ran.locks.any())
+    next_could = np.append(could[1:], NEVER)
+    ends = np.zeros(len(could), dtype=np.int64)
+    first, size = 0, BLOCK
+    while first < len(order):
+        which = order[first:first + size]
+        some = ran.of(which)
+        columns: dict[str, Any] = {
+            'times': some.could, 'dags': some.interpreter - 1, 'jobs': np.arange(len(which)),
+            'costs': took[which], 'computed': some.cpu,
+            'holds': np.zeros(len(which) * holds, dtype=np.int64),
+            'locks': some.locks.astype(np.int64)}
+        load = Load(cost_base=[0] * n, cost_stride=[1] * n, **columns)
+        ends[which] = _block_ends(tables, load, replace(
+            settings, duration_ns=int(some.could[-1] + took[which].sum() + 1)),
+            TURNS * len(order) // len(which))
+        nothing = np.maximum.accumulate(ends[which]) < next_could[first:first + size]
+        cuts = np.flatnonzero(nothing)
+        first, size = (first + int(cuts[-1]) + 1, BLOCK) if len(cuts) else (first, 2 * size)
+    return ends
+
+
+def _block_ends(tables: Tables, load: Load, settings: Settings, runs: int) -> Ints:
+    """Return when the executions of a load end; of as much there are so many runs in all."""
+    log = np.asarray(schedule(
+        tables, load, settings, log=True, compiled=prepare(tables, load, settings, runs)).log,
+        dtype=np.int64).reshape(-1, 6)
     log = log[log[:, 1] == END]
-    ends = np.zeros(len(times), dtype=np.int64)
-    ends[order[log[:, 5]]] = log[:, 0]
+    ends = np.zeros(len(load.times), dtype=np.int64)
+    ends[log[:, 5]] = log[:, 0]
     return ends
 
 
@@ -200,11 +226,9 @@ def _beside(begins: Ints, ends: Ints) -> Ints:
     """Return by interval for how long there was at least one other."""
     times = np.concatenate([begins, ends])
     order = np.argsort(times, kind='stable')
-    first = begins.min(initial=0)
-    times = times[order] - first
-    count = np.cumsum(np.repeat([1, -1], len(begins))[order])
-    total = np.concatenate([[0], np.cumsum(np.diff(times) * (count[:-1] > 1))])
-    passed: Ints = np.rint(
-        np.interp(ends - first, times, total) - np.interp(begins - first, times, total)
-    ).astype(np.int64)
-    return passed
+    passed = np.diff(times[order])
+    passed[np.cumsum(np.where(order < len(begins), 1, -1))[:-1] < 2] = 0
+    total = np.zeros_like(times)
+    total[order[1:]] = np.cumsum(passed)
+    beside: Ints = total[len(begins):] - total[:len(begins)]
+    return beside

@@ -383,6 +383,7 @@ class LoadBuilder(Observer):
             recorded = Recorded(
                 start[ran] - late[ran], took[ran] + late[ran], cpu[ran], locks[ran],
                 self._by_execution(self._process)[ran], callback, warm)
+            del number, start, cpu      # there may be millions
             cost = alone(recorded, self._cpus, beside)
             warmth[ran] = colder(callback, warm, cost)
             # what is less than recorded: it began late, or it stood still later

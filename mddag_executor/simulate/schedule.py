@@ -110,7 +110,7 @@ def schedule(
 
 def prepare(tables: Tables, load: Load, settings: Settings, runs: int = 1) -> bool:
     """Return whether so many runs are sooner done compiled; if so, compile, or load what was."""
-    executions = runs * len(load.times) * tables.n_vertices // max(1, tables.n_dags)
+    executions = runs * len(load.times) * max(1, tables.n_vertices // max(1, tables.n_dags))
     stops = len(load.holds) > 0 or settings.cpus is not None
     plain_s = executions * (_STOPS_S if stops else _PLAIN_S)
     if plain_s < SOON_S:

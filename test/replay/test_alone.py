@@ -8,9 +8,10 @@ from collections.abc import Sequence
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mddag_executor.replay import alone as module
 from mddag_executor.replay.alone import alone, colder, computing, Recorded
 import numpy as np
-from pytest import approx
+from pytest import approx, MonkeyPatch
 
 Ran = tuple[float, float, float, int]
 """When it could start, what it took, its CPU time (-1: not known); whose lock it has, 0: none."""
@@ -106,3 +107,14 @@ def test_never_longer_and_alone_never_less_than_it_computed(
     found = of(*ran, cpus=cpus, callbacks=[i % callbacks for i in range(len(ran))], beside=0.0)
     for (_, took, cpu, _), alone_ in zip(ran, found):
         assert min(cpu, took) <= alone_ <= took
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(
+    st.integers(0, 60), st.integers(0, 6), st.integers(-1, 6), st.integers(0, 2)),
+    min_size=1, max_size=40), st.integers(0, 2), st.integers(1, 7))
+def test_blocks_change_nothing(ran: list[Ran], cpus: int, block: int) -> None:
+    expected = of(*ran, cpus=cpus)
+    with MonkeyPatch.context() as patch:
+        patch.setattr(module, 'BLOCK', block)
+        assert of(*ran, cpus=cpus) == expected
