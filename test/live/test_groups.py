@@ -70,10 +70,12 @@ def test_two_executors_share_a_nodes_groups(make_executor, make_node):
         assert wait_for(lambda: len(shared.runs['message']) >= 20
                         and len(shared.runs['request']) >= 5 and len(shared.runs['own']) >= 20
                         and len(shared.runs['extra']) >= 20)
+        # as long as both spin: then the first gets the group back
+        runs = {name: set(each) for name, each in shared.runs.items()}
         of_first, of_second = threads(first), threads(second)
-    assert set(shared.runs['own']) <= of_first
+    assert runs['own'] <= of_first
     for name in ('extra', 'message', 'request'):
-        assert set(shared.runs[name]) <= of_second
+        assert runs[name] <= of_second
     assert len(shared.runs['message']) == 20 and len(shared.runs['request']) == 5
 
 
@@ -118,6 +120,9 @@ def test_a_group_changes_hands_while_both_spin_and_nothing_runs_twice(make_execu
     stop = threading.Event()
     sent = [0]
 
+    def elsewhere(executor: Any) -> int:
+        return sum(each not in threads(executor) for each in shared.runs['message'])
+
     def publish() -> None:
         while not stop.wait(0.002):
             shared.publisher.publish(Header())
@@ -134,12 +139,12 @@ def test_a_group_changes_hands_while_both_spin_and_nothing_runs_twice(make_execu
                 shared.clear()
                 assert wait_for(lambda: len(shared.runs['message']) > 3
                                 and len(shared.runs['extra']) > 1 and shared.runs['own'])
-                assert set(shared.runs['message'][1:]) <= threads(second)
+                assert elsewhere(second) <= 1  # what ran there when it changed hands
                 second.remove_callback_group(shared.extra)
                 shared.clear()
                 assert wait_for(lambda: len(shared.runs['message']) > 3
                                 and len(shared.runs['extra']) > 1)
-                assert set(shared.runs['message'][1:]) <= threads(first)
+                assert elsewhere(first) <= 1  # what ran there when it changed hands
         finally:
             stop.set()
             thread.join()
