@@ -32,10 +32,9 @@ print([t.name for t in threading.enumerate() if t.name.startswith('mddag')])
 """
 
 
-@pytest.mark.parametrize(('intake', 'number', 'spin'), [
-    ('events', signal.SIGINT, 'executor.spin()'), ('waitset', signal.SIGINT, 'executor.spin()'),
-    ('events', signal.SIGTERM, 'rclpy.spin(node, executor)'),
-    ('waitset', signal.SIGTERM, 'rclpy.spin(node, executor)')])
+@pytest.mark.parametrize('intake', ['events', 'waitset'])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('spin', ['executor.spin()', 'rclpy.spin(node, executor)'])
 def test_a_signal_ends_spin(intake, number, spin):
     process = subprocess.Popen(
         [sys.executable, '-c', PROGRAM.format(spin=spin), intake], stdout=subprocess.PIPE,
