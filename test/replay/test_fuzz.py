@@ -141,7 +141,7 @@ def inside(data: bytearray, rng: random.Random) -> None:
     packed = zstandard.compress(bytes(content))
     data[start:end] = records.record(
         Opcode.CHUNK, records.CHUNK_HEAD.pack(begin, last, len(content), zlib.crc32(content))
-        + records.UINT32.pack(4) + b'zstd' + records.UINT64.pack(len(packed)) + packed)
+        + records.UINT32.pack(4) + b'zstd' + struct.pack('<Q', len(packed)) + packed)
 
 
 @pytest.fixture(scope='module')

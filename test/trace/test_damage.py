@@ -358,7 +358,7 @@ def chunk(content: bytes, **changes: Any) -> bytes:
     return records.record(
         Opcode.CHUNK,
         records.CHUNK_HEAD.pack(0, 0, head['size'], head['crc'])
-        + prefixed(head['compression'].encode()) + records.UINT64.pack(head['length']) + content)
+        + prefixed(head['compression'].encode()) + struct.pack('<Q', head['length']) + content)
 
 
 def definitions(text: str = EVENTS['ros2:callback_end'].text) -> bytes:
