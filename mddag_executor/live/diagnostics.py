@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING
 from mddag_executor.core import quantile
 from mddag_executor.core.tally import Counts, counts, SinkTally, Tally
 from mddag_executor.live.settings import Thresholds
-from mddag_executor.live.shutdown import is_over, stop_at_exit
+from mddag_executor.live.shutdown import is_over, join, stop_at_exit
 from mddag_executor.text import counted
 from rclpy.logging import get_logger
 
@@ -290,8 +290,8 @@ class Diagnostics:
     def stop(self) -> None:
         """End publishing; nothing happens when it has never begun."""
         self._ending.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(END_TIMEOUT_S)
+        if self._thread is not None:
+            join(self._thread, END_TIMEOUT_S)
 
     def _run(self) -> None:
         try:

@@ -89,7 +89,7 @@ def join(thread: threading.Thread, seconds: float | None = None) -> None:
     try:
         thread.join(seconds)
     except RuntimeError:
-        pass  # a KeyboardInterrupt came while it was started; it finds out by itself
+        pass  # it is just being started, or that was interrupted; it finds out by itself
 
 
 def halt_at_exit(executor: _Executor) -> None:

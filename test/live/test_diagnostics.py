@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any
 
@@ -232,3 +233,18 @@ def test_a_shutdown_of_the_context_ends_it_quietly(make_executor, make_node, ros
     spinning.join()
     assert wait_for(lambda: not executor._diagnostics._thread.is_alive())
     assert 'diagnostics' not in capfd.readouterr().err
+
+
+def test_a_shutdown_while_its_thread_is_started(make_executor, monkeypatch):
+    start, begun = threading.Thread.start, threading.Event()
+
+    def late(thread: threading.Thread) -> None:
+        if thread.name == 'mddag-diagnostics':
+            begun.set()
+            time.sleep(0.2)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, 'start', late)
+    with Spinning(make_executor(loads(CHAIN), diagnostics_period='20ms')) as spinning:
+        assert begun.wait(5.0)
+    assert spinning.error is None
