@@ -419,7 +419,7 @@ class MultiDeadlineExecutor(BareExecutor):
         With one thread that was published before the answer which completed the future; with
         several it may take a moment longer.  So wait until nothing has been to do for a while.
         """
-        if self._upkeep.entities is None or not self._upkeep.entities.waitables:
+        if not self._upkeep.entities.waitables:
             return
         quiet = 0
         for _ in range(SETTLE_TURNS):

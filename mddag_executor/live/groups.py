@@ -32,6 +32,7 @@ from typing import Any, TYPE_CHECKING
 import weakref
 
 from mddag_executor.live.compat import on_changes
+from mddag_executor.live.intake.entities import LISTS
 from rclpy.executors import Executor
 from rclpy.node import Node
 
@@ -56,15 +57,12 @@ def owner_of(group: CallbackGroup | None) -> Groups | None:
 def groups_of(node: Any) -> list[CallbackGroup]:
     """Return the callback groups of a node's entities and its default one."""
     found = {node.default_callback_group: None}
-    for name in _PARTS:
+    for name in LISTS:
         for entity in list(getattr(node, name)):
             group = getattr(entity, 'callback_group', None)
             if group is not None:
                 found[group] = None
     return list(found)
-
-
-_PARTS = ('subscriptions', 'timers', 'clients', 'services', 'guards', 'waitables')
 
 
 class NodeShare:
@@ -83,7 +81,7 @@ class NodeShare:
     def __getattr__(self, name: str) -> Any:
         """Return what the node has, or of its entities those of the groups."""
         value = getattr(self._node, name)
-        if name not in _PARTS:
+        if name not in LISTS:
             return value
         return [e for e in list(value) if self._has(getattr(e, 'callback_group', None))]
 

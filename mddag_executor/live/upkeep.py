@@ -50,7 +50,7 @@ class Upkeep:
         recorder: Recorder | None,
     ) -> None:
         self.changed = True
-        self.entities: EntitySet | None = None
+        self.entities = EMPTY
         self._nodes = nodes
         self._registry = registry
         self._pool = pool
@@ -112,7 +112,6 @@ class Upkeep:
         self.entities = snapshot(self._nodes(), self.entities)
 
     def _register(self, keep: bool = False) -> None:
-        assert self.entities is not None
         added, gone = self._registry.refresh(self.entities, keep)
         engine, pool = self._pool.engine, self._pool
         if engine.other_processes is not None and (added or gone):
@@ -129,6 +128,5 @@ class Upkeep:
             self._recorder.entities(self.entities.nodes, added)
 
     def _inform_intakes(self) -> None:
-        assert self.entities is not None
         for intake in self._intakes:
             intake.update(self.entities)
