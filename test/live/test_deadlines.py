@@ -254,12 +254,12 @@ ORDER = """
 mddag: 1
 nodes:
   - node: /source
-    callbacks: [{name: tick, timer: 10s, publishes: [/go], dag: race}]
+    callbacks: [{name: tick, timer: 10s, publishes: [/c, /a, /b], dag: race}]
   - node: /racer
     callbacks:
-      - {name: c, subscription: /go, deadline: 300ms}
-      - {name: a, subscription: /go, deadline: 100ms}
-      - {name: b, subscription: /go, deadline: 200ms}
+      - {name: c, subscription: /c, deadline: 300ms}
+      - {name: a, subscription: /a, deadline: 100ms}
+      - {name: b, subscription: /b, deadline: 200ms}
 """
 
 
@@ -269,21 +269,22 @@ def test_ready_callbacks_run_in_the_policys_order(make_executor, make_node, poli
     source, racer = make_node('source'), make_node('racer')
     ran: list[str] = []
     group = ReentrantCallbackGroup()
-    publisher = source.create_publisher(Header, '/go', 10)
+    publishers = [source.create_publisher(Header, f'/{name}', 10) for name in 'cab']
 
     def tick() -> None:
-        publisher.publish(Header())
-        assert wait_for(lambda: executor.statistics()['queue'] == 3)
+        for ready, publisher in enumerate(publishers, 1):  # they become ready one after the other
+            publisher.publish(Header())
+            assert wait_for(lambda n=ready: executor.statistics()['queue'] == n)
 
     timer = source.create_timer(10.0, tick, group)
     for name in 'cab':
         racer.create_subscription(
-            Header, '/go', lambda m, n=name: ran.append(n), 10, callback_group=group)
+            Header, f'/{name}', lambda m, n=name: ran.append(n), 10, callback_group=group)
     executor = make_executor(loads(ORDER), num_workers=1, policy=policy)
     executor.add_node(source)
     executor.add_node(racer)
     with Spinning(executor):
-        assert wait_for(lambda: publisher.get_subscription_count() == 3)
+        assert wait_for(lambda: all(p.get_subscription_count() == 1 for p in publishers))
         timer.timer_period_ns = 10_000_000_000
         executor.create_task(tick_as_timer, executor, timer, tick)
         assert wait_for(lambda: len(ran) == 3)
