@@ -12,7 +12,7 @@ when the recorded ones could have, and take what these would have alone, must en
 So the times are sought with which they do: first each takes what was recorded; what it then ends
 too late is taken off, down to its CPU time, and so on.  Of ``TURNS`` tries the best one counts.
 What the model does not explain stays in the time, so that a schedule like the recorded one gives
-the recorded response times.
+the recorded response times.  A long recording goes window by window, each with its best try.
 
 That is right where as many run beside one another as in the recording.  Where fewer do, what the
 model leaves over has to be told apart.  What a callback waits for itself is told by its executions
@@ -26,10 +26,9 @@ explain, else of all that was recorded.  What one waited for more than that, whi
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any, NamedTuple
 
-from mddag_executor.core import NEVER, Tables
+from mddag_executor.core import Tables
 from mddag_executor.replay.happenings import Ints
 from mddag_executor.simulate import END, Load, schedule, Settings
 from mddag_executor.simulate.schedule import prepare
@@ -43,8 +42,8 @@ HARDLY = 0.1
 ENOUGH = 5
 """So many executions that hardly any other ran beside are enough."""
 TURNS = 8
-BLOCK = 50_000
-"""So many executions the model runs at once, or as many as run into one another."""
+WINDOW = 50_000
+"""So many executions the model runs at once, and more until nothing runs: up to as many again."""
 
 Flags = npt.NDArray[np.bool_]
 
@@ -87,11 +86,33 @@ def alone(ran: Recorded, cpus: int = 0, beside: float = 1.0) -> Ints:
     :param beside: how many are to run beside one, of those that did in the recording.
     """
     took = ran.took.copy()
-    some = _beside(ran.could, ran.could + ran.took) > 0
-    took[some] = _explained(ran.of(some), cpus)
+    others = np.zeros(len(took) * (beside < 1.0), dtype=np.int64)
+    for which in _windows(ran):
+        window = ran.of(which)
+        with_others = _beside(window.could, window.could + window.took)
+        if beside < 1.0:
+            others[which] = with_others
+        some = which[with_others > 0]
+        if len(some):
+            took[some] = _explained(ran.of(some), cpus, TURNS * len(took) // len(some))
     if beside < 1.0:
-        took -= np.rint((1.0 - beside) * _theirs(ran, took)).astype(np.int64)
+        took -= np.rint((1.0 - beside) * _theirs(ran, took, others)).astype(np.int64)
     return took
+
+
+def _windows(ran: Recorded) -> Iterator[Ints]:
+    """Yield executions in the order in which they could start, parted where the fewest ran."""
+    order = np.argsort(ran.could, kind='stable')
+    while len(order):
+        which = order[:2 * WINDOW]
+        could = ran.could[which]
+        running = np.arange(len(which)) - np.searchsorted(
+            np.sort(could + ran.took[which]), could, 'right')
+        window = len(order)
+        if len(order) > WINDOW:
+            window = WINDOW + int(running[WINDOW:].argmin())
+        yield order[:window]
+        order = order[window:]
 
 
 def colder(callback: Ints, warm: Flags, took: Ints) -> Ints:
@@ -130,11 +151,16 @@ def _by_callback(callback: Ints, those: Flags) -> Iterator[Ints]:
             yield which
 
 
-def _explained(ran: Recorded, cpus: int) -> Ints:
-    """Return the times with which the model ends executions when they ended."""
+def _explained(ran: Recorded, cpus: int, runs: int) -> Ints:
+    """
+    Return the times with which the model ends executions when they ended.
+
+    :param ran: in the order of ``could``.
+    :param runs: how many of as many executions there are to be in all.
+    """
     found, took, least_wrong = ran.took, ran.took, -1
     for _ in range(TURNS):
-        wrong = ran.could + ran.took - _ends(ran, took, cpus)
+        wrong = ran.could + ran.took - _ends(ran, took, cpus, runs)
         total = int(np.abs(wrong).sum())
         if least_wrong < 0 or total < least_wrong:
             found, least_wrong = took, total
@@ -144,49 +170,26 @@ def _explained(ran: Recorded, cpus: int) -> Ints:
     return found
 
 
-def _ends(ran: Recorded, took: Ints, cpus: int) -> Ints:
-    """
-    Return when the model ends executions that take so long alone.
-
-    Block by block, which takes less memory: one begins when nothing of those before it runs.
-    """
-    order = np.argsort(ran.could, kind='stable')
-    could = ran.could[order]
-    ended = np.searchsorted(np.sort(ran.could + took), could, 'right')
-    most = int((np.arange(1, len(could) + 1) - ended).max(initial=1))
+def _ends(ran: Recorded, took: Ints, cpus: int, runs: int) -> Ints:
+    """Return when the model ends executions that take so long alone; see ``_explained``."""
+    count = len(took)
+    ended = np.searchsorted(np.sort(ran.could + took), ran.could, 'right')
+    most = int((np.arange(1, count + 1) - ended).max(initial=1))
     n = int(ran.interpreter.max(initial=1))
+    columns: dict[str, Any] = {
+        'times': ran.could, 'dags': ran.interpreter - 1, 'jobs': np.arange(count), 'costs': took,
+        'computed': ran.cpu, 'holds': np.zeros(count * int(ran.locks.any()), dtype=np.int64),
+        'locks': ran.locks.astype(np.int64)}
+    load = Load(cost_base=[0] * n, cost_stride=[1] * n, **columns)
     tables = _interpreters(n)
     # those that stand still are more than those that ran
-    settings = Settings('fifo', 2 * most + 2, cpus=cpus or len(could) + 1)
-    holds = int(ran.locks.any())
-    next_could = np.append(could[1:], NEVER)
-    ends = np.zeros(len(could), dtype=np.int64)
-    first, size = 0, BLOCK
-    while first < len(order):
-        which = order[first:first + size]
-        some = ran.of(which)
-        columns: dict[str, Any] = {
-            'times': some.could, 'dags': some.interpreter - 1, 'jobs': np.arange(len(which)),
-            'costs': took[which], 'computed': some.cpu,
-            'holds': np.zeros(len(which) * holds, dtype=np.int64),
-            'locks': some.locks.astype(np.int64)}
-        load = Load(cost_base=[0] * n, cost_stride=[1] * n, **columns)
-        ends[which] = _block_ends(tables, load, replace(
-            settings, duration_ns=int(some.could[-1] + took[which].sum() + 1)),
-            TURNS * len(order) // len(which))
-        nothing = np.maximum.accumulate(ends[which]) < next_could[first:first + size]
-        cuts = np.flatnonzero(nothing)
-        first, size = (first + int(cuts[-1]) + 1, BLOCK) if len(cuts) else (first, 2 * size)
-    return ends
-
-
-def _block_ends(tables: Tables, load: Load, settings: Settings, runs: int) -> Ints:
-    """Return when the executions of a load end; of as much there are so many runs in all."""
+    settings = Settings('fifo', 2 * most + 2, cpus=cpus or count + 1,
+                        duration_ns=int(ran.could[-1] + took.sum() + 1))
     log = np.asarray(schedule(
         tables, load, settings, log=True, compiled=prepare(tables, load, settings, runs)).log,
         dtype=np.int64).reshape(-1, 6)
     log = log[log[:, 1] == END]
-    ends = np.zeros(len(load.times), dtype=np.int64)
+    ends = np.zeros(count, dtype=np.int64)
     ends[log[:, 5]] = log[:, 0]
     return ends
 
@@ -203,9 +206,8 @@ def _interpreters(n: int) -> Tables:
         first_sink=[0] * (n + 1), first_successor=[0] * (n + 1))
 
 
-def _theirs(ran: Recorded, took: Ints) -> Ints:
-    """Return what executions that take so long waited for others that ran beside them."""
-    beside = _beside(ran.could, ran.could + ran.took)
+def _theirs(ran: Recorded, took: Ints, beside: Ints) -> Ints:
+    """Return what executions that take so long waited for others, which ran ``beside`` them."""
     waited = took - ran.least
     computes = computing(ran.callback, ran.took, ran.cpu)
     usual = np.zeros(len(took), dtype=np.int64)

@@ -44,6 +44,8 @@ from itertools import accumulate
 from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
+from mddag_executor.memory import give_back
+from mddag_executor.replay.alone import alone, colder, ENOUGH, Recorded
 from mddag_executor.replay.dispatches import Dispatches
 from mddag_executor.replay.entities import Entities
 from mddag_executor.replay.happenings import Observer
@@ -51,6 +53,7 @@ from mddag_executor.simulate import Load
 from mddag_executor.simulate.deliveries import DELAY_NS
 from mddag_executor.simulate.load import edge_numbers, edges_of, FAILS, RUNS, SKIPPED
 from msg_graph import Dag, TaskSet
+import numpy as np
 
 _UNKNOWN = -1
 _NO_GROUP, _UNTOLD = -1, -2
@@ -79,7 +82,14 @@ class RecordedLoad(NamedTuple):
 
 
 class _Jobs:
-    """The jobs of one DAG, flat: by job and vertex, or by job and edge; ns, or unknown."""
+    """
+    The jobs of one DAG, flat: by job, by job and vertex, or by job and edge; ns, or unknown.
+
+    The columns are of array, and of numpy once all jobs are there (see ``LoadBuilder._close``).
+    """
+
+    COLUMNS = ('release', 'noticed', 'round', 'took', 'start', 'end', 'cpu', 'dispatch', 'held',
+               'arrived')
 
     def __init__(self, dag: Dag, n_edges: int) -> None:
         self.size = len(dag.vertices)
@@ -87,14 +97,12 @@ class _Jobs:
         self.publishers = [v.index for v in dag.vertices for _ in v.successors]     # by edge
         self.numbers: list[int] = []
         self.row: dict[int, int] = {}
-        self.release = array('q')
-        self.noticed = array('q')
-        self.round = array('q')
-        self.took, self.start, self.end, self.dispatch, self.cpu, self.held, self.late = (
-            array('q') for _ in range(7))
+        self.release, self.noticed, self.round = (array('q') for _ in range(3))
+        self.took, self.start, self.end, self.cpu, self.dispatch, self.held = (
+            array(code) for code in 'qqqqih')
         self.arrived = array('q')
-        self._new = array('q', [_UNKNOWN]) * self.size
-        self._new_edges = array('q', [_UNKNOWN]) * n_edges
+        self._new = [array(code, [_UNKNOWN]) * self.size for code in 'qqqqih']
+        self._new.append(array('q', [_UNKNOWN]) * n_edges)
 
     def add(self, job: int, release: int, now: int, number: int) -> None:
         """Add a job, and the round of timers that it was noticed in (or none)."""
@@ -103,9 +111,9 @@ class _Jobs:
         self.release.append(release)
         self.noticed.append(max(release, now))
         self.round.append(number)
-        for column in (self.took, self.start, self.end, self.dispatch, self.cpu, self.held):
-            column.extend(self._new)
-        self.arrived.extend(self._new_edges)
+        for column, new in zip((self.took, self.start, self.end, self.cpu, self.dispatch,
+                                self.held, self.arrived), self._new):
+            column.extend(new)
 
 
 class LoadBuilder(Observer):
@@ -258,67 +266,94 @@ class LoadBuilder(Observer):
         :param process: by vertex the process that it is to run in; None: as recorded.
         :param beside: how many executions are to run beside one, of those that did.
         """
-        import numpy as np
         if self._leg is not None:
             self._others.append(self._leg[1])
             self._leg = None
+        self._close()
         locks = self._locks()
-        every, usual, warmth = self._alone(locks, beside)
+        every, usual, warmth, late = self._alone(locks, beside)
         if beside < 1.0:
             self._notice_sooner(locks, beside)
         process = process or self._process
+        delays, transport = self._transports(overheads, process)
+        self._drop('start', 'end', 'arrived')
+        estimated, unknown = self._estimate(process)
+        took, cpu, held = (self._whole.pop(name) for name in ('took', 'cpu', 'held'))
+        demand, executions = int(took.sum()), len(took)
+        if overheads:
+            took += late
+        others = sorted(self._others)
+        more = np.zeros(len(others), dtype=np.int64)
+        costs = np.concatenate([took, np.array([
+            max(0, took) + (int(every[number]) if number >= 0 else 0)
+            for _, took, number in others], dtype=np.int64)])
+        bases = [0, *accumulate(len(jobs.numbers) * jobs.size for jobs in self._jobs)]
+        columns: dict[str, Any] = {
+            'holds': np.concatenate([held, more]) if held.any() else [],
+            'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
+            # where as many run beside one another, workers go on as they did
+            'locks': np.concatenate([locks, more]),
+            'warmth': np.concatenate([warmth, more]) if overheads and beside < 1.0 else [],
+            'delays': delays, 'delay_stride': [jobs.n_edges for jobs in self._jobs],
+            'delay_base': [0, *accumulate(
+                len(jobs.numbers) * jobs.n_edges for jobs in self._jobs[:-1])]}
+        load = self._load(costs, bases, [ready for ready, _, _ in others], overheads)._replace(
+            fates=self._fates(bases, len(costs)), **columns)
+        return RecordedLoad(
+            load, [jobs.numbers for jobs in self._jobs], demand, executions, estimated, unknown,
+            usual, transport, late if overheads else late[:0])
+
+    def _close(self) -> None:
+        """Put the columns of all DAGs' jobs together, and leave each DAG its part of them."""
+        self._whole: dict[str, Any] = {}
+        for jobs in self._jobs:
+            jobs.row.clear()
+        for name in _Jobs.COLUMNS:
+            parts = [np.asarray(getattr(jobs, name)) for jobs in self._jobs]
+            whole = self._whole[name] = np.concatenate(parts)
+            for jobs, part in zip(self._jobs, np.split(whole, np.cumsum([*map(len, parts)]))):
+                setattr(jobs, name, part)
+
+    def _drop(self, *columns: str) -> None:
+        """Forget columns: of long runs they are large."""
+        for name in columns:
+            del self._whole[name]
+            for jobs in self._jobs:
+                delattr(jobs, name)
+
+    def _estimate(self, process: Sequence[int]) -> tuple[int, list[str]]:
+        """
+        Fill in what was not recorded of executions: what they took and computed.
+
+        :return: how many there are, and the callbacks of which no time is known at all.
+        """
         typical = self._typical()
         unknown: dict[str, None] = {}
         estimated = 0
-        # columns in parts, one after the other
-        costs: list[Any] = []
-        computed: list[Any] = []
-        holds: list[Any] = []
-        late: list[Any] = [np.empty(0, dtype=np.int64)]
-        bases = [0]
-        demand = 0
         for dag, jobs in zip(self._task_set.dags, self._jobs):
-            took = np.array(jobs.took, dtype=np.int64).reshape(-1, jobs.size)
+            took, cpu, held = (np.asarray(each).reshape(-1, jobs.size) for each in (
+                jobs.took, jobs.cpu, jobs.held))
             took[[row for of, row in self._skipped if of == dag.index]] = 0
             missing = took < 0
             estimated += int(missing.sum())
+            held[held < 0] = 0
             for vertex in dag.vertices:
-                if missing[:, vertex.index].any():
-                    key = vertex.callback.key
+                v, key = vertex.index, vertex.callback.key
+                if missing[:, v].any():
                     if key not in typical:
                         unknown[key] = None
-                    took[missing[:, vertex.index], vertex.index] = typical.get(key, 0)
-            demand += int(took.sum())
-            self._computing(dag, jobs, took, missing, computed, holds, process)
-            if overheads:
-                late.append(np.array(jobs.late, dtype=np.int64))
-                took += late[-1].reshape(-1, jobs.size)
-            costs.append(took.ravel())
-            bases.append(bases[-1] + took.size)
-        executions = bases[-1]
-        others = sorted(self._others)
-        costs.append(np.array([
-            max(0, took) + (int(every[number]) if number >= 0 else 0)
-            for _, took, number in others], dtype=np.int64))
-        computed.append(np.full(len(others), _UNKNOWN))
-        holds.append(np.zeros(len(others), dtype=np.int64))
-        all_holds: Any = np.concatenate(holds)
-        all_computed: Any = np.concatenate(computed)
-        all_locks: Any = np.concatenate([locks, holds[-1]]).astype(np.int64)
-        all_warmth: Any = np.concatenate([warmth, holds[-1]])
-        delays, transport = self._transports(overheads, process)
-        load = self._load(
-            np.concatenate(costs), bases, [ready for ready, _, _ in others], overheads)._replace(
-            holds=all_holds if all_holds.any() else [],
-            computed=all_computed if (all_computed >= 0).any() else [],
-            # where as many run beside one another, workers go on as they did
-            locks=all_locks, warmth=all_warmth if overheads and beside < 1.0 else [],
-            fates=self._fates(bases, executions + len(others)),
-            delays=delays, delay_stride=[jobs.n_edges for jobs in self._jobs],
-            delay_base=[0, *accumulate(len(jobs.arrived) for jobs in self._jobs[:-1])])
-        return RecordedLoad(
-            load, [jobs.numbers for jobs in self._jobs], demand, executions, estimated,
-            list(unknown), usual, transport, np.concatenate(late))
+                    took[missing[:, v], v] = typical.get(key, 0)
+                known = cpu[:, v] >= 0
+                if known.any():     # those that did not complete are like the others
+                    share = cpu[known, v].sum() / max(1, took[known, v].sum())
+                    cpu[missing[:, v], v] = took[missing[:, v], v] * min(1.0, share)
+                    held[missing[:, v], v] = held[known, v].mean() >= 0.5
+                if vertex.callback.holds_interpreter is not None:
+                    held[:, v] = vertex.callback.holds_interpreter
+                    if vertex.callback.holds_interpreter:
+                        cpu[~known, v] = took[~known, v]
+                held[:, v] *= process[self._first[dag.index] + v]
+        return estimated, list(unknown)
 
     def _fates(self, bases: list[int], executions: int) -> list[int]:
         """Return which executions failed, or were skipped; empty: none."""
@@ -331,11 +366,6 @@ class LoadBuilder(Observer):
             fates[bases[dag] + row * self._jobs[dag].size + source] = SKIPPED
         return fates
 
-    def _all(self, column: str) -> Any:
-        """Return a column of all jobs, DAG by DAG."""
-        import numpy as np
-        return np.concatenate([np.asarray(getattr(jobs, column)) for jobs in self._jobs])
-
     def _locks(self) -> Any:
         """
         Return which executions computed with Python's lock.
@@ -343,57 +373,59 @@ class LoadBuilder(Observer):
         Those that hold the interpreter, and those of callbacks that usually do: the executor did
         not know it yet, or thought once that one waits.
         """
-        import numpy as np
         callback = self._by_execution(self._callbacks)
-        held, known = self._all('held') > 0, self._all('cpu') >= 0
+        held, known = self._whole['held'] > 0, self._whole['cpu'] >= 0
         n_held, n_known = (
             np.bincount(callback[which], minlength=len(self._task_set.callbacks))
             for which in (known & held, known))
         return known & (held | (2 * n_held >= np.maximum(1, n_known))[callback])
 
     def _by_execution(self, by_vertex: Sequence[int]) -> Any:
-        import numpy as np
+        numbers = np.array(by_vertex, dtype=np.int32)   # there may be millions
         return np.concatenate([
-            np.tile(by_vertex[first:first + jobs.size], len(jobs.numbers))
+            np.tile(numbers[first:first + jobs.size], len(jobs.numbers))
             for first, jobs in zip(self._first, self._jobs)])
 
-    def _alone(self, locks: Any, beside: float) -> tuple[Any, int | None, Any]:
+    def _alone(self, locks: Any, beside: float) -> tuple[Any, int | None, Any, Any]:
         """
         Make times those that executions would have taken alone (see ``alone``).
 
-        ``took`` becomes what their callbacks take, ``late`` what the executor does.
+        ``took`` becomes what their callbacks take.
 
         :return: how late executions were, by number, the last one what is usual; that; and by
-            execution what it takes more since its worker had slept (see ``Load.warmth``).
+            execution what it takes more since its worker had slept (see ``Load.warmth``), and
+            what the executor takes for it.
         """
-        from mddag_executor.replay.alone import alone, colder, Recorded
-        import numpy as np
         number, took, start, cpu = (
-            self._all(name) for name in ('dispatch', 'took', 'start', 'cpu'))
+            self._whole[name] for name in ('dispatch', 'took', 'start', 'cpu'))
         every = self._dispatches.late(number[locks & (number >= 0)])
+        warm = np.append(self._dispatches.warm(), True)[number]
         known = number[number >= 0]
-        usual = quantile(np.sort(every[known]).tolist(), 0.5) if len(known) else 0
-        every = np.append(every, usual)     # number -1
+        usual = quantile(memoryview(np.sort(every[known])), 0.5) if len(known) else None
+        every = np.append(every, usual or 0)     # number -1
         late = every[number]
-        ran = np.flatnonzero((took >= 0) & (start >= 0))
-        warmth = np.zeros(len(took), dtype=np.int64)
+        del self._dispatches, number, known
+        self._drop('dispatch')
+        ran: Any = (took >= 0) & (start >= 0)
+        if ran.all():
+            ran = slice(None)   # which copies nothing: there may be millions
+        warmth = np.zeros(len(took) * (beside < 1.0), dtype=np.int64)
         if (cpu[ran] >= 0).any():
-            callback = self._by_execution(self._callbacks)[ran]
-            warm = np.append(self._dispatches.warm(), True)[number[ran]]
             recorded = Recorded(
                 start[ran] - late[ran], took[ran] + late[ran], cpu[ran], locks[ran],
-                self._by_execution(self._process)[ran], callback, warm)
-            del number, start, cpu      # there may be millions
+                self._by_execution(self._process)[ran],
+                self._by_execution(self._callbacks)[ran], warm[ran])
+            give_back()
             cost = alone(recorded, self._cpus, beside)
-            warmth[ran] = colder(callback, warm, cost)
+            if beside < 1.0:
+                warmth[ran] = colder(recorded.callback, recorded.warm, cost)
             # what is less than recorded: it began late, or it stood still later
-            began = np.minimum(recorded.took - cost, np.maximum(0, late[ran] - usual))
+            began = recorded.took - cost
+            del recorded
+            began = np.minimum(began, np.maximum(0, late[ran] - (usual or 0)))
             took[ran] = np.maximum(0, cost - late[ran] + began)
             late[ran] = cost - took[ran]
-        ends = np.cumsum([len(jobs.took) for jobs in self._jobs])[:-1]
-        for jobs, *columns in zip(self._jobs, np.split(took, ends), np.split(late, ends)):
-            jobs.took, jobs.late = (array('q', column.tobytes()) for column in columns)
-        return every, usual if len(known) else None, warmth
+        return every, usual, warmth, late
 
     def _notice_sooner(self, locks: Any, beside: float) -> None:
         """
@@ -402,10 +434,8 @@ class LoadBuilder(Observer):
         One that does not compute with Python's lock delays none; of those that do, one does.  So
         they are as late as where nothing ran, or only such a one: rank by rank.
         """
-        from mddag_executor.replay.alone import ENOUGH
-        import numpy as np
         number, noticed, release, start, end = (
-            self._all(name) for name in ('round', 'noticed', 'release', 'start', 'end'))
+            self._whole[name] for name in ('round', 'noticed', 'release', 'start', 'end'))
         of = np.flatnonzero(number >= 0)
         ends = np.array(self._rounds, dtype=np.int64)
         due, home = np.full(len(ends), NEVER), np.zeros(len(ends), dtype=np.int64)
@@ -431,51 +461,20 @@ class LoadBuilder(Observer):
                     ends[those] -= np.rint((1.0 - beside) * more).astype(np.int64)
         self._rounds = array('q', ends.tobytes())
         noticed[of] = np.minimum(noticed[of], ends[number[of]])
-        lengths = np.cumsum([len(jobs.noticed) for jobs in self._jobs])
-        for jobs, column in zip(self._jobs, np.split(noticed, lengths[:-1])):
-            jobs.noticed = array('q', column.tobytes())
-
-    def _computing(
-        self, dag: Dag, jobs: _Jobs, took: Any, missing: Any, computed: list[Any],
-        holds: list[Any], process: Sequence[int],
-    ) -> None:
-        """Add what the executions of a DAG computed, and which held the interpreter."""
-        import numpy as np
-        cpu, held = (np.array(column, dtype=np.int64).reshape(-1, jobs.size)
-                     for column in (jobs.cpu, jobs.held))
-        held[held < 0] = 0
-        for vertex in dag.vertices:
-            v = vertex.index
-            known = cpu[:, v] >= 0
-            if known.any():     # those that did not complete are like the others
-                share = cpu[known, v].sum() / max(1, took[known, v].sum())
-                cpu[missing[:, v], v] = took[missing[:, v], v] * min(1.0, share)
-                held[missing[:, v], v] = held[known, v].mean() >= 0.5
-            if vertex.callback.holds_interpreter is not None:
-                held[:, v] = vertex.callback.holds_interpreter
-                if vertex.callback.holds_interpreter:
-                    cpu[~known, v] = took[~known, v]
-            held[:, v] *= process[self._first[dag.index] + v]
-        computed.append(cpu.ravel())
-        holds.append(held.ravel())
 
     def _load(
         self, costs: Any, bases: list[int], others: list[int], overheads: bool
     ) -> Load:
-        import numpy as np
         # time when ready, DAG, place of the job in its DAG, release
         parts = [np.array(
             [(ready, len(self._jobs), place, ready) for place, ready in enumerate(others)],
             dtype=np.int64).reshape(-1, 4)]
         rounds = np.array([*self._rounds, _UNKNOWN], dtype=np.int64)    # the last of none
         for dag, jobs in zip(self._task_set.dags, self._jobs):
-            release, noticed, number = (
-                np.array(each, dtype=np.int64)
-                for each in (jobs.release, jobs.noticed, jobs.round))
             ideal = self._timer[dag.index] and not overheads
-            ready = release if ideal else np.maximum(noticed, rounds[number])
+            ready: Any = jobs.release if ideal else np.maximum(jobs.noticed, rounds[jobs.round])
             parts.append(np.column_stack((
-                ready, np.full(len(ready), dag.index), np.arange(len(ready)), release)))
+                ready, np.full(len(ready), dag.index), np.arange(len(ready)), jobs.release)))
         columns = np.concatenate(parts).T
         ready, dags, rows, release = columns[:, np.lexsort(columns[::-1])]
         return Load(
@@ -490,15 +489,13 @@ class LoadBuilder(Observer):
         Where an edge is to cross from one process to another and did not, or did and is not to,
         it takes what is usual of such edges.
         """
-        import numpy as np
         delays: list[Any] = []
         measured: dict[bool, list[Any]] = {False: [np.zeros(0)], True: [np.zeros(0)]}
         changed: list[tuple[Any, bool]] = []
         for jobs, crosses in zip(self._jobs, self._crossings(process)):
-            start, end = (np.array(column, dtype=np.int64).reshape(-1, jobs.size)
-                          for column in (jobs.start, jobs.end))
-            arrived = np.array(jobs.arrived, dtype=np.int64).reshape(
-                len(jobs.numbers), jobs.n_edges)
+            start, end, arrived = (
+                np.asarray(column).reshape(len(jobs.numbers), size) for column, size in (
+                    (jobs.start, jobs.size), (jobs.end, jobs.size), (jobs.arrived, jobs.n_edges)))
             ended = end[:, jobs.publishers]
             found = arrived - ended
             known = (arrived >= start[:, jobs.publishers]) & (ended >= 0)
@@ -528,14 +525,17 @@ class LoadBuilder(Observer):
 
     def _typical(self) -> dict[str, int]:
         """Return by callback the median of its recorded times, or else the declared mean."""
-        recorded: dict[str, list[int]] = {}
+        recorded: dict[str, list[Any]] = {}
         for dag, jobs in zip(self._task_set.dags, self._jobs):
             for vertex in dag.vertices:
-                recorded.setdefault(vertex.callback.key, []).extend(
-                    took for took in jobs.took[vertex.index::jobs.size] if took >= 0)
+                recorded.setdefault(vertex.callback.key, []).append(
+                    np.array(jobs.took[vertex.index::jobs.size]))
         typical = {
             c.key: c.execution_time.mean_ns
             for c in self._task_set.callbacks if c.execution_time is not None}
-        typical.update(
-            (key, quantile(sorted(times), 0.5)) for key, times in recorded.items() if times)
+        for key, parts in recorded.items():
+            times = np.sort(np.concatenate(parts))
+            times = times[times >= 0]
+            if len(times):
+                typical[key] = quantile(memoryview(times), 0.5)
         return typical

@@ -97,24 +97,24 @@ def test_who_computes() -> None:
         True, True, True, False, False, False]
 
 
+def test_a_long_recording_goes_window_by_window(monkeypatch: MonkeyPatch) -> None:
+    monkeypatch.setattr(module, 'WINDOW', 3)
+    first = (0, 19, 10, 1), (0, 20, 10, 1), (30, 20, 20, 1), (50, 13, 10, 1), (52, 6, 3, 1)
+    later = [(could + 100, took, cpu, held) for could, took, cpu, held in first]
+    assert of(*first, *later) == 2 * of(*first) == approx(2 * [10, 10, 20, 10, 3], abs=0.1)
+
+
 @settings(deadline=None)
 @given(st.lists(st.tuples(
     st.integers(0, 10), st.integers(0, 10), st.integers(-1, 10), st.integers(0, 2)),
-    min_size=1, max_size=20), st.integers(0, 3), st.integers(1, 5))
+    min_size=1, max_size=20), st.integers(0, 3), st.integers(1, 5), st.integers(1, 30))
 def test_never_longer_and_alone_never_less_than_it_computed(
-    ran: list[Ran], cpus: int, callbacks: int
+    ran: list[Ran], cpus: int, callbacks: int, window: int
 ) -> None:
-    found = of(*ran, cpus=cpus, callbacks=[i % callbacks for i in range(len(ran))], beside=0.0)
+    """Also where the windows part what runs."""
+    with MonkeyPatch.context() as patch:
+        patch.setattr(module, 'WINDOW', window)
+        found = of(
+            *ran, cpus=cpus, callbacks=[i % callbacks for i in range(len(ran))], beside=0.0)
     for (_, took, cpu, _), alone_ in zip(ran, found):
         assert min(cpu, took) <= alone_ <= took
-
-
-@settings(deadline=None)
-@given(st.lists(st.tuples(
-    st.integers(0, 60), st.integers(0, 6), st.integers(-1, 6), st.integers(0, 2)),
-    min_size=1, max_size=40), st.integers(0, 2), st.integers(1, 7))
-def test_blocks_change_nothing(ran: list[Ran], cpus: int, block: int) -> None:
-    expected = of(*ran, cpus=cpus)
-    with MonkeyPatch.context() as patch:
-        patch.setattr(module, 'BLOCK', block)
-        assert of(*ran, cpus=cpus) == expected
