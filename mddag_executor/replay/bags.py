@@ -6,7 +6,7 @@ The stamps in ordinary rosbag2 recordings: when which message came, and what its
 Theory of operation
 -------------------
 * A bag is a folder with `metadata.yaml` and the files that it names, or one such file.  What kind
-  a file is of its first bytes say, not its name: MCAP (read with ``trace.MessageReader``), SQLite
+  a file is of its first bytes say, not its name: MCAP (read with ``trace.TraceReader``), SQLite
   (read with rosbags) or zstd around one of them (a file-compressed bag; it is unpacked to a
   temporary file).
 * Of each message there are its arrival (log time), its publication where the recorder kept that
@@ -36,9 +36,9 @@ from typing import Any
 
 from mddag_executor.errors import InputError
 from mddag_executor.text import counted
-from mddag_executor.trace import MessageReader, TraceError, TraceReader
+from mddag_executor.trace import TraceError, TraceReader
+from mddag_executor.trace.channels import Topic
 from mddag_executor.trace.errors import renamed
-from mddag_executor.trace.messages import Topic
 from mddag_executor.trace.times import joined, NEVER, stretches, Times
 import zstandard
 
@@ -157,8 +157,8 @@ class Bag:
             self.warnings.append(f'{file}: {error.problem}: it is left out')
 
     def _read_mcap(self, unpacked: Path, file: Path, topics: Collection[str]) -> None:
-        reader = MessageReader(unpacked)
         try:
+            reader = TraceReader(unpacked)
             relative = {topic[1:] for topic in topics}
             for topic, log_time, publish_time, data in reader.messages({*topics, *relative}):
                 self._add(topic, log_time, publish_time, data)
@@ -166,8 +166,8 @@ class Bag:
             raise BagError(str(file), error.problem, error.remedy) from None
         self.warnings += [
             renamed(text, reader.path, self._called(file)) for text in reader.warnings]
-        self.topics |= {_absolute(topic) for topic in reader.topics}
-        self.count += reader.count
+        self.topics |= {_absolute(topic.name) for topic in reader.topics.values()}
+        self.count += len(reader.times)
         self._look_through(reader.times)
 
     def _read_sqlite(self, unpacked: Path, file: Path, topics: Collection[str]) -> None:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from mddag_executor.replay.bags import Bag
 from mddag_executor.rerun.errors import RerunError
-from mddag_executor.trace.messages import Topic
+from mddag_executor.trace.channels import Topic
 
 _IN_MEMORY = 256 << 20
 

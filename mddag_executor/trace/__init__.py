@@ -19,14 +19,13 @@ from mddag_executor.lazy import on_first_use
 if TYPE_CHECKING:
     from mddag_executor.trace.ctf import import_ctf, Imported
     from mddag_executor.trace.errors import TraceError, TraceWarning
-    from mddag_executor.trace.messages import MessageReader
     from mddag_executor.trace.reader import read_events, TraceReader
     from mddag_executor.trace.schema import EVENTS, EventType
     from mddag_executor.trace.trace_file import TraceFile
     from mddag_executor.trace.writer import TraceWriter
 
 __all__ = [
-    'EVENTS', 'EventType', 'Imported', 'MessageReader', 'TraceError', 'TraceFile', 'TraceReader',
+    'EVENTS', 'EventType', 'Imported', 'TraceError', 'TraceFile', 'TraceReader',
     'TraceWarning', 'TraceWriter', 'import_ctf', 'read_events',
 ]
 
@@ -34,7 +33,6 @@ __getattr__, __dir__ = on_first_use(__name__, {
     name: f'{__name__}.{module}' for module, names in {
         'ctf': ('Imported', 'import_ctf'),
         'errors': ('TraceError', 'TraceWarning'),
-        'messages': ('MessageReader',),
         'reader': ('TraceReader', 'read_events'),
         'schema': ('EVENTS', 'EventType'),
         'trace_file': ('TraceFile',),

@@ -22,6 +22,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import re
 import struct
+from typing import NamedTuple
 
 from mddag_executor.trace import cdr
 from mddag_executor.trace.cdr import FieldType
@@ -34,6 +35,16 @@ Decoder = tuple[Event, Callable[[bytes], Event]]
 
 _TOPIC = re.compile(r'/trace/([A-Za-z][A-Za-z0-9_]*)/([A-Za-z][A-Za-z0-9_]*)')
 DEFINITIONS_LIMIT = 64 * 1024 * 1024        # bytes of all schemas and channels
+
+
+class Topic(NamedTuple):
+    """A channel: its topic, how its messages are encoded, and their type with its definition."""
+
+    name: str
+    encoding: str
+    message_type: str
+    definition_encoding: str
+    definition: str
 
 
 @dataclass(frozen=True)
@@ -61,7 +72,7 @@ class Channels:
         self._channels: dict[int, bytes] = {}
         self._size = 0
         #: The topics of the channels.
-        self.topics: dict[int, str] = {}
+        self.topics: dict[int, Topic] = {}
         #: Channels whose messages are not wanted.
         self.passed_over: set[int] = set()
         #: Channels whose messages have one fixed layout: the beginning of their events, the
@@ -92,22 +103,14 @@ class Channels:
         number = self._keep(self._channels, content)
         if number in self.topics:
             return
-        cursor = Cursor(content)
-        cursor.take(2)
-        schema = cursor.uint16()
-        topic = cursor.string()
-        encoding = cursor.string()
-        cursor.block()
-        self.topics[number] = topic
-        match = _TOPIC.fullmatch(topic)
+        topic = self.topics[number] = self._topic(content)
+        match = _TOPIC.fullmatch(topic.name)
         name = f'{match[1]}:{match[2]}' if match else ''
         if match is None or (self._names is not None and name not in self._names):
             self.passed_over.add(number)
             return
         try:
-            if encoding != 'cdr':
-                raise ValueError(f'the encoding is {encoding[:20]!r} instead of cdr')
-            self._decode(number, name, self._fields_of(schema))
+            self._decode(number, name, _fields_of(topic))
         except ValueError as error:
             self._decoders[number] = str(error)
 
@@ -165,16 +168,27 @@ class Channels:
                 'offsets': [end - struct.calcsize(code) for end, code in zip(ends, formats)]}), {
                     field: defaults[field] for field in missing}
 
-    def _fields_of(self, schema: int) -> dict[str, FieldType]:
-        if schema not in self._schemas:
-            raise ValueError('there is no schema')
-        cursor = Cursor(self._schemas[schema])
+    def _topic(self, content: bytes) -> Topic:
+        """Return what a channel record says; raise ValueError where it is malformed."""
+        cursor = Cursor(content)
         cursor.take(2)
+        schema = Cursor(self._schemas.get(cursor.uint16(), bytes(14)))
+        name, encoding = cursor.string(), cursor.string()
         cursor.block()
-        encoding = cursor.string()
-        if encoding != 'ros2msg':
-            raise ValueError(f'schema encoding {encoding[:20]!r} instead of ros2msg')
-        return dict(cdr.parse_ros2msg(cursor.string()))
+        schema.take(2)
+        return Topic(name, encoding, *(
+            schema.block().decode(errors='replace') for _ in ('name', 'encoding', 'data')))
+
+
+def _fields_of(topic: Topic) -> dict[str, FieldType]:
+    if topic.encoding != 'cdr':
+        raise ValueError(f'the encoding is {topic.encoding[:20]!r} instead of cdr')
+    if not topic.message_type:
+        raise ValueError('there is no schema')
+    if topic.definition_encoding != 'ros2msg':
+        raise ValueError(
+            f'schema encoding {topic.definition_encoding[:20]!r} instead of ros2msg')
+    return dict(cdr.parse_ros2msg(topic.definition))
 
 
 def _check(fields: Mapping[str, FieldType], table: Mapping[str, str]) -> None:

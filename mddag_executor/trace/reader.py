@@ -8,12 +8,14 @@ The reading itself, with its orders and what it does on damage, is in `reading`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from array import array
+from collections.abc import Callable, Collection, Iterable, Iterator
+from functools import partial
 import os
 import stat
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 import warnings
+import weakref
 
 from mddag_executor.text import counted
 from mddag_executor.trace.blocks import (
@@ -25,19 +27,18 @@ from mddag_executor.trace.blocks import (
     used_once,
     what_was_used,
 )
-from mddag_executor.trace.channels import Channels
+from mddag_executor.trace.channels import Channels, Topic
 from mddag_executor.trace.errors import TraceError, TraceWarning
 from mddag_executor.trace.events import Event, Events
-from mddag_executor.trace.reading import Reading
+from mddag_executor.trace.reading import Message, Reading
 from mddag_executor.trace.records import LIBRARY
 from mddag_executor.trace.schema import PROCESS
 
 _REMEDY = 'check its name, that you may read it, and the disk it is on'
+_T = TypeVar('_T')
 
 
-@contextmanager
-def open_trace(path: str) -> Iterator[tuple[BinaryIO, int]]:
-    """Open a file and give it with its size."""
+def _opened(path: str) -> BinaryIO:
     if '\0' in path:
         raise TraceError(path, 'is no file name', 'give the .mcap file')
     try:
@@ -46,10 +47,13 @@ def open_trace(path: str) -> Iterator[tuple[BinaryIO, int]]:
             raise no_trace(path)
         if not stat.S_ISREG(mode):      # a pipe would wait for its writer
             raise TraceError(path, 'is no file', 'give the .mcap file itself')
-        with open(path, 'rb') as stream:
-            yield stream, os.fstat(stream.fileno()).st_size
+        return open(path, 'rb')
     except OSError as error:
-        raise TraceError(path, f'cannot be read ({error.strerror})', _REMEDY) from None
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: str, error: OSError) -> TraceError:
+    return TraceError(path, f'cannot be read ({error.strerror})', _REMEDY)
 
 
 def no_trace(folder: str) -> TraceError:
@@ -74,10 +78,12 @@ def no_trace(folder: str) -> TraceError:
 
 class TraceReader:
     """
-    Reads a trace file; every call of `events` reads it anew.
+    Reads a trace file, which is opened once; every call of `events` reads it anew.
 
     `warnings` has what was found to be missing or could not be decoded, one line each, once the
-    reading has come to its end. `fields` has the names of the fields of the events met so far.
+    reading has come to its end. `fields` has the names of the fields of the events met so far,
+    `topics` all channels, and `times` the log times of all messages, once `messages` has been
+    read.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -85,12 +91,24 @@ class TraceReader:
         self.path = os.fspath(path)
         self.warnings: list[str] = []
         self.fields: dict[str, tuple[str, ...]] = {}
-        with open_trace(self.path) as (stream, size):
+        self.topics: dict[int, Topic] = {}
+        self.times = array('Q')
+        stream = self._stream = _opened(self.path)
+        self._closing = weakref.finalize(self, stream.close)
+        try:
+            size = self._size = os.fstat(stream.fileno()).st_size
             self._start, library = open_data(stream, self.path)
             #: Whether this program wrote the file.
             self.written_here = library == LIBRARY
             self._finished, self._summary = read_summary(stream, size, self._start)
             self._copies = int(has_copy(stream, self._start, size))
+        except OSError as error:
+            raise _unreadable(self.path, error) from None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process gets to know: what was found, not the open file."""
+        return {name: value for name, value in vars(self).items()
+                if name not in ('_stream', '_closing')}
 
     @property
     def message_count(self) -> int | None:
@@ -124,7 +142,8 @@ class TraceReader:
         :param sorted: whether to yield in the order of time instead of that of the file
         :raises TraceError: where the file can no longer be read, or is too unordered to be sorted
         """
-        for batch in self._read(Channels(None if names is None else set(names), True), sorted):
+        way = Reading.by_time if sorted else Reading.by_file
+        for batch in self._read(Channels(None if names is None else set(names), True), way):
             yield from batch
 
     def layout_events(self, names: Iterable[str] | None) -> Iterator[Event]:
@@ -133,30 +152,32 @@ class TraceReader:
 
         They have the fields that the file has, not those of the table.
         """
-        for batch in self._read(Channels(None if names is None else set(names), False), True):
+        for batch in self._read(
+                Channels(None if names is None else set(names), False), Reading.by_time):
             yield from batch
 
     def batches(self, names: Iterable[str]) -> Iterator[Events]:
         """Yield what ``events`` yields in the order of time, many at once."""
-        return self._read(Channels(set(names), True), True)
+        return self._read(Channels(set(names), True), Reading.by_time)
 
-    def _read(self, channels: Channels, in_time_order: bool) -> Iterator[Events]:
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Yield the messages of some topics, in the order of the file; they are not decoded."""
+        return self._read(Channels(set(), True), partial(
+            Reading.messages_of, topics=topics, times=self.times))
+
+    def _read(
+        self, channels: Channels,
+        way: Callable[[Reading, BinaryIO, Iterator[Block]], Iterator[_T]],
+    ) -> Iterator[_T]:
         reading = Reading(self.path, channels)
-        self.fields = channels.fields
+        self.fields, self.topics = channels.fields, channels.topics
         twice: list[int] = []
-        with open_trace(self.path) as (stream, size):
-            blocks = self._blocks(stream, size, twice)
-            if in_time_order:
-                yield from reading.by_time(stream, blocks)
-            else:
-                yield from reading.by_file(stream, blocks)
-        self._warn(reading, size, twice)
-
-    def _blocks(self, stream: BinaryIO, size: int, twice: list[int]) -> Iterator[Block]:
-        return usable(stream, self._start, size, self._summary, twice)
-
-    def _warn(self, reading: Reading, size: int, twice: list[int]) -> None:
-        lines = [self._missing(reading, size), reading.undecoded(), *reading.odd_times()]
+        blocks = usable(self._stream, self._start, self._size, self._summary, twice)
+        try:
+            yield from way(reading, self._stream, blocks)
+        except OSError as error:
+            raise _unreadable(self.path, error) from None
+        lines = [self._missing(reading), reading.undecoded(), *reading.odd_times()]
         if reading.restored:
             lines.append(f'{self.path}: the first chunk is damaged: used its copy')
         if twice:
@@ -165,14 +186,14 @@ class TraceReader:
             if text and text not in self.warnings:
                 self.warnings.append(text)
 
-    def _missing(self, reading: Reading, size: int) -> str | None:
+    def _missing(self, reading: Reading) -> str | None:
         """Return the line that says what is missing, None where nothing is."""
         damage, summary = reading.damage, self._summary
         found = _contents(reading.chunks, reading.messages)
         stated = (f'the file says that it holds {_contents(summary.chunks, summary.messages)}'
                   if summary else 'what there should be is not known')
         if damage:
-            return f'{what_was_used(self.path, damage, found, size)}; {stated}'
+            return f'{what_was_used(self.path, damage, found, self._size)}; {stated}'
         if not self._finished:
             return (f'{self.path}: the summary at the end is damaged or missing: used all of the '
                     f'data, {found}')

@@ -19,12 +19,14 @@ Theory of operation:
    damage leaves is always the beginning of the recording. It is kept in `damage`, not raised.
 5. In the order of time an event at a time that cannot be (`times`) is left out and counted.
 6. A message in a sound chunk that does not decode is left out and counted.
+7. The messages of other topics are given out as they are, in the order of the file.
 """
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 import struct
 from typing import Any, BinaryIO, NamedTuple
 
@@ -33,7 +35,7 @@ from mddag_executor.text import counted
 from mddag_executor.trace import records
 from mddag_executor.trace.blocks import Block, Damage, load
 from mddag_executor.trace.cdr import ENCAPSULATION
-from mddag_executor.trace.channels import Channels
+from mddag_executor.trace.channels import Channels, Topic
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.events import Event, Events, Ints, OTHER, rows_at
 from mddag_executor.trace.times import plain, Times
@@ -46,12 +48,24 @@ _PENDING_LIMIT = 2_000_000      # events in memory while putting them into the o
 _HEAD = np.dtype({
     'names': ['opcode', 'length', 'channel', 'encapsulation'], 'itemsize': 33,
     'formats': ['u1', '<u8', '<u2', '<u2'], 'offsets': [0, 1, 9, 31]})
+_MESSAGE = np.dtype({
+    'names': ['length', 'channel', 'log_time', 'publish_time'], 'itemsize': 31,
+    'formats': ['<u8', '<u2', '<u8', '<u8'], 'offsets': [1, 9, 15, 23]})
 _CONTENT = records.RECORD.size
 _FIELDS = _CONTENT + records.MESSAGE_HEAD.size + 4      # 4: the encapsulation header
 _LITTLE_ENDIAN = 0x0100         # plain CDR, little endian, as _HEAD reads it
 _CHANNEL = np.dtype({'names': ['channel'], 'formats': ['<u2'], 'offsets': [9], 'itemsize': 11})
 _INDEX_ROOM = 1 << 16           # an index takes a third of its messages, and a head a channel
 _INDEX_ENTRY = np.dtype([('time', '<u8'), ('offset', '<u8')])
+
+
+class Message(NamedTuple):
+    """A message: its channel, its times (ns) and its bytes."""
+
+    topic: Topic
+    log_time: int
+    publish_time: int
+    data: memoryview
 
 
 class _Loaded(NamedTuple):
@@ -90,6 +104,30 @@ class Reading:
         try:
             for block in blocks:
                 yield self._events([self._decode(stream, block)])
+        except Damage as damage:
+            self._keep(damage)
+
+    def messages_of(
+        self, stream: BinaryIO, blocks: Iterator[Block], topics: Collection[str],
+        times: array[int],
+    ) -> Iterator[Message]:
+        """Yield the messages of some topics; add the times of all messages to `times`."""
+        try:
+            for block in blocks:
+                data, starts = self._starts(stream, block)
+                heads = rows_at(data, _MESSAGE, starts)
+                if (heads['length'] < records.MESSAGE_HEAD.size).any():
+                    raise Damage('a message is shorter than its head', block.offset)
+                of = self._channels.topics
+                if not np.isin(heads['channel'], list(of)).all():
+                    raise Damage('a message is of no channel', block.offset)
+                times.frombytes(heads['log_time'].tobytes())
+                wanted = np.isin(heads['channel'], [n for n in of if of[n].name in topics])
+                view = memoryview(data)
+                for start, (length, channel, log_time, publish_time) in zip(
+                        starts[wanted].tolist(), heads[wanted].tolist()):
+                    yield Message(of[channel], log_time, publish_time,
+                                  view[start + _FIELDS - 4:start + _CONTENT + length])
         except Damage as damage:
             self._keep(damage)
 
@@ -183,8 +221,8 @@ class Reading:
         self.restored = True
         return load(stream, block.copy), block.copy
 
-    def _decode(self, stream: BinaryIO, block: Block) -> _Loaded:
-        """Return the events of a block in the order of the file; raise Damage where malformed."""
+    def _starts(self, stream: BinaryIO, block: Block) -> tuple[bytes, Ints]:
+        """Return the records of a block, and where messages begin in them."""
         data, source = self._load(stream, block)
         end = len(data)
         data += bytes(_HEAD.itemsize)       # a head can be read at any record, however short
@@ -193,6 +231,11 @@ class Reading:
             starts = self._walk(data, 0, end, block, True)
         self.messages += len(starts) * block.copies
         self.chunks += block.chunk * block.copies
+        return data, starts
+
+    def _decode(self, stream: BinaryIO, block: Block) -> _Loaded:
+        """Return the events of a block in the order of the file; raise Damage where malformed."""
+        data, starts = self._starts(stream, block)
         sizes = self._least_sizes()
         least = sizes[rows_at(data, _CHANNEL, starts)['channel']]
         wanted = least != 0
@@ -293,8 +336,9 @@ class Reading:
             head, unpack = self._channels.decoder(channel)
             events.append(head + unpack(message[_FIELDS:]))
         except (ValueError, struct.error) as error:
-            topic = self._channels.topics.get(channel, f'channel {channel}')
-            self._undecoded[f'{topic}: {error}'] += 1
+            topic = self._channels.topics.get(channel)
+            name = f'channel {channel}' if topic is None else topic.name
+            self._undecoded[f'{name}: {error}'] += 1
 
     def _define(self, opcode: int, content: bytes, block: Block) -> None:
         try:
