@@ -114,7 +114,7 @@ class Replay:
         return {
             **result, 'rescheduled': False, 'skip_ns': self.judge.skip,
             'callbacks': self.usage.callbacks(),
-            'undeclared': self.usage.undeclared.result(),
+            'undeclared': self.usage.undeclared(),
             'worker_use': self.usage.workers(head.workers, duration),
             'dropped': dict(sorted(self.run.dropped.items())),
             'misses': None if self.explainer is None else self.explainer.summary(),

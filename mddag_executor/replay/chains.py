@@ -32,7 +32,6 @@ from mddag_executor.core.state import SINK_LATE
 from mddag_executor.replay.happenings import (
     Batch,
     COMPLETED,
-    Execution,
     Ints,
     STARTED,
     sums,
@@ -52,21 +51,9 @@ class Breakdown(NamedTuple):
     unknown_ns: int = 0
 
 
-class Step(NamedTuple):
-    """
-    A vertex of a chain.
-
-    `leg` is the one that completed it (-1: it still ran), `execution` that execution, `group` how
-    much of its waiting was for its callback group, ns.
-    """
-
-    vertex: int
-    leg: int
-    execution: Execution
-    group: int = 0
-
-
-# Columns of a link: a step while it is only counted.
+# Columns of a link, a step of a chain: the leg that completed its vertex (-1: it still ran); of
+# the execution ready, first start, last end and the time that its pieces took, how much of its
+# waiting was for its callback group, and its CPU time, ns.
 L_VERTEX, L_LEG, L_READY, L_START, L_END, L_BUSY, L_GROUP, L_CPU, N_LINK = range(9)
 
 
@@ -82,18 +69,13 @@ class Misses(NamedTuple):
 
 
 class Worst(NamedTuple):
-    """The job with a sink's longest response time."""
+    """The job with a sink's longest response time; `chain` has its links."""
 
     job: int
     release: int
     completed: int
-    chain: list[Step]
+    chain: list[list[int]]
     breakdown: Breakdown
-
-    @property
-    def group(self) -> int:
-        """Return how much of the waiting was for callback groups, ns."""
-        return sum(step.group for step in self.chain)
 
 
 class SinkTimes:
@@ -281,10 +263,9 @@ class Chains:
             worst = int(mine[response[mine].argmax()])
             if response[worst] > times.longest:
                 times.longest = int(response[worst])
-                links = chain[first[worst]:first[worst] + lengths[worst]][::-1].tolist()
                 times.worst = Worst(
                     int(job[worst]), int(release[worst]), int(completed[worst]),
-                    [Step(link[0], link[1], Execution(*link[2:6]), link[6]) for link in links],
+                    chain[first[worst]:first[worst] + lengths[worst]][::-1].tolist(),
                     Breakdown(*parts[:-1, worst].tolist()))
 
     def result(self, task_set: TaskSet, vertex: int) -> dict[str, Any] | None:
@@ -299,14 +280,15 @@ class Chains:
                      'waiting_group_ns': round(times.group / times.completed)},
             'worst': {
                 'job': worst.job, 'release_ns': worst.release, 'completed_ns': worst.completed,
-                **worst.breakdown._asdict(), 'waiting_group_ns': worst.group,
-                'chain': [_step_result(task_set, step) for step in worst.chain]}}
+                **worst.breakdown._asdict(),
+                'waiting_group_ns': sum(link[L_GROUP] for link in worst.chain),
+                'chain': [_step_result(task_set, link) for link in worst.chain]}}
 
 
-def _step_result(task_set: TaskSet, step: Step) -> dict[str, Any]:
-    ready, start, end, busy, _ = step.execution
-    known = step.leg >= 0
+def _step_result(task_set: TaskSet, link: list[int]) -> dict[str, Any]:
+    vertex, leg, ready, start, end, busy, group, _ = link
+    known = leg >= 0
     return {
-        'vertex': task_set.vertices[step.vertex].name, 'ready_ns': ready, 'start_ns': start,
+        'vertex': task_set.vertices[vertex].name, 'ready_ns': ready, 'start_ns': start,
         'end_ns': end if known else None, 'busy_ns': busy if known else None,
-        'waiting_group_ns': step.group if known else None}
+        'waiting_group_ns': group if known else None}

@@ -59,20 +59,6 @@ class Piece(NamedTuple):
     first: bool
 
 
-class Execution(NamedTuple):
-    """
-    A whole execution: ready, first start, last end, and the time that its pieces took, ns.
-
-    :ivar number: identifies it; -1: its times are not recorded.
-    """
-
-    ready: int
-    start: int
-    end: int
-    busy: int
-    number: int = 0
-
-
 class Batch:
     """
     What happened in a stretch of a run.
@@ -176,8 +162,10 @@ class Observer:
         Note that an execution of a vertex has completed.
 
         :param whole: whether that completed the vertex, as the executor saw it.
-        :param ready: of the execution, as ``start`` to ``number``: see ``Execution``; the same
-            number again for further legs that one execution completes.
+        :param ready: of the execution, as its first ``start`` and when it ``ended``.
+        :param busy: the time that its pieces took, ns.
+        :param number: identifies it, -1: its times are not recorded; the same number again for
+            further legs that one execution completes.
         :param cpu: its CPU time, ns; -1: not known.
         :param held: whether it held the interpreter.
         """

@@ -52,6 +52,7 @@ from mddag_executor.replay.linker import (
     Execution,
     Linker,
     LinkObserver,
+    Losses,
     Publication,
 )
 from mddag_executor.replay.matching import Matching, Target
@@ -154,7 +155,7 @@ class ImportedRun(LinkObserver):
     @property
     def lost(self) -> int:
         """Return how many events the tracer says to have discarded."""
-        return self._linker.losses.discarded
+        return self._linker.discarded
 
     @property
     def unjudged(self) -> dict[int, int]:
@@ -341,13 +342,17 @@ class ImportedRun(LinkObserver):
                 f'{name}: left out: {counted(self.who.incomplete, "event")} of the '
                 'initialisation without some of the fields')
         lines += self._matching.warnings
+        if self.lost:
+            lines.append(
+                f'{name}: the tracer discarded {counted(self.lost, "event")} or more: executions '
+                'and messages may be missing')
         lines += [f'{name}: {text}' for text in self._linker.losses.lines()]
         if self._doubts.withdrawn:
             dags = [f'{self._dags[dag].name} ({n})' for dag, n in self._doubts.withdrawn.items()]
             lines.append(
                 f'{name}: not judged, because what is missing may be theirs: '
                 f'{counted(sum(self._doubts.withdrawn.values()), "job")}: {listed(dags)}')
-        lines.extend(f'{name}: {text}' for text in self._timers.lines())
+        lines.extend(f'{name}: {text}' for text in self._timers.odd.lines())
         if self._fallbacks:
             lines.append(
                 f'{name}: {counted(sum(self._fallbacks.values()), "release")} by the next best '
@@ -364,35 +369,26 @@ class _Timers:
 
     def __init__(self) -> None:
         self._last: dict[int, int] = {}
-        self._without: Counter[str] = Counter()
-        self._off: Counter[str] = Counter()
-        self._skipped: Counter[str] = Counter()
+        self.odd = Losses({
+            'without': ('execution', 'of timers whose initialisation is not in it: released when '
+                        'it started'),
+            'off': ('execution', 'of timers off the grid of the period (reset, or by another '
+                    'clock): released when it started'),
+            'skipped': ('period', 'of timers passed without an execution (late by more than one, '
+                        'or events were lost): without a job')}, 5)
 
     def release(self, timer: Callback, start: int) -> int:
         """Return the release of an execution."""
         if timer.grid is None or timer.period <= 0:
-            self._without[timer.label] += 1
+            self.odd.count('without', timer.label)
             return start
         slack = min(_SLACK_NS, timer.period // 10)
         n = (start - timer.grid + slack) // timer.period
         last = self._last.get(timer.number)
         if n < 1 or (last is not None and n <= last):
-            self._off[timer.label] += 1
+            self.odd.count('off', timer.label)
             return start
         if last is not None and n > last + 1:
-            self._skipped[timer.label] += n - last - 1
+            self.odd.count('skipped', timer.label, n - last - 1)
         self._last[timer.number] = n
         return min(timer.grid + n * timer.period, start)
-
-    def lines(self) -> list[str]:
-        """Return what to say about them."""
-        said = (
-            (self._without, 'execution', 'of timers whose initialisation is not in it: released '
-             'when it started'),
-            (self._off, 'execution', 'of timers off the grid of the period (reset, or by another '
-             'clock): released when it started'),
-            (self._skipped, 'period', 'of timers passed without an execution (late by more than '
-             'one, or events were lost): without a job'))
-        return [f'{counted(sum(counts.values()), noun)} {text}: '
-                + listed([f'{name} ({n})' for name, n in counts.most_common()])
-                for counts, noun, text in said if counts]

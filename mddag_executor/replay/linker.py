@@ -46,11 +46,12 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable as Function
+from collections.abc import Mapping
 from typing import Any
 
 from mddag_executor.replay.entities import Callback, Entities, Publisher
 from mddag_executor.replay.happenings import Observer
-from mddag_executor.text import counted
+from mddag_executor.text import counted, listed
 from mddag_executor.trace.channels import Layout
 
 LAG_NS = 200_000_000
@@ -156,50 +157,45 @@ class LinkObserver(Observer):
         """
 
 
-class Losses:
-    """What was lost in a recording, by what it affects."""
+_SAID = {
+    'ends': ('execution', 'without an end in it (the event was lost)'),
+    'starts': ('execution', 'without a start in it (the event was lost): left out'),
+    'messages': ('execution', 'for a message whose publication is not in it: of no job and no '
+                 'path'),
+    'unlinked': ('execution', 'for a message whose publication is not known (not all of its topic '
+                 'have a source timestamp in it): of no job and no path'),
+    'without_message': ('execution', 'of a subscription without a message in it (its taking is '
+                        'not recorded): of no job and no path'),
+    'partial': ('publication', 'without the tracepoint rclcpp_publish that others of the '
+                'publisher have: counted from rcl_publish on'),
+    'ambiguous': ('execution', 'for a message with the topic and source timestamp of another one: '
+                  'of no job and no path'),
+    'overwritten': ('message', 'overwritten in a ring buffer, never taken'),
+    'unknown': ('execution', 'of a callback whose initialisation is not in it')}
 
-    def __init__(self) -> None:
-        self.ends: Counter[str] = Counter()
-        self.starts: Counter[str] = Counter()
-        self.messages: Counter[str] = Counter()
-        self.unlinked: Counter[str] = Counter()
-        self.without_message: Counter[str] = Counter()
-        self.partial: Counter[str] = Counter()
-        self.ambiguous: Counter[str] = Counter()
-        self.overwritten: Counter[str] = Counter()
-        self.unknown: Counter[str] = Counter()
-        #: What the tracer itself says that it discarded.
-        self.discarded = 0
+
+class Losses:
+    """
+    What is lost or odd in a recording, counted by what it affects.
+
+    :param said: by kind a noun, and what to say of so many.
+    :param most: how many of the affected are named.
+    """
+
+    def __init__(self, said: Mapping[str, tuple[str, str]], most: int) -> None:
+        self._said, self._most = said, most
+        self._counts: dict[str, Counter[str]] = {kind: Counter() for kind in said}
+
+    def count(self, kind: str, affected: str, number: int = 1) -> None:
+        """Count something of a kind."""
+        self._counts[kind][affected] += number
 
     def lines(self) -> list[str]:
         """Return what to say about it."""
-        said = (
-            (self.ends, 'execution', 'without an end in it (the event was lost)'),
-            (self.starts, 'execution', 'without a start in it (the event was lost): left out'),
-            (self.messages, 'execution', 'for a message whose publication is not in it: of no job '
-             'and no path'),
-            (self.unlinked, 'execution', 'for a message whose publication is not known (not all '
-             'of its topic have a source timestamp in it): of no job and no path'),
-            (self.without_message, 'execution', 'of a subscription without a message in it (its '
-             'taking is not recorded): of no job and no path'),
-            (self.partial, 'publication', 'without the tracepoint rclcpp_publish that others of '
-             'the publisher have: counted from rcl_publish on'),
-            (self.ambiguous, 'execution', 'for a message with the topic and source timestamp of '
-             'another one: of no job and no path'),
-            (self.overwritten, 'message', 'overwritten in a ring buffer, never taken'),
-            (self.unknown, 'execution', 'of a callback whose initialisation is not in it'))
-        lines = [f'{counted(sum(counts.values()), noun)} {text}: {_most(counts)}'
-                 for counts, noun, text in said if counts]
-        if self.discarded:
-            lines.insert(0, f'the tracer discarded {counted(self.discarded, "event")} or more: '
-                         'executions and messages may be missing')
-        return lines
-
-
-def _most(counts: Counter[str]) -> str:
-    named = ', '.join(f'{name} ({n})' for name, n in counts.most_common(3))
-    return named + (f', … ({len(counts) - 3} more)' if len(counts) > 3 else '')
+        return [
+            f'{counted(sum(counts.values()), noun)} {text}: '
+            + listed([f'{name} ({n})' for name, n in counts.most_common()], self._most)
+            for counts, (noun, text) in zip(self._counts.values(), self._said.values()) if counts]
 
 
 class _Thread:
@@ -221,7 +217,9 @@ class Linker:
     """Links the events of a recording."""
 
     def __init__(self, entities: Entities, observer: LinkObserver) -> None:
-        self.losses = Losses()
+        self.losses = Losses(_SAID, 3)
+        #: What the tracer itself says that it discarded.
+        self.discarded = 0
         self._entities = entities
         self._observer = observer
         self._threads: dict[Thread, _Thread] = {}
@@ -289,7 +287,7 @@ class Linker:
             _, report, arguments = self._queue.popleft()
             report(*arguments)
         for publisher in self._by_rclcpp & set(self._by_rcl):
-            self.losses.partial[publisher.topic] += self._by_rcl.pop(publisher)
+            self.losses.count('partial', publisher.topic, self._by_rcl.pop(publisher))
 
     @property
     def running(self) -> list[Execution]:
@@ -308,7 +306,7 @@ class Linker:
         now = event[1]
         callback = self._entities.callback(thread[0], self._get(event, 'callback'), now)
         if callback.kind == 'unknown':
-            self.losses.unknown[callback.label] += 1
+            self.losses.count('unknown', callback.label)
         if any(run.callback is callback for run in state.stack) or len(state.stack) > _DEEPEST:
             while state.stack:
                 run = state.stack.pop()
@@ -339,18 +337,17 @@ class Linker:
             if message is None:
                 self._not_found(run, topic)
         elif message is None and run.callback.kind == 'subscription' and not run.taken:
-            self.losses.without_message[run.callback.label] += 1
+            self.losses.count('without_message', run.callback.label)
         self._observer.began(run, message)
 
     def _not_found(self, run: Execution, topic: str) -> None:
-        losses = self.losses
         if run.stamp in self._by_stamp.get(topic, ()):
-            losses.ambiguous[run.callback.label] += 1
+            self.losses.count('ambiguous', run.callback.label)
             self._observer.lost_sight(run.callback, None, run.start)
         elif self._unstamped.isdisjoint((topic, '')):
-            losses.messages[run.callback.label] += 1
+            self.losses.count('messages', run.callback.label)
         else:
-            losses.unlinked[run.callback.label] += 1
+            self.losses.count('unlinked', run.callback.label)
 
     def _find(self, topic: str, stamp: int) -> Publication | None:
         found = self._by_stamp.get(topic, {}).get(stamp)
@@ -363,7 +360,7 @@ class Linker:
         if not any(run.callback is callback for run in state.stack):
             # else it began before the recording did
             if not state.fresh or callback.made >= self._entities.begin:
-                self.losses.starts[callback.label] += 1
+                self.losses.count('starts', callback.label)
                 self._queue.append((now, self._observer.lost_sight, (callback, None, now)))
             state.fresh = False
             return
@@ -376,7 +373,7 @@ class Linker:
         self._queue.append((now, self._observer.over, (run,)))
 
     def _without_end(self, run: Execution, now: int) -> None:
-        self.losses.ends[run.callback.label] += 1
+        self.losses.count('ends', run.callback.label)
         self._queue.append((now, self._observer.lost_sight, (run.callback, run, now)))
 
     # --- publications ----------------------------------------------------------------------------
@@ -499,7 +496,7 @@ class Linker:
         callback = self._entities.callback(thread[0], self._get(event, 'callback'), event[1])
         message = self._by_address.get((thread[0], self._get(event, 'message')))
         if message is None:
-            self.losses.messages[callback.label] += 1
+            self.losses.count('messages', callback.label)
         state.take = callback, None, 0, 0, message, event[1]
 
     def _copy(self, event: Event, thread: Thread, state: _Thread) -> None:
@@ -516,7 +513,7 @@ class Linker:
         if self._get(event, 'overwritten'):
             before = self._by_slot.get(place)
             if before is not None and before[1]:
-                self.losses.overwritten[before[0].topic or 'unknown topic'] += 1
+                self.losses.count('overwritten', before[0].topic or 'unknown topic')
         self._by_slot[place] = state.last, True
 
     def _dequeue(self, event: Event, thread: Thread, state: _Thread) -> None:
@@ -524,8 +521,8 @@ class Linker:
         found = self._by_slot.pop(place, None)
         state.take = None, None, 0, 0, None if found is None else found[0], event[1]
         if found is None and not state.fresh:
-            self.losses.messages['a ring buffer'] += 1
+            self.losses.count('messages', 'a ring buffer')
 
     def _lost(self, event: Event, thread: Thread, state: _Thread) -> None:
-        self.losses.discarded += self._get(event, 'count')
+        self.discarded += self._get(event, 'count')
         self._queue.append((event[1], self._observer.lost_sight, (None, None, event[1])))

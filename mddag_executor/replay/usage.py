@@ -14,6 +14,12 @@ from msg_graph import TaskSet
 import numpy as np
 
 _KEEP = 256
+# Columns of what a callback used, ns: sums over all executions; of how many the CPU time is known,
+# what these took, and what they computed.
+(_EXECUTIONS, _BUSY, _LONGEST, _WAITING, _LONGEST_WAIT, _GROUP, _MEASURED, _MEASURED_BUSY, _CPU,
+ _HELD) = range(10)
+_NAMES = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
+          'waiting_group_ns', 'measured', 'measured_busy_ns', 'cpu_ns', 'held_interpreter')
 
 
 class GroupWaits(Observer):
@@ -62,38 +68,6 @@ class GroupWaits(Observer):
                 waited += max(0, min(end, start) - max(begun, since))
             self.found[rows[i]] = waited
         before.extend(busy[max(n, len(busy) - _KEEP):])
-
-
-class CallbackUse:
-    """Counts and sums of one callback's executions, ns."""
-
-    __slots__ = ('executions', 'busy', 'longest', 'waiting', 'longest_wait', 'group', 'measured',
-                 'measured_busy', 'cpu', 'held')
-
-    def __init__(self) -> None:
-        self.executions = 0
-        self.busy = 0
-        self.longest = 0
-        self.waiting = 0
-        self.longest_wait = 0
-        self.group = 0
-        # of how many executions the CPU time is known, what these took, and what they computed
-        self.measured = 0
-        self.measured_busy = 0
-        self.cpu = 0
-        self.held = 0
-
-    def result(self) -> dict[str, int]:
-        """Return the callback's part of the result; the sums are over all executions."""
-        result = {
-            'executions': self.executions, 'busy_ns': self.busy, 'longest_ns': self.longest,
-            'waiting_ns': self.waiting, 'longest_wait_ns': self.longest_wait,
-            'waiting_group_ns': self.group}
-        if self.measured:
-            result.update(
-                measured=self.measured, measured_busy_ns=self.measured_busy, cpu_ns=self.cpu,
-                held_interpreter=self.held)
-        return result
 
 
 class PoolUse:
@@ -161,21 +135,20 @@ class Usage(Observer):
 
     def __init__(self, task_set: TaskSet, waits: GroupWaits | None = None) -> None:
         self._waits = waits
-        self._uses = {c.key: CallbackUse() for c in task_set.callbacks}
-        places = {key: place for place, key in enumerate(self._uses)}
+        self._places = task_set.places()
         # by global vertex the place of its callback, at last that of all undeclared ones
-        self._place = np.array([*(places[v.callback.key] for v in task_set.vertices), len(places)])
-        self.undeclared = CallbackUse()
+        self._place = np.array([*task_set.places_of_vertices(), len(self._places)])
+        # by place; Python's numbers, as sums of a damaged trace may be of any size
+        self._table = np.zeros((len(self._places) + 1, len(_NAMES)), dtype=object)
         self.by_worker: Counter[int] = Counter()
         self.pool = PoolUse()
         self._counted = -1
 
     def take(self, batch: Batch) -> None:
         """Add what ran and what completed."""
-        every = [*self._uses.values(), self.undeclared]
         pieces = batch.columns(RAN)
         if len(pieces):
-            self._ran(pieces, every)
+            self._ran(pieces)
         done = batch.columns(COMPLETED)
         done = done[done[:, 10] >= 0]
         if len(done):
@@ -183,46 +156,59 @@ class Usage(Observer):
             done = done[np.r_[self._counted, numbers[:-1]] != numbers]   # not one leg more
             self._counted = int(numbers[-1])
             place = self._place[done[:, 1]]
-            _count(place, every)
-            _longest(place, done[:, 9], every, 'longest')
+            self._add(_EXECUTIONS, place)
+            self._most(_LONGEST, place, done[:, 9])
             known = done[:, 11] >= 0
             place, done = place[known], done[known]
-            counts = [sums(place, each, len(every)) for each in (
-                np.ones_like(place), done[:, 9], done[:, 11], done[:, 12])]
-            for use, n, busy, cpu, held in zip(every, *counts):
-                use.measured += n
-                use.measured_busy += busy
-                use.cpu += cpu
-                use.held += held
+            self._add(_MEASURED, place)
+            for column, field in ((_MEASURED_BUSY, 9), (_CPU, 11), (_HELD, 12)):
+                self._add(column, place, done[:, field])
 
-    def _ran(self, pieces: Ints, every: list[CallbackUse]) -> None:
+    def _ran(self, pieces: Ints) -> None:
         took, place = pieces[:, 7] - pieces[:, 6], self._place[pieces[:, 2]]
         workers, which = np.unique(pieces[:, 4], return_inverse=True)
         for worker, total in zip(workers.tolist(), sums(which, took, len(workers))):
             self.by_worker[worker] += total
         self.pool.add(pieces[:, 6], pieces[:, 7])
-        for use, total in zip(every, sums(place, took, len(every))):
-            use.busy += total
+        self._add(_BUSY, place, took)
         first = pieces[:, 8] != 0
         undeclared = pieces[:, 2] < 0
-        _count(place[undeclared & first], every)
-        _longest(place[undeclared], took[undeclared], every, 'longest')
+        self._add(_EXECUTIONS, place[undeclared & first])
+        self._most(_LONGEST, place[undeclared], took[undeclared])
         place, waited = place[first], (pieces[:, 6] - pieces[:, 5])[first]
-        for use, total in zip(every, sums(place, waited, len(every))):
-            use.waiting += total
-        _longest(place, waited, every, 'longest_wait')
+        self._add(_WAITING, place, waited)
+        self._most(_LONGEST_WAIT, place, waited)
         if self._waits is not None and self._waits.found.any():
-            for use, total in zip(every, sums(place, self._waits.found[first], len(every))):
-                use.group += total
+            self._add(_GROUP, place, self._waits.found[first])
+
+    def _add(self, column: int, places: Ints, values: Ints | None = None) -> None:
+        """Add values of callbacks at these places; without values count them."""
+        self._table[:, column] += np.array(sums(
+            places, np.ones_like(places) if values is None else values, len(self._table)),
+            dtype=object)
+
+    def _most(self, column: int, places: Ints, times: Ints) -> None:
+        """Keep the longest times of callbacks at these places."""
+        longest = np.full(len(self._table), -1, dtype=np.int64)
+        np.maximum.at(longest, places, times)
+        self._table[:, column] = np.maximum(self._table[:, column], longest.astype(object))
 
     @property
     def busy(self) -> int:
         """Return how long declared callbacks ran altogether, ns."""
-        return sum(use.busy for use in self._uses.values())
+        return int(self._table[:-1, _BUSY].sum())
 
     def callbacks(self) -> dict[str, dict[str, int]]:
         """Return what each declared callback used, in file order."""
-        return {key: use.result() for key, use in self._uses.items()}
+        return {key: self._result(place) for key, place in self._places.items()}
+
+    def undeclared(self) -> dict[str, int]:
+        """Return what all callbacks that are not declared used together."""
+        return self._result(-1)
+
+    def _result(self, place: int) -> dict[str, int]:
+        row = self._table[place].tolist()
+        return dict(zip(_NAMES, row if row[_MEASURED] else row[:_MEASURED]))
 
     def workers(self, count: int, duration: int) -> dict[str, Any]:
         """Return how busy the workers were; ``lent`` is what ran beside them (blocking calls)."""
@@ -233,20 +219,6 @@ class Usage(Observer):
             'lent_ns': sum(took for w, took in self.by_worker.items() if w < 0),
             'use': share(total, count, duration),
             'over_time': self.pool.result()}
-
-
-def _count(places: Ints, every: list[CallbackUse]) -> None:
-    """Count executions of callbacks at these places."""
-    for use, count in zip(every, np.bincount(places, minlength=len(every)).tolist()):
-        use.executions += count
-
-
-def _longest(places: Ints, times: Ints, every: list[CallbackUse], what: str) -> None:
-    """Keep the longest times of callbacks at these places."""
-    longest = np.full(len(every), -1, dtype=np.int64)
-    np.maximum.at(longest, places, times)
-    for use, most in zip(every, longest.tolist()):
-        setattr(use, what, max(getattr(use, what), most))
 
 
 def share(busy: int, workers: int, duration: int) -> float | None:

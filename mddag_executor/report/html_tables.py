@@ -144,7 +144,7 @@ def paths_html(data: ReportData) -> str:
 def callbacks_html(data: ReportData) -> str:
     """Return the table of callbacks: how often each ran, how long, how long it waited."""
     rows = list(callbacks_rows(data.usage.callbacks()))
-    undeclared = data.usage.undeclared.result()
+    undeclared = data.usage.undeclared()
     if undeclared['executions']:
         rows += callbacks_rows({'undeclared callbacks': undeclared})
     tables = [html_table(CALLBACKS_HEADER, rows, 1)]

@@ -36,7 +36,7 @@ import signal
 import struct
 import subprocess
 import sys
-from typing import Any, IO
+from typing import Any, IO, NamedTuple
 
 from mddag_executor.text import counted
 from mddag_executor.trace.cdr import FieldType
@@ -231,17 +231,12 @@ def _end_of(process: subprocess.Popen[bytes]) -> str:
 # --- from rows to events -------------------------------------------------------------------------
 
 
-class _Kind:
-    """How the events of one class are written."""
+class _Kind(NamedTuple):
+    """How the events of a class are written; `unread` is a provider that replay does not know."""
 
-    __slots__ = ('converts', 'key', 'unread')
-
-    def __init__(self, key: str, converts: Sequence[Callable[[Any], Any] | None]) -> None:
-        self.key = key
-        provider = key.partition(':')[0]
-        self.unread = None if provider in PROVIDERS else provider
-        # None where no value changes
-        self.converts = converts if any(converts) else None
+    key: str
+    converts: Sequence[Callable[[Any], Any] | None]
+    unread: str | None
 
 
 class _Importer:
@@ -277,7 +272,7 @@ class _Importer:
             self._procnames[vpid, vtid] = procname
             self._file.extend((('mddag:process', time, vtid, procname),), vpid)
         kind = self._kinds[number]
-        if kind.converts is not None:
+        if kind.converts:
             values = [value if convert is None else convert(value)
                       for convert, value in zip(kind.converts, values)]
         self._file.extend(((kind.key, time, vtid, *values),), vpid)
@@ -298,7 +293,9 @@ class _Importer:
         for (given, _), (name, _) in zip(fields, event.fields):
             if given != name and given not in dict(PREAMBLE):
                 self._changed[f'{original}.{given}'] = name
-        self._kinds[number] = _Kind(self._file.define(event), converts)
+        unread = None if event.provider in PROVIDERS else event.provider
+        self._kinds[number] = _Kind(
+            self._file.define(event), converts if any(converts) else (), unread)
 
     def _name(self, original: str) -> str:
         """Return the full name of an event; different ones stay different."""
