@@ -62,7 +62,7 @@ class Replay:
             else:
                 if not isinstance(run, OwnRun):
                     from mddag_executor.replay import imported_figures
-                    self._seen = imported_figures.Communications()
+                    self._seen = imported_figures.Communications(run.who)
                     self._paths = imported_figures.ImportedPaths(run) if paths else None
                 elif paths:
                     self._paths = OwnPaths(run)

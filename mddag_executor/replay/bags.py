@@ -293,13 +293,14 @@ def is_ordinary(path: str) -> bool:
 def _what(path: str) -> str:
     """Return whether a file is a bag's or a trace; nothing for others, and for damage."""
     try:
-        kind = _kind(Path(path))
-        if kind != _MCAP:
-            return 'bag' if kind else ''
         reader = TraceReader(path)
         return 'trace' if reader.written_here or reader.has_events() else 'bag'
     except (InputError, OSError):
-        return ''       # whoever reads it says why
+        pass        # of another kind, or damaged: then whoever reads it says why
+    try:
+        return 'bag' if _kind(Path(path)) in (_SQLITE, _ZSTD) else ''
+    except InputError:
+        return ''
 
 
 def _absolute(topic: str) -> str:

@@ -5,9 +5,10 @@
 from __future__ import annotations
 
 from array import array
+from collections import Counter
 from typing import Any
 
-from mddag_executor.replay.entities import Callback, Publisher
+from mddag_executor.replay.entities import Callback, Entities
 from mddag_executor.replay.happenings import Batch
 from mddag_executor.replay.imported_run import ImportedRun
 from mddag_executor.replay.linker import Execution, KEEP, LinkObserver, Publication
@@ -18,100 +19,85 @@ import numpy as np
 _BATCH = 1024
 
 
-class _Executions:
-    """Counts and sums of a recorded callback's executions, ns."""
+class _Times:
+    """Times that have to do with a callback, ns."""
 
-    __slots__ = ('callback', 'started', 'finished', 'busy', 'shortest', 'longest')
-
-    def __init__(self, callback: Callback) -> None:
-        self.callback = callback
-        self.started = 0
-        self.finished = 0
-        self.busy = 0
-        self.shortest = 0
-        self.longest = 0
-
-
-class _Latencies:
-    """From the publication to the start of a callback, ns."""
-
-    __slots__ = ('callback', 'spread', '_last')
+    __slots__ = ('callback', '_spread', '_last')
 
     def __init__(self, callback: Callback) -> None:
         self.callback = callback
-        self.spread = Spread()
+        self._spread = Spread()
         self._last = array('q')
 
-    def add(self, latency: int) -> None:
-        self._last.append(latency)
+    def add(self, time: int) -> None:
+        """Add a time; many go on together, which is quicker."""
+        self._last.append(time)
         if len(self._last) >= _BATCH:
-            self.flush()
+            self.all()
 
-    def flush(self) -> None:
-        """Add what is left."""
-        self.spread.add(np.array(self._last, dtype=np.int64))
+    def all(self) -> Spread:
+        """Return the distribution of all of them."""
+        self._spread.add(np.array(self._last, dtype=np.int64))
         self._last = array('q')
+        return self._spread
 
 
 class Communications(LinkObserver):
     """Collects callbacks and messages while an imported run is played."""
 
-    def __init__(self) -> None:
-        self._executions: dict[int, _Executions] = {}
-        self._sent: dict[int, tuple[Publisher, int]] = {}
-        self._arrived: dict[tuple[int, int], _Latencies] = {}
+    def __init__(self, who: Entities) -> None:
+        self._who = who
+        # by callback how often it started, and how long it ran; by publisher how often it sent,
+        # and by both how long messages took to the start of the callback
+        self._started: Counter[int] = Counter()
+        self._ran: dict[int, _Times] = {}
+        self._sent: Counter[int] = Counter()
+        self._arrived: dict[tuple[int, int], _Times] = {}
 
     def began(self, run: Execution, message: Publication | None) -> None:
         """Count an execution, and the way of its message."""
         callback = run.callback
-        use = self._executions.get(callback.number)
-        if use is None:
-            use = self._executions[callback.number] = _Executions(callback)
-        use.started += 1
+        self._started[callback.number] += 1
+        if callback.number not in self._ran:
+            self._ran[callback.number] = _Times(callback)
         if message is not None and message.publisher is not None and message.time:
             key = (message.publisher.number, callback.number)
-            found = self._arrived.get(key)
-            if found is None:
-                found = self._arrived[key] = _Latencies(callback)
-            found.add(run.start - message.time)
+            if key not in self._arrived:
+                self._arrived[key] = _Times(callback)
+            self._arrived[key].add(run.start - message.time)
 
     def over(self, run: Execution) -> None:
         """Add how long an execution took."""
-        use = self._executions[run.callback.number]
-        took = run.end - run.start
-        use.shortest = took if not use.finished else min(use.shortest, took)
-        use.longest = max(use.longest, took)
-        use.finished += 1
-        use.busy += took
+        self._ran[run.callback.number].add(run.end - run.start)
 
     def sent(self, message: Publication) -> None:
         """Count a message of its publisher."""
-        publisher = message.publisher
-        if publisher is not None:
-            _, count = self._sent.get(publisher.number, (publisher, 0))
-            self._sent[publisher.number] = publisher, count + 1
+        if message.publisher is not None:
+            self._sent[message.publisher.number] += 1
 
     def callbacks(self) -> dict[str, dict[str, int]]:
         """Return counts and times (ns) of each recorded callback that ran."""
-        return {
-            use.callback.label: {
-                'executions': use.finished, 'unfinished': use.started - use.finished,
-                'busy_ns': use.busy, 'shortest_ns': use.shortest, 'longest_ns': use.longest}
-            for use in sorted(self._executions.values(), key=lambda u: u.callback.label)}
+        found = {}
+        for number, times in sorted(self._ran.items(), key=lambda each: each[1].callback.label):
+            took = times.all()
+            found[times.callback.label] = {
+                'executions': took.count, 'unfinished': self._started[number] - took.count,
+                'busy_ns': took.total, 'shortest_ns': took.least if took.count else 0,
+                'longest_ns': max(0, took.greatest)}
+        return found
 
     def communications(self) -> list[dict[str, Any]]:
         """Return for each pair of publisher and callback messages, and publication to start."""
         found = []
-        for (number, _), latencies in self._arrived.items():
-            latencies.flush()
-            publisher, sent = self._sent.get(number, (None, 0))
-            if publisher is None:
+        for (number, _), times in self._arrived.items():
+            if number not in self._sent:
                 continue
+            publisher, latencies = self._who.every_publisher[number], times.all()
             found.append({
                 'topic': publisher.topic,
                 'publisher': publisher.node.name if publisher.node is not None else None,
-                'callback': latencies.callback.label, 'sent': sent,
-                'arrived': latencies.spread.count, 'latency_ns': latencies.spread.result()})
+                'callback': times.callback.label, 'sent': self._sent[number],
+                'arrived': latencies.count, 'latency_ns': latencies.result()})
         return sorted(found, key=lambda each: (each['topic'], each['callback']))
 
 

@@ -28,7 +28,6 @@ from typing import Any
 
 from llvmlite import ir
 from numba import njit, types
-from numba.core import cgutils
 from numba.core.imputils import lower_getattr_generic
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
 from numba.extending import intrinsic, models, overload, overload_method, register_model
@@ -165,28 +164,8 @@ def _set_word(typing: Any, vector: Any, place: Any, value: Any) -> Any:
     return types.void(vector, types.int64, types.int64), generate
 
 
-@intrinsic
-def _realloc(typing: Any, address: Any, size: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        byte = ir.IntType(8).as_pointer()
-        function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(byte, [byte, _I64]), 'realloc')
-        moved = builder.call(function, [builder.inttoptr(args[0], byte), args[1]])
-        return builder.ptrtoint(moved, _I64)
-
-    return types.int64(types.int64, types.int64), generate
-
-
-@intrinsic
-def _free(typing: Any, address: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        byte = ir.IntType(8).as_pointer()
-        function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(ir.VoidType(), [byte]), 'free')
-        builder.call(function, [builder.inttoptr(args[0], byte)])
-        return context.get_dummy_value()
-
-    return types.void(types.int64), generate
+_realloc = types.ExternalFunction('realloc', types.int64(types.int64, types.int64))
+_free = types.ExternalFunction('free', types.void(types.int64))
 
 
 def at(kind: types.Type) -> Callable[..., Any]:

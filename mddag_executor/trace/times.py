@@ -25,6 +25,7 @@ from typing import Any
 
 from mddag_executor.text import counted
 from msg_graph import format_duration
+import numpy as np
 
 NEVER = 2 ** 62
 GAP_NS = 60 * 1_000_000_000
@@ -48,14 +49,11 @@ class Times:
 
     def impossible(self, times: Sequence[int]) -> list[int]:
         """Return the places, in ascending order, of what cannot be among times of one file."""
-        if not len(times):
+        if not len(times) or plain(min(times), max(times)):
             return []
-        if plain(min(times), max(times)):
-            return []
-        import numpy as np
         array = np.array([min(max(int(time), -1), NEVER) for time in times], dtype=np.int64)
         wrong = (array < 0) | (array >= NEVER)
-        for group in self._stray(np, array, np.flatnonzero(~wrong)):
+        for group in self._stray(array, np.flatnonzero(~wrong)):
             wrong[group] = True
         found: list[int] = np.flatnonzero(wrong).tolist()
         if found and not self.left_out:
@@ -67,9 +65,9 @@ class Times:
         self.furthest = max(self.furthest, *back.tolist(), 0)
         return found
 
-    def _stray(self, np: Any, times: Any, places: Any) -> list[Any]:
+    def _stray(self, times: Any, places: Any) -> list[Any]:
         """Return the stray groups, as places."""
-        groups = grouped(np, times, places)
+        groups = grouped(times, places)
         sizes = [len(group) for group in groups]
         if len(groups) < 2:
             return []
@@ -113,7 +111,7 @@ def plain(least: int, greatest: int) -> bool:
     return 0 <= least and greatest < NEVER and greatest - least <= GAP_NS
 
 
-def grouped(np: Any, times: Any, places: Any) -> list[Any]:
+def grouped(times: Any, places: Any) -> list[Any]:
     """Return the places of times as groups without a gap, in the order of time (rule 2)."""
     order = places[np.argsort(times[places], kind='stable')]
     return list(np.split(order, np.flatnonzero(np.diff(times[order]) > GAP_NS) + 1))
@@ -131,9 +129,8 @@ def joined(several: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 def stretches(times: Sequence[int]) -> list[tuple[int, int]]:
     """Return from when to when there are times without a gap, in the order of time."""
-    import numpy as np
     array = np.array(times, dtype=np.int64)
     if not len(array):
         return []
     return [(int(array[group[0]]), int(array[group[-1]]))
-            for group in grouped(np, array, np.arange(len(array)))]
+            for group in grouped(array, np.arange(len(array)))]
