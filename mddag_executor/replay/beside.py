@@ -23,7 +23,7 @@ from typing import Any
 from mddag_executor.defaults import processors
 from mddag_executor.errors import MddagError
 from mddag_executor.replay.drift import DriftObserver
-from mddag_executor.replay.happenings import Batch, KINDS, Observer
+from mddag_executor.replay.happenings import Batch, KINDS, Observer, tell_end
 from mddag_executor.replay.own import OwnRun, STOP
 from mddag_executor.replay.own_paths import OwnPaths
 from mddag_executor.replay.run import open_run
@@ -70,12 +70,11 @@ def play_beside(
                 if what == 'take':
                     *of_batch, waits.found = more
                     more = [Batch(*of_batch)]
-                elif what == 'finished':
-                    more.append(Batch((), {}))
+                if what == 'finished':
+                    tell_end(observers, *more)
+                    continue
                 for observer in observers:
                     getattr(observer, what)(*more)
-                    if what == 'finished':
-                        observer.take(more[-1])
         except (EOFError, pickle.UnpicklingError, BrokenPipeError):
             raise MddagError(
                 f'{run.name}: the process that read it has ended early: see whether it ran out of '

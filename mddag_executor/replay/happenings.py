@@ -198,6 +198,14 @@ class Observer:
         """
 
 
+def tell_end(observers: Sequence[Observer], now: int) -> None:
+    """Tell observers that the run has ended."""
+    batch = Batch((), {})
+    for observer in observers:
+        observer.finished(now, batch)
+        observer.take(batch)
+
+
 class Batches:
     """Collects what happens, one thing after the other, and passes it on in batches."""
 
@@ -227,10 +235,7 @@ class Batches:
         """Pass on the rest and, where what is open is judged, the end of the run."""
         self.flush()
         if judged:
-            batch = Batch((), {})
-            for observer in self._observers:
-                observer.finished(now, batch)
-                observer.take(batch)
+            tell_end(self._observers, now)
 
 
 def different(values: Ints) -> list[int]:

@@ -44,6 +44,7 @@ from mddag_executor.replay.happenings import (
     RAN,
     RELEASED,
     STARTED,
+    tell_end,
     THREAD,
 )
 from mddag_executor.replay.mapping import Mapping
@@ -142,17 +143,10 @@ class OwnRun:
         if not self.shut_down:
             if self.end == 0:
                 self.end = min(max(0, self.head.time), NEVER - 1)
-            self._finish(self.end)
+            tell_end(self._observers, self.end)
         self._observers = ()
         if self.when_played is not None:
             self.when_played()
-
-    def _finish(self, judged: int) -> None:
-        """Have deadlines judged up to a time."""
-        batch = Batch((), {})
-        for observer in self._observers:
-            observer.finished(judged, batch)
-            observer.take(batch)
 
     @property
     def events(self) -> int:
@@ -362,7 +356,7 @@ class OwnRun:
                 return
             self.end = event[1]
             self.shut_down = True
-            self._finish(event[4])
+            tell_end(self._observers, event[4])
 
     def _dropped(self, dag: int, vertex: int, job: int, reason: str) -> None:
         if 0 <= dag < len(self._mapping.vertex) and 0 <= vertex < len(self._mapping.vertex[dag]):

@@ -21,7 +21,7 @@ sink: then nothing has shown that deadlines hold, and all sinks fail.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,39 +29,16 @@ from mddag_executor.core import Tables, Tally
 from mddag_executor.core.tally import counts, total
 from mddag_executor.text import counted
 from msg_graph import TaskSet
+import numpy as np
 
-FOLD = 65_536
 NOTHING_DUE = 'no job was due at any sink, so no deadline was judged'
 
 
-class Runs:
-    """A set of numbers, added in any order, as runs of consecutive ones; only runs take memory."""
-
-    def __init__(self) -> None:
-        self._new = array('q')
-        self._runs: list[tuple[int, int]] = []
-
-    def add(self, number: int) -> None:
-        """Add a number; one that is there already changes nothing."""
-        self._new.append(number)
-        if len(self._new) >= max(FOLD, len(self._runs)):
-            self._fold()
-
-    def longest(self) -> int:
-        """Return the length of the longest run."""
-        self._fold()
-        return max((last - first + 1 for first, last in self._runs), default=0)
-
-    def _fold(self) -> None:
-        """Make runs of what is new, and join those that touch."""
-        runs = sorted([*self._runs, *((number, number) for number in set(self._new))])
-        del self._new[:]
-        self._runs = []
-        for first, last in runs:
-            if self._runs and first <= self._runs[-1][1] + 1:
-                first, before = self._runs.pop()
-                last = max(last, before)
-            self._runs.append((first, last))
+def longest_run(numbers: Sequence[int]) -> int:
+    """Return how many numbers follow each other at most, in whatever order and how often told."""
+    ordered = np.unique(np.array(numbers, dtype=np.int64))
+    last = np.flatnonzero(np.diff(ordered) != 1)    # of each run but the last one
+    return int(np.diff([-1, *last, len(ordered) - 1]).max())
 
 
 class MissTally(Tally):
@@ -70,19 +47,19 @@ class MissTally(Tally):
     def __init__(self, task_set: TaskSet, tables: Tables, keep: int | None = None) -> None:
         super().__init__(task_set, tables, keep)
         #: By global vertex of each sink: the jobs that missed.
-        self.missed_jobs = {vertex: Runs() for vertex in self.sinks}
+        self.missed_jobs = {vertex: array('q') for vertex in self.sinks}
 
     def _add_miss(
         self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
     ) -> None:
         super()._add_miss(kind, dag, vertex, job, deadline, time)
-        self.missed_jobs[vertex].add(job)
+        self.missed_jobs[vertex].append(job)
 
     def add_bursts(self, dags: Mapping[str, Any]) -> None:
         """Add to each sink of a result its longest burst of misses, as `longest_burst`."""
         for v, jobs in self.missed_jobs.items():
             dag = self._dags[self._tables.dag_of[v]].name
-            dags[dag]['sinks'][self.vertex_name(v)]['longest_burst'] = jobs.longest()
+            dags[dag]['sinks'][self.vertex_name(v)]['longest_burst'] = longest_run(jobs)
 
 
 @dataclass(frozen=True)

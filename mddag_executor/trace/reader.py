@@ -36,6 +36,7 @@ from mddag_executor.trace.schema import PROCESS
 
 _REMEDY = 'check its name, that you may read it, and the disk it is on'
 _T = TypeVar('_T')
+_Way = Callable[[Reading, BinaryIO, Iterator[Block]], Iterator[_T]]
 
 
 def _opened(path: str) -> BinaryIO:
@@ -142,9 +143,7 @@ class TraceReader:
         :param sorted: whether to yield in the order of time instead of that of the file
         :raises TraceError: where the file can no longer be read, or is too unordered to be sorted
         """
-        way = Reading.by_time if sorted else Reading.by_file
-        for batch in self._read(Channels(None if names is None else set(names), True), way):
-            yield from batch
+        return self._events(names, True, Reading.by_time if sorted else Reading.by_file)
 
     def layout_events(self, names: Iterable[str] | None) -> Iterator[Event]:
         """
@@ -152,8 +151,12 @@ class TraceReader:
 
         They have the fields that the file has, not those of the table.
         """
-        for batch in self._read(
-                Channels(None if names is None else set(names), False), Reading.by_time):
+        return self._events(names, False, Reading.by_time)
+
+    def _events(
+        self, names: Iterable[str] | None, as_table: bool, way: _Way[Events]
+    ) -> Iterator[Event]:
+        for batch in self._read(Channels(None if names is None else set(names), as_table), way):
             yield from batch
 
     def batches(self, names: Iterable[str]) -> Iterator[Events]:
@@ -165,10 +168,7 @@ class TraceReader:
         return self._read(Channels(set(), True), partial(
             Reading.messages_of, topics=topics, times=self.times))
 
-    def _read(
-        self, channels: Channels,
-        way: Callable[[Reading, BinaryIO, Iterator[Block]], Iterator[_T]],
-    ) -> Iterator[_T]:
+    def _read(self, channels: Channels, way: _Way[_T]) -> Iterator[_T]:
         reading = Reading(self.path, channels)
         self.fields, self.topics = channels.fields, channels.topics
         twice: list[int] = []

@@ -24,8 +24,7 @@ from mddag_executor.core.state import (
     SINK_MISSED,
 )
 from mddag_executor.core.tally import counts
-from mddag_executor.replay import tolerances
-from mddag_executor.replay.tolerances import MissTally, Runs, Tolerance
+from mddag_executor.replay.tolerances import longest_run, MissTally, Tolerance
 from mddag_executor.report.junit import junit
 from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
@@ -75,25 +74,15 @@ def test_the_verdict_is_that_of_caret(
     assert (Tolerance(ratio, burst).broken_by(sink) is not None) == fails
 
 
-def longest(numbers: list[int]) -> int:
-    runs = Runs()
-    for number in numbers:
-        runs.add(number)
-    return runs.longest()
-
-
 def test_a_burst_is_of_consecutive_jobs_in_whatever_order_they_are_told() -> None:
-    assert longest([]) == 0
-    assert longest([7, 5, 6, 6, 9]) == 3
+    assert longest_run([]) == 0
+    assert longest_run([7, 5, 6, 6, 9]) == 3
 
 
-@given(st.lists(st.integers(0, 30)), st.integers(1, 5))
-def test_runs_are_exact_however_often_they_are_folded(numbers: list[int], fold: int) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tolerances, 'FOLD', fold)
-        found = longest(numbers)
+@given(st.lists(st.integers(0, 30)))
+def test_the_longest_burst(numbers: list[int]) -> None:
     there = ''.join('x' if number in numbers else ' ' for number in range(31))
-    assert found == max(map(len, there.split()), default=0)
+    assert longest_run(numbers) == max(map(len, there.split()), default=0)
 
 
 HOSTILE = 'a"]]><&\'\x00\x1b[2J\n\ud800\uffff\u202e</testcase>'
