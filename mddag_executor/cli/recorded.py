@@ -66,9 +66,11 @@ def check(args: argparse.Namespace) -> None:
 @contextmanager
 def opened(args: argparse.Namespace) -> Iterator[tuple[Recording, str, TaskSet | None]]:
     """Give the recording that TRACE… names, what messages call it, and GRAPH's task set."""
+    from mddag_executor.replay.bags import opened_trace
     task_set = None if args.graph is None else common.load_graph(args.graph)
     with common.input_recording(args.trace) as (path, name):
-        yield path, name, task_set
+        trace = opened_trace(path) if isinstance(path, str) else None
+        yield trace or path, name, task_set
 
 
 def is_bag(path: Recording) -> bool:

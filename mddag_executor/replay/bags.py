@@ -284,23 +284,36 @@ def _stray_stamps(arrivals: Sequence[int], stamps: Sequence[int]) -> list[int]:
 def is_ordinary(path: str) -> bool:
     """Return whether a path is a bag in which nothing was traced, so that it holds no jobs."""
     if not os.path.isdir(path):
-        return _what(path) == 'bag'
+        return _is_bag(path)
     names = [name for name in os.listdir(path) if _BAG_FILE.fullmatch(name)]
-    kinds = {_what(os.path.join(path, name)) for name in names if name != 'metadata.yaml'}
-    return 'trace' not in kinds and ('bag' in kinds or 'metadata.yaml' in names)
+    files = [os.path.join(path, name) for name in names if name != 'metadata.yaml']
+    return all(opened_trace(file) is None for file in files) and (
+        'metadata.yaml' in names or any(map(_is_bag, files)))
 
 
-def _what(path: str) -> str:
-    """Return whether a file is a bag's or a trace; nothing for others, and for damage."""
+def opened_trace(path: str) -> TraceReader | None:
+    """Return the trace that a file is, None for another one, and for damage."""
+    reader = _mcap(path)
+    return reader if reader is not None and _has_trace(reader) else None
+
+
+def _is_bag(path: str) -> bool:
+    reader = _mcap(path)
     try:
-        reader = TraceReader(path)
-        return 'trace' if reader.written_here or reader.has_events() else 'bag'
-    except (InputError, OSError):
-        pass        # of another kind, or damaged: then whoever reads it says why
-    try:
-        return 'bag' if _kind(Path(path)) in (_SQLITE, _ZSTD) else ''
+        return _kind(Path(path)) in (_SQLITE, _ZSTD) if reader is None else not _has_trace(reader)
     except InputError:
-        return ''
+        return False
+
+
+def _mcap(path: str) -> TraceReader | None:
+    try:
+        return TraceReader(path)
+    except (InputError, OSError):
+        return None     # of another kind, or damaged: then whoever reads it says why
+
+
+def _has_trace(reader: TraceReader) -> bool:
+    return reader.written_here or reader.has_events()
 
 
 def _absolute(topic: str) -> str:

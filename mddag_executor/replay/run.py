@@ -51,8 +51,8 @@ class Traces:
         return ', '.join(self.paths)
 
 
-Recording = str | os.PathLike[str] | Sequence[str] | Traces
-"""The path of a trace, or those of the traces of all processes of one run."""
+Recording = str | os.PathLike[str] | Sequence[str] | Traces | TraceReader
+"""A trace or its path, or the paths of the traces of all processes of one run."""
 
 
 def open_run(
@@ -65,11 +65,12 @@ def open_run(
     :param task_set: the declaration that judges; None: the one in the trace, if it has one.
     :param needs_declaration: whether there must be one.
     """
-    if not isinstance(path, (str, os.PathLike)):
+    if not isinstance(path, (str, os.PathLike, TraceReader)):
         return _joined(path if isinstance(path, Traces) else Traces(path), task_set)
-    path = os.fspath(path)
+    reader = path if isinstance(path, TraceReader) else None
+    path = os.fspath(path) if not isinstance(path, TraceReader) else path.path
     with named_errors(path, name or path):
-        reader = TraceReader(path)
+        reader = reader or TraceReader(path)
         head = read_head(reader)
         if head is not None:
             return OwnRun(reader, name or path, head, task_set)
