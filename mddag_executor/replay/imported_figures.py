@@ -33,9 +33,9 @@ class _Times:
         """Add a time; many go on together, which is quicker."""
         self._last.append(time)
         if len(self._last) >= _BATCH:
-            self.all()
+            self.whole()
 
-    def all(self) -> Spread:
+    def whole(self) -> Spread:
         """Return the distribution of all of them."""
         self._spread.add(np.array(self._last, dtype=np.int64))
         self._last = array('q')
@@ -79,7 +79,7 @@ class Communications(LinkObserver):
         """Return counts and times (ns) of each recorded callback that ran."""
         found = {}
         for number, times in sorted(self._ran.items(), key=lambda each: each[1].callback.label):
-            took = times.all()
+            took = times.whole()
             found[times.callback.label] = {
                 'executions': took.count, 'unfinished': self._started[number] - took.count,
                 'busy_ns': took.total, 'shortest_ns': took.least if took.count else 0,
@@ -92,7 +92,7 @@ class Communications(LinkObserver):
         for (number, _), times in self._arrived.items():
             if number not in self._sent:
                 continue
-            publisher, latencies = self._who.every_publisher[number], times.all()
+            publisher, latencies = self._who.every_publisher[number], times.whole()
             found.append({
                 'topic': publisher.topic,
                 'publisher': publisher.node.name if publisher.node is not None else None,
