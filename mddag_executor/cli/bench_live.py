@@ -209,14 +209,8 @@ def result_table(results: Sequence[dict[str, Any]]) -> str:
     load = results[0]['load']
     if load == ROBOT:
         return robot_table(results)
-    header = {'topics': ['topics', 'rate'], 'entities': ['idle']}.get(load, ['utilisation'])
-    header += ['executor']
-    header += ['due', 'in time'] if load in DECLARED else ['published', 'lost']
-    header += ['callbacks/s', 'CPU each'] + ([] if load in DECLARED else ['of it DDS'])
-    header += ['dispatch p50', 'p99', 'max']
-    if load == 'reference-system':
-        header += ['hot path p50', 'p99', 'max']
-    return table(header, [_row(load, result) for result in results])
+    rows = [_row(load, result) for result in results]
+    return table([title for title, _ in rows[0]], [[cell for _, cell in row] for row in rows])
 
 
 def robot_table(results: Sequence[dict[str, Any]]) -> str:
@@ -237,32 +231,35 @@ def robot_table(results: Sequence[dict[str, Any]]) -> str:
     return table(header, rows)
 
 
-def _row(load: str, result: dict[str, Any]) -> list[Cell]:
-    row: list[Cell]
+def _row(load: str, result: dict[str, Any]) -> list[tuple[str, Cell]]:
+    """Return the titles and cells of a measurement."""
+    row: list[tuple[str, Cell]] = [('utilisation', _number(result['utilisation'], '.2f'))]
     if load == 'topics':
-        row = [result['topics'], f'{result["rate_hz"]:g} Hz']
+        row = [('topics', result['topics']), ('rate', f'{result["rate_hz"]:g} Hz')]
     elif load == 'entities':
-        row = [result['idle']]
-    else:
-        row = [_number(result['utilisation'], '.2f')]
-    row.append(result['executor'])
+        row = [('idle', result['idle'])]
+    row.append(('executor', result['executor']))
+    due = result['sink_jobs_due']
     if load in DECLARED:
-        due = result['sink_jobs_due']
-        row += [due, None if due is None else percent(result['on_time'], due)]
+        row += [('due', due),
+                ('in time', None if due is None else percent(result['on_time'], due))]
     else:
-        row += [result['published'], result['lost']]
-    row += [_number(result['callbacks_per_s'], '.0f'),
-            _number(result['cpu_us_per_callback'], '.1f', ' us')]
+        row += [('published', result['published']), ('lost', result['lost'])]
+    row += [('callbacks/s', _number(result['callbacks_per_s'], '.0f')),
+            ('CPU each', _number(result['cpu_us_per_callback'], '.1f', ' us'))]
     if load not in DECLARED:
-        row.append(_number(result['middleware_cpu_us_per_callback'], '.1f', ' us'))
-    row += _times(result['dispatch_latency_us'])
-    return row + (_times(result['hot_path_us']) if load == 'reference-system' else [])
+        row.append(('of it DDS', _number(
+            result['middleware_cpu_us_per_callback'], '.1f', ' us')))
+    row += _times('dispatch', result['dispatch_latency_us'])
+    return row + (
+        _times('hot path', result['hot_path_us']) if load == 'reference-system' else [])
 
 
-def _times(latency: dict[str, Any] | None) -> list[Cell]:
-    if latency is None or latency['p50'] is None:
-        return [None, None, None]
-    return [f'{latency[name] / 1000:.2f} ms' for name in ('p50', 'p99', 'max')]
+def _times(what: str, latency: dict[str, Any] | None) -> list[tuple[str, Cell]]:
+    times = latency or {}
+    return [(f'{what} p50' if name == 'p50' else name,
+             None if times.get(name) is None else f'{times[name] / 1000:.2f} ms')
+            for name in ('p50', 'p99', 'max')]
 
 
 def _number(value: float | None, form: str, unit: str = '') -> str | None:

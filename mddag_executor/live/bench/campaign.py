@@ -12,7 +12,7 @@ A process that does not end in time is killed: rclpy's EventsExecutor holds off 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 import json
@@ -148,11 +148,11 @@ def run_all(
 
 
 _COUNTS = ('published', 'received', 'lost')
-_VERDICTS = ('sink_jobs_due', 'on_time', 'late', 'missing')
 _FIGURES = (
-    'callbacks_per_s', 'cpu_us_per_callback', 'middleware_cpu_us_per_callback',
-    'utilisation_taken')
-_QUANTILES = ('dispatch_latency_us', 'hot_path_us')
+    'utilisation', 'sink_jobs_due', 'on_time', 'late', 'missing', 'callbacks_per_s',
+    'cpu_us_per_callback', 'middleware_cpu_us_per_callback', 'utilisation_taken',
+    'dispatch_latency_us', 'hot_path_us')
+_OF_ROBOT = ('sinks', 'cpu_cores')
 
 
 def combine(spec: Spec, runs: Sequence[dict[str, Any]], repeat: int = 1) -> dict[str, Any]:
@@ -165,55 +165,31 @@ def combine(spec: Spec, runs: Sequence[dict[str, Any]], repeat: int = 1) -> dict
         'load': spec.load, 'executor': spec.name, 'workers': spec.workers,
         'seconds': spec.seconds, 'seed': spec.seed, 'repeat': repeat,
         'crashed': repeat - len(runs)}
-    declared = spec.load in DECLARED or spec.load == ROBOT
+    figures = (*_FIGURES, *_OF_ROBOT) if spec.load == ROBOT else _FIGURES
+    middle = {name: _median([run.get(name) for run in runs]) for name in figures}
     if spec.load == ROBOT:
-        result.update(graph=spec.graph, scale=spec.scale, sinks=_sinks(runs))
-        result['cpu_cores'] = _median(run['cpu_cores'] for run in runs)
-    elif declared:
-        result['graph'] = spec.graph
-        result['bodies'] = spec.bodies
+        result.update(graph=spec.graph, scale=spec.scale)
+        middle['sinks'] = middle['sinks'] or {}
+    elif spec.load in DECLARED:
+        result.update(graph=spec.graph, bodies=spec.bodies)
     else:
         result.update(
-            topics=spec.topics, rate_hz=spec.rate_hz, idle=spec.idle,
-            phases=spec.phases)
-    result['utilisation'] = _median(run.get('utilisation') for run in runs)
-    for name in _VERDICTS:
-        result[name] = _median(run.get(name) for run in runs)
-    due = result['sink_jobs_due']
-    result['on_time_ratio'] = result['on_time'] / due if due else None
-    for name in _FIGURES:
-        result[name] = _median(run.get(name) for run in runs)
-    for name in _QUANTILES:
-        result[name] = _medians([run.get(name) for run in runs])
-    for name in () if declared else _COUNTS:
-        result[name] = sum(run[name] for run in runs)
-    kept = {*_VERDICTS, *_FIGURES, *_QUANTILES, *_COUNTS, 'on_time_ratio', 'callbacks',
-            'window_ns', 'attribution', 'infeasible_sinks', 'sinks', 'cpu_cores'}
+            topics=spec.topics, rate_hz=spec.rate_hz, idle=spec.idle, phases=spec.phases,
+            **{name: sum(run[name] for run in runs) for name in _COUNTS})
+    due = middle['sink_jobs_due']
+    result.update(middle, on_time_ratio=middle['on_time'] / due if due else None)
+    kept = {*_FIGURES, *_OF_ROBOT, *_COUNTS, 'on_time_ratio', 'callbacks', 'window_ns',
+            'attribution', 'infeasible_sinks'} - {'utilisation'}
     result['runs'] = [{k: v for k, v in run.items() if k in kept} for run in runs]
     return result
 
 
-def _sinks(runs: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return for each sink of the robot the medians of what was due and on time, and of times."""
-    return {
-        name: {
-            **{key: _median(run['sinks'][name][key] for run in runs) for key in (
-                'due', 'on_time', 'late', 'missing')},
-            'response_ns': _medians([run['sinks'][name]['response_ns'] for run in runs])}
-        for name in (runs[0]['sinks'] if runs else ())}
-
-
-def _median(values: Iterable[float | None]) -> float | None:
-    """Return the median of what is not None; an actual value where the values are whole."""
+def _median(values: Sequence[Any]) -> Any:
+    """Return the median of what is not None, also of each in dictionaries; whole where all are."""
     found = [value for value in values if value is not None]
     if not found:
         return None
+    if isinstance(found[0], dict):
+        return {name: _median([value[name] for value in found]) for name in found[0]}
     whole = all(isinstance(value, int) for value in found)
     return statistics.median_low(found) if whole else statistics.median(found)
-
-
-def _medians(values: Sequence[dict[str, Any] | None]) -> dict[str, Any] | None:
-    found = [value for value in values if value is not None]
-    if not found:
-        return None
-    return {name: _median(value[name] for value in found) for name in found[0]}
