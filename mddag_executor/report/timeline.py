@@ -22,7 +22,7 @@ or -1-k for the k-th undeclared callback.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 from mddag_executor.core.jobs import is_miss
@@ -121,59 +121,53 @@ class Timeline(Observer):
         self._most_blocks = max(2, most // block)
         self._open = _Block(0)
         self._blocks: list[_Block] = [self._open]
-        self._numbers = 1
         self._undeclared: dict[int, int] = {}
         self._name_of = names
 
     # --- input -----------------------------------------------------------------------------------
 
-    def _decided(self, decisions: Sequence[Decision], filled: int) -> None:
-        """Keep verdicts; so many executions were in the open block then."""
-        block = self._open
-        for kind, _, vertex, job, deadline, time in decisions:
-            if kind == JOB_END or kind == DROP:
-                continue
-            verdict = _KINDS[kind]
-            block.verdicts.extend((vertex, job, deadline, time, verdict))
-            if kind != SINK_IN_TIME:
-                block.missed += 1
-                if 6 * filled < self._block_size and len(self._blocks) > 1:
-                    self._blocks[-2].missed += 1    # where much of the job ran
-                self.n_missed += 1
-
     def take(self, batch: Batch) -> None:
         """Keep what happened in a stretch of the run."""
         pieces = batch.columns(RAN)
-        n = len(pieces)
-        ended = np.cumsum(batch.order == RAN)       # how many had ended, with that one
-        decided_at = np.array(batch.decided_at, dtype=np.int64)
-        decided_after = ended[decided_at] if len(ended) else decided_at
         executions = self._rows_of(pieces)
         by_workers = pieces[pieces[:, WORKED_BY] >= 0]
         self.busy_over_time.add(by_workers[:, STARTED], by_workers[:, ENDED])
         missed = np.array([max(time, deadline) for kind, *_, deadline, time in batch.decisions
                            if is_miss(kind)], dtype=np.int64)
         self.missed_over_time.add(missed, missed + 1)
-        self.n_executions += n
         self.workers.update(np.unique(pieces[:, WORKED_BY]).tolist())
-        decided, released = decided_after.tolist(), ended[batch.places(RELEASED)]
+        # how many executions had ended says in which block something belongs
+        ran = np.arange(len(pieces)) + self.n_executions
+        ended = np.cumsum(batch.order == RAN) + self.n_executions
+        released = ended[batch.places(RELEASED)]
+        decided_at = np.array(batch.decided_at, dtype=np.int64)
+        decided = ended[decided_at] if len(ended) else decided_at + self.n_executions
         releases = batch.columns(RELEASED)[:, :3]
-        at = decision = 0
-        while True:
-            filled = len(self._open.executions) // 6
-            end = min(n, at + self._block_size - filled)
-            full = filled + end - at == self._block_size
-            # what comes with the last execution of a block belongs to the next block
-            here = (released >= at) & ((released < end) | (not full))
-            self._open.releases.frombytes(releases[here].tobytes())
-            while decision < len(decided) and (decided[decision] < end or not full):
-                self._decided([batch.decisions[decision]], filled + decided[decision] - at)
-                decision += 1
-            self._open.executions.frombytes(executions[at:end].tobytes())
-            if not full:
-                return
-            self._next_block()
-            at = end
+        self.n_executions += len(pieces)
+        for number in range(self._open.number, self.n_executions // self._block_size + 1):
+            if number > self._open.number:
+                self._next_block(number)
+            first = number * self._block_size
+            in_ran, in_released, in_decided = (
+                slice(*np.searchsorted(ended_by, (first, first + self._block_size)))
+                for ended_by in (ran, released, decided))
+            self._open.executions.frombytes(executions[in_ran].tobytes())
+            self._open.releases.frombytes(releases[in_released].tobytes())
+            for filled, decision in zip(
+                    (decided[in_decided] - first).tolist(), batch.decisions[in_decided]):
+                self._decided(decision, filled)
+
+    def _decided(self, decision: Decision, filled: int) -> None:
+        """Keep a verdict; so many executions were in the open block then."""
+        kind, _, vertex, job, deadline, time = decision
+        if kind == JOB_END or kind == DROP:
+            return
+        self._open.verdicts.extend((vertex, job, deadline, time, _KINDS[kind]))
+        if kind != SINK_IN_TIME:
+            self._open.missed += 1
+            if 6 * filled < self._block_size and len(self._blocks) > 1:
+                self._blocks[-2].missed += 1    # where much of the job ran
+            self.n_missed += 1
 
     def _rows_of(self, pieces: Ints) -> Ints:
         """Return executions as they are kept: ROW, JOB, WORKER, READY, START, END."""
@@ -200,11 +194,10 @@ class Timeline(Observer):
                 row = self._undeclared[callback] = -1 - len(self._undeclared)
         return row
 
-    def _next_block(self) -> None:
+    def _next_block(self, number: int) -> None:
         if len(self._blocks) >= self._most_blocks:
             self._blocks.remove(min(self._blocks, key=_Block.worth))
-        self._open = _Block(self._numbers)
-        self._numbers += 1
+        self._open = _Block(number)
         self._blocks.append(self._open)
 
     # --- what is asked ---------------------------------------------------------------------------
