@@ -19,9 +19,10 @@ from msg_graph.errors import Collector, did_you_mean, GraphError, printable, sho
 from msg_graph.include import Assembler, is_composed, Part, top_of
 from msg_graph.language import CALLBACK_KEYS, NODE_KEYS, PATH_KEYS, TRIGGERS
 from msg_graph.model import Callback, Path, Process
-from msg_graph.yamltext import plain_scalar, yaml_lines
+from msg_graph.yamltext import yaml_lines
+import yaml
 
-_WIDTH = 99
+_WIDTH = 75
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,18 +132,10 @@ def _error(entry: Entry, line: int, problem: str, remedy: str) -> GraphError:
 
 def processes_text(processes: Iterable[Process]) -> str:
     """Return ``processes:`` of a declaration."""
-    lines = ['processes:']
-    for process in processes:
-        line = f'  {plain_scalar(process.name)}: ['
-        for i, node in enumerate(process.nodes):
-            piece = node + (']' if i == len(process.nodes) - 1 else ',')
-            if len(line) + 1 + len(piece) > _WIDTH:
-                lines.append(line.rstrip())
-                line = '    ' + piece
-            else:
-                line += ('' if line.endswith('[') else ' ') + piece
-        lines.append(line)
-    return '\n'.join(lines) + '\n'
+    text: str = yaml.safe_dump(
+        {'processes': {process.name: list(process.nodes) for process in processes}},
+        default_flow_style=None, sort_keys=False, width=_WIDTH)
+    return text
 
 
 def _callbacks(nodes: list[Part], top: str, entries: dict[str, Entry]) -> list[Callback]:
