@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 import signal
 import threading
 from typing import Any, TYPE_CHECKING
@@ -37,6 +38,7 @@ import weakref
 
 from mddag_executor.live.compat.events_executor import events_executor_modules
 from mddag_executor.live.loading import LoadingError
+from mddag_executor.live.replacing import instead, Replacements
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
@@ -65,7 +67,7 @@ class Interception:
         self._lock = threading.Lock()
         # programs may make an executor for each of many calls
         self._foreign: weakref.WeakKeyDictionary[Executor, Foreign] = weakref.WeakKeyDictionary()
-        self._saved: list[tuple[Any, str, Any]] = []
+        self._replacements = Replacements()
         self._original_init = rclpy.init
         self._add_node = Executor.add_node
         self._remove_node = Executor.remove_node
@@ -73,7 +75,7 @@ class Interception:
 
     def install(self) -> None:
         """Put the replacements in place."""
-        replacements: list[tuple[Any, str, Any]] = [
+        functions: list[tuple[Any, str, Callable[..., Any]]] = [
             (rclpy, 'init', self._init),
             (rclpy, 'shutdown', self._shutdown),
             (rclpy, 'try_shutdown', self._shutdown),
@@ -83,7 +85,6 @@ class Interception:
             (rclpy, 'spin_once', self._spin_once),
             (rclpy, 'spin_until_future_complete', self._spin_until),
             *((place, 'EventsExecutor', _stand_in) for place in events_executor_modules()),
-            (signal, 'signal', self._signal(signal.signal)),
         ]
         methods: dict[str, Callable[..., Any]] = {
             'spin': self._executor_spin,
@@ -95,23 +96,20 @@ class Interception:
             'create_task': self._executor_create_task,
             'shutdown': self._executor_shutdown,
         }
-        classes = {
-            Executor, SingleThreadedExecutor, MultiThreadedExecutor, type(self._host.executor)}
-        for owner in classes:
-            for name in methods.keys() & vars(owner).keys():
-                original: Any = getattr(owner, name)
-                method = self._method(original, methods[name])
-                replacements.append((owner, name, method))
-        for owner, name, replacement in replacements:
+        for owner, name, replacement in functions:
             if hasattr(owner, name):
-                self._saved.append((owner, name, getattr(owner, name)))
-                setattr(owner, name, replacement)
+                self._replacements.replace(owner, name, instead(replacement))
+        self._replacements.replace(signal, 'signal', self._signal)
+        for owner in {
+                Executor, SingleThreadedExecutor, MultiThreadedExecutor,
+                type(self._host.executor)}:
+            for name in methods.keys() & vars(owner).keys():
+                self._replacements.replace(
+                    owner, name, partial(self._method, replacement=methods[name]))
 
     def uninstall(self) -> None:
         """Put everything back."""
-        while self._saved:
-            owner, name, original = self._saved.pop()
-            setattr(owner, name, original)
+        self._replacements.close()
 
     def _method(self, original: Callable[..., Any], replacement: Callable[..., Any]) -> Any:
         """Make a method that is the original for our executor and the replacement for others."""
@@ -121,7 +119,6 @@ class Interception:
             chosen = original if executor is ours else replacement
             return chosen(executor, *args, **kwargs)
 
-        method.__doc__ = original.__doc__
         return method
 
     # --- rclpy's functions -----------------------------------------------------------------------

@@ -26,9 +26,9 @@ from mddag_executor.live.compat.in_process import (
     SERVER_HANDLE,
 )
 from mddag_executor.live.entity import Entity
+from mddag_executor.live.replacing import instead, Replacements
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.loop import Loop
-from mddag_executor.rerun.replacing import instead, Replacements
 from mddag_executor.rerun.services import Header
 
 _KINDS = ('goal', 'cancel', 'result')

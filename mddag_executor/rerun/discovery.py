@@ -12,10 +12,10 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import Any
 
+from mddag_executor.live.replacing import instead, Replacements
 from mddag_executor.rerun.executor import NodeHolder
 from mddag_executor.rerun.loop import Loop
 from mddag_executor.rerun.messages import Messages
-from mddag_executor.rerun.replacing import instead, Replacements
 from mddag_executor.rerun.types import type_name
 from rclpy.node import Node
 

@@ -32,6 +32,7 @@ from mddag_executor.live.loading import describe, Program, ros_arguments
 from mddag_executor.live.other_processes import OtherProcesses
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
+from mddag_executor.live.replacing import instead, Replacements
 from mddag_executor.live.shutdown import is_over
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.actions import Actions
@@ -45,7 +46,6 @@ from mddag_executor.rerun.loop import ENDED, Loop
 from mddag_executor.rerun.messages import Messages
 from mddag_executor.rerun.outputs import Output, Outputs
 from mddag_executor.rerun.playing import CLOCK, Playing
-from mddag_executor.rerun.replacing import instead, Replacements
 from mddag_executor.rerun.services import Services
 from mddag_executor.rerun.sources import Source
 from mddag_executor.rerun.strands import Stuck

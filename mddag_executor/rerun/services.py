@@ -19,9 +19,9 @@ from typing import Any
 from mddag_executor.live.compat import complete_request, service_name
 from mddag_executor.live.compat.in_process import new_request
 from mddag_executor.live.entity import Entity, SERVICE
+from mddag_executor.live.replacing import instead, Replacements
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.loop import Loop
-from mddag_executor.rerun.replacing import instead, Replacements
 from rclpy.client import Client
 from rclpy.exceptions import InvalidHandle
 from rclpy.service import Service
