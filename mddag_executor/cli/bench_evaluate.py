@@ -9,8 +9,6 @@ The machine decides about the figures, and whatever else it does: all are median
 from __future__ import annotations
 
 import argparse
-import math
-from statistics import linear_regression
 from typing import Any
 
 from mddag_executor import defaults
@@ -85,23 +83,7 @@ def _measure(
                 sizes.append(time_vertex_jobs(
                     size, core=core, vertex_jobs=_VERTEX_JOBS[core], repeat=args.repeat))
     return {'graph': task_set.file, 'runs': runs, 'vertex_jobs': sizes,
-            'growth': growth(sizes), 'peak_memory_mb': peak}
-
-
-def growth(sizes: list[dict[str, Any]]) -> dict[str, float]:
-    """
-    Return for each core how the time for a task set grows with its vertices: the exponent.
-
-    It is 1 where a job of a vertex takes the same time in task sets of all sizes, and the slope of
-    the line of least squares through the logarithms else.
-    """
-    exponents = {}
-    for core in dict.fromkeys(row['core'] for row in sizes):
-        points = {math.log(row['vertices']): math.log(row['ns'])
-                  for row in sizes if row['core'] == core}
-        if len(points) > 1:
-            exponents[core] = 1 + linear_regression(list(points), list(points.values())).slope
-    return exponents
+            'peak_memory_mb': peak}
 
 
 def _show(result: dict[str, Any], cores: tuple[str, ...]) -> None:
@@ -114,7 +96,4 @@ def _show(result: dict[str, Any], cores: tuple[str, ...]) -> None:
     print(table(
         ('vertices', *(f'ns a vertex job, {core}' for core in cores)),
         [(size, *(round(found[size, core]) for core in cores)) for size in sizes]))
-    for core, exponent in result['growth'].items():
-        print(f'{core} core: the time for a task set grows with the {exponent:.2f}th power of its '
-              'vertices (1: linear)')
     print(f'peak memory of the runs: {result["peak_memory_mb"]:.0f} MB')

@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from mddag_executor.cli.bench_evaluate import growth
 from mddag_executor.simulate import compiling
 from mddag_executor.simulate.draws import Draws, utilisations
 from mddag_executor.simulate.measure import random_task_set, WORKERS
@@ -46,18 +45,6 @@ def test_figures(
     for row in result['vertex_jobs']:
         assert row['vertex_jobs'] >= 20_000 and 300 < row['ns'] < 1_000_000
     assert result['peak_memory_mb'] > 10
-    assert list(result['growth']) == ['plain'] and 'th power of its vertices' in out
-
-
-def test_growth() -> None:
-    """Twice the time for each job of a vertex at ten times the size: n ** 1.30103."""
-    sizes = [{'vertices': 10 ** i, 'core': core, 'ns': base * 2 ** i}
-             for i in (1, 2, 3) for core, base in (('compiled', 50), ('plain', 7000))]
-    assert growth(sizes) == {
-        'compiled': pytest.approx(1.30103), 'plain': pytest.approx(1.30103)}
-    assert growth([{'vertices': n, 'core': 'plain', 'ns': 90} for n in (10, 70)]) == {
-        'plain': pytest.approx(1)}
-    assert growth(sizes[:1]) == {}
 
 
 @pytest.mark.parametrize('n_vertices', [1, 10, 55])
