@@ -1,13 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""How much memory this process has used, and when its garbage is looked for."""
+"""How much memory this process has used, and how it gives back what is free."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 import ctypes
-import gc
 from pathlib import Path
 import resource
 
@@ -24,18 +21,6 @@ def peak_memory_mb() -> float:
         return int(status.split('VmHWM:')[1].split()[0]) / 1024
     except (OSError, IndexError, ValueError):
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-@contextmanager
-def no_garbage() -> Iterator[None]:
-    """Do not look for cycles meanwhile: there are none, and many tuples to look through."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collects:
-            gc.enable()
 
 
 def give_back() -> None:

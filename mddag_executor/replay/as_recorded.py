@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.memory import no_garbage
 from mddag_executor.replay.beside import pays, play_beside
 from mddag_executor.replay.drift import DriftObserver
 from mddag_executor.replay.explain import Explainer
@@ -20,6 +19,7 @@ from mddag_executor.replay.usage import GroupWaits, share, Usage
 from mddag_executor.text import counted
 from msg_graph import TaskSet
 from msg_graph.drift import Drift
+from msg_graph.loading import no_garbage
 
 if TYPE_CHECKING:
     from mddag_executor.replay.imported_figures import Communications, ImportedPaths

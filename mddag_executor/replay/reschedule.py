@@ -18,7 +18,7 @@ from typing import Any
 from mddag_executor.core import NEVER, POLICIES, processes_of, Tables
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
-from mddag_executor.memory import give_back, no_garbage
+from mddag_executor.memory import give_back
 from mddag_executor.replay.as_recorded import Progress, recording_result, Replay
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.load import LoadBuilder, RecordedLoad
@@ -31,6 +31,7 @@ from mddag_executor.simulate import LogEntry, schedule, Settings
 from mddag_executor.simulate.load import edge_numbers
 from mddag_executor.text import counted, listed
 from msg_graph import Process, TaskSet
+from msg_graph.loading import no_garbage
 import numpy as np
 
 MAX_WORKERS = 4096

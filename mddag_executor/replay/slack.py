@@ -37,13 +37,13 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core.jobs import is_miss
-from mddag_executor.memory import no_garbage
 from mddag_executor.replay.as_recorded import slack as margin
 from mddag_executor.replay.load import RecordedLoad
 from mddag_executor.simulate import Load, schedule, Settings
 from mddag_executor.simulate.load import as_arrays
 from mddag_executor.simulate.schedule import prepare
 from msg_graph import TaskSet
+from msg_graph.loading import no_garbage
 import numpy as np
 
 MOST = 100.0
