@@ -32,7 +32,7 @@ from collections.abc import Callable, Sequence
 import csv
 import heapq
 import io
-from typing import Any, BinaryIO, get_args, get_type_hints, NamedTuple, Protocol
+from typing import Any, BinaryIO, get_args, get_type_hints, NamedTuple
 
 from mddag_executor.core import Tables
 from mddag_executor.core.state import (
@@ -111,8 +111,8 @@ class Ran(NamedTuple):
     whole: bool = False
 
 
-class Target(Protocol):
-    """Where rows go."""
+class Target:
+    """Where rows go; here: nowhere."""
 
     def begin(self, task_set: TaskSet, tables: Tables) -> None:
         """Begin with what the run is of."""
@@ -249,7 +249,7 @@ class Exporter(Observer):
             None if completed is None else deadline - completed, VERDICTS[kind]), vertex)
 
 
-class Ordered:
+class Ordered(Target):
     """
     A target that puts rows into the order of time, and passes them on.
 
@@ -301,7 +301,7 @@ def by_start(row: ExecutionRow) -> int:
     return row.start_ns
 
 
-class Rows:
+class Rows(Target):
     """
     A target that writes rows of one kind.
 
@@ -313,9 +313,6 @@ class Rows:
     ) -> None:
         self._kind = kind
         self._writer = writer
-
-    def begin(self, task_set: TaskSet, tables: Tables) -> None:
-        """Write what the run is of: nothing."""
 
     def execution(self, ran: Ran) -> None:
         """Write an execution."""

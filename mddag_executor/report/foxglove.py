@@ -23,10 +23,8 @@ import re
 from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
-from mddag_executor.core import Tables
-from mddag_executor.report.export import JobRow, MOST_ORDERED, Ran
+from mddag_executor.report.export import JobRow, MOST_ORDERED, Ran, Target
 from mddag_executor.report.text import format_ns, printable
-from msg_graph import TaskSet
 
 _WARNING, _ERROR = 3, 4
 _NUMBER, _TEXT = {'type': 'number'}, {'type': 'string'}
@@ -49,7 +47,7 @@ _SINK = {
         'response_ms': _NUMBER, 'margin_ms': _NUMBER}}
 
 
-class FoxgloveTarget:
+class FoxgloveTarget(Target):
     """
     Writes a run as an MCAP file for Foxglove.
 
@@ -65,9 +63,6 @@ class FoxgloveTarget:
         # (time, order, channel, message)
         self._held: list[tuple[int, int, int, bytes]] = []
         self._count = 0
-
-    def begin(self, task_set: TaskSet, tables: Tables) -> None:
-        """Begin with what the run is of."""
 
     def execution(self, ran: Ran) -> None:
         """Write when a worker began to run a callback, and when it was idle again."""

@@ -30,11 +30,11 @@ from array import array
 from typing import Any, BinaryIO
 
 from mddag_executor.core import legs_of, Tables
-from mddag_executor.report.export import JobRow, Ran
+from mddag_executor.report.export import JobRow, Ran, Target
 from mddag_executor.report.text import format_ns, printable
 from msg_graph import TaskSet
 import numpy as np
-from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import TracePacket, TrackEvent
+from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TracePacket, TrackEvent
 
 _SEQUENCE = 1
 _CLEARED, _NEEDED = 1, 2        # SEQ_INCREMENTAL_STATE_CLEARED, SEQ_NEEDS_INCREMENTAL_STATE
@@ -42,7 +42,7 @@ _WORKERS, _CALLBACKS, _JOBS, _MISSED, _READY = range(1, 6)
 _MASK = 2 ** 64 - 1
 
 
-class PerfettoTarget:
+class PerfettoTarget(Target):
     """
     Writes a run as a Perfetto trace, packet by packet.
 
@@ -252,10 +252,4 @@ class PerfettoTarget:
         self._write(self._packet)
 
     def _write(self, packet: Any) -> None:
-        data = packet.SerializeToString()
-        size, head = len(data), bytearray(b'\x0a')      # field 1 of Trace, with its length
-        while size > 127:
-            head.append(size & 127 | 128)
-            size >>= 7
-        head.append(size)
-        self._file.write(bytes(head) + data)
+        self._file.write(Trace(packet=[packet]).SerializeToString())
