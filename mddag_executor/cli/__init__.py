@@ -8,7 +8,7 @@ A verb's module has these names, and is imported only when its verb is run:
 | name | meaning |
 | --- | --- |
 | `EXAMPLE` | a command line, or several lines of them, shown by `--help` |
-| `add_arguments(parser)` | declares the arguments; a verb of verbs adds its sub-verbs here |
+| `add_arguments(parser)` | declares the arguments |
 | `main(args) -> int` | does it and returns the exit status (0, or 1 for `--fail-on-miss`) |
 
 Its one-line help is in the table of `main.py`. The module of a verb of a verb (`graph_…`,

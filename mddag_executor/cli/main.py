@@ -35,7 +35,7 @@ from types import ModuleType
 from typing import Any, NamedTuple, NoReturn
 
 from mddag_executor import __version__
-from mddag_executor.cli.options import add_verb
+from mddag_executor.cli.options import add_verb, add_verbs
 from mddag_executor.cli.text import one_line
 from mddag_executor.errors import MddagError, UsageError
 
@@ -46,10 +46,15 @@ EXIT_BROKEN_PIPE = 141
 
 
 class Verb(NamedTuple):
-    """A row of the table of verbs: its module in `mddag_executor.cli` and its one-line help."""
+    """
+    A row of the table of verbs: its module in `mddag_executor.cli` and its one-line help.
+
+    What has verbs itself has these instead: `graph check` is the module `graph_check`.
+    """
 
     module: str
     summary: str
+    verbs: tuple[str, ...] = ()
 
 
 VERBS = {
@@ -62,12 +67,15 @@ VERBS = {
     'simulate': Verb('simulate', 'run a declaration in virtual time'),
     'evaluate': Verb('evaluate', 'measure acceptance ratios over many simulated runs'),
     'generate': Verb('generate', 'make random multi-deadline, multi-rate DAG sets'),
-    'graph': Verb('graph', 'check, draw, derive and analyse declarations'),
-    'import': Verb('import_', 'turn a CARET or ros2_tracing recording into a trace'),
+    'graph': Verb('graph', 'check, draw, derive and analyse declarations', (
+        'check', 'draw', 'schema', 'fmt', 'from-caret', 'from-trace', 'from-ros', 'analyse',
+        'assign-deadlines', 'place')),
+    'import': Verb('import', 'turn a CARET or ros2_tracing recording into a trace', ('ctf',)),
     'export': Verb('export', 'turn a trace into a file for Perfetto, Foxglove or spreadsheets'),
     'diff': Verb('diff', 'compare two recorded runs sink by sink'),
     'top': Verb('top', 'show the deadlines and workers of running executors, live'),
-    'bench': Verb('bench', 'measure the executor, the core, the replayer and the simulator'),
+    'bench': Verb('bench', 'measure the executor, the core, the replayer and the simulator', (
+        'live', 'core', 'replay', 'evaluate')),
 }
 # What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.
 _ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_python')
@@ -115,7 +123,10 @@ def build_parser(chosen: str | None) -> Parser:
     for name, verb in VERBS.items():
         if name == chosen:
             sentence = f'{verb.summary[:1].upper()}{verb.summary[1:]}.'
-            add_verb(verbs, name, load(verb), verb.summary, sentence)
+            if verb.verbs:
+                add_verbs(verbs, name, verb.verbs, verb.summary, sentence)
+            else:
+                add_verb(verbs, name, load(verb), verb.summary, sentence)
         else:
             verbs.add_parser(name, help=verb.summary, add_help=False)
     return parser

@@ -266,23 +266,32 @@ def add_verb(parsers: Any, name: str, module: ModuleType, summary: str, descript
     """
     Add a verb, or a verb of a verb, to the parsers that `add_subparsers` returned.
 
-    :param module: has `EXAMPLE`, `add_arguments` and, unless it has verbs itself, `main`, which
-        becomes `args.main`.
+    :param module: has `EXAMPLE`, `add_arguments`, and `main`, which becomes `args.main`.
     :param summary: for the list of verbs
     """
-    examples = ''.join(f'\n  {line}' for line in module.EXAMPLE.strip().splitlines())
-    parser = parsers.add_parser(
-        name, help=summary, allow_abbrev=False, description=description,
-        epilog=f'example:{examples}', formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = _add_parser(parsers, name, summary, description, module.EXAMPLE.strip().splitlines())
     module.add_arguments(parser)
-    if hasattr(module, 'main'):
-        parser.set_defaults(main=module.main)
+    parser.set_defaults(main=module.main)
 
 
-def add_verbs(parser: argparse.ArgumentParser, verb: str, names: Sequence[str]) -> None:
-    """Add the verbs of a verb; each is a module, `VERB_NAME`."""
-    parsers = parser.add_subparsers(
+def add_verbs(
+    parsers: Any, verb: str, names: Sequence[str], summary: str, description: str
+) -> None:
+    """Add a verb that has verbs; each of these is a module, `VERB_NAME`."""
+    modules = {name: import_module(f'mddag_executor.cli.{verb}_{name.replace("-", "_")}')
+               for name in names}
+    parser = _add_parser(parsers, verb, summary, description,
+                         [module.EXAMPLE.split('\n')[0] for module in modules.values()])
+    inner = parser.add_subparsers(
         dest=f'{verb}_verb', metavar='VERB', required=True, title='verbs')
-    for name in names:
-        module = import_module(f'mddag_executor.cli.{verb}_{name.replace("-", "_")}')
-        add_verb(parsers, name, module, module.HELP, module.DESCRIPTION)
+    for name, module in modules.items():
+        add_verb(inner, name, module, module.HELP, module.DESCRIPTION)
+
+
+def _add_parser(
+    parsers: Any, name: str, summary: str, description: str, examples: Sequence[str]
+) -> Any:
+    return parsers.add_parser(
+        name, help=summary, allow_abbrev=False, description=description,
+        epilog='\n  '.join(('example:', *examples)),
+        formatter_class=argparse.RawDescriptionHelpFormatter)

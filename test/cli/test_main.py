@@ -177,14 +177,12 @@ def test_only_the_chosen_verb_is_imported(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.parametrize('name', sorted(program.VERBS))
 def test_the_help_of_each_verb(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     row = program.VERBS[name]
-    module = program.load(row)
-    assert f'mddag {name}' in module.EXAMPLE
     with pytest.raises(SystemExit) as stop:
         program.main([name, '--help'])
     assert stop.value.code == 0
     out = capsys.readouterr().out
     assert row.summary[1:] in ' '.join(out.split())
-    assert module.EXAMPLE.strip().splitlines()[0] in out
+    assert f'example:\n  mddag {name}' in out
 
 
 def test_help_imports_nothing_heavy() -> None:

@@ -9,8 +9,8 @@ from collections.abc import Callable
 import importlib
 
 from mddag_executor import defaults
-from mddag_executor.cli import bench, graph, options
 from mddag_executor.cli import main as program
+from mddag_executor.cli import options
 from mddag_executor.core import POLICIES, PolicyError
 from mddag_executor.errors import UsageError
 from mddag_executor.simulate import JUDGES
@@ -81,7 +81,7 @@ def test_choices_are_those_of_the_program(verb: str, option: str, known: tuple[s
 
 
 @pytest.mark.parametrize('verb', [
-    *(('graph', name) for name in graph.VERBS), *(('bench', name) for name in bench.VERBS)])
+    (verb, name) for verb, row in program.VERBS.items() for name in row.verbs])
 def test_the_help_of_verbs_of_verbs(
     verb: tuple[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -94,5 +94,5 @@ def test_the_help_of_verbs_of_verbs(
         out = ' '.join(capsys.readouterr().out.split())
         assert ' '.join(says.replace('%%', '%').split()) in out
         assert 'example: mddag ' in out
-    assert all(line.startswith(f'mddag {verb[0]} ') or line.startswith('mddag run')
+    assert all(line.startswith((f'mddag {verb[0]} ', 'mddag run', 'mddag replay'))
                for line in module.EXAMPLE.strip().splitlines())

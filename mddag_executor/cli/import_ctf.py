@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The verb `import`: recordings of other tools become traces."""
+"""The verb `import ctf`: a recording of CARET or ros2_tracing becomes a trace."""
 
 from __future__ import annotations
 
@@ -11,25 +11,21 @@ from mddag_executor.cli.options import NamedFile
 from mddag_executor.cli.text import printable, Progress, warn
 from mddag_executor.text import counted
 
+HELP = 'import a session that LTTng recorded'
+DESCRIPTION = """\
+Turn a session that LTTng recorded (CARET, ros2_tracing), all its processes and events, into a
+trace. It is read with the Python bindings of babeltrace2 (apt install python3-bt2), in whichever
+Python of this machine has them."""
 EXAMPLE = """\
 mddag import ctf ~/.ros/tracing/session-20261121101500 -o drive.mcap
 mddag replay drive.mcap graph.yaml"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the formats and their arguments."""
-    formats = parser.add_subparsers(
-        dest='format', metavar='FORMAT', required=True, title='formats')
-    ctf = formats.add_parser(
-        'ctf', help='a session that LTTng recorded', allow_abbrev=False,
-        description='Turn a session that LTTng recorded (CARET, ros2_tracing), all its processes '
-        'and events, into a trace. It is read with the Python bindings of babeltrace2 '
-        '(apt install python3-bt2), in whichever Python of this machine has them.',
-        epilog='example:\n  ' + EXAMPLE.replace('\n', '\n  '),
-        formatter_class=argparse.RawDescriptionHelpFormatter)
-    ctf.add_argument('session', metavar='SESSION', help='the folder that was recorded to')
-    ctf.add_argument('-o', '--output', metavar='OUT.mcap', required=True, type=NamedFile,
-                     help='the trace to write')
+    """Declare the arguments."""
+    parser.add_argument('session', metavar='SESSION', help='the folder that was recorded to')
+    parser.add_argument('-o', '--output', metavar='OUT.mcap', required=True, type=NamedFile,
+                        help='the trace to write')
 
 
 def main(args: argparse.Namespace) -> int:
