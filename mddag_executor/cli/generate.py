@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 import os
 from pathlib import Path
 import shutil
@@ -58,11 +58,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--method', choices=METHODS, default=_DEFAULT.method,
         help='how the utilisation is distributed over DAGs and callbacks: Dirichlet-rescale or '
         'UUniFast(-Discard) (default: %(default)s)')
-    add('--max-dag-load', '--max-dag-utilisation', type=options.number,
+    add('--max-dag-load', '--max-dag-utilisation', type=options.number, dest='most_per_dag',
         default=_DEFAULT.most_per_dag, metavar='L',
         help='the largest load of one DAG, in cores; the second name is the older one '
         '(default: %(default)s)')
-    add('--periods', type=_periods, default=_DEFAULT.periods_ns, metavar='TIME,TIME…',
+    add('--periods', type=_periods, default=_DEFAULT.periods_ns, dest='periods_ns',
+        metavar='TIME,TIME…',
         help='each DAG gets one of these (default: 10ms,20ms,50ms,100ms,200ms)')
     add('--tightness', type=_numbers, default=_DEFAULT.tightness, metavar='F[:F]',
         help='each deadline divided by its base, drawn between the bounds (default: 0.5:1.0)')
@@ -93,7 +94,7 @@ def _numbers(text: str) -> tuple[float, float]:
 
 
 def _periods(text: str) -> tuple[int, ...]:
-    return tuple(options.duration(part.strip()) for part in text.split(','))
+    return tuple(options.list_of(options.duration)(text))
 
 
 def main(args: argparse.Namespace) -> int:
@@ -135,12 +136,9 @@ def _every(args: argparse.Namespace) -> Iterator[Options]:
         raise UsageError(f'--sets {sets}: it is too many: give at most {_MOST_SETS}')
     if low != high and sets == 1:
         raise UsageError('--utilisation: one task set has one: give a number, or more --sets')
-    base = Options(
-        dags=args.dags, vertices=args.vertices, sinks=args.sinks,
-        edge_probability=args.edge_probability, or_share=args.or_share, workers=args.workers,
-        method=args.method, most_per_dag=args.max_dag_load, periods_ns=args.periods,
-        tightness=args.tightness, deadline_of=args.deadline_of, spread=args.spread,
-        seed=args.seed)
+    base = Options(**{
+        field.name: getattr(args, field.name) for field in fields(Options)
+        if field.name != 'utilisation'})
     for number in range(sets):
         share = number / (sets - 1) if sets > 1 else 0.0
         yield replace(base, utilisation=round(low + (high - low) * share, 9))
