@@ -20,7 +20,12 @@ that hardly any other ran beside: the median, of those whose worker went on and 
 worker had slept.  Where there are too few, those that waited least tell it: of a callback that
 *computes* (its executions that wait least wait for less than they compute) beyond what others
 explain, else of all that was recorded.  What one waited for more than that, while others ran, is
-*theirs*.
+*theirs*: with one worker none of it is left.
+
+With several, it is left to those beside whom no more ran than can.  The others of their *kind*
+(it computes with the lock, without it, or waits) are to lose the same part of the time beside
+others as these do; so each ns beside more than can costs them the same, as much as makes it so.
+(What is lost is little for most and much for a few, so they do not all lose the same part.)
 """
 
 from __future__ import annotations
@@ -28,7 +33,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from mddag_executor.core import Tables
+from mddag_executor.core import NEVER, Tables
 from mddag_executor.replay.happenings import Ints
 from mddag_executor.simulate import END, Load, schedule, Settings
 from mddag_executor.simulate.schedule import prepare
@@ -78,25 +83,28 @@ class Recorded(NamedTuple):
             self.interpreter[which], self.callback[which], self.warm[which])
 
 
-def alone(ran: Recorded, cpus: int = 0, beside: float = 1.0) -> Ints:
+def alone(ran: Recorded, cpus: int = 0, workers: int = NEVER) -> Ints:
     """
     Return what executions would have taken alone.
 
     :param cpus: of the machine; 0: not known.
-    :param beside: how many are to run beside one, of those that did in the recording.
+    :param workers: how many each process is to have, if that is fewer than in the recording.
     """
     took = ran.took.copy()
-    others = np.zeros(len(took) * (beside < 1.0), dtype=np.int64)
+    at_once = workers * int(ran.interpreter.max(initial=1)) if workers < NEVER else NEVER
+    some, more = (np.zeros(len(took) * (workers < NEVER), dtype=np.int64) for _ in range(2))
     for which in _windows(ran):
         window = ran.of(which)
-        with_others = _beside(window.could, window.could + window.took)
-        if beside < 1.0:
-            others[which] = with_others
-        some = which[with_others > 0]
-        if len(some):
-            took[some] = _explained(ran.of(some), cpus, TURNS * len(took) // len(some))
-    if beside < 1.0:
-        took -= np.rint((1.0 - beside) * _theirs(ran, took, others)).astype(np.int64)
+        ends = window.could + window.took
+        beside = _beside(window.could, ends)
+        if workers < NEVER:
+            some[which], more[which] = beside, _beside(window.could, ends, at_once)
+        disturbed = which[beside > 0]
+        if len(disturbed):
+            took[disturbed] = _explained(
+                ran.of(disturbed), cpus, TURNS * len(took) // len(disturbed))
+    if workers < NEVER:
+        took -= _spared(ran, took, some, more)
     return took
 
 
@@ -206,10 +214,43 @@ def _interpreters(n: int) -> Tables:
         first_sink=[0] * (n + 1), first_successor=[0] * (n + 1))
 
 
-def _theirs(ran: Recorded, took: Ints, beside: Ints) -> Ints:
+def _spared(ran: Recorded, took: Ints, some: Ints, more: Ints) -> Ints:
+    """
+    Return what executions that take so long do not wait where fewer run at once.
+
+    :param some: for how long others ran beside them; ``more``: more than can.
+    """
+    computes = computing(ran.callback, ran.took, ran.cpu)
+    theirs = _theirs(ran, took, some, computes)
+    if (some == more).all():
+        return theirs
+    spared = np.minimum(0, theirs)
+    few = more <= HARDLY * some
+    waits = np.maximum(0, theirs)
+    for kind in (ran.locks, computes & ~ran.locks, ~computes & ~ran.locks):
+        many = np.flatnonzero(kind & ~few & (theirs > 0))
+        if not len(many):
+            continue
+        cost = min(0.5, waits[kind & few].sum() / max(1, some[kind & few].sum()))
+        lost = cost * some[many] / ran.took[many]
+        left = ((took[many] - waits[many]) * lost / (1 - lost)).sum()
+        spared[many] = np.minimum(waits[many], np.rint(
+            more[many] * _rate(waits[many], more[many], left)))
+    return spared
+
+
+def _rate(waits: Ints, more: Ints, left: float) -> float:
+    """Return what a time costs if so much of all waits is left without it, none below 0."""
+    each = waits / more
+    order = np.argsort(-each)
+    waited, passed = np.cumsum(waits[order]), np.cumsum(more[order])
+    last = np.searchsorted(waited - each[order] * passed, left, 'right') - 1
+    return max(0.0, float((waited[last] - left) / passed[last]))
+
+
+def _theirs(ran: Recorded, took: Ints, beside: Ints, computes: Flags) -> Ints:
     """Return what executions that take so long waited for others, which ran ``beside`` them."""
     waited = took - ran.least
-    computes = computing(ran.callback, ran.took, ran.cpu)
     usual = np.zeros(len(took), dtype=np.int64)
     for kinds in (ran.callback, 2 * ran.callback + ran.warm):
         for which in _by_callback(kinds, ran.cpu >= 0):
@@ -224,12 +265,12 @@ def _theirs(ran: Recorded, took: Ints, beside: Ints) -> Ints:
     return theirs
 
 
-def _beside(begins: Ints, ends: Ints) -> Ints:
-    """Return by interval for how long there was at least one other."""
+def _beside(begins: Ints, ends: Ints, others: int = 1) -> Ints:
+    """Return by interval for how long there were at least so many others."""
     times = np.concatenate([begins, ends])
     order = np.argsort(times, kind='stable')
     passed = np.diff(times[order])
-    passed[np.cumsum(np.where(order < len(begins), 1, -1))[:-1] < 2] = 0
+    passed[np.cumsum(np.where(order < len(begins), 1, -1))[:-1] <= others] = 0
     total = np.zeros_like(times)
     total[order[1:]] = np.cumsum(passed)
     beside: Ints = total[len(begins):] - total[:len(begins)]

@@ -258,22 +258,20 @@ class LoadBuilder(Observer):
                 for dag in self._task_set.dags]
 
     def build(
-        self, overheads: bool = True, process: Sequence[int] | None = None, beside: float = 1.0,
+        self, overheads: bool = True, process: Sequence[int] | None = None, workers: int = NEVER,
     ) -> RecordedLoad:
         """
         Return what was collected.
 
         :param process: by vertex the process that it is to run in; None: as recorded.
-        :param beside: how many executions are to run beside one, of those that did.
+        :param workers: how many each process is to have, if that is fewer than in the recording.
         """
         if self._leg is not None:
             self._others.append(self._leg[1])
             self._leg = None
         self._close()
         locks = self._locks()
-        every, usual, warmth, late = self._alone(locks, beside)
-        if beside < 1.0:
-            self._notice_sooner(locks, beside)
+        every, usual, warmth, late = self._alone(locks, workers)
         process = process or self._process
         delays, transport = self._transports(overheads, process)
         self._drop('start', 'end', 'arrived')
@@ -293,7 +291,7 @@ class LoadBuilder(Observer):
             'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
             # where as many run beside one another, workers go on as they did
             'locks': np.concatenate([locks, more]),
-            'warmth': np.concatenate([warmth, more]) if overheads and beside < 1.0 else [],
+            'warmth': np.concatenate([warmth, more]) if overheads and workers < NEVER else [],
             'delays': delays, 'delay_stride': [jobs.n_edges for jobs in self._jobs],
             'delay_base': [0, *accumulate(
                 len(jobs.numbers) * jobs.n_edges for jobs in self._jobs[:-1])]}
@@ -386,7 +384,7 @@ class LoadBuilder(Observer):
             np.tile(numbers[first:first + jobs.size], len(jobs.numbers))
             for first, jobs in zip(self._first, self._jobs)])
 
-    def _alone(self, locks: Any, beside: float) -> tuple[Any, int | None, Any, Any]:
+    def _alone(self, locks: Any, workers: int) -> tuple[Any, int | None, Any, Any]:
         """
         Make times those that executions would have taken alone (see ``alone``).
 
@@ -406,18 +404,20 @@ class LoadBuilder(Observer):
         late = every[number]
         del self._dispatches, number, known
         self._drop('dispatch')
+        if workers < NEVER:
+            self._notice_sooner(start - late, locks, workers)
         ran: Any = (took >= 0) & (start >= 0)
         if ran.all():
             ran = slice(None)   # which copies nothing: there may be millions
-        warmth = np.zeros(len(took) * (beside < 1.0), dtype=np.int64)
+        warmth = np.zeros(len(took) * (workers < NEVER), dtype=np.int64)
         if (cpu[ran] >= 0).any():
             recorded = Recorded(
                 start[ran] - late[ran], took[ran] + late[ran], cpu[ran], locks[ran],
                 self._by_execution(self._process)[ran],
                 self._by_execution(self._callbacks)[ran], warm[ran])
             give_back()
-            cost = alone(recorded, self._cpus, beside)
-            if beside < 1.0:
+            cost = alone(recorded, self._cpus, workers)
+            if workers < NEVER:
                 warmth[ran] = colder(recorded.callback, recorded.warm, cost)
             # what is less than recorded: it began late, or it stood still later
             began = recorded.took - cost
@@ -427,38 +427,51 @@ class LoadBuilder(Observer):
             late[ran] = cost - took[ran]
         return every, usual, warmth, late
 
-    def _notice_sooner(self, locks: Any, beside: float) -> None:
+    def _notice_sooner(self, could: Any, locks: Any, workers: int) -> None:
         """
-        Take off rounds what they were late since several executions ran when they were due.
+        Take off rounds what they were late since more executions ran than can.
 
-        One that does not compute with Python's lock delays none; of those that do, one does.  So
-        they are as late as where nothing ran, or only such a one: rank by rank.
+        One is *disturbed* if more ran when it was due, or one more began before it was noticed.
+        It becomes as late as those others are for which as many ran as can, or fewer: rank by
+        rank.  Whether one of them computed with Python's lock makes a difference.
+
+        :param could: when executions could have started.
         """
         number, noticed, release, start, end = (
             self._whole[name] for name in ('round', 'noticed', 'release', 'start', 'end'))
         of = np.flatnonzero(number >= 0)
         ends = np.array(self._rounds, dtype=np.int64)
-        due, home = np.full(len(ends), NEVER), np.zeros(len(ends), dtype=np.int64)
+        due, first, home = np.full(len(ends), NEVER), ends.copy(), np.zeros(len(ends), np.int64)
         np.minimum.at(due, number[of], release[of])
+        np.minimum.at(first, number[of], noticed[of])
         home[number[of]] = np.repeat(
             [self._process[source] for source in self._tables.source[:-1]],
             [len(jobs.round) for jobs in self._jobs])[of]
         process = self._by_execution(self._process)
-        late = ends - due
+        taken = ends - due
         for here in np.unique(home):
             mine = (start >= 0) & (end >= 0) & (process == here)
-            computing, others = (
-                np.searchsorted(np.sort(start[mine & how]), due, 'right')
-                - np.searchsorted(np.sort(end[mine & how]), due, 'right')
-                for how in (locks, ~locks))
-            for how in (computing == 0, computing > 0):
-                usual = late[how & (others == 0) & (home == here)]
-                those = np.flatnonzero(how & (others > 0) & (home == here))
-                those = those[np.argsort(late[those], kind='stable')]
+
+            def running(at: Any, which: Any) -> Any:
+                return (np.searchsorted(np.sort(could[which]), at, 'right')
+                        - np.searchsorted(np.sort(end[which]), at, 'right'))
+
+            begun = np.sort(could[mine])
+            crowded = begun[running(begun, mine) > workers]
+            at_due, computing = running(due, mine), running(due, mine & locks) > 0
+            disturbed = (at_due > workers) | (at_due > 0) & (
+                np.searchsorted(crowded, first) > np.searchsorted(crowded, due, 'right'))
+            for how in (computing, ~computing):
+                those = np.flatnonzero(disturbed & how & (home == here))
+                usual = taken[:0]
+                for most in range(workers, -1, -1):
+                    if len(usual) < ENOUGH:
+                        usual = taken[~disturbed & how & (at_due == most) & (home == here)]
+                those = those[np.argsort(taken[those], kind='stable')]
                 if len(usual) >= ENOUGH and len(those):
                     ranks = (np.arange(len(those)) + 0.5) / len(those)
-                    more = np.maximum(0, late[those] - np.quantile(usual, ranks))
-                    ends[those] -= np.rint((1.0 - beside) * more).astype(np.int64)
+                    more = np.maximum(0, taken[those] - np.quantile(usual, ranks))
+                    ends[those] -= np.rint(more).astype(np.int64)
         self._rounds = array('q', ends.tobytes())
         noticed[of] = np.minimum(noticed[of], ends[number[of]])
 

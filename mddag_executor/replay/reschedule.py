@@ -202,7 +202,8 @@ def reschedule(
     tables = tables._replace(process=[*_processes(run, placed), 1])
     find_policy(policy).mode(preemptive, len(placed))
     with no_garbage():
-        work = builder.build(overheads, tables.process, _beside(workers, each))
+        work = builder.build(
+            overheads, tables.process, workers if workers < each else NEVER)
     if work.unknown:
         raise ReplayError(
             run.name, f'{counted(len(work.unknown), "callback")} did not complete in it, '
@@ -226,11 +227,6 @@ def reschedule(
         return Reschedule(
             run.task_set, work, tables, settings, start, recording_result(run), warnings,
             skip=skip, overheads=overheads, processes=placed, recorded=recorded)
-
-
-def _beside(workers: int, recorded: int) -> float:
-    """Return how many executions can run beside one in a process, of those that could."""
-    return min(1.0, (workers - 1) / (recorded - 1)) if recorded > 1 else 1.0
 
 
 def _processes(run: Run, placed: Sequence[Process]) -> list[int]:

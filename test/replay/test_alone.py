@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mddag_executor.core import NEVER
 from mddag_executor.replay import alone as module
 from mddag_executor.replay.alone import alone, colder, computing, Recorded
 import numpy as np
@@ -19,7 +20,7 @@ Ran = tuple[float, float, float, int]
 
 def of(
     *ran: Ran, cpus: int = 0, here: Sequence[int] | None = None,
-    callbacks: Sequence[int] | None = None, beside: float = 1.0,
+    callbacks: Sequence[int] | None = None, workers: int = NEVER,
 ) -> list[float]:
     """Return what executions would have taken alone; all in ms."""
     could, took, cpu, held = (np.array(column) for column in zip(*ran))
@@ -28,7 +29,7 @@ def of(
     interpreter = np.array(here) if here is not None else np.maximum(held, 1)
     callback = np.arange(len(ran)) if callbacks is None else np.array(callbacks)
     warm = np.zeros(len(ran), dtype=np.bool_)
-    found = alone(Recorded(*times, cpu, held > 0, interpreter, callback, warm), cpus, beside)
+    found = alone(Recorded(*times, cpu, held > 0, interpreter, callback, warm), cpus, workers)
     return [float(each) for each in np.round(found / 1e6, 1)]
 
 
@@ -61,13 +62,13 @@ def test_cpus_that_were_busy() -> None:
 
 
 def test_what_others_did_that_nobody_explains() -> None:
-    """It counts as far as others are to run beside one."""
+    """It counts unless nothing is to run beside it."""
     quiet = [(100 * i, 12, 10, 1) for i in range(1, 6)]
     disturbed, other = (0, 20, 10, 0), (0, 20, 0.1, 0)
     executions = [disturbed, *quiet, other]
     callbacks = [0, 0, 0, 0, 0, 0, 1]
-    for beside, expected in ((1.0, 20), (0.5, 16), (0.0, 12)):
-        found = of(*executions, callbacks=callbacks, beside=beside)
+    for workers, expected in ((NEVER, 20), (2, 20), (1, 12)):
+        found = of(*executions, callbacks=callbacks, workers=workers)
         assert found == approx([expected, *[12] * 5, 20], abs=0.15)
 
 
@@ -76,9 +77,27 @@ def test_one_that_waits_is_delayed_by_others_too() -> None:
     by_itself = [(100 * i, 5, 0.1, 0) for i in range(1, 6)]
     executions = [(0, 10, 0.1, 0), *by_itself, (0, 20, 0.1, 0)]
     callbacks = [0, 0, 0, 0, 0, 0, 1]
-    for beside, expected in ((1.0, 10), (0.0, 5)):
-        found = of(*executions, callbacks=callbacks, beside=beside)
+    for workers, expected in ((NEVER, 10), (1, 5)):
+        found = of(*executions, callbacks=callbacks, workers=workers)
         assert found == approx([expected, *[5] * 5, 20], abs=0.15)
+
+
+def test_what_is_left_where_fewer_run_beside_one() -> None:
+    """With two workers those that three ran beside lose what those do that one ran beside."""
+    quiet = [(1000 + 100 * i, 10, 10, 0) for i in range(5)]
+    beside_one = [(2000 + 100 * i, 12, 10, 0) for i in range(4)]
+    beside_three = [(3000, 15, 10, 0), (3100, 30, 10, 0)]
+    others = [
+        (could, took, 0.1, 0) for could, took, *_ in beside_one] + [
+        (could, took, 0.1, 0) for could, took, *_ in beside_three for _ in range(3)]
+    executions = [*quiet, *beside_one, *beside_three, *others]
+    callbacks = [0] * 11 + [1] * len(others)
+    found = of(*executions, callbacks=callbacks, workers=2)[:11]
+    assert found[:9] == [10] * 5 + [12] * 4
+    # 2 of 12 ms were lost beside one, so 4 of 24 are beside three; who lost most keeps most
+    assert sum(found[9:]) == approx(24, abs=0.15)
+    assert found[9] == 10
+    assert of(*executions, callbacks=callbacks, workers=4)[9:11] == [15, 30]
 
 
 def test_what_takes_more_where_the_worker_had_slept() -> None:
@@ -107,14 +126,16 @@ def test_a_long_recording_goes_window_by_window(monkeypatch: MonkeyPatch) -> Non
 @settings(deadline=None)
 @given(st.lists(st.tuples(
     st.integers(0, 10), st.integers(0, 10), st.integers(-1, 10), st.integers(0, 2)),
-    min_size=1, max_size=20), st.integers(0, 3), st.integers(1, 5), st.integers(1, 30))
+    min_size=1, max_size=20), st.integers(0, 3), st.integers(1, 5), st.integers(1, 30),
+    st.integers(1, 4))
 def test_never_longer_and_alone_never_less_than_it_computed(
-    ran: list[Ran], cpus: int, callbacks: int, window: int
+    ran: list[Ran], cpus: int, callbacks: int, window: int, workers: int
 ) -> None:
     """Also where the windows part what runs."""
     with MonkeyPatch.context() as patch:
         patch.setattr(module, 'WINDOW', window)
         found = of(
-            *ran, cpus=cpus, callbacks=[i % callbacks for i in range(len(ran))], beside=0.0)
+            *ran, cpus=cpus, callbacks=[i % callbacks for i in range(len(ran))],
+            workers=workers)
     for (_, took, cpu, _), alone_ in zip(ran, found):
         assert min(cpu, took) <= alone_ <= took
