@@ -40,7 +40,6 @@ from mddag_executor.core.rules import progress
 from mddag_executor.core.state import (
     DONE,
     IDLE,
-    N_HOLDING,
     N_IDLE,
     OPEN,
     POLLING,
@@ -100,6 +99,7 @@ class Engine:
         self._work: dict[int, Work] = {}
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
+        # those that hold the interpreter, in the order in which they began
         self._holders: list[Work] = []
         # whether who holds the interpreter may have overtaken another
         self.is_shared = False
@@ -189,7 +189,7 @@ class Engine:
                 or state.scalars[POLLING] or not state.scalars[N_IDLE]
                 or entity.removed or entity.gate is not None or self._finished
                 or entity.group >= 0 and state.group_owner[entity.group] >= 0
-                or entity.habit.holds and state.scalars[N_HOLDING]):
+                or entity.habit.holds and self._holders):
             return False
         entity.ready += 1
         self.undeclared += 1
@@ -389,7 +389,7 @@ class Engine:
             if not state.scalars[N_IDLE]:
                 return None
             worker = state.worker_x.index(-1)
-        if state.scalars[N_HOLDING]:
+        if self._holders:
             state.overtaking[1] = self._may_be_overtaken(now)
         x = self.scheduler.take(worker, now)
         if state.decisions:
@@ -409,45 +409,37 @@ class Engine:
 
     # --- the interpreter -------------------------------------------------------------------------
 
-    def _holds(self, work: Work) -> bool:
-        state, x = self._state, work.x
-        return x >= 0 and state.x_worker[x] >= 0 and state.x_holds[x] != 0
-
     def _begins_to_hold(self, work: Work, now: int) -> None:
-        if self._state.scalars[N_HOLDING] == 1:
-            self._holders = [work]
-        else:
-            self._holders = [*filter(self._holds, self._holders), work]
+        self._holders.append(work)
         self.is_shared = len(self._holders) > 1
         self._holds_since = now
 
+    def _holds_no_more(self, work: Work) -> None:
+        if work in self._holders:
+            self._holders.remove(work)
+
     def _may_be_overtaken(self, now: int) -> bool:
         """Return whether what comes first may overtake who began last to hold the interpreter."""
-        work = self._holders[-1] if self._holders else None
-        if work is None or not self._holds(work):
-            return True
-        habit = work.entity.habit
-        usual = habit.computed_ns or work.entity.busy_ns / max(1, work.entity.ran)
+        entity = self._holders[-1].entity
+        usual = entity.habit.computed_ns or entity.busy_ns / max(1, entity.ran)
         return overtaking_pays(
             self.tables, self._state, 1, now - self._holds_since, int(usual), self.preempts)
 
     def interpreter_holder(self) -> Work | None:
         """Return the most urgent execution that holds the interpreter."""
-        if self._state.scalars[N_HOLDING] == 0:
-            return None
-        if self._state.scalars[N_HOLDING] == 1 and self._holders and self._holds(
-                self._holders[-1]):
-            return self._holders[-1]
-        holders = [work for work in self._holders if self._holds(work)]
-        return min(holders, key=lambda work: self._state.x_key[work.x], default=None)
+        holders = self._holders
+        if len(holders) < 2:
+            return holders[0] if holders else None
+        return min(holders, key=lambda work: self._state.x_key[work.x])
 
     def overtaken(self) -> list[Work]:
         """Return what a more urgent execution has overtaken that computes, too."""
         first = self.interpreter_holder()
-        return [work for work in self._holders if work is not first and self._holds(work)]
+        return [work for work in self._holders if work is not first]
 
     def stop_holding(self, work: Work) -> None:
         """Give the interpreter back for an execution that does not need it now."""
+        self._holds_no_more(work)
         self.scheduler.stop_holding(work.x)
 
     def makes_whole(self, work: Work) -> bool:
@@ -471,6 +463,7 @@ class Engine:
 
     def lend(self, work: Work) -> None:
         """Free the worker of an execution that goes on without one."""
+        self._holds_no_more(work)
         self.scheduler.lend(work.x)
 
     def resume(self, work: Work) -> None:
@@ -536,6 +529,7 @@ class Engine:
         """Take a running execution off its worker until ``resume``."""
         if self.record is not None:
             self._record_run(work, start, end, vtid, worker)
+        self._holds_no_more(work)
         self.scheduler.suspend(work.x)
         self._work[work.x] = work
 
@@ -545,6 +539,7 @@ class Engine:
         if entity.removed:
             self.destroyed(work, now)
             return
+        self._holds_no_more(work)
         self.scheduler.refuse(x)
         self._work[x] = work
         entity.waiting = {x: None, **entity.waiting}
@@ -559,7 +554,7 @@ class Engine:
         """Take an execution off its worker that could not do its work: its context has ended."""
         if self.record is not None and ran:
             self._record_run(work, start, end, vtid, worker)
-        self.scheduler.lend(work.x)
+        self.lend(work)
         work.x = -1
         work.entity.ran += ran
         work.entity.dropped += not ran
@@ -567,7 +562,7 @@ class Engine:
     def destroyed(self, work: Work, now: int) -> None:
         """End a dispatched execution that must not run: its job cannot complete any more."""
         x, work.x = work.x, -1
-        self._holders = [each for each in self._holders if each is not work]
+        self._holds_no_more(work)
         if work.origin is not None:
             self.scheduler.expire_open(work.origin.slot, now)
         self.scheduler.complete(x, now)
