@@ -207,4 +207,4 @@ def test_a_signal_ends_the_executors_of_all_contexts(intake):
     assert out in (
         "[('other', 'ExternalShutdownException'), ('own', 'KeyboardInterrupt')]\n",
         "[('other', 'ExternalShutdownException'), ('own', 'ExternalShutdownException')]\n")
-    assert err == ''
+    assert 'Traceback' not in err  # a busy machine skips periods of the timers, which is logged
