@@ -9,13 +9,10 @@ Theory of operation
    12): of those that compute in Python the most urgent goes first, and one at a time computes.
 2. All processes share the CPUs (``simulate.machine``).
 3. What the executor and the middleware take is added to execution times: ``CALLBACK_NS`` for each
-   callback, ``TRANSPORT_NS`` for each message that it sends to another process.  DAGs are released
+   callback, ``PUBLISH_NS`` for each callback that it sends a message to.  DAGs are released
    ``APART_NS`` after one another: timers that start together are never due at the very same time,
    so there are no ties.
-4. The thread of the intake notices a timer, and takes a message of another process, which is there
-   ``ARRIVAL_NS`` after it was sent.  That takes ``INTAKE_NS`` with Python's lock, for which it
-   waits a switch interval where a callback computes, and meanwhile that one stands still.  It is
-   an execution of its own, ahead of the callback.
+4. What timers and messages of other processes take to be noticed: see ``simulate.intakes``.
 5. One placement is better than another where fewer deadlines are missed, then where the response
    that uses most of its deadline uses less of it.  Placements that differ in one block of nodes or
    two are tried, those of the least load first, until none is better or ``MOST_TRIES`` were tried.
@@ -27,18 +24,18 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import accumulate, islice
 
-from mddag_executor.assign.placement import Placing, TRANSPORT_NS
+from mddag_executor.assign.placement import Placing
 from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core.tally import total
+from mddag_executor.simulate.intakes import Costs, Intakes
 from mddag_executor.simulate.load import edge_numbers, edges_of, Load
-from mddag_executor.simulate.schedule import prepare, schedule, Settings
+from mddag_executor.simulate.schedule import prepare, Settings
 from mddag_executor.simulate.workload import periodic_load
-from msg_graph import Process, TaskSet, Vertex
+from msg_graph import Process, TaskSet
 
-CALLBACK_NS = 130_000
-ARRIVAL_NS = 300_000
-INTAKE_NS = 300_000
+CALLBACK_NS = 20_000
+PUBLISH_NS = 75_000
 APART_NS = 20_000
 MOST_TRIES = 150
 _AHEAD = 40
@@ -53,16 +50,19 @@ class Predictor:
     :param workers: of each process.
     :param cpus: that all processes share; None: enough for all.
     :param duration_ns: virtual time of a run.
+    :param publish_ns: what publishing takes beside execution times, for each callback that it is
+        to; recorded ones have it in them.
     """
 
     def __init__(
         self, task_set: TaskSet, workers: int, cpus: int | None, policy: str, duration_ns: int,
+        publish_ns: int = PUBLISH_NS,
     ) -> None:
         self._task_set = task_set
         self._workers = workers
         self._cpus = cpus
         self._policy = find_policy(policy)
-        self._duration = duration_ns
+        self._duration, self._publish = duration_ns, publish_ns
         self._compiled: bool | None = None  # not known yet
 
     def predict(
@@ -70,73 +70,34 @@ class Predictor:
     ) -> Tally:
         """Return the verdicts about a placement, with these execution times in each job."""
         task_set = replace(self._task_set, processes=tuple(processes))
-        sends, noticed = _with_intakes(task_set)
-        tables = Tables.build(noticed, max_active_jobs=NEVER)
-        times: list[list[int]] = []
-        locks: list[int] = []
-        for number, row in enumerate(execution_ns):
-            intakes = len(noticed.dags[number].vertices) - len(row)
-            times.append([ns + CALLBACK_NS + TRANSPORT_NS * ((number, vertex) in sends)
-                          for vertex, ns in enumerate(row)] + [INTAKE_NS] * intakes)
-            locks += [0] * len(row) + [1] * intakes
-        holds = [0 if locked or vertex.callback.holds_interpreter is False else process
-                 for vertex, process, locked in zip(noticed.vertices, tables.process, locks)]
-        delays = [ARRIVAL_NS * locks[after] for _, after in edge_numbers(tables)]
+        tables = Tables.build(task_set, max_active_jobs=NEVER)
+        costs = Costs()
+        crosses = {(a, b): tables.process[a] != tables.process[b]
+                   for a, b in edge_numbers(tables)}
+        sends = {a for (a, _), leaves in crosses.items() if leaves}
+        times = [[ns + CALLBACK_NS + self._publish * len(vertex.successors)
+                  + costs.send_ns * (first + vertex.index in sends)
+                  for ns, vertex in zip(row, dag.vertices)]
+                 for row, dag, first in zip(execution_ns, task_set.dags, tables.first_vertex)]
         bases = list(accumulate(edges_of(tables), initial=0))[:-1]
-        load = _apart(periodic_load(noticed, times, self._duration)._replace(
-            holds=holds, locks=locks, delays=delays, delay_base=bases,
+        load = _apart(periodic_load(task_set, times, self._duration)._replace(
+            holds=[0 if vertex.callback.holds_interpreter is False else process
+                   for vertex, process in zip(task_set.vertices, tables.process)],
+            delays=[costs.delay_ns * leaves for leaves in crosses.values()], delay_base=bases,
             delay_stride=[0] * len(bases)))
         settings = Settings(
             self._policy.name, self._workers, self._duration, cpus=self._cpus,
             processes=max(1, len(processes)))
         if self._compiled is None:
             self._compiled = prepare(tables, load, settings, MOST_TRIES)
-        decisions = schedule(tables, load, settings, compiled=self._compiled).decisions
-        tally = Tally(noticed, tables)
+        decisions = Intakes(task_set, tables, costs).schedule(
+            load, settings, compiled=self._compiled).decisions
+        tally = Tally(task_set, tables)
         for time, dag in zip(load.times, load.dags):
             if time < self._duration:
                 tally.released(dag)
         tally.add(decisions)
         return tally
-
-
-def _with_intakes(task_set: TaskSet) -> tuple[set[tuple[int, int]], TaskSet]:
-    """
-    Return who sends to other processes, by DAG and index, and the task set with what intakes do.
-
-    That (rule 4) is behind the vertices of each DAG.
-    """
-    sends: set[tuple[int, int]] = set()
-    dags = []
-    for dag in task_set.dags:
-        vertices = list(dag.vertices)
-        source = dag.source
-        home = [task_set.process_of(vertex.callback.node) for vertex in vertices]
-        ways: list[tuple[int | None, int]] = [
-            (before, after) for before, after in dag.edges if home[before] != home[after]]
-        if vertices[source].callback.kind == 'timer':
-            ways.append((None, source))
-        for before, after in ways:
-            new = len(vertices)
-            later = vertices[after]
-            came: tuple[int, ...] = ()
-            if before is None:
-                source = new
-                vertices[after] = replace(later, predecessors=(new,))
-            else:
-                came = (before,)
-                sends.add((dag.index, before))
-                vertices[before] = replace(vertices[before], successors=tuple(
-                    new if s == after else s for s in vertices[before].successors))
-                vertices[after] = replace(later, predecessors=tuple(
-                    new if p == before else p for p in later.predecessors))
-            vertices.append(Vertex(
-                f'intake of {later.name} {new}', replace(later.callback, group=None), dag.index,
-                new, came, (after,), None))
-        dags.append(replace(
-            dag, vertices=tuple(vertices), source=source, edges=tuple(sorted(
-                (v.index, s) for v in vertices for s in v.successors))))
-    return sends, replace(task_set, dags=tuple(dags))
 
 
 def _apart(load: Load) -> Load:

@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Place nodes."""
-    from mddag_executor.assign.placed import cost_of, improve, Predictor
+    from mddag_executor.assign.placed import cost_of, improve, Predictor, PUBLISH_NS
     from mddag_executor.assign.placement import Placing
     from msg_graph.processes import with_processes
     if args.trace and args.utilisation is not None:
@@ -70,7 +70,8 @@ def main(args: argparse.Namespace) -> int:
     times, judged = _times(args, task_set, workers)
     placing = Placing(judged, args.processes, times, _groups(args.together), _groups(args.apart))
     cpus = args.cpus or defaults.processors()
-    predictor = Predictor(judged, workers, cpus, args.policy, args.duration)
+    predictor = Predictor(judged, workers, cpus, args.policy, args.duration,
+                          0 if args.trace else PUBLISH_NS)
     with Progress('placing') as line:
         place, tried = improve(
             placing, placing.place(),

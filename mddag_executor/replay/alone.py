@@ -82,6 +82,11 @@ class Recorded(NamedTuple):
             self.could[which], self.took[which], self.cpu[which], self.locks[which],
             self.interpreter[which], self.callback[which], self.warm[which])
 
+    def beside(self, others: Recorded) -> Recorded:
+        """Return these with others behind them."""
+        columns: Any = map(np.concatenate, zip(self, others))
+        return Recorded(*columns)
+
 
 def alone(ran: Recorded, cpus: int = 0, workers: int = NEVER) -> Ints:
     """

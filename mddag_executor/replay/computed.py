@@ -175,6 +175,10 @@ class _Player:
 
     def _change(self, entry: LogEntry) -> None:
         now, kind, worker, dag, v, job = entry
+        if v < 0:       # what starts it was noticed (see ``simulate.intakes``)
+            what = (dag, ~v, job)
+            self._ready[what] = max(now, self._ready.get(what, now))
+            return
         declared = dag < self._n_dags
         number = self._number(dag, job)
         what = (dag, v, job)

@@ -27,6 +27,9 @@ Theory of operation
   before that: it published early).  That is the time from its end to the successor's readiness.
 * *Dispatch*: the time from when an execution could have started to when it did (see
   ``dispatches``).  It is added to the execution time, because the worker is taken.
+* In other processes than recorded, what notices timers and messages does so anew, as
+  ``simulate.intakes`` says: it takes what it took in the recording (see ``noticed``).  A job whose
+  timer was noticed too late is not skipped then.
 * Where there is no such time in a job, the median of the edge, or of all executions, stands in.
 
 Without overheads (``overheads=False``) transport and dispatch take no time and a timer's source is
@@ -49,8 +52,10 @@ from mddag_executor.replay.alone import alone, colder, ENOUGH, Recorded
 from mddag_executor.replay.dispatches import Dispatches
 from mddag_executor.replay.entities import Entities
 from mddag_executor.replay.happenings import Observer
+from mddag_executor.replay.noticed import Noticed
 from mddag_executor.simulate import Load
 from mddag_executor.simulate.deliveries import DELAY_NS
+from mddag_executor.simulate.intakes import Costs
 from mddag_executor.simulate.load import edge_numbers, edges_of, FAILS, RUNS, SKIPPED
 from msg_graph import Dag, TaskSet
 import numpy as np
@@ -79,6 +84,7 @@ class RecordedLoad(NamedTuple):
     dispatch_ns: int | None = None
     transport_ns: int | None = None
     dispatches: Any = ()
+    intakes: Costs | None = None
 
 
 class _Jobs:
@@ -259,27 +265,36 @@ class LoadBuilder(Observer):
 
     def build(
         self, overheads: bool = True, process: Sequence[int] | None = None, workers: int = NEVER,
+        anew: bool = False,
     ) -> RecordedLoad:
         """
         Return what was collected.
 
         :param process: by vertex the process that it is to run in; None: as recorded.
         :param workers: how many each process is to have, if that is fewer than in the recording.
+        :param anew: whether intakes are to notice timers and messages anew, not as recorded; so
+            they do only where CPU times say how long others computed.
         """
         if self._leg is not None:
             self._others.append(self._leg[1])
             self._leg = None
         self._close()
         locks = self._locks()
-        every, usual, warmth, late = self._alone(locks, workers)
         process = process or self._process
-        delays, transport = self._transports(overheads, process)
+        anew = anew and bool((self._whole['cpu'] >= 0).any())
+        every, usual, warmth, late, intakes = self._alone(locks, workers, anew)
+        if anew:
+            self._skipped.clear()
+        delays, transport = self._transports(overheads, process, intakes)
         self._drop('start', 'end', 'arrived')
         estimated, unknown = self._estimate(process)
         took, cpu, held = (self._whole.pop(name) for name in ('took', 'cpu', 'held'))
         demand, executions = int(took.sum()), len(took)
         if overheads:
             took += late
+        if intakes is not None:     # who dispatches computes, too
+            cpu[cpu >= 0] += late[cpu >= 0]
+            took += intakes.send_ns * self._by_execution(self._sends(process))
         others = sorted(self._others)
         more = np.zeros(len(others), dtype=np.int64)
         costs = np.concatenate([took, np.array([
@@ -295,11 +310,12 @@ class LoadBuilder(Observer):
             'delays': delays, 'delay_stride': [jobs.n_edges for jobs in self._jobs],
             'delay_base': [0, *accumulate(
                 len(jobs.numbers) * jobs.n_edges for jobs in self._jobs[:-1])]}
-        load = self._load(costs, bases, [ready for ready, _, _ in others], overheads)._replace(
+        load = self._load(costs, bases, [ready for ready, _, _ in others],
+                          overheads and not anew)._replace(
             fates=self._fates(bases, len(costs)), **columns)
         return RecordedLoad(
             load, [jobs.numbers for jobs in self._jobs], demand, executions, estimated, unknown,
-            usual, transport, late if overheads else late[:0])
+            usual, transport, late if overheads else late[:0], intakes)
 
     def _close(self) -> None:
         """Put the columns of all DAGs' jobs together, and leave each DAG its part of them."""
@@ -384,7 +400,9 @@ class LoadBuilder(Observer):
             np.tile(numbers[first:first + jobs.size], len(jobs.numbers))
             for first, jobs in zip(self._first, self._jobs)])
 
-    def _alone(self, locks: Any, workers: int) -> tuple[Any, int | None, Any, Any]:
+    def _alone(
+        self, locks: Any, workers: int, anew: bool
+    ) -> tuple[Any, int | None, Any, Any, Costs | None]:
         """
         Make times those that executions would have taken alone (see ``alone``).
 
@@ -392,8 +410,9 @@ class LoadBuilder(Observer):
 
         :return: how late executions were, by number, the last one what is usual; that; and by
             execution what it takes more since its worker had slept (see ``Load.warmth``), and
-            what the executor takes for it.
+            what the executor takes for it; and what intakes take, if ``anew``.
         """
+        intakes = None
         number, took, start, cpu = (
             self._whole[name] for name in ('dispatch', 'took', 'start', 'cpu'))
         every = self._dispatches.late(number[locks & (number >= 0)])
@@ -416,7 +435,13 @@ class LoadBuilder(Observer):
                 self._by_execution(self._process)[ran],
                 self._by_execution(self._callbacks)[ran], warm[ran])
             give_back()
-            cost = alone(recorded, self._cpus, workers)
+            beyond = recorded
+            if anew:
+                noticed = self._noticed()
+                intakes = noticed.costs(recorded)
+                beyond = recorded.beside(noticed.executions(intakes))
+            cost = alone(beyond, self._cpus, workers)[:len(recorded.took)]
+            del beyond
             if workers < NEVER:
                 warmth[ran] = colder(recorded.callback, recorded.warm, cost)
             # what is less than recorded: it began late, or it stood still later
@@ -425,7 +450,7 @@ class LoadBuilder(Observer):
             began = np.minimum(began, np.maximum(0, late[ran] - (usual or 0)))
             took[ran] = np.maximum(0, cost - late[ran] + began)
             late[ran] = cost - took[ran]
-        return every, usual, warmth, late
+        return every, usual, warmth, late, intakes
 
     def _notice_sooner(self, could: Any, locks: Any, workers: int) -> None:
         """
@@ -437,16 +462,12 @@ class LoadBuilder(Observer):
 
         :param could: when executions could have started.
         """
-        number, noticed, release, start, end = (
-            self._whole[name] for name in ('round', 'noticed', 'release', 'start', 'end'))
+        number, noticed, start, end = (
+            self._whole[name] for name in ('round', 'noticed', 'start', 'end'))
         of = np.flatnonzero(number >= 0)
-        ends = np.array(self._rounds, dtype=np.int64)
-        due, first, home = np.full(len(ends), NEVER), ends.copy(), np.zeros(len(ends), np.int64)
-        np.minimum.at(due, number[of], release[of])
+        due, ends, home = self._when_due()
+        first = ends.copy()
         np.minimum.at(first, number[of], noticed[of])
-        home[number[of]] = np.repeat(
-            [self._process[source] for source in self._tables.source[:-1]],
-            [len(jobs.round) for jobs in self._jobs])[of]
         process = self._by_execution(self._process)
         taken = ends - due
         for here in np.unique(home):
@@ -475,6 +496,45 @@ class LoadBuilder(Observer):
         self._rounds = array('q', ends.tobytes())
         noticed[of] = np.minimum(noticed[of], ends[number[of]])
 
+    def _when_due(self) -> tuple[Any, Any, Any]:
+        """Return when each round of timers was due, and ended, and in which process it was."""
+        number, release = self._whole['round'], self._whole['release']
+        of = np.flatnonzero(number >= 0)
+        ends = np.array(self._rounds, dtype=np.int64)
+        due, home = np.full(len(ends), NEVER), np.zeros(len(ends), dtype=np.int64)
+        np.minimum.at(due, number[of], release[of])
+        home[number[of]] = np.repeat(
+            [self._process[source] for source in self._tables.source[:-1]],
+            [len(jobs.round) for jobs in self._jobs])[of]
+        return due, ends, home
+
+    def _noticed(self) -> Noticed:
+        """Return what the intakes noticed in the recording."""
+        due, ends, home = self._when_due()
+        columns = [np.stack((due, ends, home, np.ones_like(due)))]
+        to = [[self._process[b] for a, b in edge_numbers(self._tables)
+               if self._tables.dag_of[a] == dag.index] for dag in self._task_set.dags]
+        for jobs, crosses, places in zip(self._jobs, self._crossings(self._process), to):
+            end = np.asarray(jobs.end).reshape(len(jobs.numbers), jobs.size)
+            arrived = np.asarray(jobs.arrived).reshape(len(end), jobs.n_edges)
+            for edge, (crossed, _) in enumerate(crosses):
+                sent = np.minimum(end[:, jobs.publishers[edge]], arrived[:, edge])
+                known = sent >= 0
+                if crossed:
+                    columns.append(np.stack((
+                        sent[known], arrived[known, edge], np.full(known.sum(), places[edge]),
+                        np.zeros(known.sum(), dtype=np.int64))))
+        came = np.concatenate(columns, axis=1)
+        return Noticed(came[0], came[1], came[2], came[3] > 0)
+
+    def _sends(self, process: Sequence[int]) -> list[int]:
+        """Return by vertex whether it is to send to other processes, less whether it did."""
+        found = [0] * self._tables.n_vertices
+        for how, sign in ((process, 1), (self._process, -1)):
+            for before in {a for a, b in edge_numbers(self._tables) if how[a] != how[b]}:
+                found[before] += sign
+        return found
+
     def _load(
         self, costs: Any, bases: list[int], others: list[int], overheads: bool
     ) -> Load:
@@ -494,7 +554,7 @@ class LoadBuilder(Observer):
             ready, dags, rows, costs, bases, [*(jobs.size for jobs in self._jobs), 1], release)
 
     def _transports(
-        self, overheads: bool, process: Sequence[int]
+        self, overheads: bool, process: Sequence[int], intakes: Costs | None
     ) -> tuple[Any, int | None]:
         """
         Return the transports by job, and the median of all that were measured.
@@ -516,7 +576,9 @@ class LoadBuilder(Observer):
                 column = found[known[:, edge], edge]
                 found[~known[:, edge], edge] = np.median(column) if len(column) else 0
                 measured[before].append(column)
-                if before != after:
+                if intakes is not None and after:
+                    found[:, edge] = intakes.delay_ns
+                elif before != after:
                     changed.append((found[:, edge], after))
             delays.append(found)
         usual = {after: np.concatenate(each) for after, each in measured.items()}

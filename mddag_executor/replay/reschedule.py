@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 from mddag_executor.core import NEVER, POLICIES, processes_of, Tables
@@ -28,6 +28,7 @@ from mddag_executor.replay.run import open_run, Recording, Run
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import LogEntry, schedule, Settings
+from mddag_executor.simulate.intakes import Intakes
 from mddag_executor.simulate.load import edge_numbers
 from mddag_executor.text import counted, listed
 from msg_graph import Process, TaskSet
@@ -66,7 +67,9 @@ class Reschedule:
         self._start = start
         self.tally = MissTally(task_set, tables)
         load, end = work.load, settings.duration_ns
-        _, _, self.decisions, self.busy = schedule(tables, load, settings)
+        self._run = partial(schedule, tables) if work.intakes is None else Intakes(
+            task_set, tables, work.intakes).schedule
+        _, _, self.decisions, self.busy = self._run(load, settings)
         for time, dag, release in zip(*(
                 np.asarray(each).tolist() for each in (load.times, load.dags, load.releases))):
             if time < end and release >= settings.judge_from:
@@ -76,7 +79,7 @@ class Reschedule:
     @cached_property
     def log(self) -> Sequence[LogEntry]:
         """Return every start, end and preemption, on the recording's clock; it runs once more."""
-        return schedule(self.tables, self.work.load, self.settings, log=True).log
+        return self._run(self.work.load, self.settings, log=True).log
 
     @property
     def worker_names(self) -> list[str]:
@@ -203,7 +206,9 @@ def reschedule(
     find_policy(policy).mode(preemptive, len(placed))
     with no_garbage():
         work = builder.build(
-            overheads, tables.process, workers if workers < each else NEVER)
+            overheads, tables.process, workers if workers < each else NEVER,
+            overheads and not preemptive and not find_policy(policy).polling
+            and tables.process[:-1] != _processes(run, ran))
     if work.unknown:
         raise ReplayError(
             run.name, f'{counted(len(work.unknown), "callback")} did not complete in it, '

@@ -61,6 +61,7 @@ class Orders(NamedTuple):
 
     workers: int
     processes: int
+    intakes: int
     preemptive: int
     polling: int
     dispatch_overhead: int
@@ -84,17 +85,19 @@ def run_load(
     """
     sends = len(load.delay_base) > 0
     stops = len(load.holds) > 0 or o.cpus < NEVER
+    workers = [o.workers] * o.processes + [1] * (o.processes * o.intakes)
     fill_state(
-        t, s, o.workers * o.processes, o.preemptive, 2 if sends else 1, o.dispatch_overhead,
+        t, s, sum(workers), o.preemptive, 2 if sends else 1, o.dispatch_overhead,
         o.switch_overhead, o.polling)
-    if o.processes > 1:
-        divide(s, [o.workers] * o.processes)
+    if len(workers) > 1:
+        divide(s, workers)
     s.scalars[JUDGE_FROM] = o.judge_from
     stop, keep = o.stop_at_first_miss != 0, o.keep_log != 0
-    for _ in range(o.workers * o.processes):
+    for _ in range(sum(workers)):
         busy.append(0)
     if stops:
-        fill_machine(t, s, m, o.cpus, int(needs_python(load)))
+        fill_machine(
+            t, s, m, o.cpus, int(needs_python(load)), o.processes if o.intakes != 0 else NEVER)
     if sends:
         d.sent.append(0)
         if stops:

@@ -17,7 +17,8 @@ Where what it needs is not free, it stands still.  The rules of the core (rule 1
 those that hold the interpreter are started; this module, how those that run share it:
 
 * **The lock.**  Who has it keeps it until it needs it no more, or until another has waited for a
-  *switch interval*; then they take turns, in the order in which they asked, as in CPython.
+  *switch interval*; then they take turns, in the order in which they asked, as in CPython.  What
+  starts when one of its process ends goes on in its thread, and with the lock.
 * **CPUs.**  Those that compute, of those with the lock only the one that has it, share the CPUs.
   Where there are more, they take turns by *slices*; what begins to compute goes first.
 
@@ -52,8 +53,9 @@ _LOCK, _CPU, _NOTHING = range(3)
 # Columns of ``Machine.scalars``: how many CPUs there are; whether executions that do not hold the
 # interpreter need it at their end; up to when time has been taken in; when CPUs change hands, if
 # nothing happens before; when somebody needs something else, or must wait; how often it was found
-# out who goes on; when overtaking pays that does not pay now.
-CPUS, PYTHON, SETTLED, SLICE_AT, NEXT_TIME, SHARES, OVERTAKE_AT = range(7)
+# out who goes on; when overtaking pays that does not pay now; how many interpreters there are, of
+# which those of further pools (``intakes``) are the same once more.
+CPUS, PYTHON, SETTLED, SLICE_AT, NEXT_TIME, SHARES, OVERTAKE_AT, INTERPRETERS = range(8)
 
 
 class Machine(NamedTuple):
@@ -92,13 +94,15 @@ def new_machine(t: Tables, s: State, cpus: int | None = None, python: bool = Fal
     :param python: whether executions that do not hold the interpreter need it at their end.
     """
     machine = empty(Machine)
-    fill_machine(t, s, machine, cpus or NEVER, int(python))
+    fill_machine(t, s, machine, cpus or NEVER, int(python), NEVER)
     return machine
 
 
-def fill_machine(t: Tables, s: State, m: Machine, cpus: int, python: int) -> None:
+def fill_machine(
+    t: Tables, s: State, m: Machine, cpus: int, python: int, interpreters: int
+) -> None:
     """Fill the columns of a machine that is all empty; see ``new_machine``."""
-    for value in (cpus, python, 0, NEVER, NEVER, 1, NEVER):
+    for value in (cpus, python, 0, NEVER, NEVER, 1, NEVER, interpreters):
         m.scalars.append(value)
     for vertex in range(len(t.process)):
         while len(s.overtaking) <= t.process[vertex]:
@@ -250,10 +254,26 @@ def _find_need(t: Tables, s: State, m: Machine, x: int, at: int) -> None:
         interpreter = s.x_holds[x]
         if interpreter == 0:
             interpreter = t.process[s.x_vertex[x]]
+            if interpreter > m.scalars[INTERPRETERS]:
+                interpreter -= m.scalars[INTERPRETERS]
         if x not in m.lock_queue[interpreter]:
-            m.lock_queue[interpreter].append(x)
+            _ask(t, s, m, x, interpreter)
     elif need == _CPU and x not in m.computing:
         m.anew.append(x)
+
+
+def _ask(t: Tables, s: State, m: Machine, x: int, interpreter: int) -> None:
+    """Queue for the lock; what starts where one that had it has just ended takes its place."""
+    queue = m.lock_queue[interpreter]
+    if len(queue) > 0 and m.at[x] == 0:
+        first = queue[0]
+        if (s.x_worker[first] < 0 and m.need[first] == _CPU
+                and t.process[s.x_vertex[first]] == t.process[s.x_vertex[x]]):
+            queue[0] = x
+            if m.lock_had[interpreter] == first:
+                m.lock_had[interpreter] = x
+            return
+    queue.append(x)
 
 
 def _pass_lock(s: State, m: Machine, process: int, now: int) -> None:

@@ -38,7 +38,8 @@ class Settings:
         each preemption.
     :ivar cpus: that those who compute share; None: enough for all.
     :ivar judge_from: jobs released before are not judged.
-    :ivar processes: how many there are, each with an interpreter of its own.
+    :ivar processes: how many there are, each with an interpreter of its own; ``intakes``: and a
+        pool of one more worker, behind those of all (see ``intakes``).
     """
 
     policy: str = 'rad'
@@ -52,6 +53,7 @@ class Settings:
     cpus: int | None = None
     judge_from: int = -NEVER
     processes: int = 1
+    intakes: bool = False
 
     @property
     def preempts(self) -> bool:
@@ -62,7 +64,7 @@ class Settings:
     def orders(self) -> Orders:
         """Return the same as integers, for the engine; raise as ``preempts``."""
         return Orders(
-            self.workers, self.processes, int(self.preempts),
+            self.workers, self.processes, int(self.intakes), int(self.preempts),
             int(find_policy(self.policy).polling), self.dispatch_overhead_ns,
             self.switch_overhead_ns, self.judge_from, self.cpus or NEVER, self.duration_ns,
             int(self.stop_at_first_miss), int(self.judge == 'horizon'), 1)

@@ -5,15 +5,15 @@
 from __future__ import annotations
 
 from mddag_executor.assign.placed import (
-    ARRIVAL_NS,
     CALLBACK_NS,
     cost_of,
     improve,
-    INTAKE_NS,
     Predictor,
+    PUBLISH_NS,
 )
-from mddag_executor.assign.placement import Placing, TRANSPORT_NS
+from mddag_executor.assign.placement import Placing
 from mddag_executor.core.tally import total
+from mddag_executor.simulate.intakes import Costs
 from mddag_executor.simulate.machine import SWITCH_NS
 from msg_graph import loads, Process, TaskSet
 import pytest
@@ -66,8 +66,9 @@ def test_what_leaves_its_process_takes_longer() -> None:
         found: int = tally.result()['dags']['/a']['sinks']['/b:t']['response_ns']['max']
         return found
 
-    assert response(ALL) == 5 * MS + 2 * CALLBACK_NS + INTAKE_NS
-    assert response(EACH) == response(ALL) + TRANSPORT_NS + ARRIVAL_NS + INTAKE_NS
+    costs = Costs()
+    assert response(ALL) == 5 * MS + 2 * CALLBACK_NS + PUBLISH_NS + costs.timer_ns
+    assert response(EACH) == response(ALL) + costs.send_ns + costs.message_ns
 
 
 def test_a_timer_is_noticed_a_switch_interval_later_where_a_callback_computes() -> None:
@@ -79,16 +80,19 @@ nodes:
 """
 
     def responses(processes: tuple[Process, ...]) -> tuple[int, int]:
-        dags = Predictor(loads(urgent), 7, 2, 'rad', 1000 * MS).predict(
+        dags = Predictor(loads(urgent), 7, 3, 'rad', 1000 * MS).predict(
             processes, [[50 * MS], [MS]]).result()['dags']
         long, short = (dags[name]['sinks'][f'{name}:t']['response_ns']['max']
                        for name in ('/a', '/b'))
         return long, short
 
     alone, together = responses(EACH), responses(ALL)
-    assert alone == (50 * MS + CALLBACK_NS + INTAKE_NS, MS + CALLBACK_NS + INTAKE_NS)
+    costs = Costs()
+    assert alone == (50 * MS + CALLBACK_NS + costs.timer_ns,
+                     MS + CALLBACK_NS + costs.timer_ready_ns)
     assert together[1] == alone[1] + SWITCH_NS
-    assert together[0] >= alone[0] + 4 * INTAKE_NS  # it stands still while others are noticed
+    # it stands still while others are noticed
+    assert together[0] >= alone[0] + 4 * costs.timer_ns
 
 
 def several(*times: int) -> tuple[TaskSet, list[list[int]]]:

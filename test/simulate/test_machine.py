@@ -142,6 +142,14 @@ def test_a_worker_that_goes_on_is_warm() -> None:
     assert in_ms(times(jobs, 3, warmth=ms)) == [(0, 4), (4, 7), (20, 26)]
 
 
+def test_a_worker_that_goes_on_keeps_the_lock() -> None:
+    """The second overtakes the first; the third comes at its end, and need not wait again."""
+    jobs = of_ms(Job(0, 90, 60, True), Job(1, 20, 1, True), Job(3, 20, 1, True))
+    jobs[1].cost, jobs[2].cost = MS // 4, MS // 4
+    jobs[2].release = 2 * MS + MS // 4
+    assert in_ms(times(jobs, 3))[1:] == [(1, 2.25), (2.25, 2.5)]
+
+
 def test_cpus_are_shared_by_slices() -> None:
     """Of three at a time the first two, then the third and the first, then all that is left."""
     jobs = of_ms(*(Job(0, 50, 6) for _ in range(3)))
@@ -213,7 +221,10 @@ class Lock:
     queue: list[Job] = field(default_factory=list)
     left: int = 0
 
-    def pass_on(self, wanted: list[Job]) -> None:
+    def pass_on(self, wanted: list[Job], now: int) -> None:
+        goes_on = [job for job in wanted if job.start == now]
+        if self.queue and self.queue[0].end == now and goes_on:
+            self.queue[0] = goes_on[0]
         had, several = self.queue[:1], len(self.queue) > 1
         self.queue = [job for job in self.queue if job in wanted]
         self.queue += [job for job in wanted if job not in self.queue]
@@ -261,7 +272,7 @@ class Ticks:
         having = []
         for number in (1, 2):
             lock = self.locks.setdefault(number, Lock())
-            lock.pass_on([job for job in wanted[LOCK] if job.interpreter == number])
+            lock.pass_on([job for job in wanted[LOCK] if job.interpreter == number], now)
             having += lock.queue[:1]
         self._pass_cpus(wanted[CPU] + having)
         for job in wanted[NOTHING] + self.computing[:self.cpus]:
