@@ -182,15 +182,6 @@ class Habit:
         """Return whether it is not known yet whether it computes with the lock released."""
         return self._tries < FIRST and not self._declared and self.computed_ns >= BRIEF_NS
 
-    @property
-    def look_ns(self) -> int:
-        """Return after how long to look at one that keeps others from the interpreter."""
-        ns = LOOK_NS
-        if self.is_to_be_learnt or self._released > MIXED:  # at the latest before it ends
-            while ns > BRIEF_NS // 2 and 2 * ns > self.computed_ns:
-                ns //= 2
-        return ns
-
     def was_released(self, released: bool) -> bool:
         """Learn whether it computed with the lock released, and return that."""
         self._tries += 1

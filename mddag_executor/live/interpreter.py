@@ -20,8 +20,7 @@ do is declared or learnt (``habits``).  Here
     that waits for him; where the lock was not free meanwhile it may have waited for that, and is
     looked at once more.  If it computes while the looking thread has the lock, it
     computes with the lock released (numpy, hashlib): it gives the interpreter back, too, and that
-    is remembered.  At first that is tried, too, whenever anything arrives; and of one that may
-    compute so and takes less than 4 ms, at half of its time.
+    is remembered.  At first that is tried, too, whenever anything arrives.
 3.  while nothing is held back nobody looks, and nobody is woken: an alarm is set when something is
     held back for the first time, and called off when nothing is any more.
 
@@ -136,22 +135,20 @@ class Interpreter:
                 self._alarm.start(0)
             return
         habit = holder.entity.habit
-        is_to_be_learnt = self._may_overlap and habit.is_to_be_learnt
-        if is_to_be_learnt:
+        if self._may_overlap and habit.is_to_be_learnt:
             seat = self._seat(holder)
             if (seat is not None and seat.cpu_clock is not None
                     and seat.thread is not threading.current_thread()):
                 habit.was_released(self._computes_now(seat.cpu_clock))
-        is_trusted = (
-            self.looks_late and habit.is_trusted and not pauses and not is_to_be_learnt)
+        is_trusted = self.looks_late and habit.is_trusted and not pauses
         if holder is not self._seen[0]:
             if not is_trusted:
                 self._idle = 0
                 self._note(holder)
-                self._watch(habit.look_ns)
+                self._watch(LOOK_NS)
         elif not self.rings_at:
             if not is_trusted:
-                self._watch(habit.look_ns)
+                self._watch(LOOK_NS)
         elif monotonic_ns() - self._seen[1] >= LOOK_NS and not self._has_computed(holder):
             self._watch(SOON_NS)  # it was seen on the way
 

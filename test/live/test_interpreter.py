@@ -10,7 +10,6 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-from mddag_executor.live.habits import LOOK_NS
 from mddag_executor.live.interpreter import Habit, Interpreter
 import msg_graph
 import pytest
@@ -300,18 +299,6 @@ def test_computing_with_the_lock_released_is_noticed_and_looked_at_again():
     for _ in range(20):
         habit.was_released(False)
     assert any(learnt((10, 9.5, 9.6), habit=habit) for _ in range(20))
-
-
-def test_a_short_one_that_may_compute_with_the_lock_released_is_looked_at_before_it_ends():
-    habit = Habit()
-    learnt(*[(1, 0.95, 0.96)] * 20, habit=habit)
-    assert habit.look_ns < 0.5 * MS
-    for _ in range(20):
-        habit.was_released(False)
-    assert habit.look_ns == LOOK_NS
-    long = Habit()
-    learnt(*[(10, 9.5, 9.6)] * 20, habit=long)
-    assert long.look_ns == LOOK_NS
 
 
 def test_the_alarm_that_rings_for_the_end_is_not_set_anew():
