@@ -260,8 +260,8 @@ def test_a_joined_run_is_rescheduled(tmp_path: Path) -> None:
 TWO = """
 mddag: 1
 nodes:
-  - {node: /a, callbacks: [{name: t, timer: 10ms, deadline: 8ms}]}
-  - {node: /b, callbacks: [{name: t, timer: 10ms, deadline: 8ms}]}
+  - {node: /a, callbacks: [{name: t, timer: 12ms, deadline: 8ms}]}
+  - {node: /b, callbacks: [{name: t, timer: 12ms, deadline: 8ms}]}
 """
 
 
@@ -272,8 +272,8 @@ def two(tmp_path: Path) -> list[str]:
     for dag, name in enumerate(('up', 'down')):
         trace = Trace(tmp_path, name, 0, dag=dag, graph=TWO)
         for i in range(9):
-            trace.runs(i * 10 * MS, i * 10 * MS, 5 * MS)
-        paths.append(trace.end(100 * MS))
+            trace.runs(i * 12 * MS, i * 12 * MS, 5 * MS)
+        paths.append(trace.end(120 * MS))
     return paths
 
 
@@ -341,8 +341,8 @@ def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, mddag: Any) 
     trace = Trace(tmp_path, 'whole', 0, graph=TWO)
     for i in range(9):
         for trace.dag in range(2):
-            trace.runs(i * 10 * MS, i * 10 * MS + trace.dag * 5 * MS, 5 * MS,
-                       ready=i * 10 * MS)
+            trace.runs(i * 12 * MS, i * 12 * MS + trace.dag * 5 * MS, 5 * MS,
+                       ready=i * 12 * MS)
             trace.job -= not trace.dag
     path = trace.end(100 * MS)
     assert ' 0 late' not in mddag('replay', path, '--reschedule').stdout
