@@ -44,7 +44,7 @@ def install() -> None:
     call = Client.call
 
     def publish(self: Any, msg: Any) -> None:
-        state: PublisherState = self.__dict__.get(_STATE) or publisher_state(self)
+        state = publisher_state(self)
         with state.lock:
             state.count += 1
             begin = time_ns()

@@ -10,7 +10,7 @@ records, in the order in which it does: what a thread ran only when it has run.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from pathlib import Path
@@ -118,6 +118,19 @@ def legs_to(task_set: TaskSet, tables: Tables) -> dict[int, list[tuple[int, int]
                     if before == vertex.index:
                         targets.append((first + after, leg))
     return found
+
+
+def add_execution(
+    file: TraceFile, start: int, end: int, dag: int, vertex: int, job: int, worker: int = 0, *,
+    ready: int | None = None, vpid: int = 1, thread: int = 10, address: int = 9,
+    computed: Sequence[Any] = (),
+) -> None:
+    """Record an execution that completes its vertex; without `ready` it has not waited."""
+    file.add('dispatch', start, vpid, thread, address, dag, vertex, job, worker,
+             start if ready is None else ready, 0)
+    file.add('callback_start', start, vpid, thread, address, False)
+    file.add('callback_end', end, vpid, thread, address)
+    file.add('complete', end, vpid, thread, address, dag, vertex, job, True, end, 0, *computed)
 
 
 @dataclass

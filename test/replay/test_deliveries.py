@@ -18,7 +18,7 @@ from mddag_executor.trace import TraceFile
 from msg_graph import loads
 import pytest
 
-from .helpers import Chances, MS, SMALL, START_TIME, VirtualRun
+from .helpers import add_execution, Chances, MS, SMALL, START_TIME, VirtualRun
 
 CHAIN = """\
 mddag: 1
@@ -130,11 +130,8 @@ nodes:
                 start = ready + wake
                 end = start + 5 * MS
                 worker = vertex % 2
-                file.add('dispatch', start, 1, 10 + worker, 9 + vertex, 0, vertex, job, worker,
-                         ready, 0)
-                file.add('callback_start', start, 1, 10 + worker, 9 + vertex, False)
-                file.add('callback_end', end, 1, 10 + worker, 9 + vertex)
-                file.add('complete', end, 1, 10 + worker, 9 + vertex, 0, vertex, job, True, end, 0)
+                add_execution(file, start, end, 0, vertex, job, worker, ready=ready,
+                              thread=10 + worker, address=9 + vertex)
                 ready = end + delay - ready_early
         file.add('shutdown', START_TIME + 300 * MS, 1, 1, START_TIME + 300 * MS)
 
@@ -184,10 +181,7 @@ nodes:
         for dag, start, end in ((0, 9000, 5 * MS), (1, 5 * MS + 2000, 8 * MS)):
             ready = START_TIME + (9000 if dag == 0 else 1000)
             start, end = START_TIME + start, START_TIME + end
-            file.add('dispatch', start, 1, 10, 9 + dag, dag, 0, 0, 0, ready, 0)
-            file.add('callback_start', start, 1, 10, 9 + dag, False)
-            file.add('callback_end', end, 1, 10, 9 + dag)
-            file.add('complete', end, 1, 10, 9 + dag, dag, 0, 0, True, end, 0)
+            add_execution(file, start, end, dag, 0, 0, ready=ready, address=9 + dag)
         file.add('shutdown', START_TIME + 50 * MS, 1, 1, START_TIME + 50 * MS)
     outcome = reschedule(path)
     assert [(time - START_TIME, kind, vertex) for time, kind, _, _, vertex, _ in outcome.log] == [
@@ -221,12 +215,8 @@ nodes:
                 worker = dag + vertex
                 if due >= 0:
                     file.add('job_release', ready, 1, 1, dag, job, release)
-                file.add('dispatch', ready, 1, 10 + worker, 9 + worker, dag, vertex, job, worker,
-                         ready, 0)
-                file.add('callback_start', ready, 1, 10 + worker, 9 + worker, False)
-                file.add('callback_end', ready + took, 1, 10 + worker, 9 + worker)
-                file.add('complete', ready + took, 1, 10 + worker, 9 + worker, dag, vertex, job,
-                         True, ready + took, 0)
+                add_execution(file, ready, ready + took, dag, vertex, job, worker,
+                              thread=10 + worker, address=9 + worker)
         file.add('shutdown', START_TIME + 2000 * MS, 1, 1, START_TIME + 2000 * MS)
     for workers, expected in ((3, 2 * MS), (2, 2 * MS), (1, 0)):
         load = reschedule(path, workers=workers).work.load

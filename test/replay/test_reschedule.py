@@ -24,7 +24,16 @@ from mddag_executor.trace import TraceFile
 from msg_graph import loads, TaskSet
 import pytest
 
-from .helpers import Chances, declarations, MS, small, START_TIME, VirtualRun, VPID
+from .helpers import (
+    add_execution,
+    Chances,
+    declarations,
+    MS,
+    small,
+    START_TIME,
+    VirtualRun,
+    VPID,
+)
 from .simulated import executions, loose, write_simulated
 
 JOBS = 12
@@ -255,10 +264,7 @@ nodes:
             file.add('job_release', START_TIME + 30 * MS, VPID, 1, dag, 0, START_TIME)
         for dag in (0, 1):
             start, end = START_TIME + 30 * MS, START_TIME + 33 * MS
-            file.add('dispatch', start, VPID, dag, 9, dag, 0, 0, dag, start, 0)
-            file.add('callback_start', start, VPID, dag, 9, False)
-            file.add('callback_end', end, VPID, dag, 9)
-            file.add('complete', end, VPID, dag, 9, dag, 0, 0, True, end, 0)
+            add_execution(file, start, end, dag, 0, 0, dag, vpid=VPID, thread=dag)
         file.add('shutdown', START_TIME + 90 * MS, VPID, 1, START_TIME + 90 * MS)
     assert starts(reschedule(path).log) == [(30, 0, 0, 0), (30, 1, 1, 0)]
     outcome = reschedule(path, overheads=False)
@@ -278,10 +284,7 @@ def test_what_was_not_recorded_takes_the_median_then_the_declared_mean(tmp_path:
             file.add('job_release', release, VPID, 1, 1, job, release)
             if took:
                 end = release + took * MS
-                file.add('dispatch', release, VPID, 8, 9, 1, 0, job, 0, release, 0)
-                file.add('callback_start', release, VPID, 8, 9, False)
-                file.add('callback_end', end, VPID, 8, 9)
-                file.add('complete', end, VPID, 8, 9, 1, 0, job, True, end, 0)
+                add_execution(file, release, end, 1, 0, job, vpid=VPID, thread=8)
         file.add('job_release', START_TIME + 40 * MS, VPID, 1, 0, 0, START_TIME + 40 * MS)
         file.add('shutdown', START_TIME + 60 * MS, VPID, 1, START_TIME + 60 * MS)
     outcome = reschedule(path)
@@ -364,10 +367,7 @@ def test_jobs_are_called_as_in_the_recording(tmp_path: Path) -> None:
             file.add('job_release', START_TIME + job % 8 * MS, VPID, 1, 1, job,
                      START_TIME + job % 8 * MS)
         start, end = START_TIME + 8 * MS, START_TIME + 14 * MS
-        file.add('dispatch', start, VPID, 8, 9, 1, 0, 2**40 + 7, 0, start, 0)
-        file.add('callback_start', start, VPID, 8, 9, False)
-        file.add('callback_end', end, VPID, 8, 9)
-        file.add('complete', end, VPID, 8, 9, 1, 0, 2**40 + 7, True, end, 0)
+        add_execution(file, start, end, 1, 0, 2**40 + 7, vpid=VPID, thread=8)
         file.add('shutdown', START_TIME + 60 * MS, VPID, 1, START_TIME + 60 * MS)
     outcome = reschedule(path)
     assert outcome.result()['first_miss']['job'] == 2**40
@@ -435,10 +435,7 @@ def test_what_a_timer_skipped_is_skipped_again(tmp_path: Path) -> None:
             if job == 1:
                 file.add('expire', now, 1, 1, 0, job)
                 continue
-            file.add('dispatch', now, 1, 10, 9, 0, 0, job, 0, now, 0)
-            file.add('callback_start', now, 1, 10, 9, False)
-            file.add('callback_end', now + MS, 1, 10, 9)
-            file.add('complete', now + MS, 1, 10, 9, 0, 0, job, True, now + MS, 0)
+            add_execution(file, now, now + MS, 0, 0, job)
         file.add('shutdown', START_TIME + 60 * MS, 1, 1, START_TIME + 60 * MS)
     result = reschedule(path, workers=4).result()
     sink = result['dags']['a']['sinks']['/n:a']
@@ -469,11 +466,8 @@ def of_python(path: Path, jobs: list[tuple[int, int, int, int, bool]], cpus: int
             file.add('job_release', now, 1, 1, dag, job, now)
         for end, dag, job, start, cpu, held in ends:
             now, end = START_TIME + start * MS, START_TIME + end * MS
-            file.add('dispatch', now, 1, 10 + dag, 9 + dag, dag, 0, job, dag, now, 0)
-            file.add('callback_start', now, 1, 10 + dag, 9 + dag, False)
-            file.add('callback_end', end, 1, 10 + dag, 9 + dag)
-            file.add('complete', end, 1, 10 + dag, 9 + dag, dag, 0, job, True, end, 0, cpu * MS,
-                     held)
+            add_execution(file, now, end, dag, 0, job, dag, thread=10 + dag, address=9 + dag,
+                          computed=(cpu * MS, held))
         file.add('shutdown', START_TIME + 200 * MS, 1, 1, START_TIME + 200 * MS)
 
 

@@ -30,6 +30,8 @@ from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
+from .helpers import add_execution
+
 MS = 1_000_000
 GRAPH = """\
 mddag: 1
@@ -122,10 +124,7 @@ def trace(tmp_path: Path) -> Path:
             release = (job + 1) * 10 * MS
             end = release + (9 if job in (2, 3) else 1) * MS
             file.add('job_release', release, 1, 1, 0, job, release)
-            file.add('dispatch', release, 1, 5, 7, 0, 0, job, 0, release, 0)
-            file.add('callback_start', release, 1, 5, 7, False)
-            file.add('callback_end', end, 1, 5, 7)
-            file.add('complete', end, 1, 5, 7, 0, 0, job, True, end, 0)
+            add_execution(file, release, end, 0, 0, job, thread=5, address=7)
             if job in (2, 3):
                 file.add('deadline', end, 1, 5, 0, 0, job, release + 8 * MS, end)
         file.add('shutdown', 200 * MS, 1, 1, 200 * MS)

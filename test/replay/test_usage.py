@@ -15,7 +15,7 @@ from mddag_executor.replay.usage import GroupWaits, PoolUse
 from mddag_executor.trace import TraceFile
 import numpy as np
 
-from .helpers import MS, START_TIME
+from .helpers import add_execution, MS, START_TIME
 
 STEP = PoolUse.FIRST_STEP_NS
 SPANS = st.lists(st.tuples(st.integers(0, 10 ** 13), st.integers(0, 10 ** 11)), max_size=30)
@@ -80,11 +80,8 @@ def test_what_computed_and_held_the_interpreter(tmp_path: Path) -> None:
             start = START_TIME + job * 100 * MS
             end = start + busy * MS
             file.add('job_release', start, 1, 1, 0, job, start)
-            file.add('dispatch', start, 1, 10, 9, 0, 0, job, 0, start, 0)
-            file.add('callback_start', start, 1, 10, 9, False)
-            file.add('callback_end', end, 1, 10, 9)
-            file.add('complete', end, 1, 10, 9, 0, 0, job, True, end, 0,
-                     *(() if cpu is None else (cpu * MS, held)))
+            add_execution(file, start, end, 0, 0, job,
+                          computed=() if cpu is None else (cpu * MS, held))
     use = replay(path).result()['callbacks']['/n:a']
     assert (use['executions'], use['measured'], use['measured_busy_ns']) == (3, 2, 6 * MS)
     assert (use['cpu_ns'], use['held_interpreter']) == (3 * MS, 1)
