@@ -30,12 +30,7 @@ from mddag_executor.errors import MddagError
 from mddag_executor.live.bench.spec import Spec
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.live_runs import summary
-from mddag_executor.report.tables import (
-    each_sink,
-    percent,
-    response_cells,
-    sink_table,
-)
+from mddag_executor.report.tables import each_sink, percent, response_cells, sink_table
 from mddag_executor.resources import find
 from mddag_executor.text import counted
 
@@ -108,7 +103,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _introduction(args: argparse.Namespace, graph: Path) -> Iterator[str]:
-    from mddag_executor.live.execution import ExecutionPlan
+    from mddag_executor.live.measure import ExecutionPlan
     from msg_graph import load
     task_set = load(graph)
     plan = ExecutionPlan(task_set, args.seed, args.utilisation, WORKERS)

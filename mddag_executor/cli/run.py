@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 import os
 from pathlib import Path
@@ -40,10 +40,9 @@ from mddag_executor.report.text import listed
 from msg_graph import loads
 
 if TYPE_CHECKING:
-    from mddag_executor.live.execution import ExecutionPlan
     from mddag_executor.live.executor import MultiDeadlineExecutor
     from mddag_executor.live.loading import Program
-    from mddag_executor.live.measure import Books
+    from mddag_executor.live.measure import ExecutionPlan, Ledger
     from mddag_executor.live.session import Session
     from mddag_executor.live.supervisor import Supervisor
     from msg_graph import TaskSet
@@ -172,7 +171,7 @@ def run_here(
     plan = None
     programs: list[Program] = []
     if args.synthetic is not None:
-        from mddag_executor.live.execution import ExecutionPlan
+        from mddag_executor.live.measure import ExecutionPlan
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
     else:
         from mddag_executor.live.loading import resolve, ros_arguments
@@ -281,8 +280,8 @@ def _run(
     ends: Callable[[], None],
 ) -> tuple[dict[str, Any], BaseException | None, dict[str, Any]]:
     """Run until the end; see ``run_here``."""
-    from mddag_executor.live.parts import plain
-    from mddag_executor.live.session import measured, Session
+    from mddag_executor.live.measure import measure
+    from mddag_executor.live.session import Session
     from mddag_executor.live.watch import Watch
 
     def end_begins() -> None:
@@ -293,33 +292,32 @@ def _run(
     session = Session(executor, on_end=end_begins)
     watch = Watch(executor, task_set)
     seconds = None if args.duration is None else args.duration / 1e9
-    books: Books | None = None
+    ledger: Ledger | None = None
     signals.end_of(session)
     with Progress('running', seconds) as progress:
         if plan is not None:
             if args.part is None:
                 warn_of(plan, args.ros_args)
-            books = _run_synthetic(args, session, task_set, plan, seconds, progress)
+            ledger = _run_synthetic(args, session, task_set, plan, seconds, progress)
         else:
             _run_programs(args, task_set, session, executor, programs, seconds, progress)
     result = {
         'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
         **executor.statistics(),
-        'measured': None if books is None or plan is None else measured(books, plan)}
+        'measured': None if ledger is None or plan is None else measure(ledger, plan)}
     result['drift'] = [each.result() for each in watch.drift(result)]
     if not session.clean:
         warn('a callback has not ended in time; it is left behind')
     rest = {} if args.part is None else {
-        'observed': plain(watch.observed(result)), 'books': books and books.plain()}
+        'observed': asdict(watch.observed(result)), 'ledger': ledger and vars(ledger)}
     return result, session.error, rest
 
 
 def _run_synthetic(
     args: argparse.Namespace, session: Session, task_set: TaskSet, plan: ExecutionPlan,
     seconds: float | None, progress: Progress,
-) -> Books | None:
+) -> Ledger | None:
     from mddag_executor.live import current_job
-    from mddag_executor.live.session import run_and_note
     from mddag_executor.live.synthetic import SyntheticWorkload
     workload = SyntheticWorkload(
         task_set, plan, current_job=current_job, process=args.process)
@@ -327,8 +325,9 @@ def _run_synthetic(
         session.executor.add_node(node)
     try:
         with session:
-            return run_and_note(
-                session, workload, seconds, progress.update, begin=_begin(args, task_set))
+            measured = workload.run(
+                session, seconds, progress.update, begin=_begin(args, task_set))
+            return workload.ledger if measured else None
     finally:
         workload.destroy()
 

@@ -57,8 +57,8 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     :raises msg_graph.GraphError: when the declaration is wrong
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
-    from mddag_executor.live.execution import ExecutionPlan
     from mddag_executor.live.loading import ros_arguments
+    from mddag_executor.live.measure import ExecutionPlan
     from mddag_executor.live.parts import left, Part, together
     from mddag_executor.live.supervisor import Run, Supervisor
     plan = None

@@ -1,10 +1,16 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Measure any executor by what its callbacks did.
+A run of synthetic nodes: how long their callbacks execute, and the figures from what they noted.
 
 Theory of operation
 -------------------
+As in the paper's experiment, each vertex gets **one** execution time for the whole run, drawn from
+its declared quantiles.  Then all of them are scaled by one factor so that the normalised
+utilisation, sum(C / T) / workers, is what was asked for.  One such draw is one point of the
+experiment: whether its deadlines can be met at all depends on the draw
+(``ExecutionPlan.infeasible``), so a figure measured with one seed speaks for that seed.
+
 The nodes themselves write the ledger, so any executor can be measured with the same yardstick,
 and an executor cannot embellish its figures: each body appends how long it took, each sink
 appends (release, completion).  Appending to a list is one indivisible step in CPython, so no lock
@@ -13,7 +19,7 @@ is taken in a callback.
 *Due* are the nominal releases (first release plus k periods) whose deadline lies inside the
 measured window, whether or not the executor ever noticed them.  Of these a sink is *on time* when
 it completed by its deadline, *late* when it completed after it, and *missing* when it has not
-completed when the books are closed.  A release that an executor skipped, a message that got lost
+completed when the ledger is closed.  A release that an executor skipped, a message that got lost
 and a job that still waits are all missing.  What was not yet due at the window's end is not
 counted either way.
 
@@ -26,44 +32,129 @@ that do not complete the join are not counted as callbacks: their cost is overhe
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+import math
+import random
 import time
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.core.tally import quantiles_us, SinkTally
-from mddag_executor.live.execution import ExecutionPlan
+from mddag_executor.errors import MddagError
+from mddag_executor.simulate.workload import draw_execution_times
+from mddag_executor.simulate.workload import utilisation as normalised
 from msg_graph import Dag, TaskSet, Vertex
+from msg_graph.analysis import path_lengths
+
+Body = Literal['sleep', 'spin', 'native']
+Mode = Literal[Body, 'mixed']
+BODIES: tuple[Body, ...] = ('sleep', 'spin', 'native')
 
 _EARLY_NS = 1_000_000
 """How much before its nominal time a release may be noted: clocks are read twice (ns)."""
 
 
-@dataclass(frozen=True)
-class Reading:
+class PlanError(MddagError):
+    """An execution plan that cannot be made from this declaration."""
+
+
+class Infeasible(NamedTuple):
+    """A sink whose critical path, its own time included, is longer than its deadline."""
+
+    vertex: str
+    critical_path_ns: int
+    deadline_ns: int
+
+
+class ExecutionPlan:
+    """
+    The execution time of each vertex for one run.
+
+    :param task_set: the declared DAG tasks.
+    :param seed: the same seed gives the same draw, on every machine and Python version.
+    :param utilisation: normalised utilisation to scale to; None takes the draw as it is.
+    :param workers: the number of workers that the utilisation is normalised to.
+    :param mode: what executions do: one of ``BODIES``, or ``mixed``, which draws it for each
+        callback.
+    :raises PlanError: when a utilisation is asked for and no execution time is declared.
+    """
+
+    def __init__(
+        self,
+        task_set: TaskSet,
+        seed: int = 0,
+        utilisation: float | None = None,
+        workers: int = 7,
+        mode: Mode = 'sleep',
+    ) -> None:
+        self.seed = seed
+        self.workers = workers
+        self.mode: Mode = mode
+        self.task_set = task_set
+        drawn = draw_execution_times(task_set, seed, undeclared=0)
+        self.factor = 1.0
+        if utilisation is not None:
+            if not (utilisation > 0 and math.isfinite(utilisation)):
+                raise PlanError(
+                    f'utilisation {utilisation}: this is no number above zero: give one as 0.6')
+            before = normalised(task_set, drawn, workers)
+            if before == 0:
+                raise PlanError(
+                    f'{task_set.file}: no callback has an execution time, so there is nothing to '
+                    'scale: declare execution_time, or leave the utilisation out')
+            self.factor = utilisation / before
+        self._times = [[round(c * self.factor) for c in dag] for dag in drawn]
+
+    @property
+    def utilisation(self) -> float:
+        """Return the normalised utilisation that results: sum(C / T) / workers."""
+        return normalised(self.task_set, self._times, self.workers)
+
+    def execution_ns(self, dag: int, vertex: int) -> int:
+        """Return the execution time of a vertex, by DAG index and local index, ns."""
+        return self._times[dag][vertex]
+
+    def body(self, vertex: Vertex) -> Body:
+        """Return what the execution of a vertex does."""
+        if self.mode == 'mixed':
+            return random.Random(f'{self.seed} {vertex.callback.key}').choice(BODIES)
+        return self.mode
+
+    def infeasible(self) -> list[Infeasible]:
+        """Return the sinks that no scheduler can serve in time."""
+        found = []
+        for dag in self.task_set.dags:
+            ends = path_lengths(dag, self._times[dag.index])
+            for vertex in (dag.vertices[sink] for sink in dag.sinks):
+                deadline = vertex.deadline_ns
+                if deadline is not None and ends[vertex.index] > deadline:
+                    found.append(Infeasible(vertex.name, ends[vertex.index], deadline))
+        return found
+
+
+class Reading(NamedTuple):
     """What is counted at one instant: ns since the epoch, CPU of the process (ns), bodies run."""
 
     at_ns: int
     cpu_ns: int
-    bodies: tuple[int, ...]
+    bodies: Sequence[int]
 
 
 class Ledger:
     """
-    Books about one run of synthetic nodes.
+    What is noted of one run of synthetic nodes; as JSON, its ``vars`` are for ``of_processes``.
 
     ``durations[dag][vertex]`` takes how long each body took (ns), ``completions[dag][vertex]`` of
     a sink (release, completion) in ns since the epoch, ``delays[dag]`` by how much the source's
     body started after its release.  ``misattributed`` takes (vertex name, release by the message,
     release by the executor) where these differ, ``unattributed`` the names of vertices that ran as
-    no job.
+    no job, ``dropped_joins`` those of joins that were given up.
 
     :param keep: how much of each to keep, the last; None: all.
+    :ivar window: the readings between which the run is measured.
     """
 
     def __init__(self, task_set: TaskSet, keep: int | None = None) -> None:
-        self.task_set = task_set
         self.durations: list[list[deque[int]]] = [
             [deque(maxlen=keep) for _ in d.vertices] for d in task_set.dags]
         self.completions: list[list[deque[tuple[int, int]]]] = [
@@ -71,7 +162,10 @@ class Ledger:
         self.delays: list[deque[int]] = [deque(maxlen=keep) for _ in task_set.dags]
         self.misattributed: deque[tuple[str, int, int]] = deque(maxlen=keep)
         self.unattributed: deque[str] = deque(maxlen=keep)
+        self.dropped_joins: deque[str] = deque(maxlen=keep)
         self.first_release: list[int | None] = [None for _ in task_set.dags]
+        self.window = Reading(0, 0, ()), Reading(0, 0, ())
+        self.warm_up_ns = 0
         self.clock_offset_ns = epoch_offset_ns()
         #: Executions up to this long were emulated busily, longer ones by sleep.
         self.busy_below_ns = 0
@@ -83,99 +177,77 @@ class Ledger:
         return Reading(
             at_ns=time.monotonic_ns() + self.clock_offset_ns,
             cpu_ns=time.process_time_ns(),
-            bodies=tuple(len(vertex) for dag in self.durations for vertex in dag))
-
-
-@dataclass(frozen=True)
-class Books:
-    """The ledger of a run, the readings between which it is measured, the joins given up."""
-
-    ledger: Ledger
-    start: Reading
-    end: Reading
-    evicted_joins: int = 0
-
-    def plain(self) -> dict[str, Any]:
-        """Return what ``add`` takes of another process, as JSON has it."""
-        return {
-            **{name: [[list(vertex) for vertex in dag] for dag in getattr(self.ledger, name)]
-               for name in ('durations', 'completions')},
-            **{name: list(getattr(self.ledger, name))
-               for name in ('misattributed', 'unattributed', 'first_release')},
-            'delays': [list(delays) for delays in self.ledger.delays],
-            'busy_below_ns': self.ledger.busy_below_ns, 'evicted_joins': self.evicted_joins,
-            'start': asdict(self.start), 'end': asdict(self.end)}
+            bodies=[len(vertex) for dag in self.durations for vertex in dag])
 
     @classmethod
-    def of_processes(cls, task_set: TaskSet, parts: Sequence[dict[str, Any]]) -> Books:
+    def of_processes(cls, task_set: TaskSet, parts: Sequence[dict[str, Any]]) -> Ledger:
         """
-        Return the books of a run from those of its processes (``plain``), of one at least.
+        Return the ledger of a run from those of its processes, of one at least.
 
         The window is that in which all of them measured; what each counted in its own, which is
         hardly another one, counts for its part of that.
         """
-        ledger = Ledger(task_set)
+        whole = cls(task_set)
         for part in parts:
-            for name in ('durations', 'completions'):
-                for dag, vertices in zip(getattr(ledger, name), part[name]):
-                    for vertex, entries in zip(dag, vertices):
-                        vertex.extend(entries)
-            for delays, more in zip(ledger.delays, part['delays']):
-                delays.extend(more)
-            ledger.misattributed.extend(part['misattributed'])
-            ledger.unattributed.extend(part['unattributed'])
-            ledger.busy_below_ns = max(ledger.busy_below_ns, part['busy_below_ns'])
             for dag, first in enumerate(part['first_release']):
                 if first is not None:
-                    ledger.first_release[dag] = first
-        begin = max(part['start']['at_ns'] for part in parts)
-        until = max(begin, min(part['end']['at_ns'] for part in parts))
+                    whole.first_release[dag] = first
+                whole.delays[dag].extend(part['delays'][dag])
+                for name in ('durations', 'completions'):
+                    for vertex, entries in zip(getattr(whole, name)[dag], part[name][dag]):
+                        vertex.extend(entries)
+            for name in ('misattributed', 'unattributed', 'dropped_joins'):
+                getattr(whole, name).extend(part[name])
+            for name in ('busy_below_ns', 'warm_up_ns'):
+                setattr(whole, name, max(getattr(whole, name), part[name]))
+        windows = [[Reading(*each) for each in part['window']] for part in parts]
+        begin = max(start.at_ns for start, _ in windows)
+        until = max(begin, min(end.at_ns for _, end in windows))
         cpu = 0
         bodies = [0] * len(task_set.vertices)
-        for part in parts:
-            first, last = Reading(**part['start']), Reading(**part['end'])
-            share = (until - begin) / max(1, last.at_ns - first.at_ns)
-            cpu += round((last.cpu_ns - first.cpu_ns) * share)
-            for i, (before, after) in enumerate(zip(first.bodies, last.bodies)):
+        for start, end in windows:
+            share = (until - begin) / max(1, end.at_ns - start.at_ns)
+            cpu += round((end.cpu_ns - start.cpu_ns) * share)
+            for i, (before, after) in enumerate(zip(start.bodies, end.bodies)):
                 bodies[i] += round((after - before) * share)
-        return cls(ledger, Reading(begin, 0, (0,) * len(bodies)),
-                   Reading(until, cpu, tuple(bodies)),
-                   sum(part['evicted_joins'] for part in parts))
+        whole.window = Reading(begin, 0, [0] * len(bodies)), Reading(until, cpu, bodies)
+        return whole
 
 
-def measure(
-    ledger: Ledger, plan: ExecutionPlan, start: Reading, end: Reading
-) -> dict[str, Any]:
+def measure(ledger: Ledger, plan: ExecutionPlan) -> dict[str, Any]:
     """
-    Judge what came due between two readings.
+    Judge what came due in the window.
 
     :return: the figures of ``bench live --json`` (``sink_jobs_due``, ``on_time``, …,
         ``cpu_us_per_callback``), the window, and for each DAG and sink due, on_time, late,
         missing and the response times (completion minus nominal release, ns) of the completed.
     """
-    dags: dict[str, Any] = {}
-    totals = dict.fromkeys(('due', 'on_time', 'late', 'missing'), 0)
-    for dag in ledger.task_set.dags:
-        sinks = {}
-        for index in dag.sinks:
-            sink = _judge(ledger, dag, dag.vertices[index], start.at_ns, end.at_ns)
-            sinks[dag.vertices[index].name] = sink
-            for name in totals:
-                totals[name] += sink[name]
-        dags[dag.name] = {'sinks': sinks}
-    due = totals['due']
+    start, end = ledger.window
+    dags = {dag.name: {'sinks': {
+        vertex.name: _judge(ledger, dag, vertex, start.at_ns, end.at_ns)
+        for vertex in (dag.vertices[sink] for sink in dag.sinks)}} for dag in plan.task_set.dags}
+    sums = totals(sink for dag in dags.values() for sink in dag['sinks'].values())
+    due = sums['sink_jobs_due']
     return {
         'mode': plan.mode, 'seed': plan.seed, 'workers': plan.workers,
         'utilisation': plan.utilisation, 'utilisation_taken': _taken(ledger, plan),
         'window_start_ns': start.at_ns, 'window_ns': end.at_ns - start.at_ns,
-        'sink_jobs_due': due, 'on_time': totals['on_time'], 'late': totals['late'],
-        'missing': totals['missing'],
-        'on_time_ratio': totals['on_time'] / due if due else None,
+        'warm_up_ns': ledger.warm_up_ns, **sums,
+        'on_time_ratio': sums['on_time'] / due if due else None,
         **_throughput(ledger, plan, start, end),
         'source_delay_us': quantiles_us([d for delays in ledger.delays for d in list(delays)]),
         'attribution': {
             'wrong': len(ledger.misattributed), 'none': len(ledger.unattributed)},
-        'dags': dags}
+        'incomplete_joins_dropped': len(ledger.dropped_joins), 'dags': dags}
+
+
+def totals(sinks: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Return the sums of ``judge_sink``."""
+    sums = dict.fromkeys(('sink_jobs_due', 'on_time', 'late', 'missing'), 0)
+    for sink in sinks:
+        for name in sums:
+            sums[name] += sink['due' if name == 'sink_jobs_due' else name]
+    return sums
 
 
 def _judge(ledger: Ledger, dag: Dag, vertex: Vertex, start: int, end: int) -> dict[str, Any]:
@@ -219,8 +291,8 @@ def _throughput(
     callbacks = sum(counts)
     cpu = end.cpu_ns - start.cpu_ns
     # CPU that the emulation itself takes is execution, not overhead.
-    times = [plan.execution_ns(v.dag, v.index) for v in ledger.task_set.vertices]
-    bodies = [plan.body(v) for v in ledger.task_set.vertices]
+    times = [plan.execution_ns(v.dag, v.index) for v in plan.task_set.vertices]
+    bodies = [plan.body(v) for v in plan.task_set.vertices]
     cpu -= sum(n * t for v, (n, t) in enumerate(zip(counts, times))
                if bodies[v] != 'sleep' or t <= ledger.busy_below_ns)
     seconds = (end.at_ns - start.at_ns) / 1e9
@@ -237,9 +309,9 @@ def _taken(ledger: Ledger, plan: ExecutionPlan) -> float:
     What never ran counts with its planned time, so a starving executor looks no better.
     """
     total = 0.0
-    for vertex in ledger.task_set.vertices:
+    for vertex in plan.task_set.vertices:
         durations = ledger.durations[vertex.dag][vertex.index]
         mean = sum(durations) / len(durations) if durations else plan.execution_ns(
             vertex.dag, vertex.index)
-        total += mean / ledger.task_set.dags[vertex.dag].period_ns
+        total += mean / plan.task_set.dags[vertex.dag].period_ns
     return total / plan.workers

@@ -21,7 +21,7 @@ these times.  However long another process takes for that, it is waited for; but
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 import json
 import os
 from pathlib import Path
@@ -30,9 +30,8 @@ from typing import Any
 
 from mddag_executor.core.tally import of_processes
 from mddag_executor.live.entity import COUNTS
-from mddag_executor.live.execution import ExecutionPlan
-from mddag_executor.live.measure import Books
-from mddag_executor.live.session import MATCH_TIMEOUT_S, measured, Session
+from mddag_executor.live.measure import ExecutionPlan, Ledger, measure
+from mddag_executor.live.session import MATCH_TIMEOUT_S, Session
 from msg_graph import TaskSet
 from msg_graph.binding import Entity
 from msg_graph.drift import drift, Observed, Releases
@@ -70,7 +69,7 @@ class Part:
         """Leave what came of this process."""
         path = self.folder / f'{os.getpid()}.json'
         part = path.with_suffix('.part')
-        part.write_text(json.dumps(result))
+        part.write_text(json.dumps(result, default=list))
         part.replace(path)
 
     @staticmethod
@@ -127,14 +126,6 @@ def left(folder: str, pid: int) -> Any:
         return None
 
 
-def plain(observed: Observed) -> dict[str, Any]:
-    """Return what was observed as JSON has it."""
-    return {
-        **asdict(observed), 'nodes': sorted(observed.nodes or ()),
-        'publishes': {key: sorted(topics) for key, topics in observed.publishes.items()},
-        'undeclared': [list(entity) for entity in observed.undeclared]}
-
-
 def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) -> dict[str, Any]:
     """
     Return the result of a run from those of its processes.
@@ -143,7 +134,7 @@ def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) ->
     """
     parts = [result for _, result in results]
     callbacks = _callbacks(parts)
-    books = [part['books'] for part in parts if part['books'] is not None]
+    ledgers = [part['ledger'] for part in parts if part['ledger'] is not None]
     every = {process.name for process in task_set.processes}
     return {
         **of_processes(task_set, results),
@@ -161,8 +152,8 @@ def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) ->
                       if not callbacks.get(c.key, {'ran': 0})['ran']],
         # only what all of them measured has a window
         'measured': None if plan is None or {
-            name for name, part in results if part['books'] is not None} != every else measured(
-                Books.of_processes(task_set, books), plan),
+            name for name, part in results if part['ledger'] is not None} != every else measure(
+                Ledger.of_processes(task_set, ledgers), plan),
         'drift': [each.result() for each in drift(task_set, _observed(task_set, results))]}
 
 

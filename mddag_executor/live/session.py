@@ -12,10 +12,6 @@ run (time, a signal, an exception of a callback, the end of the programs) calls 
 That notes the end and releases a lock on which ``wait`` sleeps.  No ``threading.Event``: a
 signal's handler runs in the thread that waits, between any two of its steps, also while that holds
 the event's inner lock, and ``set`` would then wait for that lock for ever.
-
-A synthetic run has these steps: wait until publishers and subscriptions have met, start all timers
-and sensors together, let ``WARM_UP_S`` pass, read the counters, wait for the measured window, read
-them again, stop the sensors, and shut the executor down.  Only then the figures are made.
 """
 
 from __future__ import annotations
@@ -24,16 +20,11 @@ from collections.abc import Callable
 import math
 import threading
 import time
-from typing import Any
 
 from mddag_executor.errors import MddagError
-from mddag_executor.live.execution import ExecutionPlan
-from mddag_executor.live.measure import Books, measure, Reading
-from mddag_executor.live.synthetic import SyntheticWorkload
 from mddag_executor.text import counted
 from rclpy.executors import Executor, ExternalShutdownException
 
-WARM_UP_S = 1.0
 END_TIMEOUT_S = 5.0
 HURRIED_END_TIMEOUT_S = 0.5
 MATCH_TIMEOUT_S = 30.0
@@ -165,41 +156,3 @@ class Session:
                 return
         self._thread.join(max(0.2, begin + self._patience_s - time.monotonic()))
         self.clean = not self._thread.is_alive()
-
-
-def measured(books: Books, plan: ExecutionPlan, warm_up_s: float = WARM_UP_S) -> dict[str, Any]:
-    """Return the figures of ``measure``, and those of the run."""
-    result = measure(books.ledger, plan, books.start, books.end)
-    result['warm_up_ns'] = round(warm_up_s * 1e9)
-    result['incomplete_joins_dropped'] = books.evicted_joins
-    return result
-
-
-def run_and_note(
-    session: Session, workload: SyntheticWorkload, duration_s: float | None,
-    tick: Tick | None = None, warm_up_s: float = WARM_UP_S,
-    begin: Callable[[Session, Callable[[], list[str]]], int | None] = Session.wait_until_matched,
-) -> Books | None:
-    """
-    Run a synthetic workload in a session that spins already, and end the session.
-
-    :param duration_s: length of the measured window, which begins ``warm_up_s`` after the timers;
-        None: until the session is stopped.
-    :param begin: waits until publishers and subscriptions have met, and for other processes.
-    :return: the books about it; None when the run was stopped before the window began.
-    :raises SessionError: when publishers and subscriptions do not find each other.
-    """
-    window: tuple[Reading, Reading] | None = None
-    try:
-        executors: Callable[[], list[str]] = getattr(session.executor, 'unmatched', list)
-        begin(session, lambda: workload.unmatched() + executors())
-        if not session.stopped:
-            workload.start(session.executor.wake)
-            if not session.wait(warm_up_s):
-                start = workload.ledger.reading()
-                session.wait(duration_s, tick)
-                window = start, workload.ledger.reading()
-    finally:
-        workload.stop()
-        session.end()
-    return None if window is None else Books(workload.ledger, *window, workload.evicted_joins)

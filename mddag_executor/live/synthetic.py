@@ -33,8 +33,14 @@ the paper; each declared group is a ``MutuallyExclusiveCallbackGroup`` of its no
 no services for parameters and types and no rosout publisher, so that a hundred of them start
 within a second.
 
+``sleep`` stands for work outside of Python (a GPU, a C++ library that releases the interpreter
+lock): it takes a worker but no CPU, so the CPU that the process does take is overhead.
+``spin`` takes CPU and the interpreter lock: all bodies together have at most one core.
+``native`` takes CPU without the lock, as numpy or OpenCV.
+
 All timers are started together, only when every publisher has met its subscribers, so that no
-release is lost to discovery; the DAGs' first releases are one period after that instant.
+release is lost to discovery; the DAGs' first releases are one period after that instant.  Then
+``WARM_UP_S`` pass before the measured window begins.
 """
 
 from __future__ import annotations
@@ -42,22 +48,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+import hashlib
+import statistics
 import threading
 import time
+from typing import Any
 
-from mddag_executor.live.bodies import (
-    CurrentJob,
-    Grid,
-    Join,
-    no_job,
-    plain_callback,
-    Role,
-    SENSOR,
-    stamped,
-    sync_callback,
-)
-from mddag_executor.live.execution import emulator, ExecutionPlan
-from mddag_executor.live.measure import Ledger
+from mddag_executor.live.measure import Body, ExecutionPlan, Ledger
+from mddag_executor.live.session import Session, Tick
 from msg_graph import Callback, TaskSet, Vertex
 from rcl_interfaces.srv import ListParameters
 from rclpy.callback_groups import (
@@ -78,6 +76,7 @@ from std_msgs.msg import Header
 QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=10)
 SENSORS_NODE = '/mddag_sensors'
+WARM_UP_S = 1.0
 _LEAD_NS = 20_000_000
 _CLOCKS_NS = 1_000_000
 """Well above what the clocks of two processes differ by, and below any period."""
@@ -94,6 +93,253 @@ def quiet_node(full_name: str, context: Context | None = None, **parameters: boo
             'start_type_description_service': False, **parameters}.items()])
 
 
+Emulate = Callable[[int], None]
+"""
+Executes for that many nanoseconds in the calling thread.
+
+A sleeper's attribute ``busy_below_ns`` says up to which execution time it takes CPU for it.
+"""
+
+
+def typical_oversleep_ns(samples: int = 100, asked_ns: int = 300_000) -> int:
+    """Measure by how much time.sleep() is late on this machine when it is idle: the median, ns."""
+    late = []
+    for _ in range(samples):
+        start = time.monotonic_ns()
+        time.sleep(asked_ns / 1e9)
+        late.append(time.monotonic_ns() - start - asked_ns)
+    return max(0, int(statistics.median(late)))
+
+
+def sleeper(oversleep_ns: int | None = None) -> Emulate:
+    """
+    Make a function that takes a worker for some time without taking CPU.
+
+    It asks time.sleep() for less by what this machine typically adds, so that the mean is right
+    when the machine isn't overloaded.  What is shorter than that (about 70 us under Linux, whose
+    timer slack is 50 us) is waited out busily.  When the machine is overloaded, executions get
+    longer: that is so for real callbacks too, and it is not hidden.
+
+    :param oversleep_ns: the typical oversleep; None measures it (30 ms).
+    """
+    typical = typical_oversleep_ns() if oversleep_ns is None else oversleep_ns
+    monotonic_ns, sleep = time.monotonic_ns, time.sleep
+
+    def emulate(execution_ns: int) -> None:
+        if execution_ns > typical:
+            sleep((execution_ns - typical) * 1e-9)
+            return
+        end = monotonic_ns() + execution_ns
+        while monotonic_ns() < end:
+            pass
+
+    emulate.busy_below_ns = typical  # type: ignore[attr-defined]
+    return emulate
+
+
+def spinner() -> Emulate:
+    """Make a function that takes that much CPU time of the calling thread."""
+    thread_time_ns = time.thread_time_ns
+
+    def emulate(execution_ns: int) -> None:
+        end = thread_time_ns() + execution_ns
+        while thread_time_ns() < end:
+            pass
+
+    return emulate
+
+
+def native() -> Emulate:
+    """
+    Make a function that takes about that much CPU time in C, without the interpreter lock.
+
+    How much C does in a time is measured first (some milliseconds), and then goes by what it did
+    lately: the speed of a virtual machine changes by a tenth.
+    """
+    def compute(iterations: int) -> None:
+        hashlib.pbkdf2_hmac('sha256', b'password', b'salt', iterations)
+
+    def taken(iterations: int) -> int:
+        before = time.thread_time_ns()
+        compute(iterations)
+        return time.thread_time_ns() - before
+
+    few, many = (min(taken(n) for _ in range(5)) for n in (1, 2000))
+    each = max(1, many - few) / 1999
+
+    def emulate(execution_ns: int) -> None:
+        nonlocal each
+        iterations = max(1, round((execution_ns - few) / each))
+        took = taken(iterations)
+        if iterations >= 500:
+            each += ((took - few) / iterations - each) / 16
+
+    return emulate
+
+
+def emulator(body: Body) -> Emulate:
+    """Return what executes a body."""
+    return sleeper() if body == 'sleep' else spinner() if body == 'spin' else native()
+
+
+JOIN_LIMIT = 64
+"""Incomplete joins that a sync vertex keeps; the oldest is dropped and counted."""
+
+SENSOR = '#sensor '
+"""What the ``frame_id`` of a stand-in sensor's message starts with; its topic follows."""
+
+CurrentJob = Callable[[], Any]
+"""Returns None, or what has the ``release_ns`` of the job that the calling thread runs."""
+
+
+def no_job() -> None:
+    """Stand for ``current_job`` under executors that know no jobs."""
+
+
+def stamped(release: int, sender: str = '') -> Header:
+    """Make a message that carries a release (ns since the epoch)."""
+    message = Header(frame_id=sender)
+    message.stamp.sec, message.stamp.nanosec = divmod(release, 1_000_000_000)
+    return message
+
+
+def release_of(message: Header) -> int:
+    """Return the release that a message carries, ns since the epoch."""
+    stamp = message.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+class Role:
+    """
+    A callback as one vertex: what it does for a message of that DAG.
+
+    :ivar senders: the ``frame_id`` of the messages that it waits for.
+    :ivar waiting: of a sync the incomplete joins: which messages have come, by release.
+    :param sender: the ``frame_id`` of the messages that it publishes.
+    """
+
+    def __init__(
+        self, vertex: Vertex, senders: list[str], sender: str, execution_ns: int,
+        publishers: list[Publisher], emulate: Emulate, ledger: Ledger,
+    ) -> None:
+        self.vertex = vertex
+        self.senders = senders
+        self.waiting: dict[int, set[str]] = {}
+        self._ledger = ledger
+        self._sender = sender
+        self._execution_ns = execution_ns
+        self._publishers = publishers
+        self._emulate = emulate
+        self._durations = ledger.durations[vertex.dag][vertex.index]
+        self._completions = ledger.completions[vertex.dag][vertex.index]
+        self._lock = threading.Lock()
+
+    def is_whole(self, release: int, sender: str) -> bool:
+        """Note a message of a sync; return whether it was the last one of its job."""
+        with self._lock:
+            seen = self.waiting.setdefault(release, set())
+            seen.add(sender)
+            if len(seen) == len(self.senders):
+                del self.waiting[release]
+                return True
+            if len(self.waiting) > JOIN_LIMIT:
+                del self.waiting[next(iter(self.waiting))]
+                self._ledger.dropped_joins.append(self.vertex.name)
+            return False
+
+    def execute(self, message: Header, release: int) -> None:
+        """Execute the body, publish, and note the completion of a sink."""
+        monotonic_ns = time.monotonic_ns
+        start = monotonic_ns()
+        self._emulate(self._execution_ns)
+        self._durations.append(monotonic_ns() - start)
+        message.frame_id = self._sender
+        for publisher in self._publishers:
+            publisher.publish(message)
+        if self.vertex.deadline_ns is not None:
+            self._completions.append((release, monotonic_ns() + self._ledger.clock_offset_ns))
+
+
+class Grid:
+    """
+    Nominal due times of a started timer, ns since the epoch.
+
+    ``release`` is to be called once in each call of the timer.
+    """
+
+    def __init__(self, timer: Timer, clock_offset_ns: int) -> None:
+        self._timer = timer
+        self._offset = clock_offset_ns
+        self._period = timer.timer_period_ns
+        self._lock = threading.Lock()
+        # Of several readings the one with the least time between the clocks is the best.
+        readings = []
+        for _ in range(3):
+            before = time.monotonic_ns()
+            left = timer.time_until_next_call()
+            after = time.monotonic_ns()
+            readings.append((after - before, (before + after) // 2 + left))
+        self._first = self._next = min(readings)[1]
+
+    @property
+    def first_release(self) -> int:
+        """Return the first due time."""
+        return int(self._first + self._offset)
+
+    def release(self) -> int:
+        """Return the due time that this call of the timer stands for."""
+        with self._lock:
+            release = self._next
+            left = self._timer.time_until_next_call()
+            if left is not None:  # else it was cancelled meanwhile
+                periods = round((time.monotonic_ns() + left - self._first) / self._period)
+                self._next = self._first + periods * self._period
+        return int(release + self._offset)
+
+
+def callback_of(
+    roles: list[Role], ledger: Ledger, current_job: CurrentJob
+) -> Callable[[Header], None]:
+    """
+    Make the callback of a subscription: the sender of a message says which vertex runs.
+
+    That of all legs of a sync executes the body in the last leg of a job.
+    """
+    by_sender = {sender: role for role in roles for sender in role.senders}
+    is_sync = bool(roles) and roles[0].vertex.callback.kind == 'sync'
+
+    def on_message(message: Header) -> None:
+        role = by_sender.get(message.frame_id)
+        if role is None:
+            return  # published by somebody outside of the declaration
+        release = release_of(message)
+        if is_sync and not role.is_whole(release, message.frame_id):
+            return
+        if current_job is not no_job:
+            release = attributed(role, release, ledger, current_job)
+            if not role.vertex.predecessors:
+                message = stamped(release)
+        role.execute(message, release)
+
+    return on_message
+
+
+def attributed(role: Role, release: int, ledger: Ledger, current_job: CurrentJob) -> int:
+    """
+    Compare the release that a message carries with the job that the executor runs it as.
+
+    :return: of a source the release that the executor says, otherwise the message's.
+    """
+    job = current_job()
+    if job is None:
+        ledger.unattributed.append(role.vertex.name)
+    elif not role.vertex.predecessors:
+        return int(job.release_ns)
+    elif abs(job.release_ns - release) > ledger.tolerance_ns:
+        ledger.misattributed.append((role.vertex.name, release, job.release_ns))
+    return release
+
+
 @dataclass
 class Sensor:
     """Stand-in for what starts DAGs whose source is no timer, and what sends a release."""
@@ -107,8 +353,7 @@ class SyntheticWorkload:
     """
     The nodes of a declaration, their timers and stand-in sensors, and the books about them.
 
-    Use: add ``nodes`` to an executor, let it spin, wait until none is ``unmatched``, ``start``,
-    measure with ``ledger``, ``stop``, shut the executor down, ``destroy``.
+    Use: add ``nodes`` to an executor, ``run``, ``destroy``; then ``measure`` judges the ledger.
 
     :param task_set: the declaration.
     :param plan: how long each vertex executes.
@@ -129,7 +374,6 @@ class SyntheticWorkload:
         self.ledger = Ledger(task_set, keep)
         if process is not None:
             self.ledger.tolerance_ns = _CLOCKS_NS
-        self._joins: dict[str, list[Join]] = {}
         self._current_job = current_job
         self._context = context
         self._emulate = {body: emulator(body) for body in sorted(
@@ -162,10 +406,36 @@ class SyntheticWorkload:
         """Return the nodes that an executor is to run."""
         return list(self._nodes.values())
 
-    @property
-    def evicted_joins(self) -> int:
-        """Return how many joins were dropped incomplete."""
-        return sum(join.evicted for joins in self._joins.values() for join in joins)
+    def run(
+        self, session: Session, duration_s: float | None, tick: Tick | None = None,
+        warm_up_s: float = WARM_UP_S,
+        begin: Callable[[Session, Callable[[], list[str]]], object] = Session.wait_until_matched,
+    ) -> bool:
+        """
+        Run in a session that spins already, and end the session.
+
+        :param duration_s: length of the measured window, which begins ``warm_up_s`` after the
+            timers; None: until the session is stopped.
+        :param begin: waits until publishers and subscriptions have met, and for other processes.
+        :return: whether there is a window: the run was not stopped before it began.
+        :raises mddag_executor.live.session.SessionError: when they do not find each other.
+        """
+        ledger, was_measured = self.ledger, False
+        ledger.warm_up_ns = round(warm_up_s * 1e9)
+        try:
+            executors: Callable[[], list[str]] = getattr(session.executor, 'unmatched', list)
+            begin(session, lambda: self.unmatched() + executors())
+            if not session.stopped:
+                self.start(session.executor.wake)
+                if not session.wait(warm_up_s):
+                    start = ledger.reading()
+                    session.wait(duration_s, tick)
+                    ledger.window = start, ledger.reading()
+                    was_measured = True
+        finally:
+            self.stop()
+            session.end()
+        return was_measured
 
     def unmatched(self) -> list[str]:
         """Return the topics whose publishers and subscriptions have not all met yet."""
@@ -252,7 +522,9 @@ class SyntheticWorkload:
             elif callback.kind == 'service':
                 self._add_service(node, group, callback, roles[0])
             else:
-                self._add_subscriptions(node, group, callback, roles)
+                on_message = callback_of(roles, self.ledger, self._current_job)
+                for topic in callback.topics:
+                    node.create_subscription(Header, topic, on_message, QOS, callback_group=group)
         return node
 
     def _publisher(self, node: Node, topic: str) -> Publisher:
@@ -265,21 +537,17 @@ class SyntheticWorkload:
     def _role(self, vertex: Vertex, publishers: list[Publisher]) -> Role:
         name = self.task_set.dags[vertex.dag].name
         senders = [f'{name}#{index}' for index in vertex.predecessors]
-        completions = self.ledger.completions[vertex.dag][vertex.index]
         return Role(
-            vertex=vertex, sender=f'{name}#{vertex.index}',
-            senders=senders or [SENSOR + topic for topic in vertex.callback.topics],
-            execution_ns=self.plan.execution_ns(vertex.dag, vertex.index),
-            publishers=publishers, emulate=self._emulate[self.plan.body(vertex)],
-            durations=self.ledger.durations[vertex.dag][vertex.index],
-            completions=completions if vertex.deadline_ns is not None else None,
-            clock_offset_ns=self.ledger.clock_offset_ns)
+            vertex, senders or [SENSOR + topic for topic in vertex.callback.topics],
+            f'{name}#{vertex.index}', self.plan.execution_ns(vertex.dag, vertex.index),
+            publishers, self._emulate[self.plan.body(vertex)], self.ledger)
 
     def _add_timer(
         self, node: Node, group: CallbackGroup, callback: Callback, role: Role
     ) -> None:
         dag = role.vertex.dag
-        grids, current_job, offset = self._grids, self._current_job, role.clock_offset_ns
+        grids, current_job = self._grids, self._current_job
+        offset = self.ledger.clock_offset_ns
         delays = self.ledger.delays[dag]
 
         def on_timer() -> None:
@@ -311,17 +579,6 @@ class SyntheticWorkload:
 
         node.create_service(
             ListParameters, callback.service or '', on_request, callback_group=group)
-
-    def _add_subscriptions(
-        self, node: Node, group: CallbackGroup, callback: Callback, roles: list[Role]
-    ) -> None:
-        if callback.kind == 'sync':
-            joins = self._joins[callback.key] = [Join(role) for role in roles]
-            on_message = sync_callback(joins, self.ledger, self._current_job)
-        else:
-            on_message = plain_callback(roles, self.ledger, self._current_job)
-        for topic in callback.topics:
-            node.create_subscription(Header, topic, on_message, QOS, callback_group=group)
 
     def _is_here(self, node: str) -> bool:
         return self._process in (None, self.task_set.process_of(node))

@@ -44,8 +44,8 @@ from typing import Any
 
 from mddag_executor.defaults import LIVE_SEED
 from mddag_executor.live import DeadlineMiss
-from mddag_executor.live.execution import ExecutionPlan
 from mddag_executor.live.executor import MultiDeadlineExecutor
+from mddag_executor.live.measure import ExecutionPlan
 from msg_graph import load, TaskSet
 import rclpy
 from rclpy.executors import ExternalShutdownException

@@ -9,7 +9,7 @@ import threading
 from typing import Any
 
 from mddag_executor.live import current_job
-from mddag_executor.live.execution import ExecutionPlan
+from mddag_executor.live.measure import ExecutionPlan
 from mddag_executor.live.synthetic import quiet_node, SyntheticWorkload
 from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle

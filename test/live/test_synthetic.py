@@ -10,18 +10,18 @@ import time
 from typing import Any
 
 from mddag_executor.live import current_job
-from mddag_executor.live.bodies import Grid, Join, JOIN_LIMIT, Role
-from mddag_executor.live.execution import (
-    BODIES,
-    ExecutionPlan,
+from mddag_executor.live.executor import MultiDeadlineExecutor
+from mddag_executor.live.measure import BODIES, ExecutionPlan, Ledger, measure, PlanError
+from mddag_executor.live.session import Session
+from mddag_executor.live.synthetic import (
+    Grid,
+    JOIN_LIMIT,
     native,
-    PlanError,
+    Role,
     sleeper,
     spinner,
+    SyntheticWorkload,
 )
-from mddag_executor.live.executor import MultiDeadlineExecutor
-from mddag_executor.live.session import measured, run_and_note, Session
-from mddag_executor.live.synthetic import SyntheticWorkload
 from mddag_executor.simulate import draw_execution_times
 from msg_graph import load, loads, TaskSet
 import pytest
@@ -205,26 +205,27 @@ def test_native_bodies_take_cpu_time() -> None:
 
 # --- joins and releases --------------------------------------------------------------------------
 
-def role(task_set: TaskSet, name: str, senders: list[str]) -> Role:
-    return Role(task_set.vertex(name), senders, '', 0, [], lambda ns: None, [], None, 0)
+def role(task_set: TaskSet, ledger: Ledger, senders: str) -> Role:
+    return Role(task_set.vertex('/join:cb'), list(senders), '', 0, [], lambda ns: None, ledger)
 
 
 def test_only_the_last_leg_of_a_job_completes_a_join(task_set: TaskSet) -> None:
-    join = Join(role(task_set, '/join:cb', ['a', 'b', 'c']))
-    assert [join.completes(1, s) for s in 'ab'] == [False, False]
-    assert not join.completes(2, 'c')
-    assert not join.completes(1, 'b')  # twice the same is no third
-    assert join.completes(1, 'c')
+    join = role(task_set, Ledger(task_set), 'abc')
+    assert [join.is_whole(1, s) for s in 'ab'] == [False, False]
+    assert not join.is_whole(2, 'c')
+    assert not join.is_whole(1, 'b')  # twice the same is no third
+    assert join.is_whole(1, 'c')
     assert list(join.waiting) == [2]
 
 
 def test_incomplete_joins_are_bounded_and_counted(task_set: TaskSet) -> None:
-    join = Join(role(task_set, '/join:cb', ['a', 'b']))
+    ledger = Ledger(task_set)
+    join = role(task_set, ledger, 'ab')
     for release in range(JOIN_LIMIT + 3):
-        join.completes(release, 'a')
-    assert (len(join.waiting), join.evicted) == (JOIN_LIMIT, 3)
-    assert not join.completes(0, 'b')  # its first leg is gone
-    assert join.completes(JOIN_LIMIT + 2, 'b')
+        join.is_whole(release, 'a')
+    assert (len(join.waiting), len(ledger.dropped_joins)) == (JOIN_LIMIT, 3)
+    assert not join.is_whole(0, 'b')  # its first leg is gone
+    assert join.is_whole(JOIN_LIMIT + 2, 'b')
 
 
 def test_a_late_timer_call_does_not_move_the_release(ros_context: Any) -> None:
@@ -296,11 +297,10 @@ def test_every_release_reaches_every_sink(task_set: TaskSet, ros_context: Any) -
     for node in workload.nodes:
         executor.add_node(node)
     with Session(executor) as session:
-        books = run_and_note(session, workload, 1.0, warm_up_s=0.5)
+        assert workload.run(session, 1.0, warm_up_s=0.5)
     assert session.error is None
     assert session.clean
-    assert books is not None
-    result = measured(books, workload.plan, 0.5)
+    result = measure(workload.ledger, workload.plan)
     names = {n for dag in result['dags'].values() for n in dag['sinks']}
     assert names == {
         '/filter/left:again', '/sink:cb@fast', '/sink:cb@slow', '/tracker:cb', '/gate:cb'}
@@ -346,7 +346,7 @@ def test_groups_keep_their_callbacks_apart(task_set: TaskSet, ros_context: Any) 
     for node in workload.nodes:
         executor.add_node(node)
     with Session(executor) as session:
-        run_and_note(session, workload, 0.5, warm_up_s=0.1)
+        workload.run(session, 0.5, warm_up_s=0.1)
     assert len(most) > 10
     assert max(most) == 1
     workload.destroy()

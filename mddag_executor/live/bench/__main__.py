@@ -17,24 +17,12 @@ import os
 import sys
 import threading
 import traceback
-from typing import Any, TextIO
+from typing import TextIO
 
 from mddag_executor.errors import MddagError
-from mddag_executor.live.bench.declared import run_declared
-from mddag_executor.live.bench.messages import run_messages
-from mddag_executor.live.bench.robot import run_robot
-from mddag_executor.live.bench.spec import DECLARED, ROBOT, Spec
+from mddag_executor.live.bench.loads import run
+from mddag_executor.live.bench.spec import Spec
 from msg_graph import GraphError
-import rclpy
-from rclpy.signals import SignalHandlerOptions
-
-
-def run(spec: Spec) -> dict[str, Any]:
-    """Make a measurement; see ``run_declared``, ``run_messages`` and ``run_robot``."""
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    if spec.load == ROBOT:
-        return run_robot(spec)
-    return run_declared(spec) if spec.load in DECLARED else run_messages(spec)
 
 
 def _end_with_stdin() -> None:
@@ -55,7 +43,7 @@ def main(text: str) -> int:
         traceback.print_exc()
         return 70
     with output:
-        json.dump(result, output)
+        json.dump(result, output, default=list)
         output.write('\n')
     return 0
 

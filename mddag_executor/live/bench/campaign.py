@@ -52,7 +52,7 @@ def measure(
     """
     names = _processes(spec)
     if len(names) > 1:
-        from mddag_executor.live.bench.declared import of_processes
+        from mddag_executor.live.bench.loads import of_processes
         with ThreadPoolExecutor(len(names)) as threads:
             parts = threads.map(lambda name: measure(
                 replace(spec, process=name), tick if name == names[0] else None, patience_s),

@@ -1,18 +1,46 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Make and spin the executors that are compared."""
+"""
+The executors that are compared, how they are spun, and when their callbacks start.
+
+Theory of operation
+-------------------
+*No executor at all* (``NoExecutor``) shows what the nodes of a declaration cost by themselves.
+A thread for each timer waits until that is due and calls it.  Whoever
+publishes takes the message from each subscription of the topic, and runs its callback, in its own
+thread.  There is no intake, queue, order, pool, callback group or attribution; nothing is handed
+from one thread to another.  What is left is what every executor pays for: waiting for timers,
+emulated execution, publishing, the middleware, taking messages, and the bodies themselves.  So the
+difference to an executor's CPU time is what that executor takes.  Callbacks that one message
+starts run one after the other, and so do all jobs of a DAG, so less is done in time; the cost of
+each callback hardly depends on that.
+
+*Starts* of callbacks are noted in the same way under every executor: the callback of a
+subscription or timer is replaced by one that reads the clock first, which costs about 1 us.  A
+list takes one tuple for each start; appending is one indivisible step in CPython, so there is no
+lock.
+"""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable, Iterable
+import inspect
+import threading
 import time
+from typing import Any
 
 from mddag_executor.live.bench.spec import NONE, OURS, Spec
-from mddag_executor.live.bench.unmanaged import NoExecutor
+from mddag_executor.live.compat import message_taker, timer_functions
 from mddag_executor.live.session import Session
 from msg_graph import TaskSet
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
 from rclpy.task import Future
+from rclpy.timer import Timer
 from rclpy.utilities import ok as context_ok
 
 
@@ -58,3 +86,128 @@ class UnfinishedSession(Session):
         if not self.stopped:
             self.stop()
             time.sleep(0.05)
+
+
+class NoExecutor(Executor):
+    """Stands where an executor does; for a process that ends when it has been measured."""
+
+    def spin(self) -> None:
+        """Run the timers and subscriptions of the nodes that were added."""
+        nodes = self.get_nodes()
+        take_where_published([s for node in nodes for s in node.subscriptions])
+        for timer in [timer for node in nodes for timer in node.timers]:
+            threading.Thread(target=self._run, args=(timer,), daemon=True).start()
+        while self.context.ok():
+            time.sleep(0.1)
+
+    def _run(self, timer: Timer) -> None:
+        _, call, _ = timer_functions(timer)
+        while self.context.ok():
+            left: int | None = timer.time_until_next_call()
+            if left is None:
+                return  # it was cancelled, at the end
+            if left > 0:
+                time.sleep(left / 1e9)
+                continue
+            with timer.handle:
+                call()
+            timer.callback()
+
+
+def take_where_published(subscriptions: list[Subscription]) -> None:
+    """Let every publisher of this process take from these, and run their callbacks."""
+    by_topic: dict[str, list[tuple[Subscription, Any]]] = {}
+    for subscription in subscriptions:
+        by_topic.setdefault(subscription.topic_name, []).append(
+            (subscription, message_taker(subscription)))
+    send = Publisher.publish
+    takers: dict[int, list[tuple[Subscription, Any]]] = {}
+
+    def publish(self: Any, msg: Any) -> None:
+        send(self, msg)
+        found = takers.get(id(self))
+        if found is None:
+            found = takers[id(self)] = by_topic.get(self.topic_name, [])
+        for subscription, take in found:
+            with subscription.handle:
+                taken = take()
+            if taken is not None:
+                subscription.callback(*taken)
+
+    Publisher.publish = publish  # type: ignore[method-assign]
+
+
+Start = tuple[int, int]
+"""When a callback started, ns since the epoch, and its dispatch latency, ns."""
+
+
+def _nothing(message: Any) -> None:
+    pass
+
+
+class Starts:
+    """
+    What is noted about the starts of callbacks.
+
+    ``messages`` has a ``Start`` for each message that a callback was called with.
+    """
+
+    def __init__(self) -> None:
+        self.messages: list[Start] = []
+        self._timers: list[tuple[list[int], deque[int]]] = []
+
+    def noting(self, callback: Callable[[Any], None] = _nothing) -> Callable[..., None]:
+        """Return a subscription's callback that notes its start and calls another one."""
+        append, time_ns = self.messages.append, time.time_ns
+
+        def on_message(message: Any, info: Any = None) -> None:
+            now = time_ns()
+            if info is None:
+                message, info = message
+            append((now, now - info['source_timestamp']))
+            callback(message)
+
+        # rclpy goes by the signature whether a callback wants message and info. Its EventsExecutor
+        # (7.1) then gives both in one tuple, which is why the second argument has a default.
+        vars(on_message)['__signature__'] = inspect.Signature([
+            inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY)
+            for name in ('message', 'info')])
+        return on_message
+
+    def watch_timer(self, timer: Timer, delays: deque[int]) -> None:
+        """
+        Note the starts of a timer.
+
+        :param delays: where its callback itself appends by how much it started late, ns.
+        """
+        starts: list[int] = []
+        append, time_ns, callback = starts.append, time.time_ns, timer.callback
+
+        def on_timer() -> None:
+            append(time_ns())
+            callback()
+
+        timer.callback = on_timer
+        self._timers.append((starts, delays))
+
+    def watch(self, nodes: Iterable[Node], delays: dict[Timer, deque[int]]) -> None:
+        """Note the starts of all subscriptions and timers of nodes."""
+        for node in nodes:
+            for subscription in node.subscriptions:
+                subscription.callback = self.noting(subscription.callback)
+            for timer in node.timers:
+                self.watch_timer(timer, delays[timer])
+
+    def within(self, begin: int, end: int, timers: bool = True) -> list[int]:
+        """
+        Return the latencies of what started in a window, ns.
+
+        :param begin: of the window, ns since the epoch; so is the end.
+        :param timers: whether those of timers count, too.
+        """
+        found = [latency for at, latency in list(self.messages) if begin <= at <= end]
+        for starts, delays in self._timers if timers else ():
+            # One of each for every call.  Calls of one timer that overlap may come in another
+            # order here than there, which can matter only at the edges of the window.
+            found += [late for at, late in zip(list(starts), list(delays)) if begin <= at <= end]
+        return found

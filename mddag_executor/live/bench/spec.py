@@ -18,7 +18,7 @@ PEERS = ('single', 'multi', 'events')
 """rclpy's SingleThreadedExecutor, MultiThreadedExecutor and EventsExecutor."""
 
 NONE = 'none'
-"""No executor: what the nodes of a declared load cost by themselves (see ``unmanaged``)."""
+"""No executor: what the nodes of a declared load cost by themselves (see ``executors``)."""
 
 EXECUTORS = (*OURS, *PEERS)
 ROBOT = 'robot'
