@@ -27,8 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from msg_graph.draft import Draft, DraftCallback, DraftNode, DraftPath
-from msg_graph.draft_text import declaration_of
+from msg_graph.draft import declaration_of, Draft, DraftCallback, DraftNode, DraftPath
 from msg_graph.errors import GraphError, shown
 from msg_graph.names import CALLBACK, GROUP, Name, NODE, SERVICE, TOPIC
 from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Sequence, Tree

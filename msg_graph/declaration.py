@@ -14,10 +14,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from msg_graph.duration import format_duration
-from msg_graph.entries import Entry
 from msg_graph.errors import Collector, did_you_mean, GraphError, printable, shown
 from msg_graph.include import Assembler, is_composed, Part, top_of
-from msg_graph.language import CALLBACK_KEYS, NODE_KEYS, PATH_KEYS, TRIGGERS
+from msg_graph.language import CALLBACK_KEYS, Entry, NODE_KEYS, PATH_KEYS, TRIGGERS
 from msg_graph.model import Callback, Path, Process
 from msg_graph.yamltext import yaml_lines
 import yaml

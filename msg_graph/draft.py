@@ -3,20 +3,46 @@
 """
 Drafts of declarations: a system as far as a file, a trace or the system itself shows it.
 
-Drafts come from CARET architecture files (``caret``), from traces and from running systems;
-``draft_text`` writes them as declarations to fill in. Names in a draft are valid: whoever makes
-one checks them.
+Theory of operation
+-------------------
+Drafts come from CARET architecture files (``caret``), from traces and from running systems. Names
+in a draft are valid: whoever makes one checks them. ``declaration_of`` writes one as a declaration
+to fill in.
+
+What is known becomes entries. What is not stands as a comment that is an entry once its first
+``# `` is gone, with ``FILL IN`` and a proposal, so that ``mddag graph check`` names what is still
+open (``open_blanks``), all of it at once, instead of the errors that come of it:
+
+1. *deadline* of a sink: the shortest period of the sources that lead to it.
+2. *period* of a subscription whose topic nobody publishes, and of a service: the measured time
+   between two of its executions, where there is one.
+3. *publishes*, where it is not known which of a node's callbacks publishes a topic: on each that
+   may.
+4. *timers* that are only supposed, as nothing else seems to start what their node publishes.
+
+A named path becomes an entry where each of its nodes has just one callback that fits.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+import re
 
+from msg_graph.duration import DAY, exact_duration, format_duration, MICROSECOND
+from msg_graph.errors import GraphError, GraphErrors, printable
 from msg_graph.model import ExecutionTime, ReleaseFrom
+from msg_graph.names import PATH
+from msg_graph.yamltext import plain_scalar
 
 UNDEFINED = 'UNDEFINED'
 """Stands for a topic at the end of a path (CARET's word)."""
+MARK = 'FILL IN'
+_OPEN = re.compile(rf'\s*#\s+(?:(\w+:).*\s#\s+)?{MARK}: (.*)')
+_ENTRY = re.compile(r'\s*- (?:name|node):|\s*-\s*\{')
+_LITTLE = 1e-4      # of a period
 
 
 @dataclass
@@ -99,3 +125,225 @@ class Draft:
         """Yield the callbacks of all nodes."""
         for node in self.nodes:
             yield from node.callbacks.values()
+
+
+def declaration_of(draft: Draft) -> str:
+    """Return the text of a declaration with marked blanks."""
+    return '\n'.join(_Writer(draft).lines()) + '\n'
+
+
+def open_blanks(text: str, file: str) -> list[GraphError]:
+    """Return an error for each blank that is left in a declaration."""
+    return [GraphError(
+        file, number,
+        f"{match[1] or 'this'} is a blank to fill in ({match[2]})",
+        "correct the value and take the '# ' away" if match[1] else 'do so, then remove the line')
+        for number, line in enumerate(text.splitlines(), 1)
+        if MARK in line and (match := _OPEN.fullmatch(line)) is not None]
+
+
+def with_blanks(error: GraphError, text: str, file: str) -> GraphError:
+    """Return an error with the blanks of its file, and without what is wrong because of them."""
+    blanks = open_blanks(text, file)
+    if not blanks:
+        return error
+    starts = [number for number, line in enumerate(text.splitlines(), 1) if _ENTRY.match(line)]
+    unfinished = {bisect_right(starts, blank.line or 0) for blank in blanks}
+    others = [each for each in error.errors if each.file != file or each.line is None
+              or bisect_right(starts, each.line) not in unfinished]
+    found = (*blanks, *others)
+    return found[0] if len(found) == 1 else GraphErrors(found)
+
+
+class _Writer:
+
+    def __init__(self, draft: Draft) -> None:
+        self._draft = draft
+        self._callbacks = list(draft.callbacks())
+        self._publishers: dict[str, list[DraftCallback]] = {}
+        self._started: dict[str, list[DraftCallback]] = {}
+        for callback in self._callbacks:
+            for topic in callback.publishes:
+                self._publishers.setdefault(topic, []).append(callback)
+            if callback.kind in ('subscription', 'sync'):
+                for topic in callback.starts:
+                    self._started.setdefault(topic, []).append(callback)
+        self._maybe = {topic for callback in self._callbacks for topic in callback.maybe}
+        self._sources = Counter(c.node for c in self._callbacks if self._is_source(c))
+        self._period = self._shortest_periods()
+
+    def _is_source(self, callback: DraftCallback) -> bool:
+        if callback.kind == 'sync':
+            return False
+        return callback.kind != 'subscription' or not (
+            callback.starts[0] in self._publishers or callback.starts[0] in self._maybe)
+
+    def _shortest_periods(self) -> dict[str, DraftCallback]:
+        """Return by callback the source with the shortest period that leads to it, perhaps."""
+        found: dict[str, DraftCallback] = {}
+        sources = [c for c in self._callbacks if self._is_source(c) and c.source_period_ns]
+        for source in sorted(sources, key=lambda c: c.source_period_ns or 0):
+            stack = [source]
+            while stack:
+                callback = stack.pop()
+                if callback.key not in found:
+                    found[callback.key] = source
+                    stack.extend(after for topic in callback.publishes + callback.maybe
+                                 for after in self._started.get(topic, ()))
+        return found
+
+    def lines(self) -> Iterator[str]:
+        yield f'# From {printable(self._draft.origin)}.'
+        yield f"# Lines with '{MARK}' are blanks: correct the value, then take the '# ' away."
+        yield "# 'mddag graph check' lists what is still open."
+        yield 'mddag: 1'
+        if self._draft.workers is not None:
+            yield f'workers: {self._draft.workers}'
+        yield 'nodes:'
+        for node in self._draft.nodes:
+            yield f'  - node: {plain_scalar(node.name)}'
+            yield '    callbacks:'
+            for callback in node.callbacks.values():
+                yield from self._callback(callback)
+        yield from self._paths()
+
+    def _callback(self, callback: DraftCallback) -> Iterator[str]:
+        yield f'      - name: {plain_scalar(callback.name)}'
+        yield self._trigger(callback)
+        yield from self._source(callback)
+        if callback.group is not None:
+            yield f'        group: {plain_scalar(callback.group)}'
+        yield from self._publishes(callback)
+        if callback.reads:
+            yield f'        reads: [{", ".join(map(plain_scalar, callback.reads))}]'
+        if not any(topic in self._started for topic in callback.publishes):
+            yield self._deadline(callback)
+        yield from (f'        {key}: {value}' for key, value in callback.also.items())
+        if callback.times is not None:
+            yield from _execution_time(*callback.times)
+
+    def _trigger(self, callback: DraftCallback) -> str:
+        if callback.kind == 'timer':
+            if callback.guessed and not (callback.publishes or callback.maybe):
+                return (f'        # timer: 100ms  # {MARK}: what starts it? Nothing is seen of '
+                        'the node but its name; remove it if it has no callbacks')
+            if callback.guessed and callback.interval_ns is None:
+                return (f'        # timer: 100ms  # {MARK}: what starts it? No message came while '
+                        'it was looked at')
+            if callback.guessed:
+                return (f'        timer: {_rounded(callback.interval_ns or 0)}  # {MARK}: is this '
+                        f'a timer? Proposed: the measured {_measured(callback)}')
+            period_ns = callback.period_ns or 0
+            if not MICROSECOND <= period_ns <= DAY:
+                return (f'        # timer: 100ms  # {MARK}: its period is said to be '
+                        f'{exact_duration(period_ns)}')
+            return f'        timer: {_whole(period_ns)}'
+        if callback.kind == 'sync':
+            return f'        sync: [{", ".join(callback.starts)}]'
+        return f'        {callback.kind}: {callback.starts[0]}'
+
+    def _source(self, callback: DraftCallback) -> Iterator[str]:
+        """Yield what concerns a source: the name of its DAG, and its period if it is no timer."""
+        source = self._is_source(callback)
+        known = callback.kind == 'timer' or callback.period_ns is not None
+        if source and (callback.dag or self._sources[callback.node] > 1):
+            dag = f'dag: {plain_scalar(callback.dag or callback.node + "/" + callback.name)}'
+            blank = callback.kind == 'subscription' and not known
+            yield f'        # {dag}  # {MARK}: with the period' if blank else f'        {dag}'
+        if callback.kind in ('timer', 'sync'):
+            return
+        if source and known:
+            yield f'        period: {exact_duration(callback.period_ns or 0)}'
+            if callback.release_from != 'arrival':
+                yield f'        release_from: {callback.release_from}'
+        elif source:
+            yield f'        # period: {self._period_blank(callback)}'
+        elif callback.starts[0] not in self._publishers:
+            yield f'        # {callback.starts[0]} has no known publisher yet: see its blanks'
+
+    def _period_blank(self, callback: DraftCallback) -> str:
+        what = ('the time between two requests' if callback.kind == 'service' else
+                'nobody here publishes the topic; the time between two messages')
+        if callback.interval_ns is not None:
+            return (f'{_rounded(callback.interval_ns)}  # {MARK}: {what}; proposed: the measured '
+                    f'{_measured(callback)}')
+        return f'{"1s" if callback.kind == "service" else "100ms"}  # {MARK}: {what}'
+
+    def _publishes(self, callback: DraftCallback) -> Iterator[str]:
+        every = ', '.join(callback.publishes + callback.maybe)
+        if callback.maybe:
+            names = ', '.join(callback.maybe)
+            yield f'        # publishes: [{every}]  # {MARK}: which callback publishes {names}?'
+            if callback.publishes:
+                yield '        # (instead of the next line)'
+        if callback.publishes:
+            yield f'        publishes: [{", ".join(callback.publishes)}]'
+
+    def _deadline(self, callback: DraftCallback) -> str:
+        if callback.deadline_ns is not None and not callback.maybe:
+            return f'        deadline: {exact_duration(callback.deadline_ns)}'
+        what = 'if it is a sink' if callback.maybe else 'a sink'
+        if callback.key not in self._period:
+            return (f'        # deadline: 100ms  # {MARK}: {what}; no source with a known period '
+                    'leads here')
+        source = self._period[callback.key]
+        leads = 'timer' if source.kind == 'timer' else 'source'
+        return (f'        # deadline: {_period(source)}  # {MARK}: {what}; proposed: the period '
+                f'of the {leads} that leads here')
+
+    def _paths(self) -> Iterator[str]:
+        found = [(path, self._path_keys(path)) for path in self._draft.paths]
+        if any(keys for _, keys in found):
+            yield 'paths:'
+        for path, keys in found:
+            if keys:
+                yield f'  - name: {plain_scalar(path.name)}'
+                yield '    callbacks:'
+                yield from (f"      - '{key}'" for key in keys)
+            else:
+                chain = ' -> '.join([*path.keys, *(node for node, _, _ in path.steps)])
+                yield printable(f'# {MARK}: path {path.name}: which callbacks? {chain}')
+
+    def _path_keys(self, path: DraftPath) -> list[str]:
+        keys = [callback.key for key in path.keys for callback in self._callbacks
+                if callback.key == key]
+        if len(keys) < len(path.keys):
+            return []
+        for node, taken, published in path.steps:
+            fits = [c for c in self._callbacks if c.node == node
+                    and (taken == UNDEFINED or taken in c.starts or taken in c.reads)
+                    and (published == UNDEFINED or published in c.publishes)]
+            if len(fits) != 1:
+                return []
+            keys.append(fits[0].key)
+        return keys if len(keys) > 1 and PATH.check(path.name) is None else []
+
+
+def _period(source: DraftCallback) -> str:
+    if source.period_ns is not None:
+        return _whole(source.period_ns)
+    return _rounded(source.interval_ns or 0)
+
+
+def _whole(period_ns: int) -> str:
+    """Return a timer's period as people write it: rounded to 1 us, where that changes little."""
+    rounded = round(period_ns / MICROSECOND) * MICROSECOND
+    close = abs(rounded - period_ns) <= _LITTLE * period_ns
+    return exact_duration(rounded if close else period_ns)
+
+
+def _rounded(nanoseconds: int) -> str:
+    """Return a measured time with three digits."""
+    digits = 10 ** max(0, len(str(nanoseconds)) - 3)
+    return exact_duration(max(1_000, round(nanoseconds / digits) * digits))
+
+
+def _measured(callback: DraftCallback) -> str:
+    return f'time between two of its executions, {format_duration(callback.interval_ns or 0)}'
+
+
+def _execution_time(time: ExecutionTime, count: int) -> Iterator[str]:
+    quantiles = ', '.join(f'{ns / 1000:.3f}'.rstrip('0').rstrip('.') for ns in time.quantiles_ns)
+    percent = ', '.join(repr(share).removesuffix('.0') for share in time.percent)
+    yield f'        # measured in {count} execution{"s" * (count != 1)}'
+    yield f'        execution_time: {{quantiles_us: [{quantiles}], percent: [{percent}]}}'

@@ -29,9 +29,8 @@ import os
 import re
 import stat
 
-from msg_graph.entries import ARGUMENT, Entry
 from msg_graph.errors import did_you_mean, GraphError, listed, shown
-from msg_graph.language import FILE, INCLUDE
+from msg_graph.language import ARGUMENT, Entry, FILE, INCLUDE
 from msg_graph.yamltext import (
     decode,
     Mapping,

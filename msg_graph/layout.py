@@ -222,17 +222,6 @@ class _Writer:
                 self._line += f' {piece}'
 
 
-def checked(text: str, wanted: TaskSet) -> str:
-    """Return a text that was written anew; refuse it if it does not give the task set wanted."""
-    try:
-        same = without_lines(loads(text, wanted.file)) == without_lines(wanted)
-    except GraphError:
-        same = False
-    if not same:
-        raise refused(wanted.file)
-    return text
-
-
 def without_lines(task_set: TaskSet) -> TaskSet:
     """Return the task set without the places in the text."""
     nowhere = {callback.key: {'line': 0} for callback in task_set.callbacks}

@@ -11,7 +11,7 @@ from os import fspath, PathLike
 
 from msg_graph.declaration import parse_declaration
 from msg_graph.derive import derive_task_set
-from msg_graph.draft_text import with_blanks
+from msg_graph.draft import with_blanks
 from msg_graph.errors import GraphError
 from msg_graph.model import TaskSet
 from msg_graph.yamltext import decode, MAX_BYTES

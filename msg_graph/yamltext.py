@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 The tree is built from the parser's events, not by PyYAML's composer or constructor:
 
-1. It never recurses, so no nesting can overflow the stack; nesting beyond ``MAX_DEPTH`` ends it.
+1. Nesting beyond ``MAX_DEPTH`` ends it, so none can overflow the stack.
 2. Scalars stay text. What a text means is decided by the key it stands at, so that ``on``, ``1e3``
    or ``2026-01-01`` are never turned into something that nobody wrote.
 3. An alias shares the tree of its anchor. Every tree knows its size with all aliases written out;
@@ -31,6 +31,7 @@ MAX_SIZE = 2_000_000
 _LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _NOT_YAML = re.compile('[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]')
 _PLAIN_TAGS = (None, '!')
+_ENDS = (yaml.SequenceEndEvent, yaml.MappingEndEvent)
 _PLAIN = re.compile(r'[/A-Za-z_][/A-Za-z0-9_.-]*')
 _SIMPLE = re.compile(r'[+-]?[A-Za-z0-9_/.][A-Za-z0-9_/. +-]*')
 _WORDS = {'true', 'false', 'yes', 'no', 'on', 'off', 'null', 'y', 'n'}
@@ -144,10 +145,8 @@ def parse_yaml(text: str, file: str) -> Tree | None:
             'give the YAML file of a declaration')
     if len(text.encode()) > MAX_BYTES:
         decode(text.encode(), file)
-    builder = _Builder(file)
     try:
-        for event in yaml.parse(text, Loader=_LOADER):
-            builder.add(event)
+        return _Builder(text, file).document()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         what = error.problem or error.context or 'it cannot be parsed'
@@ -156,92 +155,86 @@ def parse_yaml(text: str, file: str) -> Tree | None:
             'check indentation, brackets and quotes') from None
     except yaml.YAMLError as error:
         raise GraphError(file, None, f'not YAML: {error}', 'give a YAML file') from None
-    return builder.root
 
 
 class _Builder:
-    """Builds the tree from parser events, keeping the containers that are open on a stack."""
+    """Builds the tree from the parser's events; nesting is bounded, so this may recurse."""
 
-    def __init__(self, file: str) -> None:
-        self.root: Tree | None = None
+    def __init__(self, text: str, file: str) -> None:
+        self._events: Any = yaml.parse(text, Loader=_LOADER)
         self._file = file
-        self._stack: list[Sequence | Mapping] = []
-        self._keys: list[str | None] = []  # of each open mapping the key without a value yet
+        self._open: list[Tree] = []
         self._anchors: dict[str, Tree] = {}
 
-    def add(self, event: Any) -> None:
-        """Take the parser's next event."""
-        kind = type(event)
-        if kind is yaml.ScalarEvent:
-            scalar = Scalar(event.start_mark.line + 1, event.value, not event.style)
-            self._anchor(event, scalar)
-            self._attach(event, scalar, 1)
-        elif kind is yaml.AliasEvent:
-            self._alias(event)
-        elif kind is yaml.SequenceStartEvent:
-            self._open(event, Sequence(event.start_mark.line + 1))
-        elif kind is yaml.MappingStartEvent:
-            self._open(event, Mapping(event.start_mark.line + 1))
-        elif kind is yaml.SequenceEndEvent or kind is yaml.MappingEndEvent:
-            self._close(event)
-        elif kind is yaml.DocumentStartEvent and self.root is not None:
-            raise self._error(
-                event, 'a second YAML document starts here', 'keep one document in the file')
+    def document(self) -> Tree | None:
+        """Return the tree of the one document."""
+        root: Tree | None = None
+        for event in self._events:
+            if isinstance(event, yaml.DocumentStartEvent) and root is not None:
+                raise self._error(
+                    event, 'a second YAML document starts here', 'keep one document in the file')
+            if isinstance(event, yaml.NodeEvent):
+                root = self._tree(event)
+        return root
 
     def _error(self, event: Any, problem: str, remedy: str) -> GraphError:
         return GraphError(self._file, event.start_mark.line + 1, problem, remedy)
 
-    def _anchor(self, event: Any, tree: Tree) -> None:
-        """Look at the properties that may stand before a value."""
+    def _tree(self, event: Any) -> Tree:
+        """Return the tree that begins with an event."""
+        kind = type(event)
+        if kind is yaml.AliasEvent:
+            return self._anchored(event)
         if event.tag not in _PLAIN_TAGS:
             raise self._error(
                 event, f'the tag {shown(event.tag)} has no meaning here', 'remove the tag')
+        line = event.start_mark.line + 1
+        if kind is yaml.ScalarEvent:
+            scalar = Scalar(line, event.value, not event.style)
+            if event.anchor is not None:
+                self._anchors[event.anchor] = scalar
+            return scalar
+        tree = Sequence(line) if kind is yaml.SequenceStartEvent else Mapping(line)
         if event.anchor is not None:
             self._anchors[event.anchor] = tree
+        self._open.append(tree)
+        if len(self._open) > MAX_DEPTH:
+            raise self._error(
+                event, f'more than {MAX_DEPTH} levels of nesting',
+                'check the brackets: a declaration needs fewer than ten levels')
+        self._fill(tree)
+        self._open.pop()
+        return tree
 
-    def _alias(self, event: Any) -> None:
+    def _anchored(self, event: Any) -> Tree:
         name = shown(event.anchor)
         tree = self._anchors.get(event.anchor)
         if tree is None:
             raise self._error(
                 event, f'the alias {name} has no anchor', 'define the anchor before it')
-        if any(tree is each for each in self._stack):
+        if any(tree is each for each in self._open):
             raise self._error(
                 event, f'the alias {name} stands inside of its own anchor', 'write the value out')
-        self._attach(event, tree, tree.size)
+        return tree
 
-    def _open(self, event: Any, tree: Sequence | Mapping) -> None:
-        self._anchor(event, tree)
-        self._attach(event, tree, 0)  # its size is known when it closes
-        self._stack.append(tree)
-        self._keys.append(None)
-        if len(self._stack) > MAX_DEPTH:
-            raise self._error(
-                event, f'more than {MAX_DEPTH} levels of nesting',
-                'check the brackets: a declaration needs fewer than ten levels')
-
-    def _close(self, event: Any) -> None:
-        tree = self._stack.pop()
-        self._keys.pop()
-        if self._stack:
-            self._grow(event, self._stack[-1], tree.size)
-
-    def _attach(self, event: Any, tree: Tree, size: int) -> None:
-        """Hang a tree below the innermost open container."""
-        if not self._stack:
-            self.root = tree
-            return
-        parent = self._stack[-1]
-        self._grow(event, parent, size)
-        if type(parent) is Sequence:
-            parent.items.append(tree)
-        elif type(parent) is Mapping:
-            key = self._keys[-1]
-            if key is None:
-                self._keys[-1] = self._key(event, parent, tree)
-            else:
-                parent.entries[key] = tree
-                self._keys[-1] = None
+    def _fill(self, tree: Sequence | Mapping) -> None:
+        """Take in what stands in a list or mapping, and count it, with aliases written out."""
+        key: str | None = None
+        while type(event := next(self._events)) not in _ENDS:
+            each = self._tree(event)
+            tree.size += each.size
+            if tree.size > MAX_SIZE:
+                raise self._error(
+                    event,
+                    f'more than {MAX_SIZE} entries (aliases count as often as they are used)',
+                    'remove the aliases, or split the file into several graphs')
+            if type(tree) is Sequence:
+                tree.items.append(each)
+            elif type(tree) is Mapping and key is None:
+                key = self._key(event, tree, each)
+            elif type(tree) is Mapping and key is not None:
+                tree.entries[key] = each
+                key = None
 
     def _key(self, event: Any, parent: Mapping, tree: Tree) -> str:
         if not isinstance(tree, Scalar):
@@ -252,11 +245,3 @@ class _Builder:
                 f'remove one of them (the first is in line {parent.key_lines[tree.text]})')
         parent.key_lines[tree.text] = event.start_mark.line + 1
         return tree.text
-
-    def _grow(self, event: Any, parent: Sequence | Mapping, size: int) -> None:
-        """Count what a container gets, with aliases written out."""
-        parent.size += size
-        if parent.size > MAX_SIZE:
-            raise self._error(
-                event, f'more than {MAX_SIZE} entries (aliases count as often as they are used)',
-                'remove the aliases, or split the file into several graphs')

@@ -29,7 +29,7 @@ from mddag_executor.assign.proportional import scaled
 from mddag_executor.errors import MddagError
 from mddag_executor.simulate.evaluate import evaluate, Experiment, uses_compiled
 from mddag_executor.simulate.evaluation import wilson, Z_95
-from msg_graph.deadlines import with_deadlines
+from msg_graph.edit import with_deadlines
 
 PRECISION = 0.01
 """The result is at most by this part larger than a scale that is not good."""

@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Assign deadlines."""
-    from msg_graph.deadlines import deadlines_in_text, load_with_or_without_deadlines
+    from msg_graph.edit import deadlines_in_text, load_with_or_without_deadlines
     if args.by == 'path' and args.target is not None:
         raise UsageError("--target: '--by path' has none: give --by search, or leave it out")
     if args.by == 'search' and (args.factor is not None or args.base is not None):

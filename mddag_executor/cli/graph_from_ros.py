@@ -37,7 +37,7 @@ def main(args: argparse.Namespace) -> int:
     """Write the declaration."""
     from mddag_executor.cli.systems import write_declaration
     from mddag_executor.live.graph_probe import draft_of, probe
-    from msg_graph.draft_text import declaration_of
+    from msg_graph.draft import declaration_of
     with Progress('looking at the nodes', args.timeout) as line:
         found = probe(args.timeout, line.update)
     warn(*found.warnings)

@@ -35,6 +35,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Write the declaration."""
     from mddag_executor.cli.systems import recorded_system, write_declaration
-    from msg_graph.draft_text import declaration_of
+    from msg_graph.draft import declaration_of
     write_declaration(args.output, declaration_of(recorded_system(args.trace).draft()))
     return 0

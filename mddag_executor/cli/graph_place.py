@@ -62,7 +62,7 @@ def main(args: argparse.Namespace) -> int:
     """Place nodes."""
     from mddag_executor.assign.placed import cost_of, improve, Predictor, PUBLISH_NS
     from mddag_executor.assign.placement import Placing
-    from msg_graph.processes import with_processes
+    from msg_graph.edit import with_processes
     if args.trace and args.utilisation is not None:
         raise UsageError('--utilisation: recorded execution times are not scaled: leave it out')
     task_set = common.load_graph(args.graph)

@@ -132,7 +132,7 @@ def _processes(
     args: argparse.Namespace
 ) -> Callable[[TaskSet, list[list[int]]], Sequence[Process]] | None:
     """Return a function that says which node runs in which process, as `--processes` says."""
-    from msg_graph.processes import load_processes
+    from msg_graph.edit import load_processes
     given = args.processes
     if given is None:
         return None

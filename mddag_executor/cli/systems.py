@@ -45,7 +45,7 @@ def recorded_system(given: str) -> System:
 
 def write_declaration(output: str, text: str) -> None:
     """Write a declaration with blanks, and say how many there are."""
-    from msg_graph.draft_text import MARK
+    from msg_graph.draft import MARK
     common.write_text(output, text)
     if output == '-':
         return

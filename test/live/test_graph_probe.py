@@ -12,7 +12,7 @@ from typing import Any
 
 from mddag_executor.live.graph_probe import draft_of, Endpoints, Probe, probe, Seen
 from msg_graph import loads
-from msg_graph.draft_text import declaration_of, MARK
+from msg_graph.draft import declaration_of, MARK
 import pytest
 from rclpy.node import Node
 from std_msgs.msg import Empty, String

@@ -8,7 +8,7 @@ import re
 
 from msg_graph import GraphError, loads
 from msg_graph.caret import declaration_from_caret
-from msg_graph.draft_text import MARK
+from msg_graph.draft import MARK
 import pytest
 
 HEAD = 'executors: []\nnamed_paths: []\nnodes:\n'

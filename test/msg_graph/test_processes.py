@@ -7,7 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from msg_graph import GraphError, load, loads, Process
-from msg_graph.processes import load_processes, with_processes
+from msg_graph.edit import load_processes, with_processes
 import pytest
 
 from .helpers import error, MARK

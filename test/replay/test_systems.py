@@ -14,7 +14,7 @@ from mddag_executor.replay.drafting import System
 from mddag_executor.trace import TraceFile
 from msg_graph import load, loads
 from msg_graph.caret import declaration_from_caret
-from msg_graph.draft_text import declaration_of, MARK
+from msg_graph.draft import declaration_of, MARK
 import pytest
 
 MS = 1_000_000

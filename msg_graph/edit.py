@@ -1,29 +1,47 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Deadlines of a declaration's sinks: given anew, in the text with its comments and in the task set.
+Deadlines of sinks and ``processes:`` given anew: in the text of a declaration, and its task set.
 
 Theory of operation
 -------------------
 1. Deadlines belong to callbacks: where a callback is several vertices, all have its deadline.
 2. In the text only the values of ``deadline:`` change, in their places; a callback that has none
-   gets a line of its own, or an entry in its braces.  So comments, order and layout stay.
-3. The new text must give the task set with just those deadlines changed; else it is refused.
+   gets a line of its own, or an entry in its braces.  ``processes:`` is the last entry where it is
+   written anew.  Comments outside of it, order, layout and all else stay.
+3. The new text must give the task set with just that changed; else it is refused.
    (It can, where a value is an alias of one that stands elsewhere.)
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator
+from collections.abc import Mapping as Table
+from dataclasses import replace
 from typing import Any
 
+from msg_graph.declaration import processes_text, read_processes
 from msg_graph.duration import exact_duration, SECOND
-from msg_graph.layout import checked, refused
+from msg_graph.errors import GraphError
+from msg_graph.language import Entry, FILE
+from msg_graph.layout import refused, without_lines
 from msg_graph.loading import loads
-from msg_graph.model import TaskSet
+from msg_graph.model import Process, TaskSet
+from msg_graph.yamltext import Mapping, parse_yaml
 import yaml
 
 _LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+
+
+def checked(text: str, wanted: TaskSet) -> str:
+    """Return a text that was written anew; refuse it if it does not give the task set wanted."""
+    try:
+        same = without_lines(loads(text, wanted.file)) == without_lines(wanted)
+    except GraphError:
+        same = False
+    if not same:
+        raise refused(wanted.file)
+    return text
 
 
 def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, list[str]]:
@@ -37,7 +55,7 @@ def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, list[
     return with_deadlines(task_set, dict.fromkeys(missing, SECOND)), missing
 
 
-def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Mapping[str, int]) -> str:
+def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Table[str, int]) -> str:
     """
     Return a declaration with other deadlines; comments, order and all else stay.
 
@@ -45,7 +63,7 @@ def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Mapping[str, int]
     :param deadlines: by the callback's key, ns.
     """
     try:
-        result = _changed(text, deadlines)
+        result = _with_deadlines(text, deadlines)
     except KeyError:  # of a declaration of several files
         raise refused(task_set.file) from None
     return checked(result, with_deadlines(task_set, deadlines))
@@ -64,7 +82,7 @@ def _entries(node: Any) -> dict[str, Any]:
     return {key.value: value for key, value in node.value}
 
 
-def _changed(text: str, deadlines: Mapping[str, int]) -> str:
+def _with_deadlines(text: str, deadlines: Table[str, int]) -> str:
     """Return a text with other or additional deadlines."""
     lines = text.splitlines(keepends=True)
     edits: list[tuple[int, int, int, str]] = []  # line, from column, to column, new text
@@ -88,10 +106,44 @@ def _changed(text: str, deadlines: Mapping[str, int]) -> str:
     return ''.join(lines)
 
 
-def with_deadlines(task_set: TaskSet, deadlines: Mapping[str, int]) -> TaskSet:
+def with_deadlines(task_set: TaskSet, deadlines: Table[str, int]) -> TaskSet:
     """
     Return a task set with other deadlines.
 
     :param deadlines: by the callback's key, ns; of sinks only.
     """
     return task_set.with_callbacks({key: {'deadline_ns': ns} for key, ns in deadlines.items()})
+
+
+def load_processes(text: str, file: str, task_set: TaskSet) -> tuple[Process, ...]:
+    """Return the processes that a file declares for a task set; its other keys do not count."""
+    entry = Entry(parse_yaml(text, file) or Mapping(1), file, 'the file', FILE)
+    processes = read_processes(entry, (callback.node for callback in task_set.callbacks))
+    if not processes:
+        raise GraphError(file, None, "there is no 'processes:'",
+                         'write processes: {NAME: [/node, …], …}')
+    return processes
+
+
+def with_processes(task_set: TaskSet, processes: Iterable[Process]) -> TaskSet:
+    """Return a task set, and its text, with other processes, which have all of its nodes."""
+    order = {callback.node: i for i, callback in enumerate(reversed(task_set.callbacks))}
+    processes = tuple(
+        replace(each, nodes=tuple(sorted(each.nodes, key=lambda node: -order[node])))
+        for each in processes)
+    after = replace(task_set, processes=processes,
+                    text=_with_entry(task_set.text, task_set.file, processes))
+    checked(after.text, after)
+    return after
+
+
+def _with_entry(text: str, file: str, processes: tuple[Process, ...]) -> str:
+    tree = parse_yaml(text, file)
+    lines = text.splitlines(keepends=True)
+    if isinstance(tree, Mapping) and 'processes' in tree.entries:
+        begin = tree.key_lines['processes'] - 1
+        later = [line - 1 for line in tree.key_lines.values() if line - 1 > begin]
+        del lines[begin:min(later, default=len(lines))]
+    if lines and not lines[-1].endswith('\n'):
+        lines[-1] += '\n'
+    return ''.join(lines) + processes_text(processes)
