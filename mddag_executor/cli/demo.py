@@ -8,12 +8,16 @@ another's threads, caches or nodes beside it: `mddag run --synthetic sleep`, whi
 times `mddag replay`; and rclpy's own MultiThreadedExecutor with the same nodes, seed and number of
 threads.  Both executors are measured by the nodes themselves, in the same way
 (`mddag_executor.live.measure`), so the figures side by side mean the same.
+
+With `--processes N` callbacks compute in Python, in N processes.  The steps are `graph place`;
+`run --synthetic spin` of what that wrote, which records; `replay` of all traces; and rclpy's
+EventsExecutor in the same processes, and both executors in one process.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from io import StringIO
 import json
@@ -25,12 +29,18 @@ from typing import Any
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, format_ns, printable, Progress, run_program, table
-from mddag_executor.core.tally import counts
+from mddag_executor.core.tally import counts, total
 from mddag_executor.errors import MddagError
 from mddag_executor.live.bench.spec import Spec
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.live_runs import summary
-from mddag_executor.report.tables import each_sink, percent, response_cells, sink_table
+from mddag_executor.report.tables import (
+    each_sink,
+    percent,
+    response_cells,
+    sink_table,
+    verdicts_line,
+)
 from mddag_executor.resources import find
 from mddag_executor.text import counted
 
@@ -40,6 +50,8 @@ mddag demo --processes 2"""
 
 WORKERS = defaults.WORKERS
 UTILISATION = 0.6
+UTILISATION_EACH = 0.1
+"""Of seven workers, with `--processes`: 0.7 of a core for each."""
 DEFAULT_SEED = 0
 """The first seed; at utilisation 0.6 its draw is feasible (`ExecutionPlan.infeasible`)."""
 
@@ -74,11 +86,15 @@ def main(args: argparse.Namespace) -> int:
     graph = find('config/autoware.yaml')
     # at once, also into a pipe: the next step takes long
     say = partial(print, flush=True, file=None if common.wants_tables(args) else StringIO())
-    if args.processes is not None:
-        from mddag_executor.cli.demo_processes import run_demo
-        result = run_demo(args, graph, output, say)
-        common.write_result(args, result)
-        return 0
+    run = _in_one_process if args.processes is None else _in_several
+    common.write_result(args, run(args, graph, output, say))
+    return 0
+
+
+def _in_one_process(
+    args: argparse.Namespace, graph: Path, output: Path, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Run the steps, say what each found, and return all of it."""
     args.utilisation = args.utilisation or UTILISATION
     for line in _introduction(args, graph):
         say(line)
@@ -88,18 +104,73 @@ def main(args: argparse.Namespace) -> int:
         say(line)
     recorded, rescheduled = run_replays(graph, output)
     say('\n== The recording, replayed ==')
-    say(replay_table(live, recorded, rescheduled))
+    say(beside(('p99',), live=live['dags'], recorded=recorded['dags'],
+               rescheduled=rescheduled['dags']))
     say(agreement(live, recorded))
     for line in causes_line(recorded['misses']):
         say(f'{line} (mddag explain {output / "demo.mcap"})')
     say(f"\n== The same nodes on rclpy's MultiThreadedExecutor({WORKERS}), "
         f'{args.baseline_seconds:g} s ==')
-    baseline = run_baseline(args, graph)
+    baseline = _measured(args, graph, 'multi', args.utilisation)
     say(side_by_side(live['measured'], baseline))
-    common.write_result(args, {
-        'live': live, 'recorded': recorded, 'rescheduled': rescheduled, 'baseline': baseline,
-        'trace': str((output / 'demo.mcap').absolute())})
-    return 0
+    return {'live': live, 'recorded': recorded, 'rescheduled': rescheduled, 'baseline': baseline,
+            'trace': str((output / 'demo.mcap').absolute())}
+
+
+def _in_several(
+    args: argparse.Namespace, graph: Path, output: Path, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Run the steps of `--processes`, say what each found, and return all of it."""
+    utilisation = args.utilisation or UTILISATION_EACH * args.processes
+    load = ['--utilisation', str(utilisation), '--seed', str(args.seed),
+            '--workers', str(WORKERS)]
+    placed = output / 'placed.yaml'
+    say(f'{graph}: callbacks compute in Python, {utilisation * WORKERS:.2f} cores in all')
+    say(f'\n== Placed in {counted(args.processes, "process", "processes")} ==')
+    placement = json_of(mddag(
+        'graph', 'place', str(graph), '--processes', str(args.processes), *load,
+        '-o', str(placed), '--json', '-'), 'placing')
+    for process, share in zip(placement['processes'], placement['loads']):
+        say(f'{process["name"]}: {counted(len(process["nodes"]), "node")}, {share:.2f} of a core')
+    say(f'predicted: {verdicts_line(placement["predicted"])}')
+    say(f'predicted of one process: {verdicts_line(placement["one_process"])}')
+    say(f'\n== Under MultiDeadlineExecutor({WORKERS}) each, recording, {args.seconds:g} s ==')
+    live = json_of(mddag(
+        'run', str(placed), '--synthetic', 'spin', *load, '--duration', f'{args.seconds:.3f}s',
+        '--trace', str(output / 'demo.mcap'), '--json', '-'), 'running', args.seconds + 3)
+    say(sink_table(live['dags']))
+    for line in summary(live):
+        say(line)
+    traces = [process['trace']['path'] for process in live['processes']]
+    say('\n== The recordings of all processes, replayed as one run ==')
+    recorded = json_of(mddag('replay', *traces, '--json', '-'), 'replaying')
+    say(beside(('median', 'p99'), predicted=placement['predicted'], live=live['dags'],
+               replayed=recorded['dags']))
+    say(f'mddag replay {" ".join(traces)} --report {output / "demo.html"}')
+    say(f'\n== Side by side, {args.baseline_seconds:g} s each ==')
+    runs = [(what, executor, _measured(args, path, executor, utilisation)) for what, path in (
+        (f'{args.processes} processes', placed), ('one process', graph))
+        for executor in ('rad-events', 'events')]
+    say(table(['', 'executor', 'due', 'in time', 'share'], [
+        [what, 'this' if executor == 'rad-events' else 'EventsExecutor', run['sink_jobs_due'],
+         run['on_time'], percent(run['on_time'], run['sink_jobs_due'])]
+        for what, executor, run in runs]))
+    return {'placement': placement, 'live': live, 'recorded': recorded, 'traces': traces,
+            'measured': [{'what': what, 'executor': executor, **run}
+                         for what, executor, run in runs]}
+
+
+def _measured(
+    args: argparse.Namespace, graph: Path, executor: str, utilisation: float
+) -> dict[str, Any]:
+    """Run the same nodes on an executor; return what they measured."""
+    from mddag_executor.live.bench.campaign import measure
+    spec = Spec(
+        load='autoware', executor=executor, workers=WORKERS, seconds=args.baseline_seconds,
+        seed=args.seed, graph=str(graph), utilisation=utilisation,
+        bodies='sleep' if args.processes is None else 'spin')
+    with Progress('measuring', args.baseline_seconds + 3) as progress:
+        return measure(spec, progress.update)
 
 
 def _introduction(args: argparse.Namespace, graph: Path) -> Iterator[str]:
@@ -147,16 +218,6 @@ def run_replays(graph: Path, output: Path) -> tuple[dict[str, Any], dict[str, An
     return recorded, rescheduled
 
 
-def run_baseline(args: argparse.Namespace, graph: Path) -> dict[str, Any]:
-    """Run the same nodes on rclpy's MultiThreadedExecutor; return what they measured."""
-    from mddag_executor.live.bench.campaign import measure
-    spec = Spec(
-        load='autoware', executor='multi', workers=WORKERS, seconds=args.baseline_seconds,
-        seed=args.seed, graph=str(graph), utilisation=args.utilisation)
-    with Progress('running the baseline', args.baseline_seconds + 3) as progress:
-        return measure(spec, progress.update)
-
-
 def mddag(*arguments: str) -> list[str]:
     """Return the command line of a verb."""
     return [sys.executable, '-m', 'mddag_executor', *arguments]
@@ -177,23 +238,27 @@ def json_of(command: list[str], what: str, seconds: float | None = None) -> dict
     return result
 
 
-def replay_table(
-    live: dict[str, Any], recorded: dict[str, Any], rescheduled: dict[str, Any]
-) -> str:
-    """Return a table with a row for each sink: live, as recorded and rescheduled."""
-    header = (
-        'DAG', 'sink', 'live in time', 'recorded in time', 'rescheduled in time',
-        'live p99', 'recorded p99', 'rescheduled p99', 'deadline')
+def beside(which: Sequence[str], **several: dict[str, Any]) -> str:
+    """
+    Return a table with a row for each sink: what each of several results says of it.
+
+    :param which: of the response times' `median` and `p99`.
+    """
     rows: list[list[Cell]] = []
-    for sink in each_sink(live['dags']):
-        results = [
-            r['dags'][sink.dag]['sinks'][sink.name] for r in (live, recorded, rescheduled)]
+    for sink in each_sink(next(iter(several.values()))):
+        results = [dags[sink.dag]['sinks'][sink.name] for dags in several.values()]
+        times = [dict(zip(('median', 'p99'), response_cells(r['response_ns']))) for r in results]
         verdicts = [counts(result) for result in results]
         rows.append([
             sink.shown_dag, sink.shown_name, *(f'{v.in_time} of {v.due}' for v in verdicts),
-            *(response_cells(r['response_ns'])[1] for r in results),
+            *(cells[what] for what in which for cells in times),
             format_ns(results[0]['relative_deadline_ns'])])
-    return table(header, rows)
+    totals = [total(dags) for dags in several.values()]
+    rows.append(['all', '', *(percent(v.in_time, v.due) for v in totals),
+                 *[''] * (len(which) * len(several) + 1)])
+    return table(
+        ['DAG', 'sink', *(f'{name} in time' for name in several),
+         *(f'{name} {what}' for what in which for name in several), 'deadline'], rows)
 
 
 def agreement(live: dict[str, Any], recorded: dict[str, Any]) -> str:

@@ -89,17 +89,14 @@ def test_every_executor_is_offered_the_same(tmp_path: Path, mddag: Mddag) -> Non
 
 
 class VirtualStop:
-    """An event that is set after a time of a virtual clock."""
+    """Says after a time of a virtual clock that it is time to stop."""
 
     def __init__(self, after_ns: int) -> None:
         self.now, self.end = 0, after_ns
 
-    def is_set(self) -> bool:
-        return self.now >= self.end
-
     def wait(self, seconds: float) -> bool:
         self.now = min(self.end, self.now + round(seconds * 1e9))
-        return self.is_set()
+        return self.now >= self.end
 
 
 @pytest.mark.parametrize('seed', [None, 1])
@@ -111,7 +108,7 @@ def test_topics_are_published_in_rows_or_at_drawn_phases(
     published: list[tuple[int, int]] = []
     topics: Any = [SimpleNamespace(publish=lambda _, index=index: published.append(
         (stop.now, index))) for index in range(5)]
-    assert publisher.publish(topics, 20.0, seed, stop) == [20] * 5
+    assert publisher.publish(topics, 20.0, seed, stop.wait) == [20] * 5
     times = [time for time, _ in published]
     if seed is None:
         assert [index for _, index in published] == [0, 1, 2, 3, 4] * 20

@@ -9,7 +9,7 @@ from pathlib import Path
 import subprocess
 from typing import Any
 
-from mddag_executor.cli.demo import agreement, replay_table, side_by_side
+from mddag_executor.cli.demo import agreement, beside, side_by_side
 from msg_graph import load
 import pytest
 
@@ -28,8 +28,11 @@ def test_the_demo_says_where_recording_and_live_differ() -> None:
     assert agreement(live, other) == (
         'The replay counts otherwise for 1 of 2 sinks: /b:y (live 20 completed, 2 late; '
         'recorded 20, 3)')
-    assert replay_table(live, same, other).splitlines()[2].split()[:10] == [
+    table = beside(('p99',), **{name: each['dags'] for name, each in (
+        ('live', live), ('recorded', same), ('rescheduled', other))}).splitlines()
+    assert table[2].split()[:10] == [
         'b:y', '18', 'of', '20', '18', 'of', '20', '17', 'of', '20']
+    assert table[3].split()[0] == 'all'
 
 
 def test_the_demo_sets_both_executors_side_by_side() -> None:
