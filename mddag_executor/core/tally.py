@@ -32,7 +32,7 @@ from mddag_executor.core.state import (
     SINK_MISSED,
 )
 from mddag_executor.core.tables import Tables
-from msg_graph import TaskSet
+from msg_graph import Dag, TaskSet
 
 VERDICTS = {
     SINK_IN_TIME: 'in_time', SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
@@ -283,6 +283,12 @@ class Tally:
                 'dag': self._dags[dag].name, 'vertex': self.vertex_name(vertex), 'job': job,
                 'deadline_ns': deadline, 'completed_ns': time if kind == SINK_LATE else None}
 
+    def sinks_of(self, dag: Dag) -> dict[int, SinkTally]:
+        """Return what came of the sinks of a DAG, by global vertex."""
+        first = self._tables.first_sink
+        return {v: self.sinks[v]
+                for v in self._tables.sinks[first[dag.index]:first[dag.index + 1]]}
+
     def vertex_name(self, vertex: int) -> str:
         """Return the name of a global vertex."""
         dag = self._dags[self._tables.dag_of[vertex]]
@@ -295,13 +301,12 @@ class Tally:
 
     def result(self) -> dict[str, Any]:
         """Return the result format's verdicts: ``deadline_missed`` to ``dags``."""
-        tables = self._tables
         dags: dict[str, Any] = {}
         for dag in self._dags:
-            vertices = tables.sinks[tables.first_sink[dag.index]:tables.first_sink[dag.index + 1]]
             dags[dag.name] = {
                 'jobs': self.jobs[dag.index],
                 'ends': {_OUTCOMES[e]: n for e, n in self.ends[dag.index].items()},
-                'sinks': {self.vertex_name(v): self.sinks[v].result() for v in vertices}}
+                'sinks': {self.vertex_name(v): sink.result()
+                          for v, sink in self.sinks_of(dag).items()}}
         return {'deadline_missed': self.missed, 'first_miss': self.first_miss,
                 'never_due': never_due(dags), 'dags': dags}

@@ -24,25 +24,26 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
 import os
 import socket
 import threading
 import time
-from typing import TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import quantile
-from mddag_executor.core.tally import Counts, counts, SinkTally, Tally
+from mddag_executor.core.tally import Counts, counts, Tally
 from mddag_executor.live.settings import Thresholds
 from mddag_executor.live.shutdown import is_over, join, stop_at_exit
 from mddag_executor.text import counted
 from rclpy.logging import get_logger
 
 if TYPE_CHECKING:
+    from diagnostic_msgs.msg import DiagnosticArray
     from mddag_executor.live.pool import Pool
     from mddag_executor.live.recorder import Recorder
     from mddag_executor.live.registry import Registry
-    from msg_graph import TaskSet
+    from msg_graph import Dag, TaskSet
     from rclpy.context import Context
 
 TOPIC = '/diagnostics'
@@ -52,8 +53,7 @@ OK, WARN, ERROR, STALE = range(4)
 END_TIMEOUT_S = 2.0
 
 
-@dataclass(frozen=True)
-class Status:
+class Status(NamedTuple):
     """One status: name, level (OK, WARN, ERROR, STALE), message, values by key."""
 
     name: str
@@ -62,80 +62,65 @@ class Status:
     values: dict[str, str]
 
 
-def last_responses(sink: SinkTally, count: int) -> list[int]:
-    """Return the last response times, ns; while others are added, one may be there twice."""
-    kept = sink.responses
-    return [kept[-i] for i in range(1, min(count, len(kept)) + 1)]
+class _Seen(NamedTuple):
+    """The counters of a DAG at one time, as they stood."""
+
+    results: Counts
+    jobs: int
+    completed: list[int]
+    causes: Counter[str]
 
 
 class DagWatch:
     """
     Judges the state of one DAG, period by period.
 
-    :param dag: its index.
-    :param period_ns: the period of its source.
     :param every_ns: the period of the diagnostics.
     :param causes: how many misses of which cause there have been.
     """
 
     def __init__(
-        self, tally: Tally, dag: int, name: str, period_ns: int, sinks: list[SinkTally],
-        names: list[str], thresholds: Thresholds, every_ns: int, causes: Mapping[str, int],
+        self, tally: Tally, dag: Dag, thresholds: Thresholds, every_ns: int,
+        causes: Mapping[str, int],
     ) -> None:
-        self._causes = causes
-        self._caused: deque[Counter[str]] = deque(maxlen=thresholds.window)
-        self._last_causes = Counter(causes)
         self._tally = tally
         self._dag = dag
-        self._name = name
-        self._period_ns = period_ns
-        self._sinks = sinks
-        self._names = names
         self._thresholds = thresholds
-        self._stale_after = max(thresholds.stale_periods * period_ns, every_ns)
-        self._last = self._read()
-        self._jobs = tally.jobs[dag]
-        self._completed = [s.completed for s in sinks]
-        self._window: deque[Counts] = deque(maxlen=thresholds.window)
+        self._causes = causes
+        self._sinks = {tally.vertex_name(v): sink for v, sink in tally.sinks_of(dag).items()}
+        self._stale_after = max(thresholds.stale_periods * dag.period_ns, every_ns)
+        # what was seen in each period of the window, and before it
+        self._seen = deque([self._look()], maxlen=thresholds.window + 1)
         self._released_at: int | None = None
 
-    def _read(self) -> Counts:
-        """Read the counters as they stand."""
-        return Counts.total(counts(vars(sink)) for sink in self._sinks)
+    def _look(self) -> _Seen:
+        sinks = self._sinks.values()
+        return _Seen(
+            Counts.total(counts(vars(sink)) for sink in sinks), self._tally.jobs[self._dag.index],
+            [sink.completed for sink in sinks], Counter(self._causes))
 
     def status(self, now: int) -> Status:
         """Return the state of things; to be called once a period (``now``: monotonic ns)."""
-        results, jobs = self._read(), self._tally.jobs[self._dag]
-        step = results.minus(self._last)
-        self._window.append(step)
-        if jobs != self._jobs:
+        last, seen = self._seen[-1], self._look()
+        self._seen.append(seen)
+        if seen.jobs != last.jobs:
             self._released_at = now
-        self._last, self._jobs = results, jobs
-        window = Counts.total(self._window)
-        causes = self._why()
-        level, message = self._level(step, window, now, causes)
+        before, results = self._seen[0], seen.results
+        window = results.minus(before.results)
+        since = Counter(seen.causes)
+        since.subtract(before.causes)   # what turns out to be the machine's counts less before
+        causes = ', '.join(f'{n} {cause}' for cause, n in since.most_common() if n > 0)
+        level, message = self._level(results.minus(last.results), window, now, causes)
         ratio = window.missed / window.due if window.due else 0.0
         values = {
-            'period_ms': _ms(self._period_ns), 'jobs': str(jobs),
+            'period_ms': _ms(self._dag.period_ns), 'jobs': str(seen.jobs),
             'results': str(results.due), 'missed': str(results.missed),
             'late': str(results.late), 'expired': str(results.expired),
             'aborted': str(results.aborted), 'failed': str(results.failed),
             'window_results': str(window.due), 'window_missed': str(window.missed),
             'window_missed_ratio': f'{ratio:.4f}', 'window_causes': causes,
-            **self._response_times()}
-        return Status(f'{self._thresholds.name}: {self._name}', level, message, values)
-
-    def _why(self) -> str:
-        """Return the causes of the window's misses, the most frequent first."""
-        causes = Counter(self._causes)
-        step = Counter(causes)
-        step.subtract(self._last_causes)    # what turns out to be the machine's counts less before
-        self._caused.append(step)
-        self._last_causes = causes
-        total: Counter[str] = Counter()
-        for each in tuple(self._caused):
-            total.update(each)
-        return ', '.join(f'{n} {cause}' for cause, n in total.most_common() if n > 0)
+            **self._response_times(last, seen)}
+        return Status(f'{self._thresholds.name}: {self._dag.name}', level, message, values)
 
     def _level(
         self, step: Counts, window: Counts, now: int, causes: str
@@ -158,18 +143,18 @@ class DagWatch:
             return WARN, message
         return OK, message
 
-    def _response_times(self) -> dict[str, str]:
+    def _response_times(self, last: _Seen, seen: _Seen) -> dict[str, str]:
         """Return the response times of the last period, in parts of their deadlines and in ms."""
         times: list[int] = []
         used: list[float] = []
         margins: dict[str, int] = {}
-        for i, sink in enumerate(self._sinks):
-            completed = sink.completed
-            found = last_responses(sink, completed - self._completed[i])
-            self._completed[i] = completed
+        for (name, sink), before, now in zip(self._sinks.items(), last.completed, seen.completed):
+            # while others are added, one may be there twice
+            kept = sink.responses
+            found = [kept[-i] for i in range(1, min(now - before, len(kept)) + 1)]
             times += found
             if found:
-                margins[self._names[i]] = sink.relative_deadline_ns - max(found)
+                margins[name] = sink.relative_deadline_ns - max(found)
                 used.append(max(found) / sink.relative_deadline_ns)
         if not times:
             return {}
@@ -255,19 +240,15 @@ class Diagnostics:
         self._registry = registry
         self._period_ns = period_ns
         self._hardware_id = f'{socket.gethostname()}/{process or os.getpid()}'
-        tally, tables = pool.engine.verdicts.tally, pool.engine.tables
+        verdicts = pool.engine.verdicts
         self._dags = []
         for dag in task_set.dags if task_set is not None else ():
-            sinks = tables.sinks[tables.first_sink[dag.index]:tables.first_sink[dag.index + 1]]
             # one that several processes share is reported where its source and its sinks are
             reported_by = dag.vertices if process is None else [
                 dag.vertices[i] for i in (dag.source, *dag.sinks)]
             self._dags.append((
                 {vertex.callback.key for vertex in reported_by},
-                DagWatch(tally, dag.index, dag.name, dag.period_ns,
-                         [tally.sinks[v] for v in sinks],
-                         [tally.vertex_name(v) for v in sinks], thresholds, period_ns,
-                         pool.engine.verdicts.causes[dag.index])))
+                DagWatch(verdicts.tally, dag, thresholds, period_ns, verdicts.causes[dag.index])))
         self._pool = PoolWatch(pool, registry, recorder, thresholds)
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
@@ -295,52 +276,43 @@ class Diagnostics:
 
     def _run(self) -> None:
         try:
-            publisher = _Publisher(self._context, self._hardware_id)
-            try:
-                due = time.monotonic_ns() + self._period_ns
-                while not self._ending.wait(max(0, due - time.monotonic_ns()) / 1e9):
-                    if is_over(self._context):
-                        return
-                    publisher.publish(self.statuses())
-                    # a period that was missed (the machine slept) is not made up for
-                    due = max(due + self._period_ns, time.monotonic_ns())
-            finally:
-                publisher.destroy()
+            self._publish()
         except Exception as error:
             if not is_over(self._context):
                 get_logger('mddag_executor').error(f'there will be no diagnostics: {error}')
 
-
-class _Publisher:
-    """A node that publishes statuses; no executor runs it, since it has nothing to run."""
-
-    def __init__(self, context: Context, hardware_id: str) -> None:
+    def _publish(self) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.node import Node
         from rclpy.parameter import Parameter
-        self._hardware_id = hardware_id
+        # No executor runs the node, since it has nothing to run.
         # Its own arguments go before those of the process, which name the process' nodes.
-        self._node = Node(
-            NODE_NAME, context=context, enable_rosout=False, start_parameter_services=False,
+        node = Node(
+            NODE_NAME, context=self._context, enable_rosout=False, start_parameter_services=False,
             cli_args=['--ros-args', '-r', f'__node:={NODE_NAME}_{os.getpid()}'],
             parameter_overrides=[Parameter('start_type_description_service', value=False)])
-        self._publisher = self._node.create_publisher(DiagnosticArray, TOPIC, 10)
+        try:
+            publisher = node.create_publisher(DiagnosticArray, TOPIC, 10)
+            due = time.monotonic_ns() + self._period_ns
+            while not self._ending.wait(max(0, due - time.monotonic_ns()) / 1e9):
+                if is_over(self._context):
+                    return
+                publisher.publish(self._message())
+                # a period that was missed (the machine slept) is not made up for
+                due = max(due + self._period_ns, time.monotonic_ns())
+        finally:
+            with suppress(Exception):  # the context has ended meanwhile
+                node.destroy_node()
 
-    def publish(self, statuses: list[Status]) -> None:
+    def _message(self) -> DiagnosticArray:
         from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
         message = DiagnosticArray()
         # of the system's clock: simulated time may stand still, and this is about the process
         stamp = message.header.stamp
         stamp.sec, stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
-        for status in statuses:
+        for status in self.statuses():
             message.status.append(DiagnosticStatus(
                 level=bytes([status.level]), name=status.name, message=status.message,
                 hardware_id=self._hardware_id,
                 values=[KeyValue(key=key, value=value) for key, value in status.values.items()]))
-        self._publisher.publish(message)
-
-    def destroy(self) -> None:
-        try:
-            self._node.destroy_node()
-        except Exception:
-            pass  # the context has ended meanwhile
+        return message

@@ -35,10 +35,8 @@ class Watched:
         self.job = 0
         self.causes: dict[str, int] = {}
         self.now = SECOND
-        dag = task_set.dags[0]
         self.watch = DagWatch(
-            self.tally, 0, dag.name, dag.period_ns, [self.tally.sinks[self.sink]],
-            [self.tally.vertex_name(self.sink)], Thresholds(**thresholds), SECOND, self.causes)
+            self.tally, task_set.dags[0], Thresholds(**thresholds), SECOND, self.causes)
 
     def after(self, in_time: int = 0, late: int = 0, expired: int = 0) -> Any:
         for kind, count, response in (
@@ -63,7 +61,7 @@ def test_levels_follow_the_share_of_misses_in_the_window():
     assert (status.level, status.message) == (
         WARN, '1 of 100 results missed their deadlines: 1 waited')
     assert status.values['margin_min_ms'] == '-10.000'
-    assert status.values[f'margin_ms {watched.watch._names[0]}'] == '-10.000'
+    assert status.values[f'margin_ms {watched.tally.vertex_name(watched.sink)}'] == '-10.000'
     assert status.values['window_missed_ratio'] == '0.0100'
     status = watched.after(in_time=20, expired=30)
     assert (status.level, status.values['expired']) == (ERROR, '30')
