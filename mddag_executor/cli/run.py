@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from mddag_executor.live.executor import MultiDeadlineExecutor
     from mddag_executor.live.loading import Program
     from mddag_executor.live.measure import ExecutionPlan, Ledger
+    from mddag_executor.live.processes import Supervisor
     from mddag_executor.live.session import Session
-    from mddag_executor.live.supervisor import Supervisor
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -135,8 +135,7 @@ def main(args: argparse.Namespace) -> int:
 
 def part(args: argparse.Namespace) -> int:
     """Run one process of several, and leave what came of it in the folder of the run."""
-    from mddag_executor.live.parts import Part
-    from mddag_executor.live.supervisor import belong_to_parent
+    from mddag_executor.live.processes import belong_to_parent, Part
     the_part = Part.read(args.part)
     belong_to_parent(the_part.parent)
     task_set = loads(the_part.text, name=args.graph)
@@ -282,7 +281,7 @@ def _run(
     """Run until the end; see ``run_here``."""
     from mddag_executor.live.measure import measure
     from mddag_executor.live.session import Session
-    from mddag_executor.live.watch import Watch
+    from mddag_executor.live.statistics import Watch
 
     def end_begins() -> None:
         ends()
@@ -334,7 +333,7 @@ def _run_synthetic(
 
 def _begin(args: argparse.Namespace, task_set: TaskSet) -> Callable[..., int | None]:
     """Return what waits until publishers and subscriptions have met, and for other processes."""
-    from mddag_executor.live.parts import Part
+    from mddag_executor.live.processes import Part
     from mddag_executor.live.session import Session
     if args.part is None:
         return Session.wait_until_matched

@@ -27,8 +27,8 @@ from mddag_executor.errors import UsageError
 from mddag_executor.report.live_runs import ended_line, summary
 from mddag_executor.report.tables import sink_table
 from msg_graph import TaskSet
+from msg_graph.edit import load_processes, with_processes
 from msg_graph.errors import listed, shown
-from msg_graph.processes import load_processes, with_processes
 
 EXIT_DIED = 70
 _PROBE_TIMEOUT_S = 120.0
@@ -59,8 +59,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     """
     from mddag_executor.live.loading import ros_arguments
     from mddag_executor.live.measure import ExecutionPlan
-    from mddag_executor.live.parts import left, Part, together
-    from mddag_executor.live.supervisor import Run, Supervisor
+    from mddag_executor.live.processes import left, Part, Run, Supervisor, together
     plan = None
     if args.synthetic is not None:
         workers = defaults.workers(args.workers, task_set)
@@ -184,8 +183,7 @@ def _probe(
 ) -> Mapping[str, Sequence[str]]:
     """Return the names of the nodes that each SPEC brings."""
     from mddag_executor.live.loading import ros_arguments
-    from mddag_executor.live.parts import left
-    from mddag_executor.live.supervisor import ProcessError
+    from mddag_executor.live.processes import left, ProcessError
     # Nobody is to hear of these nodes.
     environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
     with subprocess.Popen(

@@ -9,7 +9,8 @@ Theory of operation
 after the executor: it takes note of entities that come and go, resumes what cannot say when it
 is ready, and ends the spin on an exception, a shutdown, a done future or a time-out.
 
-``spin_once`` (see ``stepping``) runs one callback in the calling thread.
+``spin_once`` uses no thread at all: one wait set over everything hands over what is ready, and the
+calling thread runs the one callback that the core puts first.
 
 Whatever has been taken and not run yet stays with the core and runs with the next spin.
 """
@@ -43,7 +44,7 @@ from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import Entity, TASK
 from mddag_executor.live.groups import Groups
 from mddag_executor.live.intake.events import EventsIntake
-from mddag_executor.live.intake.waitset import WaitSetIntake
+from mddag_executor.live.intake.waitset import ALL_KINDS, WaitSetIntake
 from mddag_executor.live.interpreter import short_switch_interval
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.rates import RateWatch
@@ -64,10 +65,9 @@ from mddag_executor.live.settings import (
 )
 from mddag_executor.live.shutdown import call_at_shutdown, halt_at_exit, is_over
 from mddag_executor.live.statistics import statistics
-from mddag_executor.live.stepping import Stepper
 from mddag_executor.live.stop_watch import StopWatch
 from mddag_executor.live.tasks import make_task, Unclaimed
-from mddag_executor.live.upkeep import Upkeep
+from mddag_executor.live.upkeep import Intake, Upkeep
 from mddag_executor.live.verdicts import DeadlineMiss
 from mddag_executor.live.work import QuickCallback, Work
 from msg_graph import TaskSet
@@ -215,8 +215,8 @@ class MultiDeadlineExecutor(BareExecutor):
         self._announcements: Announcements | None = None
         self._upkeep = Upkeep(
             self._nodes_to_look_after, self._registry, self._pool, self._recorder)
-        self._intake: EventsIntake | WaitSetIntake | None = None
-        self._stepper: Stepper | None = None
+        self._intake: Intake | None = None
+        self._stepping: WaitSetIntake | None = None
         super().__init__(context=context)
         self._diagnostics: Diagnostics | None = None
         if every_ns is not None:
@@ -446,7 +446,7 @@ class MultiDeadlineExecutor(BareExecutor):
         kind = self._intake_kind
         if kind == 'auto':
             kind = 'events' if EventsIntake.available() else 'waitset'
-        intake: EventsIntake | WaitSetIntake
+        intake: Intake
         if kind == 'events':
             intake = EventsIntake(
                 self.context, self._receiver, on_shutdown=self._attention.ring,
@@ -536,11 +536,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._look_after()
                 self._raise_error()
                 self._pool.stopped_at = 0
-                if self._stepper is None:
-                    self._stepper = Stepper(
-                        self.context, self._receiver, self.guards(), self._upkeep, self._pool,
-                        self._submit_tasks)
-                ran = self._stepper.step(deadline, done)
+                ran = self._step(deadline, done)
                 self._raise_error()
                 if ran or done():
                     return
@@ -551,6 +547,31 @@ class MultiDeadlineExecutor(BareExecutor):
             raise
         finally:
             self._spinning.release()
+
+    def _step(self, deadline: float | None, done: Callable[[], bool]) -> bool:
+        """
+        Handle what is ready, waiting where nothing is; run one callback if there is one.
+
+        :param deadline: when to wait no longer (monotonic, s); None: never.
+        :param done: whether there is nothing to wait for any more.
+        :return: whether one ran.
+        """
+        if self._stepping is None:
+            self._stepping = WaitSetIntake(
+                self.context, self._receiver, self.guards(), ALL_KINDS)
+            self._upkeep.add_intake(self._stepping)
+        self._upkeep.refresh()
+        self._pool.look_around()
+        self._stepping.poll(0.0)
+        self._submit_tasks()
+        if self._pool.run_one():
+            return True
+        if done():  # what it woke up for has just been polled away
+            return False
+        self._stepping.poll(None if deadline is None else max(0.0, deadline - time.monotonic()))
+        self._upkeep.refresh()
+        self._submit_tasks()
+        return self._pool.run_one()
 
     # --- the end ---------------------------------------------------------------------------------
 
@@ -566,9 +587,10 @@ class MultiDeadlineExecutor(BareExecutor):
         self.begin_end()
         self.wake()
         self._pool.pause()
-        if self._stepper is not None and self._spinning.acquire(blocking=False):
-            self._stepper.stop()
-            self._stepper = None
+        if self._stepping is not None and self._spinning.acquire(blocking=False):
+            self._stepping.stop()
+            self._upkeep.remove_intake(self._stepping)
+            self._stepping = None
             self._spinning.release()
         if not self._pool.close(timeout_sec):
             return False

@@ -36,9 +36,9 @@ import threading
 from typing import Any, TYPE_CHECKING
 import weakref
 
+from mddag_executor.live.compat import instead, Replacements
 from mddag_executor.live.compat.events_executor import events_executor_modules
 from mddag_executor.live.loading import LoadingError
-from mddag_executor.live.replacing import instead, Replacements
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node

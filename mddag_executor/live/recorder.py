@@ -7,42 +7,17 @@ from __future__ import annotations
 from collections.abc import Iterable
 import socket
 import threading
-from typing import Any, Protocol
+from typing import Any
 import weakref
 
 from mddag_executor import defaults
-from mddag_executor.clocks import boot
+from mddag_executor.clocks import boot, TraceClock
 from mddag_executor.live.entity import Entity, SERVICE, SUBSCRIPTION, TIMER
 from mddag_executor.trace.errors import TraceError
 from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
 from rclpy.logging import get_logger
 from rclpy.utilities import get_rmw_implementation_identifier
-
-
-class Clock(Protocol):
-    """The trace's clock."""
-
-    offset_ns: int
-
-    def now(self) -> int:
-        """Return the time."""
-
-
-class Writer(Protocol):
-    """Writes a trace; see ``trace.TraceWriter``."""
-
-    error: TraceError | None
-
-    @property
-    def dropped(self) -> int:
-        """Return how many recorded events are not in the file and will not be."""
-
-    def record(self, *event: Any) -> None:
-        """Record an event."""
-
-    def close(self) -> None:
-        """Complete the file."""
 
 
 class Recorder:
@@ -52,20 +27,20 @@ class Recorder:
     Addresses are those of Python objects: the node, the entity, and, for callbacks, what is kept
     for the entity (``Entity``).
 
-    :param writer: writes the file; None: one that keeps nobody waiting.
+    :param writer: writes the file, as a ``TraceWriter``; None: one that keeps nobody waiting.
     :param cpus: that there are, 0: nobody knows; None: the machine's.
     :raises mddag_executor.trace.TraceError: when the file cannot be written.
     """
 
     def __init__(
         self, path: str, task_set: TaskSet | None, policy: str, workers: int,
-        default_deadline: int, max_active_jobs: int, clock: Clock, writer: Writer | None = None,
+        default_deadline: int, max_active_jobs: int, clock: TraceClock, writer: Any = None,
         cpus: int | None = None,
     ) -> None:
         if writer is None:
             from mddag_executor.trace.writer import TraceWriter  # late: it loads the compression
             writer = TraceWriter(path, clock_offset=clock.offset_ns)
-        self.writer: Writer = writer
+        self.writer = writer
         self.record = self.writer.record
         self.path = path
         self._clock = clock

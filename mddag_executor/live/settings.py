@@ -1,6 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The settings with which an executor is made: checked, and brought into one form."""
+"""
+The settings with which an executor is made: checked, and brought into one form.
+
+What makes no sense, or is impossible on this machine or for this process, is a ``UsageError``.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +31,7 @@ MOST_JOBS = 1_000_000
 
 
 def whole_number(name: str, value: Any, most: int, unit: str = '') -> int:
-    """
-    Return a whole number from 1 up.
-
-    :raises UsageError: when it is none, or too large.
-    """
+    """Return a whole number from 1 up."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -47,21 +47,13 @@ def whole_number(name: str, value: Any, most: int, unit: str = '') -> int:
 
 
 def check_callable(name: str, value: Any) -> None:
-    """
-    Look at something that is to be called.
-
-    :raises UsageError: when that is impossible.
-    """
+    """Look at something that is to be called, or None."""
     if value is not None and not callable(value):
         raise UsageError(f'{name}: {value!r} cannot be called: give a function or None')
 
 
 def check_thresholds(value: Any) -> Thresholds:
-    """
-    Return the thresholds of the diagnostics, the usual ones for None.
-
-    :raises UsageError: when it is something else.
-    """
+    """Return the thresholds of the diagnostics, the usual ones for None."""
     if value is not None and not isinstance(value, Thresholds):
         raise UsageError(f'thresholds: {value!r} are none: give Thresholds(...), or None')
     return value or Thresholds()
@@ -71,7 +63,6 @@ def check_context(context: Any) -> None:
     """
     Look at the context that an executor is to belong to, None for the default one.
 
-    :raises UsageError: when it is no context.
     :raises NotInitializedException: when it has not been initialised.
     """
     if context is not None and not isinstance(context, Context):
@@ -81,11 +72,7 @@ def check_context(context: Any) -> None:
 
 
 def check_process(name: str | None, task_set: TaskSet | None) -> None:
-    """
-    Look at the name of a declared process.
-
-    :raises UsageError: when there is none of that name.
-    """
+    """Look at the name of a declared process, or None."""
     names = [process.name for process in task_set.processes] if task_set is not None else []
     if name is not None and name not in names:
         remedy = did_you_mean(name, names, f'give one of {listed(names)}') if names else (
@@ -130,7 +117,6 @@ def diagnostics_period_ns(period: int | str | None) -> int | None:
     Return the period of the diagnostics in ns, None for none.
 
     :param period: ns, or text as ``1s``; None or 0: no diagnostics.
-    :raises UsageError: when it is too short.
     """
     if isinstance(period, str):
         period = parse_duration(period)
@@ -152,7 +138,6 @@ def resolve(
     Return the task set, the number of workers and the default deadline (ns) of an executor.
 
     :raises msg_graph.GraphError: when the declaration is not right.
-    :raises UsageError: on a value that makes no sense.
     """
     task_set = load(graph) if isinstance(graph, (str, os.PathLike)) else graph
     if task_set is not None and not isinstance(task_set, TaskSet):
@@ -173,11 +158,7 @@ def resolve(
 def thread_setting(
     policy: str | None, priority: int | None, cpus: Iterable[int] | None
 ) -> Callable[[], None] | None:
-    """
-    Return what each worker thread calls first, None where nothing is to be set.
-
-    :raises UsageError: on a setting that this machine or process cannot have.
-    """
+    """Return what each worker thread calls first, None where nothing is to be set."""
     if policy is None and cpus is None:
         if priority is not None:
             raise UsageError(

@@ -15,7 +15,7 @@ from functools import partial
 import os
 import threading
 import time
-from typing import Any, Protocol
+from typing import Any
 import weakref
 
 from mddag_executor.live.compat import on_end
@@ -27,18 +27,6 @@ LAST_LOOK_NS = 500_000_000
 EXIT_PATIENCE_S = 1.0
 """So long a program that ends waits for callbacks that still run in an executor's threads."""
 _now = time.monotonic_ns
-
-
-class _Stopped(Protocol):
-
-    def stop(self) -> None: ...
-
-
-class _Executor(Protocol):
-
-    def halt(self) -> None: ...
-
-    def wait_halted(self, seconds: float) -> None: ...
 
 
 _Kept = dict[weakref.ref[Any], Any]
@@ -73,7 +61,7 @@ def is_over(context: Context) -> bool:
         return True
 
 
-def stop_at_exit(thing: _Stopped) -> None:
+def stop_at_exit(thing: Any) -> None:
     """
     Have what has threads stopped before the interpreter and the middleware end, if they run then.
 
@@ -92,21 +80,20 @@ def join(thread: threading.Thread, seconds: float | None = None) -> None:
         pass  # it is just being started, or that was interrupted; it finds out by itself
 
 
-def halt_at_exit(executor: _Executor) -> None:
+def halt_at_exit(executor: Any) -> None:
     """Have an executor stopped before the interpreter ends, in whichever thread it spins."""
     _keep(_executors, executor)
 
 
 @atexit.register
 def _stop_all() -> None:
-    executors: list[_Executor] = [executor for executor, _ in _living(_executors)]
+    executors = [executor for executor, _ in _living(_executors)]
     for executor in executors:
         executor.halt()
     end = _now() + int(EXIT_PATIENCE_S * 1e9)
     for executor in executors:
         executor.wait_halted(max(0.0, (end - _now()) / 1e9))
-    started: list[_Stopped] = [thing for thing, _ in _living(_started)]
-    for thing in started:
+    for thing, _ in _living(_started):
         thing.stop()
 
 

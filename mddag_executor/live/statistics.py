@@ -1,16 +1,26 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""A snapshot of what an executor has done: plain dictionaries, as ``--json`` has them."""
+"""
+What an executor has done: a snapshot in plain dictionaries, as ``--json`` has them, and drift.
+
+The rules of drift are in ``msg_graph.drift``. What they need to know of a live run the executor
+keeps anyway, but for the releases: ``Watch`` gets each of them.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core.tally import counts, never_due
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 from mddag_executor.live.why import CAUSES
+from msg_graph import TaskSet
+from msg_graph.drift import Drift, drift, Observed, Releases
+
+if TYPE_CHECKING:
+    from mddag_executor.live.executor import MultiDeadlineExecutor
 
 
 def statistics(
@@ -64,3 +74,41 @@ def statistics(
             'path': recorder.path, 'lost': recorder.writer.dropped,
             'error': None if recorder.writer.error is None else str(recorder.writer.error)},
     }
+
+
+class Watch:
+    """
+    Watches an executor from here on.
+
+    :param task_set: the declaration that the executor was made with.
+    """
+
+    def __init__(self, executor: MultiDeadlineExecutor, task_set: TaskSet) -> None:
+        self._executor = executor
+        self._task_set = task_set
+        self._now = executor._trace_clock.now
+        self._begin = self._now()
+        self._releases = [Releases() for _ in task_set.dags]
+        executor._engine.verdicts.on_release = self._released
+
+    def _released(self, dag: int, release: int) -> None:
+        if dag < len(self._releases):
+            self._releases[dag].add(release)
+
+    def drift(self, statistics: dict[str, Any]) -> list[Drift]:
+        """Return where the run and the declaration disagree; ``statistics`` are its counts."""
+        return drift(self._task_set, self.observed(statistics))
+
+    def observed(self, statistics: dict[str, Any]) -> Observed:
+        """Return what was seen; ``statistics`` are the counts of the run."""
+        first = min((r.first for r in self._releases if r.count), default=self._begin)
+        counts = statistics['callbacks']
+        sources = (dag.vertices[dag.source].callback.key for dag in self._task_set.dags)
+        return Observed(
+            duration_ns=max(0, self._now() - first),
+            releases=dict(zip(sources, self._releases)),
+            got={key: count['ready'] for key, count in counts.items()},
+            ran={key: count['ran'] for key, count in counts.items()},
+            publishes={**self._executor._registry.publishes()},
+            nodes={key.rpartition(':')[0] for key in counts},
+            undeclared=self._executor._registry.undeclared())

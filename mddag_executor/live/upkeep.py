@@ -13,9 +13,11 @@ from __future__ import annotations
 from collections.abc import Callable
 import threading
 import time
-from typing import Any, Protocol
+from typing import Any
 
-from mddag_executor.live.intake.entities import EMPTY, EntitySet, snapshot
+from mddag_executor.live.intake.entities import EMPTY, snapshot
+from mddag_executor.live.intake.events import EventsIntake
+from mddag_executor.live.intake.waitset import WaitSetIntake
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
@@ -25,15 +27,7 @@ REFRESH_REST = 3
 HAND_OVER_S = 2.0
 """For so long an intake is given to take no more of something; it takes a few milliseconds."""
 
-
-class Intake(Protocol):
-    """What is kept up to date of an intake."""
-
-    def update(self, entities: EntitySet) -> None:
-        """Set what to look after."""
-
-    def settled(self) -> bool:
-        """Return whether what was set has come into force."""
+Intake = EventsIntake | WaitSetIntake
 
 
 class Upkeep:

@@ -17,16 +17,17 @@ from functools import partial
 import itertools
 from typing import Any
 
-from mddag_executor.live.compat import attach_futures
-from mddag_executor.live.compat.in_process import (
+from mddag_executor.live.compat import (
     action_handle,
+    attach_futures,
     CLIENT_HANDLE,
     feedback_callback,
     goal_states,
+    instead,
+    Replacements,
     SERVER_HANDLE,
 )
 from mddag_executor.live.entity import Entity
-from mddag_executor.live.replacing import instead, Replacements
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.loop import Loop
 from mddag_executor.rerun.services import Header

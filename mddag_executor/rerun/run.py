@@ -22,8 +22,10 @@ import time
 from typing import Any, BinaryIO
 
 from mddag_executor import defaults
+from mddag_executor.clocks import TraceClock
 from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE_JOBS
 from mddag_executor.live import hooks
+from mddag_executor.live.compat import instead, Replacements
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import WAITABLE
 from mddag_executor.live.hosting import Guest
@@ -32,7 +34,6 @@ from mddag_executor.live.loading import describe, Program, ros_arguments
 from mddag_executor.live.other_processes import OtherProcesses
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
-from mddag_executor.live.replacing import instead, Replacements
 from mddag_executor.live.shutdown import is_over
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.actions import Actions
@@ -388,12 +389,11 @@ class Rerun:
             recorded, self.warnings)
 
 
-class _TraceTime:
+class _TraceTime(TraceClock):
     """The clock of a trace: virtual time."""
 
-    offset_ns = 0
-
     def __init__(self, start: int) -> None:
+        self.offset_ns = 0
         self._start = start
         self.loop: Loop | None = None
 

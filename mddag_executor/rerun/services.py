@@ -16,10 +16,14 @@ from functools import partial
 import itertools
 from typing import Any
 
-from mddag_executor.live.compat import complete_request, service_name
-from mddag_executor.live.compat.in_process import new_request
+from mddag_executor.live.compat import (
+    complete_request,
+    instead,
+    new_request,
+    Replacements,
+    service_name,
+)
 from mddag_executor.live.entity import Entity, SERVICE
-from mddag_executor.live.replacing import instead, Replacements
 from mddag_executor.live.work import Work
 from mddag_executor.rerun.loop import Loop
 from rclpy.client import Client

@@ -17,7 +17,7 @@ from typing import Any
 
 from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
-from mddag_executor.live import parts
+from mddag_executor.live import processes
 from mddag_executor.replay import replay
 from mddag_executor.trace import read_events
 from msg_graph import loads
@@ -148,8 +148,8 @@ class Beside:
 
 def test_processes_start_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """However late another process is: it is waited for until its nodes are made, and ready."""
-    parts.Part.make(str(tmp_path), CHAIN)
-    monkeypatch.setattr(parts.time, 'monotonic_ns', lambda: 5 * 10 ** 9)
+    processes.Part.make(str(tmp_path), CHAIN)
+    monkeypatch.setattr(processes.time, 'monotonic_ns', lambda: 5 * 10 ** 9)
     unmatched = ['/half']
     seen = []
 
@@ -160,22 +160,22 @@ def test_processes_start_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         return write
 
     session: Any = Beside(note('made', 6 * 10 ** 9), unmatched.clear, note('ready', 7 * 10 ** 9))
-    parts.Part.read(str(tmp_path)).start_together(
+    processes.Part.read(str(tmp_path)).start_together(
         'first', ['first', 'second'], session, lambda: unmatched)
     assert sorted(seen[0]) == ['first.made'] and 'first.ready' in seen[1]
-    assert session.waited == 2 + parts.LEAD_NS / 1e9
+    assert session.waited == 2 + processes.LEAD_NS / 1e9
 
 
 def test_who_has_ended_is_not_waited_for(tmp_path: Path) -> None:
     """As a process that is started again in the last second, when the others end."""
-    parts.Part.make(str(tmp_path), CHAIN)
+    processes.Part.make(str(tmp_path), CHAIN)
     for step in ('made', 'ready'):
         (tmp_path / f'second.{step}').write_text('1')
-    session: Any = Beside(lambda: parts.Part.ended(str(tmp_path), 'second'))
-    part = parts.Part.read(str(tmp_path))
+    session: Any = Beside(lambda: processes.Part.ended(str(tmp_path), 'second'))
+    part = processes.Part.read(str(tmp_path))
     part.start_together('first', ['first', 'second', 'third'], session, lambda: ['/half'])
-    assert not session.happens and session.waited <= parts.LEAD_NS / 1e9
-    parts.Part.starts(str(tmp_path), 'second')  # again: from now on it is
+    assert not session.happens and session.waited <= processes.LEAD_NS / 1e9
+    processes.Part.starts(str(tmp_path), 'second')  # again: from now on it is
     session = Beside(lambda: (tmp_path / 'third.made').write_text('1'), lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         part.start_together('first', ['first', 'second', 'third'], session, lambda: ['/half'])

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from mddag_executor.live.watch import Watch
+from mddag_executor.live.statistics import Watch
 from msg_graph import loads
 from rclpy.node import Node
 from std_msgs.msg import Empty
