@@ -191,7 +191,8 @@ def peek(t: Tables, s: State, now: int) -> int:
                     wait_for_poll(t, s, entry)
                 queue = next_queue(t, s, False)
                 continue
-            if (divided or s.x_holds[x] != 0) and not may_start(t, s, entry):
+            if ((divided or s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0)
+                    and not may_start(t, s, entry)):
                 heappop(queue)
                 heappush(s.held_back, entry)
                 if group >= 0 and s.group_owner[group] == -1:

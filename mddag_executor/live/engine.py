@@ -57,6 +57,8 @@ if TYPE_CHECKING:
 
 MOST_MISSED = 1000
 """After a long stop (a suspended machine) at most so many releases are judged one by one."""
+MOST_LOOKED_AT = 32
+"""Of more that waits nobody looks whether all of it needs the interpreter."""
 
 
 class Engine:
@@ -94,13 +96,13 @@ class Engine:
         self.has_more = False
         self.to_ask_again: list[Entity] = []
         self._state = self.scheduler.state
-        # what waits for the interpreter (rule 11); not to be changed from outside
-        self.held_back = self._state.held_back
+        # what waits; not to be changed from outside
+        self.queues = self._state.ready, self._state.held_back, self._state.unpolled
         self._work: dict[int, Work] = {}
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
-        # those that hold the interpreter, in the order in which they began
-        self._holders: list[Work] = []
+        # those that hold the interpreter, in the order in which they began; likewise
+        self.holders: list[Work] = []
         # whether who holds the interpreter may have overtaken another
         self.is_shared = False
         # whether who is overtaken pauses
@@ -189,7 +191,7 @@ class Engine:
                 or state.scalars[POLLING] or not state.scalars[N_IDLE]
                 or entity.removed or entity.gate is not None or self._finished
                 or entity.group >= 0 and state.group_owner[entity.group] >= 0
-                or entity.habit.holds and self._holders):
+                or entity.habit.holds and self.holders):
             return False
         entity.ready += 1
         self.undeclared += 1
@@ -362,8 +364,7 @@ class Engine:
     @property
     def has_waiting(self) -> bool:
         """Return whether anything waits that a worker may be able to run."""
-        state = self._state
-        return bool(state.ready or state.unpolled or state.held_back)
+        return any(self.queues)
 
     @property
     def idle_workers(self) -> int:
@@ -379,7 +380,7 @@ class Engine:
         :param worker: -1: the idle one with the lowest number, if there is any.
         """
         state = self._state
-        if not (state.ready or state.held_back or state.unpolled):
+        if not any(self.queues):
             self.has_more = False
             return None
         if self.alone is not None:
@@ -389,45 +390,55 @@ class Engine:
             if not state.scalars[N_IDLE]:
                 return None
             worker = state.worker_x.index(-1)
-        if self._holders:
+        if self.holders:
             state.overtaking[1] = self._may_be_overtaken(now)
+            if not state.overtaking[1] and self._all_is_to_hold():
+                self.has_more = False
+                return None
         x = self.scheduler.take(worker, now)
         if state.decisions:
             self._decided(now)
         if x < 0:
-            self.has_more = bool(state.ready or state.held_back or state.unpolled)
+            self.has_more = any(self.queues)
             return None
         work = self._work.pop(x)
         work.entity.waiting.pop(x, None)
         work.worker = worker
         if state.x_holds[x]:
             self._begins_to_hold(work, now)
-            self.has_more = bool(state.ready or state.unpolled)  # what is held back stays there
+            self.has_more = not self._all_is_to_hold()  # that is less urgent
         else:
-            self.has_more = bool(state.ready or state.held_back or state.unpolled)
+            self.has_more = any(self.queues)
         return work
 
     # --- the interpreter -------------------------------------------------------------------------
 
+    def _all_is_to_hold(self) -> bool:
+        """Return whether all that waits is to hold the interpreter; False also for very many."""
+        state = self._state
+        holds, ready = state.x_holds, state.ready
+        return not state.unpolled and len(ready) <= MOST_LOOKED_AT and (
+            0 not in [holds[entry[4]] for entry in ready])
+
     def _begins_to_hold(self, work: Work, now: int) -> None:
-        self._holders.append(work)
-        self.is_shared = len(self._holders) > 1
+        self.holders.append(work)
+        self.is_shared = len(self.holders) > 1
         self._holds_since = now
 
     def _holds_no_more(self, work: Work) -> None:
-        if work in self._holders:
-            self._holders.remove(work)
+        if work in self.holders:
+            self.holders.remove(work)
 
     def _may_be_overtaken(self, now: int) -> bool:
         """Return whether what comes first may overtake who began last to hold the interpreter."""
-        entity = self._holders[-1].entity
+        entity = self.holders[-1].entity
         usual = entity.habit.computed_ns or entity.busy_ns / max(1, entity.ran)
         return overtaking_pays(
             self.tables, self._state, 1, now - self._holds_since, int(usual), self.preempts)
 
     def interpreter_holder(self) -> Work | None:
         """Return the most urgent execution that holds the interpreter."""
-        holders = self._holders
+        holders = self.holders
         if len(holders) < 2:
             return holders[0] if holders else None
         return min(holders, key=lambda work: self._state.x_key[work.x])
@@ -435,7 +446,7 @@ class Engine:
     def overtaken(self) -> list[Work]:
         """Return what a more urgent execution has overtaken that computes, too."""
         first = self.interpreter_holder()
-        return [work for work in self._holders if work is not first]
+        return [work for work in self.holders if work is not first]
 
     def stop_holding(self, work: Work) -> None:
         """Give the interpreter back for an execution that does not need it now."""
@@ -502,8 +513,8 @@ class Engine:
             self.alone = None
             return
         x, work.x = work.x, -1
-        if work in self._holders:
-            self._holders.remove(work)
+        if work in self.holders:
+            self.holders.remove(work)
         end_it = self.scheduler.fail if failed else self.scheduler.complete
         if self.record is None:
             end_it(x, end)

@@ -66,18 +66,21 @@ class Habit:
     :param declared: what the declaration says, or None: it is learnt.
     :ivar holds: 1 or 0, for its next execution.
     :ivar computed_ns: how long it computes, lately; 0 where that is not learnt.
+    :ivar is_to_be_learnt: whether it is not known yet if it computes with the lock released.
     :ivar runs: how many executions have begun; whoever begins one counts it.
     :ivar due: from which run on ``is_to_be_measured`` is to be asked.
     """
 
     __slots__ = (
-        'holds', '_declared', 'computed_ns', '_part', '_known', '_released', '_passed', 'runs',
-        'due', '_close', '_unclear', '_looks', '_tries', '_trusted_from', '_sampled', '_overlaps')
+        'holds', '_declared', 'computed_ns', 'is_to_be_learnt', '_part', '_known', '_released',
+        '_passed', 'runs', 'due', '_close', '_unclear', '_looks', '_tries', '_trusted_from',
+        '_sampled', '_overlaps')
 
     def __init__(self, declared: bool | None = None) -> None:
         self.holds = int(declared or False)
         self._declared = declared is not None
         self.computed_ns = 0.0
+        self.is_to_be_learnt = False
         self._part: float | None = None
         self._known = 0
         self._released = 0.0
@@ -166,6 +169,7 @@ class Habit:
         else:
             self._part += (part - self._part) / LATELY
             self.computed_ns += (computed - self.computed_ns) / LATELY
+        self.is_to_be_learnt = self._tries < FIRST and self.computed_ns >= BRIEF_NS
         least, shortest = (WAITS, SHORT_NS / 2) if self._known else (COMPUTES, SHORT_NS)
         if (part >= least and computed >= shortest) != self._known and not self._overlaps:
             self._measure_next(LATELY)  # it may have changed
@@ -177,14 +181,10 @@ class Habit:
         return not self._declared and self.computed_ns >= BRIEF_NS and (
             self._looks <= FIRST or self._released > MIXED or self._looks % TRY_SAMPLE == 0)
 
-    @property
-    def is_to_be_learnt(self) -> bool:
-        """Return whether it is not known yet whether it computes with the lock released."""
-        return self._tries < FIRST and not self._declared and self.computed_ns >= BRIEF_NS
-
     def was_released(self, released: bool) -> bool:
         """Learn whether it computed with the lock released, and return that."""
         self._tries += 1
+        self.is_to_be_learnt &= self._tries < FIRST
         self._released += (released - self._released) / min(LATELY, self._tries)
         overlapped = self._overlaps
         self._overlaps = self._released >= (STILL_RELEASED if overlapped else RELEASED)

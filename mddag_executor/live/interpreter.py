@@ -127,7 +127,7 @@ class Interpreter:
         pauses = self._preemption is not None and self._preemption.update([
             (work, seat) for work in engine.overtaken()
             if (seat := self._seat(work)) is not None])
-        holder = engine.interpreter_holder() if engine.held_back or pauses else None
+        holder = engine.interpreter_holder() if any(engine.queues) or pauses else None
         if holder is None:
             self._seen = None, 0, 0
             if self.rings_at:
@@ -155,7 +155,7 @@ class Interpreter:
     def look_at_late(self) -> None:
         """Look at who has kept others from the interpreter since the last call of this."""
         engine = self._engine
-        if not engine.held_back:
+        if not engine.has_waiting:
             self._late = None
             return
         with self._lock:

@@ -120,9 +120,8 @@ class Pool:
             running = current.running
             if running is None:
                 own = self._hand_out(now, current.intake)
-            elif not (running.published and running.engine is self.engine
-                      and running.work is not None and not running.work.entity.ends_soon.debt):
-                self._hand_out(now)  # else who has published goes on with it soon
+            elif not (running.goes_on and running.engine is self.engine):
+                self._hand_out(now)  # else it goes on with it soon
         if own is not None:
             self._run_here(own)
 
@@ -158,9 +157,11 @@ class Pool:
         try:
             yield
         finally:
+            running = current.running
             with self.lock:
                 self._batches -= 1
-                self._hand_out(self.tick())
+                if running is None or not (running.goes_on and running.engine is self.engine):
+                    self._hand_out(self.tick())
 
     def tick(self) -> int:
         """Return the engine's time now; the caller holds the lock."""
@@ -314,7 +315,7 @@ class Pool:
             seat = self._seats[work.worker]
             seat.work = work
             seat.wake.release()
-        if engine.held_back or engine.is_shared or self.interpreter.rings_at:
+        if engine.holders and any(engine.queues) or engine.is_shared or self.interpreter.rings_at:
             self.interpreter.look_after()
         return chosen
 
@@ -370,6 +371,7 @@ class Pool:
             work.cpu_ns += thread_time_ns()
         end = monotonic_ns() + offset
         current.running = None
+        seat.goes_on = False
         if seat.published:
             after = end - offset - seat.published
             if entity.ends_soon.debt or after > SOON_NS:
@@ -392,7 +394,7 @@ class Pool:
             seat.work = None
             if seat.thread is None:
                 seat.began_ns = NEVER
-                if engine.has_waiting or engine.is_shared or self.interpreter.rings_at:
+                if any(engine.queues) or engine.is_shared or self.interpreter.rings_at:
                     self._hand_out(now)
             elif self._closed or not self.running or seat.worker < 0:
                 self._leave(seat, now)
@@ -400,7 +402,8 @@ class Pool:
                 seat.work = engine.dispatch(now, seat.worker)
                 if engine.has_more:
                     self._hand_out(now)
-                elif engine.held_back or engine.is_shared or self.interpreter.rings_at:
+                elif (engine.holders and any(engine.queues) or engine.is_shared
+                        or self.interpreter.rings_at):
                     self.interpreter.look_after()
         let_run = type(raised) is not Refused
         if waits_for is not None:

@@ -193,7 +193,7 @@ class Loop:
             self.computing.share(now)
             if self.computing.go_on(now):
                 return True
-        if engine.held_back and now >= self._ask_at:
+        if engine.has_waiting and engine.interpreter_holder() and now >= self._ask_at:
             self._ask_at = now + POLL_NS
             self.at(self._ask_at, TIMER, _nothing)  # it may overtake by then
         return self._advance(deadline)

@@ -8,9 +8,11 @@ import subprocess
 import sys
 
 from hypothesis import assume, given
+from hypothesis import strategies as st
 from mddag_executor.core import NEVER, POLICIES
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import Entity
+from mddag_executor.live.habits import Habit
 from mddag_executor.live.jobs import Origin
 from mddag_executor.live.work import Work
 from msg_graph import TaskSet
@@ -98,6 +100,33 @@ def test_the_same_events_give_the_same_answers_as_the_simulator(case: Case) -> N
     driver.engine.finish(HORIZON * TICK)
     verdicts = driver.engine.verdicts.tally.result()
     assert verdicts['dags'] == run.result()['dags']
+
+
+@examples(150)
+@given(st.lists(st.booleans() | st.integers(0, 2), max_size=120))
+def test_nothing_waits_that_may_run_beside_who_computes(steps: list[bool | int]) -> None:
+    """What computes or does not becomes ready, or a worker ends, as the pool does it."""
+    engine = Engine(
+        None, 3, 'rad', default_deadline=10 ** 9, max_active_jobs=NEVER, expire_after=NEVER)
+    entities = [Entity('waitable', None, '/n', None, -1, 0, '') for _ in range(2)]
+    for holds, entity in enumerate(entities):
+        entity.habit = Habit(bool(holds))
+    running: dict[int, Work] = {}
+    for now, step in enumerate(steps):
+        begun: list[Work | None] = []
+        if isinstance(step, bool):
+            engine.ready(Work(None, print, entity=entities[step]), now)
+            begun.append(engine.dispatch(now))
+        elif step in running:
+            engine.finished(running.pop(step), now, now, now, 0, step)
+            begun.append(engine.dispatch(now, step))
+        while begun and engine.has_more and (len(begun) == 1 or begun[-1] is not None):
+            begun.append(engine.dispatch(now))
+        running |= {work.worker: work for work in begun if work is not None}
+        if len(running) < engine.n_workers:
+            assert not entities[0].waiting
+            assert not entities[1].waiting or engine.holders
+        assert sum(work.entity.habit.holds for work in running.values()) <= 1
 
 
 def test_a_full_queue_drops_the_oldest_and_counts_it() -> None:

@@ -302,7 +302,7 @@ def test_computing_with_the_lock_released_is_noticed_and_looked_at_again():
 
 
 def test_the_alarm_that_rings_for_the_end_is_not_set_anew():
-    engine: Any = SimpleNamespace(held_back=False)
+    engine: Any = SimpleNamespace(queues=(), has_waiting=False)
     interpreter = Interpreter(engine, threading.Lock(), [], lambda: None)
     interpreter._watch(3600 * 1000 * MS)
     ring = interpreter._alarm.ring
