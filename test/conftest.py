@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 import contextlib
 from functools import cache
 import importlib
+import io
 import os
 from pathlib import Path, PurePosixPath
 import signal
@@ -241,6 +242,26 @@ def ros_context(no_thread_leak: None) -> Iterator[Any]:
     rclpy.init(context=context)
     yield context
     context.try_shutdown()
+
+
+@pytest.fixture
+def call(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Give a function that runs `mddag` with arguments in this process, which is quicker."""
+    def run(*arguments: str | Path, cwd: Path | None = None,
+            stdin: str | bytes = b'') -> subprocess.CompletedProcess[str]:
+        from mddag_executor.cli.main import main
+        command = [*map(str, arguments)]
+        with monkeypatch.context() as patch:
+            if cwd is not None:
+                patch.chdir(cwd)
+            given = stdin if isinstance(stdin, bytes) else stdin.encode()
+            patch.setattr('sys.stdin', io.TextIOWrapper(io.BytesIO(given), encoding='utf-8'))
+            status = main(command)
+        out, err = capsys.readouterr()
+        return subprocess.CompletedProcess(command, status, out, err)
+    return run
 
 
 @pytest.fixture

@@ -305,8 +305,8 @@ def test_nothing_outlives_a_killed_bench() -> None:
     (['--load', 'autoware', '--graph', '/none.yaml'], '/none.yaml: '),
     (['--load', 'topics', '--json', '/none/x'], '/none/x: there is no directory /none'),
 ])
-def test_a_wrong_command_line_is_one_line(mddag: Mddag, arguments: list[str], text: str) -> None:
-    process = mddag('bench', 'live', *arguments)
+def test_a_wrong_command_line_is_one_line(call: Mddag, arguments: list[str], text: str) -> None:
+    process = call('bench', 'live', *arguments)
     assert process.returncode == 2
     assert process.stderr.startswith('error: ')
     assert text in process.stderr

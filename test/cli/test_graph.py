@@ -28,9 +28,9 @@ paths:
 """
 
 
-def test_json(mddag: Mddag, tmp_path: Path) -> None:
+def test_json(call: Mddag, tmp_path: Path) -> None:
     (tmp_path / 'g.yaml').write_text(GRAPH)
-    done = mddag('graph', 'check', 'g.yaml', '--json', 'out.json', cwd=tmp_path)
+    done = call('graph', 'check', 'g.yaml', '--json', 'out.json', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     assert 'one' in done.stdout
     result = json.loads((tmp_path / 'out.json').read_text())
@@ -50,9 +50,9 @@ def test_json(mddag: Mddag, tmp_path: Path) -> None:
         'paths': {'p': ['/n:t', '/n:x', '/n:y']}}
 
 
-def test_table(mddag: Mddag, tmp_path: Path) -> None:
+def test_table(call: Mddag, tmp_path: Path) -> None:
     (tmp_path / 'g.yaml').write_text(GRAPH)
-    done = mddag('graph', 'check', 'g.yaml', cwd=tmp_path)
+    done = call('graph', 'check', 'g.yaml', cwd=tmp_path)
     assert done.returncode == 0
     rows = [line.split() for line in done.stdout.splitlines()]
     assert rows[1] == ['one', '10', 'ms', '3', '7', 'ms', '0.9000', '/n:x', '5', 'ms']
@@ -62,9 +62,9 @@ def test_table(mddag: Mddag, tmp_path: Path) -> None:
         '2 DAGs, 4 vertices, 4 callbacks, 1 queue edge, 1 path')
 
 
-def test_standard_input_and_output(mddag: Mddag) -> None:
+def test_standard_input_and_output(call: Mddag) -> None:
     text = (CONFIG / 'autoware_multi.yaml').read_text()
-    done = mddag('graph', 'check', '-', '--json', '-', input=text)
+    done = call('graph', 'check', '-', '--json', '-', stdin=text)
     assert (done.returncode, done.stderr) == (0, '')
     result = json.loads(done.stdout)
     assert len(result['dags']) == 11
@@ -73,14 +73,14 @@ def test_standard_input_and_output(mddag: Mddag) -> None:
     assert list(control['sinks'].values()) == [30_000_000, 15_000_000]
 
 
-def test_total_of_the_workload(mddag: Mddag) -> None:
-    done = mddag('graph', 'check', CONFIG / 'autoware.yaml')
+def test_total_of_the_workload(call: Mddag) -> None:
+    done = call('graph', 'check', CONFIG / 'autoware.yaml')
     assert done.stdout.splitlines()[-1] == (
         '11 DAGs, 86 vertices, 84 callbacks, 32 queue edges, 5 paths, load 5.102, '
         'utilisation 0.729 of 7 workers')
 
 
-def test_utilisation_is_one_thing_in_all_commands(mddag: Mddag, tmp_path: Path) -> None:
+def test_utilisation_is_one_thing_in_all_commands(call: Mddag, tmp_path: Path) -> None:
     (tmp_path / 'g.yaml').write_text(
         'mddag: 1\nworkers: 2\nnodes:\n  - node: /n\n    callbacks:\n'
         '      - {name: t, timer: 10ms, deadline: 10ms, execution_time: 4ms}\n')
@@ -88,7 +88,7 @@ def test_utilisation_is_one_thing_in_all_commands(mddag: Mddag, tmp_path: Path) 
     for command in (
             ['graph', 'check', 'g.yaml'], ['graph', 'analyse', 'g.yaml'], trace,
             ['replay', 'g.mcap'], ['replay', 'g.mcap', '--reschedule']):
-        done = mddag(*command, '--json', '-', cwd=tmp_path)
+        done = call(*command, '--json', '-', cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         result = json.loads(done.stdout)
         assert result['utilisation'] == pytest.approx(0.2, abs=0.002), command
@@ -103,21 +103,21 @@ def test_utilisation_is_one_thing_in_all_commands(mddag: Mddag, tmp_path: Path) 
      "or add 'period:' if it comes from outside of the graph"),
     ('', "error: g.yaml: the file is empty: write a declaration that starts with 'mddag: 1'"),
 ])
-def test_bad_input_is_one_line(mddag: Mddag, tmp_path: Path, text: str, line: str) -> None:
+def test_bad_input_is_one_line(call: Mddag, tmp_path: Path, text: str, line: str) -> None:
     (tmp_path / 'g.yaml').write_text(text)
-    done = mddag('graph', 'check', 'g.yaml', '--json', 'out.json', cwd=tmp_path)
+    done = call('graph', 'check', 'g.yaml', '--json', 'out.json', cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, '')
     assert done.stderr == line + '\n'
     assert not (tmp_path / 'out.json').exists()
 
 
-def test_missing_file_and_bad_usage(mddag: Mddag, tmp_path: Path) -> None:
-    done = mddag('graph', 'check', 'none.yaml', cwd=tmp_path)
+def test_missing_file_and_bad_usage(call: Mddag, tmp_path: Path) -> None:
+    done = call('graph', 'check', 'none.yaml', cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith('error: none.yaml: the file cannot be read (No such file')
     assert done.stderr.count('\n') == 1
     for arguments in (('graph',), ('graph', 'chek', 'g'), ('graph', 'check')):
-        done = mddag(*arguments)
+        done = call(*arguments)
         assert done.returncode == 2
         assert done.stderr.startswith('error: ')
         assert done.stderr.count('\n') == 1

@@ -23,21 +23,21 @@ nodes:
 """
 
 
-def test_table(mddag: Mddag) -> None:
-    done = mddag('graph', 'analyse', '-', '--budget', 'mean', input=GRAPH)
+def test_table(call: Mddag) -> None:
+    done = call('graph', 'analyse', '-', '--budget', 'mean', stdin=GRAPH)
     assert (done.returncode, done.stderr) == (0, '')
     assert 'after Melani et al. 2015' in done.stdout
     assert done.stdout.splitlines()[-1] == (
         '2 workers, budget mean: the deadlines hold under any work-conserving, preemptive or not; '
         'rad, not preemptive (the live executor)')
-    done = mddag('graph', 'analyse', '-', input=GRAPH)
+    done = call('graph', 'analyse', '-', stdin=GRAPH)
     assert done.stdout.splitlines()[-1] == (
         '2 workers, budget max: no scheduler can keep these deadlines')
 
 
-def test_json(mddag: Mddag) -> None:
-    done = mddag('graph', 'analyse', CONFIG / 'autoware.yaml', '--budget', 'mean', '--workers',
-                 '5', '--json', '-')
+def test_json(call: Mddag) -> None:
+    done = call('graph', 'analyse', CONFIG / 'autoware.yaml', '--budget', 'mean', '--workers',
+                '5', '--json', '-')
     assert (done.returncode, done.stderr) == (0, '')
     result = json.loads(done.stdout)
     assert (result['workers'], result['budget']) == (5, 'mean')
@@ -53,32 +53,32 @@ def test_json(mddag: Mddag) -> None:
                for test in result['tests'])
 
 
-def test_schedule_abstraction(mddag: Mddag, tmp_path: Path) -> None:
+def test_schedule_abstraction(call: Mddag, tmp_path: Path) -> None:
     stand_in = Path(__file__).resolve().parents[1] / 'analysis' / 'stand_in_nptest.py'
     program = tmp_path / 'nptest'
     program.write_text(f'#!/bin/sh\nexec {sys.executable} {stand_in} "$@"\n')
     program.chmod(0o755)
-    done = mddag('graph', 'analyse', '-', '--budget', 'mean', '--sag', 'jobs', '--sag-binary',
-                 './nptest', input=GRAPH, cwd=tmp_path)
+    done = call('graph', 'analyse', '-', '--budget', 'mean', '--sag', 'jobs', '--sag-binary',
+                './nptest', stdin=GRAPH, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     line = next(line for line in done.stdout.splitlines() if line.startswith('schedule abs'))
     assert 'holds' in line and '1 job, 2 states' in line
     assert sorted(path.name for path in (tmp_path / 'jobs').iterdir()) == [
         'edges.csv', 'jobs.csv', 'tasks.csv']
-    done = mddag('graph', 'analyse', '-', '--sag-binary', './nptest', '--json', '-', input=GRAPH,
-                 cwd=tmp_path)
+    done = call('graph', 'analyse', '-', '--sag-binary', './nptest', '--json', '-', stdin=GRAPH,
+                cwd=tmp_path)
     assert json.loads(done.stdout)['tests'][-1]['verdict'] == 'says nothing'
-    done = mddag('graph', 'analyse', '-', '--sag-binary', './none', input=GRAPH, cwd=tmp_path)
+    done = call('graph', 'analyse', '-', '--sag-binary', './none', stdin=GRAPH, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith('error: ./none: it cannot be run (No such file or directory): ')
-    done = mddag('graph', 'analyse', '-', '--horizon', '1s', input=GRAPH)
+    done = call('graph', 'analyse', '-', '--horizon', '1s', stdin=GRAPH)
     assert done.returncode == 2
 
 
-def test_bad_input(mddag: Mddag) -> None:
+def test_bad_input(call: Mddag) -> None:
     text = GRAPH[:GRAPH.index(', execution')] + '}\n'
     for arguments in (('-',), ('-', '--workers', '0'), ('-', '--budget', 'min')):
-        done = mddag('graph', 'analyse', *arguments, input=text)
+        done = call('graph', 'analyse', *arguments, stdin=text)
         assert (done.returncode, done.stdout) == (2, '')
         assert done.stderr.startswith('error: ')
         assert done.stderr.count('\n') == 1

@@ -18,8 +18,8 @@ CONFIG = Path(__file__).resolve().parents[2] / 'config'
 
 
 @pytest.mark.parametrize(('ending', 'begin'), [('dot', 'digraph '), ('mmd', 'flowchart LR\n')])
-def test_text(mddag: Mddag, tmp_path: Path, ending: str, begin: str) -> None:
-    done = mddag('graph', 'draw', CONFIG / 'autoware.yaml', '-o', f'o.{ending}', cwd=tmp_path)
+def test_text(call: Mddag, tmp_path: Path, ending: str, begin: str) -> None:
+    done = call('graph', 'draw', CONFIG / 'autoware.yaml', '-o', f'o.{ending}', cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
     text = (tmp_path / f'o.{ending}').read_text()
     assert text.startswith(begin)
@@ -29,33 +29,33 @@ def test_text(mddag: Mddag, tmp_path: Path, ending: str, begin: str) -> None:
 @pytest.mark.needs('graphviz')
 @pytest.mark.parametrize(('ending', 'begin'), [
     ('svg', b'<?xml'), ('png', b'\x89PNG'), ('pdf', b'%PDF')])
-def test_graphviz(mddag: Mddag, tmp_path: Path, ending: str, begin: bytes) -> None:
+def test_graphviz(call: Mddag, tmp_path: Path, ending: str, begin: bytes) -> None:
     text = (CONFIG / 'autoware_multi.yaml').read_text()
-    done = mddag('graph', 'draw', '-', '-o', f'o.{ending}', cwd=tmp_path, input=text)
+    done = call('graph', 'draw', '-', '-o', f'o.{ending}', cwd=tmp_path, stdin=text)
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
     assert (tmp_path / f'o.{ending}').read_bytes().startswith(begin)
 
 
 @pytest.mark.needs('graphviz')
-def test_a_large_graph(mddag: Mddag, tmp_path: Path) -> None:
+def test_a_large_graph(call: Mddag, tmp_path: Path) -> None:
     lines = ['mddag: 1', 'nodes:']
     for dag in range(60):
         lines += [f'  - node: /n{dag}', '    callbacks:',
                   f'      - {{name: c, timer: 10ms, publishes: [/t{dag}]}}']
         lines += [f'      - {{name: c{i}, subscription: /t{dag}, deadline: 20ms}}'
                   for i in range(20)]
-    done = mddag('graph', 'draw', '-', '-o', 'o.svg', cwd=tmp_path, input='\n'.join(lines))
+    done = call('graph', 'draw', '-', '-o', 'o.svg', cwd=tmp_path, stdin='\n'.join(lines))
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
     text = (tmp_path / 'o.svg').read_text()
     assert text.count('class="edge"') == 60 * 20
 
 
 def test_without_graphviz(
-        mddag: Mddag, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        call: Mddag, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv('PATH', str(Path(sys.executable).parent))
     if shutil.which('dot') is not None:
         pytest.skip('Graphviz lies beside Python')
-    done = mddag('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
+    done = call('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr == (
         "error: o.svg: this needs Graphviz, and its program 'dot' is not there: install it with "
@@ -63,20 +63,20 @@ def test_without_graphviz(
 
 
 def test_graphviz_that_fails(
-        mddag: Mddag, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        call: Mddag, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = tmp_path / 'dot'
     program.write_text('#!/bin/sh\ncat >/dev/null\necho no fonts >&2\nexit 3\n')
     program.chmod(0o755)
     monkeypatch.setenv('PATH', f'{tmp_path}:/usr/bin:/bin')
-    done = mddag('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
+    done = call('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith('error: o.svg: Graphviz failed (no fonts): ')
     assert not (tmp_path / 'o.svg').exists()
 
 
-def test_bad_usage(mddag: Mddag, tmp_path: Path) -> None:
+def test_bad_usage(call: Mddag, tmp_path: Path) -> None:
     for name in ('o.jpeg', 'o', '-'):
-        done = mddag('graph', 'draw', CONFIG / 'autoware.yaml', '-o', name, cwd=tmp_path)
+        done = call('graph', 'draw', CONFIG / 'autoware.yaml', '-o', name, cwd=tmp_path)
         assert done.returncode == 2
         assert done.stderr == (
             f'error: {name}: no ending that says what to draw: use one of .svg, .png, .pdf, '

@@ -25,38 +25,38 @@ nodes:
 """
 
 
-def test_schema(mddag: Mddag, tmp_path: Path) -> None:
-    done = mddag('graph', 'schema')
+def test_schema(call: Mddag, tmp_path: Path) -> None:
+    done = call('graph', 'schema')
     assert (done.returncode, done.stderr) == (0, '')
     assert json.loads(done.stdout) == schema()
-    done = mddag('graph', 'schema', '-o', 's.json', cwd=tmp_path)
+    done = call('graph', 'schema', '-o', 's.json', cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, '')
     assert json.loads((tmp_path / 's.json').read_text()) == schema()
 
 
-def test_fmt_in_place(mddag: Mddag, tmp_path: Path) -> None:
+def test_fmt_in_place(call: Mddag, tmp_path: Path) -> None:
     path = tmp_path / 'g.yaml'
     path.write_text(UGLY)
-    done = mddag('graph', 'fmt', '--check', 'g.yaml', cwd=tmp_path)
+    done = call('graph', 'fmt', '--check', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stdout) == (1, '')
     assert done.stderr == "g.yaml: not in normal form: run 'mddag graph fmt' on it\n"
     assert path.read_text() == UGLY
-    done = mddag('graph', 'fmt', 'g.yaml', cwd=tmp_path)
+    done = call('graph', 'fmt', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
     assert path.read_text() == NORMAL
-    done = mddag('graph', 'fmt', '--check', 'g.yaml', cwd=tmp_path)
+    done = call('graph', 'fmt', '--check', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
 
 
-def test_fmt_standard_input(mddag: Mddag) -> None:
-    done = mddag('graph', 'fmt', '-', input=UGLY)
+def test_fmt_standard_input(call: Mddag) -> None:
+    done = call('graph', 'fmt', '-', stdin=UGLY)
     assert (done.returncode, done.stdout, done.stderr) == (0, NORMAL, '')
 
 
-def test_fmt_leaves_a_wrong_declaration_alone(mddag: Mddag, tmp_path: Path) -> None:
+def test_fmt_leaves_a_wrong_declaration_alone(call: Mddag, tmp_path: Path) -> None:
     path = tmp_path / 'g.yaml'
     path.write_text(UGLY.replace('timer', 'tmer'))
-    done = mddag('graph', 'fmt', 'g.yaml', cwd=tmp_path)
+    done = call('graph', 'fmt', 'g.yaml', cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith('error: g.yaml:3: ')
     assert path.read_text() == UGLY.replace('timer', 'tmer')

@@ -25,9 +25,9 @@ nodes:
 """
 
 
-def test_a_placement_is_written_and_predicted(graph: Path, mddag: Mddag) -> None:
-    run = mddag('graph', 'place', 'graph.yaml', '--processes', '2', '--cpus', '2',
-                '-o', 'placed.yaml', '--json', 'out.json')
+def test_a_placement_is_written_and_predicted(graph: Path, call: Mddag) -> None:
+    run = call('graph', 'place', 'graph.yaml', '--processes', '2', '--cpus', '2',
+               '-o', 'placed.yaml', '--json', 'out.json')
     assert run.returncode == 0, run.stderr
     placed = load('placed.yaml')
     assert Path('placed.yaml').read_text().startswith(GRAPH)
@@ -39,27 +39,27 @@ def test_a_placement_is_written_and_predicted(graph: Path, mddag: Mddag) -> None
     assert [p['name'] for p in result['processes']] == ['p1', 'p2']
     assert sorted(result['loads'], reverse=True)[0] == pytest.approx(0.4, abs=0.02)
     assert 1.2 < result['factor'] < 1.34 and result['draws'] == [1.0] * 10
-    again = mddag('graph', 'place', 'placed.yaml', '--processes', '1', '-o', '-')
+    again = call('graph', 'place', 'placed.yaml', '--processes', '1', '-o', '-')
     assert again.stdout == GRAPH + 'processes:\n  p1: [/a, /b, /c]\n'
     assert 'The deadlines do not hold' in again.stderr
 
 
-def test_rules_of_the_user(graph: Path, mddag: Mddag) -> None:
+def test_rules_of_the_user(graph: Path, call: Mddag) -> None:
     place = ['graph', 'place', 'graph.yaml', '--processes', '2', '-o', 'placed.yaml']
-    assert mddag(*place, '--together', '/a, /b').returncode == 0
+    assert call(*place, '--together', '/a, /b').returncode == 0
     assert load('placed.yaml').process_of('/a') == load('placed.yaml').process_of('/b')
-    assert mddag(*place, '--apart', '/a,/c', '--apart', '/b,/c').returncode == 0
+    assert call(*place, '--apart', '/a,/c', '--apart', '/b,/c').returncode == 0
     assert [p.nodes for p in load('placed.yaml').processes] == [('/a', '/b'), ('/c',)]
 
 
-def test_times_of_a_recorded_run(graph: Path, mddag: Mddag) -> None:
+def test_times_of_a_recorded_run(graph: Path, call: Mddag) -> None:
     Path('times.json').write_text(json.dumps(
         {f'/{n}': {f'/{n}:t': us} for n, us in (('a', 45_000), ('b', 5_000), ('c', 40_000))}))
-    recorded = mddag('simulate', 'graph.yaml', '--execution-times', 'times.json', '--trace',
-                     'run.mcap', '--duration', '1s')
+    recorded = call('simulate', 'graph.yaml', '--execution-times', 'times.json', '--trace',
+                    'run.mcap', '--duration', '1s')
     assert recorded.returncode == 0, recorded.stderr
-    run = mddag('graph', 'place', 'graph.yaml', '--processes', '2', '--trace', 'run.mcap',
-                '-o', 'placed.yaml', '--json', 'out.json')
+    run = call('graph', 'place', 'graph.yaml', '--processes', '2', '--trace', 'run.mcap',
+               '-o', 'placed.yaml', '--json', 'out.json')
     assert run.returncode == 0, run.stderr
     result = json.loads(Path('out.json').read_text())
     assert sorted(result['loads']) == pytest.approx([0.45, 0.45], abs=0.01)
@@ -78,10 +78,10 @@ def test_times_of_a_recorded_run(graph: Path, mddag: Mddag) -> None:
     (['bare.yaml', '--processes', '1'], 'declares no execution_time'),
 ])
 def test_bad_input_is_one_line(
-        graph: Path, mddag: Mddag, arguments: list[str], message: str) -> None:
+        graph: Path, call: Mddag, arguments: list[str], message: str) -> None:
     Path('bare.yaml').write_text(
         'mddag: 1\nnodes:\n  - node: /a\n    callbacks: [{name: a, timer: 1ms, deadline: 1ms}]\n')
-    run = mddag('graph', 'place', *arguments, '-o', 'placed.yaml')
+    run = call('graph', 'place', *arguments, '-o', 'placed.yaml')
     assert (run.returncode, run.stdout) == (2, '')
     assert message in run.stderr and run.stderr.count('\n') == 1
     assert not Path('placed.yaml').exists()

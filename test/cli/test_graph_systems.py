@@ -29,18 +29,18 @@ nodes:
 """
 
 
-def test_from_trace(mddag: Mddag, tmp_path: Path) -> None:
-    done = mddag('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
+def test_from_trace(call: Mddag, tmp_path: Path) -> None:
+    done = call('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, 'no blanks to fill in\n', '')
     task_set = msg_graph.load(tmp_path / 'g.yaml')
     assert len(task_set.dags) == 11 and len(task_set.vertices) == 86
-    with BAG.open('rb') as stream:
-        done = mddag('graph', 'from-trace', '-', stdin=stream)
+    done = call('graph', 'from-trace', '-', stdin=BAG.read_bytes())
     assert (done.returncode, done.stderr) == (0, '')
     assert done.stdout.splitlines()[1:] == (tmp_path / 'g.yaml').read_text().splitlines()[1:]
 
 
-def test_from_trace_keeps_what_was_declared(mddag: Mddag, tmp_path: Path) -> None:
+def test_from_trace_keeps_what_was_declared(
+        call: Mddag, mddag: Mddag, tmp_path: Path) -> None:
     pytest.importorskip('rclpy')
     (tmp_path / 'g.yaml').write_text(
         'mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n      - {name: t, timer: 10ms, '
@@ -48,34 +48,34 @@ def test_from_trace_keeps_what_was_declared(mddag: Mddag, tmp_path: Path) -> Non
     done = mddag('run', 'g.yaml', '--synthetic', 'sleep', '--duration', '0.3s', '--trace',
                  'r.mcap', cwd=tmp_path)
     assert done.returncode == 0
-    done = mddag('graph', 'from-trace', 'r.mcap', '-o', 'again.yaml', cwd=tmp_path)
+    done = call('graph', 'from-trace', 'r.mcap', '-o', 'again.yaml', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     callback, = msg_graph.load(tmp_path / 'again.yaml').callbacks
     assert (callback.on_miss, callback.max_active_jobs, callback.holds_interpreter) == (
         'abort', 900, False)
 
 
-def test_from_trace_of_something_else(mddag: Mddag, tmp_path: Path) -> None:
+def test_from_trace_of_something_else(call: Mddag, tmp_path: Path) -> None:
     (tmp_path / 'x').write_text('no trace')
     (tmp_path / 'empty').mkdir()
-    done = mddag('graph', 'from-trace', 'empty', '-o', 'g.yaml', cwd=tmp_path)
+    done = call('graph', 'from-trace', 'empty', '-o', 'g.yaml', cwd=tmp_path)
     assert done.stderr == 'error: empty: is an empty folder: give a trace, an .mcap file\n'
     for name in ('x', 'none', str(tmp_path)):
-        done = mddag('graph', 'from-trace', name, '-o', 'g.yaml', cwd=tmp_path)
+        done = call('graph', 'from-trace', name, '-o', 'g.yaml', cwd=tmp_path)
         assert (done.returncode, done.stdout) == (2, '')
         assert done.stderr.startswith(f'error: {name}: ') and done.stderr.count('\n') == 1
     assert not (tmp_path / 'g.yaml').exists()
 
 
-def test_from_caret_with_a_trace(mddag: Mddag, tmp_path: Path) -> None:
+def test_from_caret_with_a_trace(call: Mddag, tmp_path: Path) -> None:
     (tmp_path / 'a.yaml').write_text(ARCHITECTURE)
-    done = mddag('graph', 'from-caret', 'a.yaml', '--trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
+    done = call('graph', 'from-caret', 'a.yaml', '--trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, "2 blanks to fill in, marked 'FILL IN'\n")
     assert done.stderr == f'warning: {BAG}: 1 of the 2 callbacks of a.yaml did not run\n'
     text = (tmp_path / 'g.yaml').read_text()
     assert len(re.findall(r'# measured in \d+ executions\n        execution_time: {quant', text)
                ) == 1
-    done = mddag('graph', 'from-caret', '-', '--trace', '-', input=ARCHITECTURE)
+    done = call('graph', 'from-caret', '-', '--trace', '-', stdin=ARCHITECTURE)
     assert (done.returncode, done.stdout) == (2, '')
 
 
@@ -89,15 +89,15 @@ def test_from_ros_where_nothing_runs(mddag: Mddag, tmp_path: Path) -> None:
     assert (done.returncode, done.stderr.count('\n')) == (2, 1)
 
 
-def test_replay_tells_of_drift(mddag: Mddag, tmp_path: Path) -> None:
-    done = mddag('replay', BAG, '--json', '-')
+def test_replay_tells_of_drift(call: Mddag, tmp_path: Path) -> None:
+    done = call('replay', BAG, '--json', '-')
     assert done.returncode == 0
     assert json.loads(done.stdout)['drift'] == []
-    assert 'difference' not in mddag('replay', BAG).stdout
-    mddag('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
+    assert 'difference' not in call('replay', BAG).stdout
+    call('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
     text = (tmp_path / 'g.yaml').read_text()
     (tmp_path / 'h.yaml').write_text(text.replace('timer: 100ms', 'timer: 200ms'))
-    done = mddag('replay', BAG, 'h.yaml', '--json', 'r.json', cwd=tmp_path)
+    done = call('replay', BAG, 'h.yaml', '--json', 'r.json', cwd=tmp_path)
     assert done.returncode == 0
     found = json.loads((tmp_path / 'r.json').read_text())['drift']
     assert {each['kind'] for each in found} == {'rate'}
@@ -113,29 +113,29 @@ def test_drift_lines() -> None:
     assert (len(many), many[-1]) == (MOST_LINES + 2, '  … (3 more)')
 
 
-def test_includes(mddag: Mddag, tmp_path: Path) -> None:
+def test_includes(call: Mddag, tmp_path: Path) -> None:
     (tmp_path / 'part.yaml').write_text(
         'mddag: 1\narguments:\n  d:\nnodes:\n  - {node: /n, callbacks: '
         '[{name: t, timer: 10ms, deadline: $(d)}]}\n')
     top = tmp_path / 'top.yaml'
     top.write_text('mddag: 1\ninclude:\n  - {file: part.yaml, namespace: /a, set: {d: 5ms}}\n'
                    '  - {file: part.yaml, namespace: /b, set: {d: 6}}\n')
-    done = mddag('graph', 'check', 'top.yaml', cwd=tmp_path)
+    done = call('graph', 'check', 'top.yaml', cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, '')
     assert done.stderr.startswith("error: part.yaml:5: callback '/b/n:t': 'deadline': '6' has no")
     top.write_text(top.read_text().replace('d: 6', 'd: 6ms'))
-    done = mddag('graph', 'check', 'top.yaml', cwd=tmp_path)
+    done = call('graph', 'check', 'top.yaml', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     assert '2 DAGs, 2 vertices' in done.stdout
-    done = mddag('graph', 'check', '-', input=top.read_text(), cwd=tmp_path)
+    done = call('graph', 'check', '-', stdin=top.read_text(), cwd=tmp_path)
     assert done.returncode == 2
     assert 'not read from a file includes nothing' in done.stderr
-    done = mddag('simulate', 'top.yaml', '--policy', 'rad', '--workers', '1', '--duration',
-                 '100ms', '--trace', 's.mcap', '--execution-times', '-', cwd=tmp_path,
-                 input='{"/a/n": {"/a/n:t": 10}, "/b/n": {"/b/n:t": 10}}')
+    done = call('simulate', 'top.yaml', '--policy', 'rad', '--workers', '1', '--duration',
+                '100ms', '--trace', 's.mcap', '--execution-times', '-', cwd=tmp_path,
+                stdin='{"/a/n": {"/a/n:t": 10}, "/b/n": {"/b/n:t": 10}}')
     assert (done.returncode, done.stderr) == (0, '')
     top.unlink()  # the trace holds all of the declaration
-    done = mddag('replay', 's.mcap', cwd=tmp_path)
+    done = call('replay', 's.mcap', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
-    done = mddag('graph', 'fmt', 'part.yaml', cwd=tmp_path)
+    done = call('graph', 'fmt', 'part.yaml', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')

@@ -64,13 +64,13 @@ nodes:
     (['untimed.yaml', '--synthetic', 'sleep', '--utilisation', '0.5'], 'declare execution_time'),
 ])
 def test_bad_input_is_one_line_and_starts_nothing(
-    graph: Path, mddag: Mddag, arguments: list[str], message: str
+    graph: Path, call: Mddag, arguments: list[str], message: str
 ) -> None:
     Path('bad.yaml').write_text('mddag: 2\n')
     Path('untimed.yaml').write_text(
         'mddag: 1\nnodes:\n  - node: /a\n    callbacks: [{name: a, timer: 1ms, deadline: 1ms}]\n')
     before = set(Path('.').iterdir())
-    process = mddag('run', *arguments)
+    process = call('run', *arguments)
     assert process.returncode == 2
     assert process.stdout == ''
     assert process.stderr.startswith('error: ')

@@ -178,11 +178,11 @@ def test_a_trace_that_the_replayer_reads(
     assert [path.name for path in tmp_path.iterdir() if 'part' in path.name] == []
 
 
-def test_standard_input(mddag: Mddag, graph: Path, times: Path) -> None:
-    plain = mddag('simulate', graph, '--execution-times', times, '--json', '-')
-    first = mddag('simulate', '-', '--execution-times', times, '--json', '-', input=GRAPH)
-    second = mddag('simulate', graph, '--execution-times', '-', '--json', '-',
-                   input=json.dumps(TIMES))
+def test_standard_input(call: Mddag, graph: Path, times: Path) -> None:
+    plain = call('simulate', graph, '--execution-times', times, '--json', '-')
+    first = call('simulate', '-', '--execution-times', times, '--json', '-', stdin=GRAPH)
+    second = call('simulate', graph, '--execution-times', '-', '--json', '-',
+                  stdin=json.dumps(TIMES))
     assert (first.returncode, first.stderr, second.returncode) == (0, '', 0)
     assert second.stdout == plain.stdout
     assert json.loads(first.stdout)['dags'] == json.loads(plain.stdout)['dags']
@@ -225,13 +225,13 @@ def changed(**times: Any) -> str:
     ([], changed(**{'/filter:near': '\x1b[31m\n'}), 'execution time of /filter:near'),
 ])
 def test_bad_input_is_one_line(
-    mddag: Mddag, graph: Path, arguments: list[str], times: str | None, says: str
+    call: Mddag, graph: Path, arguments: list[str], times: str | None, says: str
 ) -> None:
     if times is not None:
         (graph.parent / 'times.json').write_text(times)
         arguments = [*arguments, '--execution-times', 'times.json']
     before = sorted(graph.parent.iterdir())
-    done = mddag('simulate', 'graph.yaml', *arguments, cwd=graph.parent)
+    done = call('simulate', 'graph.yaml', *arguments, cwd=graph.parent)
     assert (done.returncode, done.stdout) == (2, '')
     assert done.stderr.startswith('error: ')
     assert done.stderr.count('\n') == 1
@@ -251,12 +251,12 @@ def test_bad_input_is_one_line(
     ([], 'required: GRAPH'),
 ])
 def test_bad_files_are_one_line(
-    mddag: Mddag, graph: Path, graph_arguments: list[str], says: str
+    call: Mddag, graph: Path, graph_arguments: list[str], says: str
 ) -> None:
     (graph.parent / 'binary.yaml').write_bytes(bytes(range(256)))
     (graph.parent / 'bare.yaml').write_text(
         'mddag: 1\nnodes:\n  - node: /a\n    callbacks: [{name: b, timer: 1ms, deadline: 1ms}]\n')
-    done = mddag('simulate', *graph_arguments, cwd=graph.parent)
+    done = call('simulate', *graph_arguments, cwd=graph.parent)
     assert (done.returncode, done.stdout) == (2, '')
     assert done.stderr.startswith('error: ')
     assert done.stderr.count('\n') == 1

@@ -139,11 +139,11 @@ def test_live_in_a_terminal_and_ctrl_c_ends_it(running: Any):
     assert 'workers of' in text and 'Traceback' not in text
 
 
-def test_nobody_to_hear(mddag: Mddag):
-    done = mddag('top', '--once', '--topic', '/nobody', '--timeout', '300ms')
+def test_nobody_to_hear(call: Mddag):
+    done = call('top', '--once', '--topic', '/nobody', '--timeout', '300ms')
     assert done.returncode == 2 and done.stdout == ''
     assert done.stderr.startswith('error: /nobody: no executor has published its state here: ')
-    done = mddag('top', '--duration', '300ms', '--topic', '/nobody')
+    done = call('top', '--duration', '300ms', '--topic', '/nobody')
     assert done.returncode == 2
 
 
@@ -152,18 +152,18 @@ def test_nobody_to_hear(mddag: Mddag):
     (['--duration', '3'], 'has no unit'),
     (['--once', '--json', 'no/such/dir/x.json'], 'no directory'),
 ])
-def test_bad_input(mddag: Mddag, arguments: list[str], message: str):
-    done = mddag('top', *arguments)
+def test_bad_input(call: Mddag, arguments: list[str], message: str):
+    done = call('top', *arguments)
     assert done.returncode == 2 and done.stdout == ''
     assert done.stderr.startswith('error: ') and message in done.stderr
     assert done.stderr.count('\n') == 1
 
 
-def test_run_takes_no_strange_period(mddag: Mddag, tmp_path: Path):
+def test_run_takes_no_strange_period(call: Mddag, tmp_path: Path):
     (tmp_path / 'graph.yaml').write_text(GRAPH)
     for value, message in (('1', 'has no unit'), ('1ms', 'too short'), ('never', 'never')):
-        done = mddag('run', str(tmp_path / 'graph.yaml'), '--synthetic', 'sleep',
-                     '--diagnostics', value)
+        done = call('run', str(tmp_path / 'graph.yaml'), '--synthetic', 'sleep',
+                    '--diagnostics', value)
         assert done.returncode == 2 and message in done.stderr
 
 

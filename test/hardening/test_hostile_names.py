@@ -82,10 +82,10 @@ VERBS = {
 
 
 @pytest.mark.parametrize('name', VERBS)
-def test_no_verb_obeys_a_name(mddag: Mddag, trace: Path, tmp_path: Path, name: str) -> None:
+def test_no_verb_obeys_a_name(call: Mddag, trace: Path, tmp_path: Path, name: str) -> None:
     before = {path for path in Path('/tmp').iterdir() if 'mddag-owned' in path.name}
     arguments = [str(trace) if word == 'TRACE' else word for word in VERBS[name]]
-    done = mddag(*arguments, cwd=tmp_path)
+    done = call(*arguments, cwd=tmp_path)
     assert done.returncode in (0, 2), done.stderr
     assert 'Traceback' not in done.stderr
     if done.returncode == 2:
@@ -110,9 +110,9 @@ def test_no_verb_obeys_a_name(mddag: Mddag, trace: Path, tmp_path: Path, name: s
     assert {path for path in Path('/tmp').iterdir() if 'mddag-owned' in path.name} == before
 
 
-def test_most_verbs_really_read_it(mddag: Mddag, trace: Path, tmp_path: Path) -> None:
+def test_most_verbs_really_read_it(call: Mddag, trace: Path, tmp_path: Path) -> None:
     """What the test above lets through as refused is the exception."""
-    done = mddag('replay', trace, '--json', '-', cwd=tmp_path)
+    done = call('replay', trace, '--json', '-', cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     jobs = sum(dag['jobs'] for dag in json.loads(done.stdout)['dags'].values())
     assert jobs > 20
@@ -140,7 +140,7 @@ def test_a_hostile_declaration_in_a_trace(tmp_path: Path, field: str, text: str)
 
 @pytest.mark.parametrize('include', ['/etc/passwd', 'secret.yaml', '../secret.yaml'])
 def test_a_declaration_in_a_trace_includes_nothing(
-    mddag: Mddag, tmp_path: Path, include: str
+    call: Mddag, tmp_path: Path, include: str
 ) -> None:
     (tmp_path / 'secret.yaml').write_text('mddag: 1\nnodes: [this is secret]\n')
     event = next(event for event in read_events(BAG) if event['_name'] == 'mddag:task_set')
@@ -149,7 +149,7 @@ def test_a_declaration_in_a_trace_includes_nothing(
                       file=str(tmp_path / 'graph.yaml'))
         file.add('task_set', event['_timestamp'], 1, 1, *(
             values.get(name, 0) for name, _ in EVENTS['mddag:task_set'].fields))
-    done = mddag('replay', 'run.mcap', cwd=tmp_path)
+    done = call('replay', 'run.mcap', cwd=tmp_path)
     assert done.returncode == 2
     assert 'secret]' not in done.stderr and 'root:' not in done.stderr
     assert done.stderr.count('\n') == 1
@@ -158,28 +158,28 @@ def test_a_declaration_in_a_trace_includes_nothing(
 
 @pytest.mark.parametrize('names', [
     ['../secret.mcap'], ['/etc/passwd'], ['sub/../../secret.mcap'], ['\x00'], [5], {}, [[]], None])
-def test_a_bag_names_only_its_own_files(mddag: Mddag, tmp_path: Path, names: object) -> None:
+def test_a_bag_names_only_its_own_files(call: Mddag, tmp_path: Path, names: object) -> None:
     (tmp_path / 'secret.mcap').write_bytes(BAG.read_bytes())
     bag = tmp_path / 'bag'
     bag.mkdir()
     (bag / 'metadata.yaml').write_text(yaml.safe_dump(
         {'rosbag2_bagfile_information': {'relative_file_paths': names, 'message_count': 1}}))
-    done = mddag('replay', bag, TOP / 'config' / 'autoware.yaml', '--reschedule', cwd=tmp_path)
+    done = call('replay', bag, TOP / 'config' / 'autoware.yaml', '--reschedule', cwd=tmp_path)
     assert done.returncode == 2, done.stdout
     assert done.stderr.startswith('error: ') and done.stderr.count('\n') == 1, done.stderr
     harmless(done.stderr)
 
 
-def test_names_of_files_are_shown_harmless(mddag: Mddag, tmp_path: Path) -> None:
+def test_names_of_files_are_shown_harmless(call: Mddag, tmp_path: Path) -> None:
     for verb in (('graph', 'check'), ('replay',), ('simulate',)):
-        done = mddag(*verb, 'no\x1b[31m\u202esuch', cwd=tmp_path)
+        done = call(*verb, 'no\x1b[31m\u202esuch', cwd=tmp_path)
         assert done.returncode == 2
         harmless(done.stderr)
     name = 'a\x1b[31m.mcap'
     os.link(BAG, tmp_path / name) if os.stat(BAG).st_dev == os.stat(tmp_path).st_dev else \
         (tmp_path / name).write_bytes(BAG.read_bytes())
     for options in ((), ('--reschedule',), ('--report', 'o\x1b.html'), ('--json', 'o\x1b.json')):
-        done = mddag('replay', name, *options, cwd=tmp_path)
+        done = call('replay', name, *options, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         harmless(done.stdout)
         harmless(done.stderr)

@@ -119,18 +119,18 @@ def test_a_file_full_of_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     assert MOST_ERRORS <= len(looked_for) <= 2 * MOST_ERRORS
 
 
-def test_the_program_shows_all(mddag: Mddag, tmp_path: Path) -> None:
+def test_the_program_shows_all(call: Mddag, tmp_path: Path) -> None:
     (tmp_path / 'g.yaml').write_text(LINKS)
-    done = mddag('graph', 'check', 'g.yaml', cwd=tmp_path)
+    done = call('graph', 'check', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, '')
     lines = done.stderr.splitlines()
     assert lines == [f'error: {error}' for error in found(LINKS).errors]
 
 
-def test_the_program_says_where_it_stops(mddag: Mddag) -> None:
+def test_the_program_says_where_it_stops(call: Mddag) -> None:
     lines = [f'      - {{name: c{i}, timer: 10}}' for i in range(200)]
     text = '\n'.join(['mddag: 1', 'nodes:', '  - node: /n', '    callbacks:', *lines])
-    done = mddag('graph', 'check', '-', input=text)
+    done = call('graph', 'check', '-', stdin=text)
     assert done.returncode == 2
     shown = done.stderr.splitlines()
     assert len(shown) == MOST_ERRORS + 1
