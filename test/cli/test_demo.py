@@ -98,7 +98,7 @@ def test_the_main_job_in_two_processes(
     tmp_path: Path, mddag: Callable[..., subprocess.CompletedProcess[str]]
 ) -> None:
     process = mddag(
-        'demo', '--processes', '2', '--seconds', '2', '--baseline-seconds', '1', '--utilisation',
+        'demo', '--processes', '2', '--seconds', '1', '--baseline-seconds', '0.5', '--utilisation',
         '0.05', '--output', tmp_path / 'made', '--json', tmp_path / 'result.json', timeout=180.0)
     assert process.returncode == 0, process.stderr
     result = json.loads((tmp_path / 'result.json').read_text())

@@ -249,7 +249,7 @@ def test_resumed(graph: Path, tmp_path: Path, how: list[str], seconds: float) ->
     experiment = Experiment(load(graph), ('rad', 'fifo'), workers=1, duration_ns=200_000_000)
     kept = Evaluation((experiment,), 1000000)
     Checkpoint(str(tmp_path / 'kept.npz'), NotImplemented).restore(kept)
-    done = kept.done.nonzero()[0][:400]
+    done = kept.done.nonzero()[0][:100]
     whole = evaluate(experiment, int(done[-1]) + 1, core='plain')
     assert kept.runs == counts[1]
     assert (kept.accepted[:, done] == whole.accepted[:, done]).all()
