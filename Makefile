@@ -3,7 +3,7 @@
 
 VENV := .venv
 KILTED := .venv-kilted
-# Tests that run ROS go one after the other, the others beside them (see test/conftest.py).
+# Whole files of tests that run ROS come first, then the others one by one (see test/conftest.py).
 PYTEST_ARGS ?= -n 2
 BIN := $(VENV)/bin
 

@@ -129,14 +129,12 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 # --- order ---------------------------------------------------------------------------------------
 
 
-# What runs ROS, or looks at how time passes. Side by side (`make test`) they are one group, which
-# one process runs one after the other while the other process runs the rest.
-ALONE = (
+# What runs ROS, or waits as time passes. Side by side (`make test`) a process takes whole files of
+# these, which come first: most of their time they wait, so that both take what is left then.
+ROS = (
     'live', 'bench', 'launch', 'examples', 'hardening/test_misuse.py', 'cli/test_run.py',
     'cli/test_demo.py', 'cli/test_top.py', 'cli/test_bench_replay.py', 'cli/test_graph_systems.py',
     'replay/test_live_replay.py', 'test_docs.py', 'test_readme.py', 'endurance/test_soak.py')
-# One fixture runs all of these, once; they only count how often they fail.
-MUTATIONS = 'live/mutations'
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -144,8 +142,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if 'PYTEST_XDIST_WORKER' in os.environ:
         # The longest first, so that no process has to wait for the other at the end.
         items.sort(key=lambda item: (
-            not _is_alone(item.nodeid), not _is_in(item.nodeid, MUTATIONS),
-            item.get_closest_marker('slow') is None))
+            not _runs_ros(item.nodeid), item.get_closest_marker('slow') is None))
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -155,20 +152,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     class Scheduling(LoadScopeScheduling):
 
         def _split_scope(self, nodeid: str) -> str:
-            if _is_in(nodeid, MUTATIONS):
-                return MUTATIONS
-            return 'alone' if _is_alone(nodeid) else nodeid
+            return nodeid.partition('::')[0] if _runs_ros(nodeid) else nodeid
 
+    config.option.loadscopereorder = False  # they are in order
     return Scheduling(config, log)
 
 
-def _is_alone(nodeid: str) -> bool:
-    return (any(_is_in(nodeid, each) for each in ALONE)
-            and not _is_in(nodeid, MUTATIONS))
-
-
-def _is_in(nodeid: str, path: str) -> bool:
-    return PurePosixPath(nodeid.partition('::')[0]).is_relative_to(PurePosixPath(HERE.name, path))
+def _runs_ros(nodeid: str) -> bool:
+    file = PurePosixPath(nodeid.partition('::')[0])
+    return any(file.is_relative_to(PurePosixPath(HERE.name, each)) for each in ROS)
 
 
 def _rank(item: pytest.Item) -> tuple[bool, int]:
