@@ -57,7 +57,7 @@ def test_the_main_job_end_to_end(
 ) -> None:
     process = mddag(
         'demo', '--seconds', '3', '--baseline-seconds', '1', '--utilisation', '0.3',
-        '--output', tmp_path / 'made', '--json', tmp_path / 'result.json')
+        '--output', tmp_path / 'made', '--json', tmp_path / 'result.json', timeout=150.0)
     assert process.returncode == 0, process.stderr
     # A busy machine skips periods, and that is said.
     assert all(line.startswith('[WARN] ') for line in process.stderr.splitlines())

@@ -262,11 +262,11 @@ class Soak:
         for timer in self.nodes.workload.timers.values():
             timer.cancel()
         time.sleep(DRAIN_S)
-        n_open = list(self.executor._engine.scheduler.state.n_open)
         self._ending = True
         ended = self.executor.shutdown(10.0)
         self._thread.join(10.0)
         statistics = self.executor.statistics()
+        n_open = list(self.executor._engine.scheduler.state.n_open)
         self._simulated.stop()
         self.nodes.workload.destroy()
         self._stalls.stop()

@@ -16,8 +16,10 @@ from .known_causes import causes, PERIODS, record
 @pytest.mark.parametrize('cause', [each for each in PERIODS if each != 'interpreter'])
 def test_the_cause_of_most_misses(cause: str, tmp_path: Path) -> None:
     trace = tmp_path / 'run.mcap'
-    record(cause, trace, misses=9, scale=3.0)
-    told = causes(trace)
+    for misses in (9, 36):  # a busy machine has stops of its own, so that fewer are made
+        record(cause, trace, misses, scale=3.0)
+        told = causes(trace)
+        if told.get(cause, 0) >= 5:
+            break
     assert told.get(cause, 0) >= 5
-    # a busy machine has stops of its own
     assert all(n <= told[cause] for other, n in told.items() if other != 'machine'), told
