@@ -35,6 +35,14 @@ _PERIOD_TOLERANCE = 2e-3
 _WORDS = {'subscription': 'topic', 'service': 'service'}
 _PYTHON = re.compile(r'(?:[\w<>]+\.)*(\w+|<lambda>)')
 _CPP = re.compile(r'[\w:<>*& ]*?\b(\w+)\([^()]*\)')
+_BACKGROUND_TOPICS = {'/rosout', '/parameter_events', '/clock', '/diagnostics'}
+_BACKGROUND_SERVICES = {
+    'describe_parameters', 'get_parameter_types', 'get_parameters', 'list_parameters',
+    'set_parameters', 'set_parameters_atomically', 'get_type_description',
+    'get_logger_levels', 'set_logger_levels'}
+_LIFECYCLE = {
+    'change_state', 'get_state', 'get_available_states', 'get_available_transitions',
+    'get_transition_graph', 'transition_event'}
 
 
 class Entity(NamedTuple):
@@ -167,3 +175,15 @@ def entity_name(node: str, symbol: str, what: str) -> str:
     if not node:
         return f'{function or "callback"} ({what})'
     return f'{node}: {what}' if function is None else f'{node}: {function} ({what})'
+
+
+def is_background(name: str, node: str) -> bool:
+    """
+    Return whether a node has a topic or service as every node has, or is an action's inner one.
+
+    So it is with what every lifecycle node has. A declaration is about what a system is there for,
+    not about what the client library adds.
+    """
+    before, _, word = name.rpartition('/')
+    return (name in _BACKGROUND_TOPICS or '/_action/' in name or word in _BACKGROUND_SERVICES
+            or (word in _LIFECYCLE and before == node))

@@ -29,7 +29,7 @@ from collections.abc import Callable
 
 from msg_graph.draft import declaration_of, Draft, DraftCallback, DraftNode, DraftPath
 from msg_graph.errors import GraphError, shown
-from msg_graph.names import CALLBACK, GROUP, Name, NODE, SERVICE, TOPIC
+from msg_graph.language import CALLBACK, GROUP, Name, NODE, SERVICE, TOPIC
 from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Sequence, Tree
 
 _REMEDY = "give an architecture file as caret_analyze's Architecture.export writes it"

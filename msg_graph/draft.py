@@ -33,8 +33,8 @@ import re
 
 from msg_graph.duration import DAY, exact_duration, format_duration, MICROSECOND
 from msg_graph.errors import GraphError, GraphErrors, printable
+from msg_graph.language import PATH
 from msg_graph.model import ExecutionTime, ReleaseFrom
-from msg_graph.names import PATH
 from msg_graph.yamltext import plain_scalar
 
 UNDEFINED = 'UNDEFINED'

@@ -31,11 +31,10 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from msg_graph.analysis import topological_order
-from msg_graph.binding import Entity, meant
+from msg_graph.binding import Entity, is_background, meant
 from msg_graph.duration import format_duration
 from msg_graph.errors import printable
 from msg_graph.model import Callback, Dag, TaskSet
-from msg_graph.names import is_background
 
 TOLERANCE = 0.2
 LEAST = 10

@@ -10,6 +10,8 @@ the value of each is. A kind reads a value, with errors that name file, line and
 part of the JSON Schema. So what a file may hold stands in one place, the tables below; the parser
 goes by them, and the JSON Schema is made from them.
 
+A *name* of a node, topic, callback, … is a text that is valid for what it names.
+
 The schema is that of draft 7, which the language servers for YAML know best. It says what one
 entry may look like; what takes more than one entry to judge (publishers, cycles, sinks) only
 ``load`` can say.
@@ -28,20 +30,6 @@ from typing import Any
 from msg_graph.duration import DAY, DurationError, MICROSECOND, parse_duration, UNITS
 from msg_graph.errors import did_you_mean, GraphError, listed, shown
 from msg_graph.model import ExecutionTime
-from msg_graph.names import (
-    CALLBACK,
-    Check,
-    check_key,
-    check_read,
-    DAG,
-    GROUP,
-    Name,
-    NODE,
-    PATH,
-    PROCESS,
-    SERVICE,
-    TOPIC,
-)
 from msg_graph.yamltext import Mapping, Scalar, Sequence, Tree
 
 Schema = dict[str, Any]
@@ -53,6 +41,73 @@ ARGUMENT_USE = rf'\$\({ARGUMENT.pattern}\)'
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
 _INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
 _USE: Schema = {'type': 'string', 'pattern': ARGUMENT_USE}
+_ROS_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
+_WORD = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_.-]*')
+
+Check = Callable[[str], 'tuple[str, str] | None']
+"""Looks at a text; returns what is wrong with it and what to do, or None."""
+
+
+@dataclass(frozen=True)
+class Name:
+    """
+    A kind of name.
+
+    :ivar what: what errors call it.
+    """
+
+    what: str
+    pattern: re.Pattern[str] = _WORD
+    longest: int = 255
+
+    @property
+    def is_global(self) -> bool:
+        """Whether it is a full name of the ROS graph, as a node's or topic's."""
+        return self.pattern is _ROS_NAME
+
+    def check(self, text: str) -> tuple[str, str] | None:
+        """Return what is wrong with a name and what to do, or None."""
+        what = f'{self.what} name'
+        if self.is_global and not text.startswith('/'):
+            return (f'{shown(text)} is not an absolute {what}',
+                    f'write it in full, as {shown("/" + text.lstrip("~/"))}')
+        if not self.pattern.fullmatch(text):
+            if self.is_global:
+                return (f'{shown(text)} is not a valid {what}',
+                        "use '/' and words of letters, digits and '_' that start with no digit")
+            return (f'{shown(text)} is no name for a {self.what}',
+                    "use letters, digits, '_', '-' and '.'")
+        if len(text) > self.longest:
+            return (f'the {what if self.is_global else "name"} {shown(text)} is too long',
+                    f'use at most {self.longest} characters')
+        return None
+
+
+NODE = Name('node', _ROS_NAME)  # as rmw_validate_node_name and its namespaces ask
+TOPIC = Name('topic', _ROS_NAME, 247)  # RMW_TOPIC_MAX_NAME_LENGTH
+SERVICE = Name('service', _ROS_NAME, 247)
+CALLBACK = Name('callback')
+GROUP = Name('callback group')
+DAG = Name('DAG', re.compile(r'/?[A-Za-z0-9_.-]+(?:/[A-Za-z0-9_.-]+)*'))
+PATH = Name('path')
+PROCESS = Name('process')
+
+
+def check_read(text: str) -> tuple[str, str] | None:
+    """Check an entry of ``reads``: a topic, or the name of a callback of the same node."""
+    if ':' in text:
+        return (
+            f'{shown(text)} names a callback with its node',
+            'name the topic that is taken, or just the name of a callback of the same node')
+    return (TOPIC if text.startswith('/') else CALLBACK).check(text)
+
+
+def check_key(text: str) -> tuple[str, str] | None:
+    """Check the key of a callback, ``/node:callback``."""
+    node, colon, name = text.rpartition(':')
+    if not colon:
+        return (f'{shown(text)} names no callback', "write '/node:callback'")
+    return NODE.check(node) or CALLBACK.check(name)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, Progress, table, warn
 from mddag_executor.core import POLICIES
 from mddag_executor.errors import UsageError
-from mddag_executor.live.bench.spec import (
+from mddag_executor.live.bench.campaign import (
     DECLARED,
     EXECUTORS,
     LOADS,

@@ -31,7 +31,7 @@ from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, format_ns, printable, Progress, run_program, table
 from mddag_executor.core.tally import counts, total
 from mddag_executor.errors import MddagError
-from mddag_executor.live.bench.spec import Spec
+from mddag_executor.live.bench.campaign import Spec
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.live_runs import summary
 from mddag_executor.report.tables import (

@@ -31,9 +31,10 @@ import time
 from typing import Any
 
 from mddag_executor.live.compat import message_taker
+from msg_graph.binding import is_background
 from msg_graph.draft import Draft, DraftCallback, DraftNode
 from msg_graph.drift import Releases
-from msg_graph.names import is_background, NODE, SERVICE, TOPIC
+from msg_graph.language import NODE, SERVICE, TOPIC
 import rclpy
 from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks

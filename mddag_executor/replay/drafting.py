@@ -38,9 +38,9 @@ from mddag_executor.replay.entities import (
 from mddag_executor.trace import TraceReader
 from msg_graph import Callback as Declared
 from msg_graph import ExecutionTime, GraphError, loads, TaskSet
-from msg_graph.binding import function_of
+from msg_graph.binding import function_of, is_background
 from msg_graph.draft import Draft, DraftCallback, DraftNode
-from msg_graph.names import CALLBACK, is_background, NODE, SERVICE, TOPIC
+from msg_graph.language import CALLBACK, NODE, SERVICE, TOPIC
 
 PERCENT = (0.0, 50.0, 90.0, 99.0, 100.0)
 _STEP = 4096

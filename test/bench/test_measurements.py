@@ -20,8 +20,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from mddag_executor.live.bench import campaign, publisher
-from mddag_executor.live.bench.campaign import CrashError, measure, run_all
-from mddag_executor.live.bench.spec import BenchError, Spec
+from mddag_executor.live.bench.campaign import BenchError, CrashError, measure, run_all, Spec
 from mddag_executor.resources import find
 from msg_graph import load
 import pytest

@@ -6,8 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from mddag_executor.errors import MddagError
-from mddag_executor.live.bench.campaign import combine
-from mddag_executor.live.bench.spec import parse_executors, Spec
+from mddag_executor.live.bench.campaign import combine, parse_executors, Spec
 import pytest
 
 

@@ -20,8 +20,8 @@ import traceback
 from typing import TextIO
 
 from mddag_executor.errors import MddagError
+from mddag_executor.live.bench.campaign import Spec
 from mddag_executor.live.bench.loads import run
-from mddag_executor.live.bench.spec import Spec
 from msg_graph import GraphError
 
 

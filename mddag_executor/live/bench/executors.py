@@ -30,7 +30,7 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.live.bench.spec import NONE, OURS, Spec
+from mddag_executor.live.bench.campaign import NONE, OURS, Spec
 from mddag_executor.live.compat import message_taker, timer_functions
 from mddag_executor.live.session import Session
 from msg_graph import TaskSet

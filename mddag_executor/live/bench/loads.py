@@ -28,9 +28,9 @@ from typing import Any, cast
 
 from mddag_executor.core.tally import quantiles_us
 from mddag_executor.live import current_job
+from mddag_executor.live.bench.campaign import BenchError, DECLARED, OURS, ROBOT, Spec
 from mddag_executor.live.bench.executors import make_executor, Starts, UnfinishedSession
 from mddag_executor.live.bench.publisher import PublisherProcess
-from mddag_executor.live.bench.spec import BenchError, DECLARED, OURS, ROBOT, Spec
 from mddag_executor.live.measure import ExecutionPlan, judge_sink, Ledger, measure, Mode, totals
 from mddag_executor.live.synthetic import no_job, QOS, quiet_node, SyntheticWorkload
 from mddag_executor.resources import find

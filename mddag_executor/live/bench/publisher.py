@@ -25,7 +25,7 @@ import random
 import time
 from typing import Any
 
-from mddag_executor.live.bench.spec import BenchError
+from mddag_executor.live.bench.campaign import BenchError
 from mddag_executor.live.session import MATCH_TIMEOUT_S
 from mddag_executor.live.synthetic import QOS, quiet_node
 import rclpy
