@@ -9,19 +9,10 @@ all that the rest of a program needs to know about the graph. The rules are in `
 
 from __future__ import annotations
 
+from msg_graph.derive import load, loads
 from msg_graph.duration import DurationError, format_duration, parse_duration
 from msg_graph.errors import GraphError, GraphErrors
-from msg_graph.loading import load, loads
-from msg_graph.model import (
-    Callback,
-    Dag,
-    ExecutionTime,
-    Path,
-    Process,
-    QueueEdge,
-    TaskSet,
-    Vertex,
-)
+from msg_graph.model import Callback, Dag, ExecutionTime, Path, Process, QueueEdge, TaskSet, Vertex
 
 __all__ = [
     'Callback', 'Dag', 'DurationError', 'ExecutionTime', 'GraphError', 'GraphErrors',

@@ -30,11 +30,10 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from msg_graph.analysis import topological_order
 from msg_graph.binding import Entity, is_background, meant
 from msg_graph.duration import format_duration
 from msg_graph.errors import printable
-from msg_graph.model import Callback, Dag, TaskSet
+from msg_graph.model import Callback, Dag, TaskSet, topological_order
 
 TOLERANCE = 0.2
 LEAST = 10

@@ -21,11 +21,11 @@ from dataclasses import replace
 from typing import Any
 
 from msg_graph.declaration import processes_text, read_processes
+from msg_graph.derive import loads
 from msg_graph.duration import exact_duration, SECOND
 from msg_graph.errors import GraphError
 from msg_graph.language import Entry, FILE
 from msg_graph.layout import refused, without_lines
-from msg_graph.loading import loads
 from msg_graph.model import Process, TaskSet
 from msg_graph.yamltext import Mapping, parse_yaml
 import yaml

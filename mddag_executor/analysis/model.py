@@ -11,7 +11,7 @@ from mddag_executor.core import Tables
 from mddag_executor.errors import MddagError
 from mddag_executor.text import counted
 from msg_graph import Dag, ExecutionTime, TaskSet
-from msg_graph.analysis import path_lengths, topological_order
+from msg_graph.model import path_lengths, topological_order
 
 
 class AnalysisError(MddagError):

@@ -49,7 +49,7 @@ from heapq import heappop, heappush
 from typing import NamedTuple
 
 from mddag_executor.analysis.model import Task
-from msg_graph.analysis import path_lengths
+from msg_graph.model import path_lengths
 
 _MOST_JOBS = 1_000  # of more jobs than these, in one window, each counts in full
 

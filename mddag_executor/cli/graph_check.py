@@ -81,7 +81,7 @@ def check_result(task_set: TaskSet) -> dict[str, Any]:
 
 
 def _dag_result(dag: Dag, rad_offsets: list[int], workers: int) -> dict[str, Any]:
-    from msg_graph.analysis import load_of, mean_execution_times, path_lengths
+    from msg_graph.model import load_of, mean_execution_times, path_lengths
     means, load = mean_execution_times(dag), load_of(dag)
     return {
         'period_ns': dag.period_ns,

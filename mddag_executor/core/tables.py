@@ -47,7 +47,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from msg_graph import Callback, Dag, TaskSet, Vertex
-from msg_graph.analysis import path_lengths
+from msg_graph.model import path_lengths
 
 NEVER = 2 ** 62
 """A time that is never reached (ns): larger than any clock, small enough to add to."""

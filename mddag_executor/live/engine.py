@@ -483,7 +483,7 @@ class Engine:
             self.scheduler.resume(work.x)
 
     def leave_group(self, work: Work) -> None:
-        """Note that an execution's callback group has let it run (see ``gates``)."""
+        """Note that an execution's callback group has let it run (see ``groups``)."""
         self.scheduler.leave_group(work.x)
 
     def ask_again(self) -> None:
@@ -545,7 +545,7 @@ class Engine:
         self._work[work.x] = work
 
     def refused(self, work: Work, now: int) -> None:
-        """Put an execution back that its callback group does not let run now (see ``gates``)."""
+        """Put an execution back that its callback group does not let run now (see ``groups``)."""
         entity, x = work.entity, work.x
         if entity.removed:
             self.destroyed(work, now)

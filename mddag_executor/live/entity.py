@@ -13,7 +13,7 @@ from msg_graph import Callback, TaskSet
 from msg_graph.binding import entity_name
 
 if TYPE_CHECKING:
-    from mddag_executor.live.gates import Gate
+    from mddag_executor.live.groups import Gate
 
 TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
     'timer', 'subscription', 'service', 'client', 'guard', 'waitable', 'task')

@@ -29,7 +29,7 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE_JOBS
 from mddag_executor.core.policies import policy as find_policy
-from mddag_executor.live import hooks
+from mddag_executor.live import hooks, settings
 from mddag_executor.live.alarm import Bell
 from mddag_executor.live.announcements import Announcements
 from mddag_executor.live.compat import (
@@ -51,18 +51,7 @@ from mddag_executor.live.rates import RateWatch
 from mddag_executor.live.receiver import Receiver
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
-from mddag_executor.live.settings import (
-    check_callable,
-    check_context,
-    check_process,
-    check_thresholds,
-    diagnostics_period_ns,
-    MOST_JOBS,
-    resolve,
-    thread_setting,
-    Thresholds,
-    whole_number,
-)
+from mddag_executor.live.settings import Thresholds
 from mddag_executor.live.shutdown import call_at_shutdown, halt_at_exit, is_over
 from mddag_executor.live.statistics import statistics
 from mddag_executor.live.stop_watch import StopWatch
@@ -160,16 +149,17 @@ class MultiDeadlineExecutor(BareExecutor):
         preempt: bool = False,
         cpu_order: bool = False,
     ) -> None:
-        task_set, num_workers, deadline_ns = resolve(
+        task_set, num_workers, deadline_ns = settings.resolve(
             graph, num_workers, default_deadline, intake)
-        prepare = thread_setting(worker_policy, worker_priority, worker_cpus)
-        every_ns = diagnostics_period_ns(diagnostics_period)
-        max_active_jobs = whole_number('max_active_jobs', max_active_jobs, MOST_JOBS)
-        check_callable('on_deadline_miss', on_deadline_miss)
+        prepare = settings.thread_setting(worker_policy, worker_priority, worker_cpus)
+        every_ns = settings.diagnostics_period_ns(diagnostics_period)
+        max_active_jobs = settings.whole_number(
+            'max_active_jobs', max_active_jobs, settings.MOST_JOBS)
+        settings.check_callable('on_deadline_miss', on_deadline_miss)
         find_policy(policy)
-        check_context(context)
-        check_process(process, task_set)
-        thresholds = check_thresholds(thresholds)
+        settings.check_context(context)
+        settings.check_process(process, task_set)
+        thresholds = settings.check_thresholds(thresholds)
         # All is checked by now: nothing below leaves a trace or a thread of what can't be made.
         hooks.install()
         self._trace_clock = TraceClock()

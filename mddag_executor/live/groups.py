@@ -1,16 +1,17 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Callback groups of their own executors, as rclcpp has them (rclpy#850).
+Callback groups of their own executors, and those of a user's own class.
 
 Theory of operation
 -------------------
-An executor runs all of a node that was added to it, but for the callback groups that somebody has
-added to an executor one by one: ``add_callback_group`` takes a group out of the hands of whoever
-has the node.  A group belongs to one executor at most, so mutual exclusion within it needs nothing
-more.  Who owns a group is known to the process (``_owners``), not to the node: rclpy's nodes know
-one executor.  What an executor sees of a node that is shared is a ``NodeShare``, the node with
-only those entities that the executor is to run.
+**Their own executors**, as rclcpp has them (rclpy#850).  An executor runs all of a node that was
+added to it, but for the callback groups that somebody has added to an executor one by one:
+``add_callback_group`` takes a group out of the hands of whoever has the node.  A group belongs to
+one executor at most, so mutual exclusion within it needs nothing more.  Who owns a group is known
+to the process (``_owners``), not to the node: rclpy's nodes know one executor.  What an executor
+sees of a node that is shared is a ``NodeShare``, the node with only those entities that the
+executor is to run.
 
 A node notifies its one executor when entities come and go.  So that the owners of its groups hear
 of it too, they are notified beside it, from when somebody first adds a group.
@@ -21,6 +22,16 @@ over.  What the first has taken and not run yet is dropped and counted; what run
 
 Only executors of this kind know of all this: one of rclpy's own that has the node too would go on
 running the group.
+
+**Of a user's own class** (``Gate``).  Of rclpy's two kinds of callback groups the core knows what
+they allow.  Any other is asked, as rclpy's executors do: ``can_execute`` and
+``beginning_execution`` before a callback, and ``ending_execution`` after it.  That is code of the
+user's, which may wait for a lock.  So the worker that is to run the callback asks, without the
+engine's lock.
+
+Each entity of such a group is a group of one in the core (rule 4), which it leaves as soon as it
+may run: so its messages are asked about one at a time, in their order.  What is refused waits,
+and is asked about again after each callback that ends, and every few milliseconds in a spin.
 """
 
 from __future__ import annotations
@@ -33,12 +44,15 @@ import weakref
 
 from mddag_executor.live.compat import on_changes
 from mddag_executor.live.intake.entities import LISTS
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.executors import Executor
 from rclpy.node import Node
 
 if TYPE_CHECKING:
+    from mddag_executor.live.work import Work
     from rclpy.callback_groups import CallbackGroup
 
+_METHODS = ('can_execute', 'beginning_execution', 'ending_execution')
 _lock = threading.Lock()
 _owners: weakref.WeakKeyDictionary[CallbackGroup, weakref.ref[Groups]] = \
     weakref.WeakKeyDictionary()
@@ -197,3 +211,47 @@ def _hook_nodes() -> None:
 def _wake_sharers(node: Node) -> None:
     for groups in list(_sharers.get(node, ())):
         groups._wake()
+
+
+class Refused(Exception):
+    """The callback group does not let a callback run now."""
+
+
+def decides_itself(group: Any) -> bool:
+    """Return whether a callback group is of neither of rclpy's kinds, or changes one of them."""
+    return not any(
+        all(getattr(getattr(group, name), '__func__', None) is getattr(kind, name)
+            for name in _METHODS)
+        for kind in (MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup))
+
+
+class Gate:
+    """
+    An entity's callback group that decides itself.
+
+    :param passed: called with an execution that may run, before it does.
+    """
+
+    def __init__(self, group: Any, entity: Any, passed: Callable[[Work], None]) -> None:
+        self._group = group
+        self._entity = entity
+        self._passed = passed
+
+    def step(self, work: Work) -> Any:
+        """
+        Run a step of an execution as ``Work.step`` does, if it may begin.
+
+        :raises Refused: where it may not.
+        """
+        group, entity = self._group, self._entity
+        if work.coroutine is None:
+            if not (group.can_execute(entity) and group.beginning_execution(entity)):
+                raise Refused
+            self._passed(work)
+        waits_for = None
+        try:
+            waits_for = work.step()
+        finally:
+            if waits_for is None:
+                group.ending_execution(entity)
+        return waits_for

@@ -44,7 +44,7 @@ from mddag_executor.errors import MddagError
 from mddag_executor.simulate.workload import draw_execution_times
 from mddag_executor.simulate.workload import utilisation as normalised
 from msg_graph import Dag, TaskSet, Vertex
-from msg_graph.analysis import path_lengths
+from msg_graph.model import path_lengths
 
 Body = Literal['sleep', 'spin', 'native']
 Mode = Literal[Body, 'mixed']

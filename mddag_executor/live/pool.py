@@ -42,7 +42,7 @@ from mddag_executor.live.compat import UNKNOWN
 from mddag_executor.live.cpu_order import CpuOrder
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import BRIEF_NS, MOST_DEBT, SOON_NS
-from mddag_executor.live.gates import Refused
+from mddag_executor.live.groups import Refused
 from mddag_executor.live.interpreter import Interpreter
 from mddag_executor.live.preemption import Preemption
 from mddag_executor.live.seat import current, Seat

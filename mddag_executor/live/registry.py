@@ -21,7 +21,7 @@ from mddag_executor.live.entity import (
     TIMER,
     WAITABLE,
 )
-from mddag_executor.live.gates import decides_itself, Gate
+from mddag_executor.live.groups import decides_itself, Gate
 from mddag_executor.live.intake.entities import EntitySet
 from mddag_executor.live.work import Work
 from msg_graph import binding, Callback, TaskSet
@@ -45,7 +45,7 @@ class Registry:
 
     :ivar by_id: what is kept for each entity of rclpy, by the ``id`` of that.
     :param passed: called with each execution that a callback group has let through (see
-        ``gates``).
+        ``groups``).
     """
 
     def __init__(

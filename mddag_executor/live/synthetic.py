@@ -592,20 +592,18 @@ class SyntheticWorkload:
             # One message on a topic releases all DAGs that wait for it, in other processes, too.
             start = vertex.callback.service or vertex.callback.topics[0]
             self._n_publishers[start] += start not in first
-            if self._is_here(first.setdefault(start, vertex.callback).node):
-                self._add_sensor(start, vertex)
-
-    def _add_sensor(self, start: str, source: Vertex) -> None:
-        callback = source.callback
-        if self._sensor_node is None:
-            self._sensor_node = quiet_node(SENSORS_NODE, self._context)
-        # (Of two periods the shorter one sets the pace.)
-        if start not in self._sensors:
-            send = self._requests(start) if callback.service else self._messages(start)
-            self._sensors[start] = Sensor([], callback.period_ns or 0, send)
-        sensor = self._sensors[start]
-        sensor.period_ns = min(sensor.period_ns, callback.period_ns or 0)
-        sensor.dags.append(source.dag)
+            if not self._is_here(first.setdefault(start, vertex.callback).node):
+                continue
+            if self._sensor_node is None:
+                self._sensor_node = quiet_node(SENSORS_NODE, self._context)
+            period = vertex.callback.period_ns or 0
+            if start not in self._sensors:
+                make = self._requests if vertex.callback.service else self._messages
+                self._sensors[start] = Sensor([], period, make(start))
+            sensor = self._sensors[start]
+            # (Of two periods the shorter one sets the pace.)
+            sensor.period_ns = min(sensor.period_ns, period)
+            sensor.dags.append(vertex.dag)
 
     def _messages(self, topic: str) -> Callable[[int], None]:
         assert self._sensor_node is not None

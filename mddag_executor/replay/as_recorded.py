@@ -18,8 +18,8 @@ from mddag_executor.replay.run import open_run, Recording, Run
 from mddag_executor.replay.usage import GroupWaits, share, Usage
 from mddag_executor.text import counted
 from msg_graph import TaskSet
+from msg_graph.derive import no_garbage
 from msg_graph.drift import Drift
-from msg_graph.loading import no_garbage
 
 if TYPE_CHECKING:
     from mddag_executor.replay.imported_figures import Communications, ImportedPaths

@@ -32,7 +32,7 @@ from mddag_executor.simulate.intakes import Intakes
 from mddag_executor.simulate.load import edge_numbers
 from mddag_executor.text import counted, listed
 from msg_graph import Process, TaskSet
-from msg_graph.loading import no_garbage
+from msg_graph.derive import no_garbage
 import numpy as np
 
 MAX_WORKERS = 4096

@@ -43,7 +43,7 @@ from mddag_executor.simulate import Load, schedule, Settings
 from mddag_executor.simulate.load import as_arrays
 from mddag_executor.simulate.schedule import prepare
 from msg_graph import TaskSet
-from msg_graph.loading import no_garbage
+from msg_graph.derive import no_garbage
 import numpy as np
 
 MOST = 100.0

@@ -37,7 +37,7 @@ from typing import Any
 from mddag_executor.core import NEVER
 from mddag_executor.live.compat import UNKNOWN
 from mddag_executor.live.engine import Engine
-from mddag_executor.live.gates import Refused
+from mddag_executor.live.groups import Refused
 from mddag_executor.live.jobs import Origin
 from mddag_executor.live.work import Destroyed, QuickCallback, Work
 from mddag_executor.rerun.computing import Computing

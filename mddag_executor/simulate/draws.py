@@ -25,8 +25,8 @@ import zlib
 from mddag_executor.core import rad_offsets
 from mddag_executor.errors import InputError, UsageError
 from msg_graph import ExecutionTime, TaskSet
-from msg_graph.analysis import topological_order
 from msg_graph.duration import DAY
+from msg_graph.model import topological_order
 import numpy as np
 import numpy.typing as npt
 

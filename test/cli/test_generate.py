@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mddag_executor.cli import main as program
 from msg_graph import load, loads
-from msg_graph.analysis import load_of
+from msg_graph.model import load_of
 import pytest
 
 from .helpers import caller

@@ -12,7 +12,7 @@ from mddag_executor.generate import BASES, generate, GenerateError, METHODS, Opt
 from mddag_executor.generate.shapes import draw_shape, MOST_COPIES
 from mddag_executor.generate.shares import Dice
 from msg_graph import loads, TaskSet
-from msg_graph.analysis import load_of, mean_execution_times, path_lengths
+from msg_graph.model import load_of, mean_execution_times, path_lengths
 import pytest
 
 

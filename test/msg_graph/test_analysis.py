@@ -8,7 +8,7 @@ from itertools import permutations
 
 from hypothesis import given
 from hypothesis import strategies as st
-from msg_graph import analysis, Dag, loads
+from msg_graph import Dag, loads, model
 
 from .helpers import graph
 
@@ -24,14 +24,14 @@ DIAMOND = graph("""
 
 
 def test_diamond() -> None:
-    order = analysis.topological_order(DIAMOND)
+    order = model.topological_order(DIAMOND)
     assert sorted(order) == [0, 1, 2, 3, 4]
     assert all(order.index(a) < order.index(b) for a, b in DIAMOND.edges)
-    means = analysis.mean_execution_times(DIAMOND)
+    means = model.mean_execution_times(DIAMOND)
     assert means == [1_000_000, 5_000_000, 2_000_000, 4_000_000, 7_000_000]
-    assert analysis.path_lengths(DIAMOND, means) == [
+    assert model.path_lengths(DIAMOND, means) == [
         8_000_000, 7_000_000, 2_000_000, 6_000_000, 9_000_000]
-    assert analysis.load_of(DIAMOND) == 1.9
+    assert model.load_of(DIAMOND) == 1.9
 
 
 def test_unknown_where_an_execution_time_is_missing() -> None:
@@ -41,8 +41,8 @@ def test_unknown_where_an_execution_time_is_missing() -> None:
             - {name: t, timer: 10ms, publishes: [/a], execution_time: 1ms}
             - {name: s, subscription: /a, deadline: 1ms}
     """).dags[0]
-    assert analysis.mean_execution_times(dag) is None
-    assert analysis.load_of(dag) is None
+    assert model.mean_execution_times(dag) is None
+    assert model.load_of(dag) is None
 
 
 @st.composite
@@ -73,4 +73,4 @@ def test_path_lengths_are_those_of_all_paths(case: tuple[Dag, list[int]]) -> Non
         for rest in permutations(range(len(dag.vertices)), length + 1):
             if all(step in dag.edges for step in zip(rest, rest[1:])):
                 best = max(best, sum(weights[i] for i in rest))
-    assert max(analysis.path_lengths(dag, weights)) == best
+    assert max(model.path_lengths(dag, weights)) == best

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from msg_graph import analysis, Dag, load, TaskSet
+from msg_graph import Dag, load, model, TaskSet
 import pytest
 
 from .autoware_facts import DAGS
@@ -69,7 +69,7 @@ def test_deadlines_are_those_of_the_paper(autoware: TaskSet) -> None:
 
 def test_load_is_that_of_the_paper(autoware: TaskSet) -> None:
     """On seven cores the mean load is about that of the paper's most frequent runs, 0.7."""
-    shares = [analysis.load_of(dag) for dag in autoware.dags]
+    shares = [model.load_of(dag) for dag in autoware.dags]
     assert sum(share for share in shares if share) / 7 == pytest.approx(0.729, abs=0.001)
 
 
@@ -104,7 +104,7 @@ def test_only_deadlines_differ(autoware: TaskSet, multi: TaskSet) -> None:
 def deadlines_at(dag: Dag) -> list[int]:
     """Return for each vertex the least deadline among the sinks that it leads to."""
     least: dict[int, int] = {}
-    for index in reversed(analysis.topological_order(dag)):
+    for index in reversed(model.topological_order(dag)):
         vertex = dag.vertices[index]
         least[index] = vertex.deadline_ns or min(least[after] for after in vertex.successors)
     return [least[index] for index in range(len(dag.vertices))]
@@ -141,7 +141,7 @@ def test_deadlines_can_be_met(multi: TaskSet) -> None:
         p95 = [
             v.callback.execution_time.draw(0.95) for v in dag.vertices
             if v.callback.execution_time is not None]
-        lengths = analysis.path_lengths(dag, p95)
+        lengths = model.path_lengths(dag, p95)
         for sink in dag.sinks:
             deadline = dag.vertices[sink].deadline_ns
             assert deadline is not None and lengths[sink] <= deadline
