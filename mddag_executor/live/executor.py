@@ -50,13 +50,12 @@ from mddag_executor.live.pool import Pool
 from mddag_executor.live.rates import RateWatch
 from mddag_executor.live.receiver import Receiver
 from mddag_executor.live.recorder import Recorder
-from mddag_executor.live.registry import Registry
+from mddag_executor.live.registry import Registry, Upkeep
 from mddag_executor.live.settings import Thresholds
 from mddag_executor.live.shutdown import call_at_shutdown, halt_at_exit, is_over
 from mddag_executor.live.statistics import statistics
 from mddag_executor.live.stop_watch import StopWatch
 from mddag_executor.live.tasks import make_task, Unclaimed
-from mddag_executor.live.upkeep import Intake, Upkeep
 from mddag_executor.live.verdicts import DeadlineMiss
 from mddag_executor.live.work import QuickCallback, Work
 from msg_graph import TaskSet
@@ -205,7 +204,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._announcements: Announcements | None = None
         self._upkeep = Upkeep(
             self._nodes_to_look_after, self._registry, self._pool, self._recorder)
-        self._intake: Intake | None = None
+        self._intake: EventsIntake | WaitSetIntake | None = None
         self._stepping: WaitSetIntake | None = None
         super().__init__(context=context)
         self._diagnostics: Diagnostics | None = None
@@ -436,7 +435,7 @@ class MultiDeadlineExecutor(BareExecutor):
         kind = self._intake_kind
         if kind == 'auto':
             kind = 'events' if EventsIntake.available() else 'waitset'
-        intake: Intake
+        intake: EventsIntake | WaitSetIntake
         if kind == 'events':
             intake = EventsIntake(
                 self.context, self._receiver, on_shutdown=self._attention.ring,
