@@ -145,10 +145,10 @@ class Ledger:
     What is noted of one run of synthetic nodes; as JSON, its ``vars`` are for ``of_processes``.
 
     ``durations[dag][vertex]`` takes how long each body took (ns), ``completions[dag][vertex]`` of
-    a sink (release, completion) in ns since the epoch, ``delays[dag]`` by how much the source's
-    body started after its release.  ``misattributed`` takes (vertex name, release by the message,
-    release by the executor) where these differ, ``unattributed`` the names of vertices that ran as
-    no job, ``dropped_joins`` those of joins that were given up.
+    a sink (release, completion) in ns since the epoch, ``delays[dag]`` when a timer started that
+    is a source, and by how much after its release.  ``misattributed`` takes (vertex name, release
+    by the message, release by the executor) where these differ, ``unattributed`` the names of
+    vertices that ran as no job, ``dropped_joins`` those of joins that were given up.
 
     :param keep: how much of each to keep, the last; None: all.
     :ivar window: the readings between which the run is measured.
@@ -159,7 +159,8 @@ class Ledger:
             [deque(maxlen=keep) for _ in d.vertices] for d in task_set.dags]
         self.completions: list[list[deque[tuple[int, int]]]] = [
             [deque(maxlen=keep) for _ in d.vertices] for d in task_set.dags]
-        self.delays: list[deque[int]] = [deque(maxlen=keep) for _ in task_set.dags]
+        self.delays: list[deque[tuple[int, int]]] = [
+            deque(maxlen=keep) for _ in task_set.dags]
         self.misattributed: deque[tuple[str, int, int]] = deque(maxlen=keep)
         self.unattributed: deque[str] = deque(maxlen=keep)
         self.dropped_joins: deque[str] = deque(maxlen=keep)
@@ -235,7 +236,7 @@ def measure(ledger: Ledger, plan: ExecutionPlan) -> dict[str, Any]:
         'warm_up_ns': ledger.warm_up_ns, **sums,
         'on_time_ratio': sums['on_time'] / due if due else None,
         **_throughput(ledger, plan, start, end),
-        'source_delay_us': quantiles_us([d for delays in ledger.delays for d in list(delays)]),
+        'source_delay_us': quantiles_us([d for delays in ledger.delays for _, d in list(delays)]),
         'attribution': {
             'wrong': len(ledger.misattributed), 'none': len(ledger.unattributed)},
         'incomplete_joins_dropped': len(ledger.dropped_joins), 'dags': dags}

@@ -554,7 +554,7 @@ class SyntheticWorkload:
             start = time.monotonic_ns() + offset
             job = current_job()
             release = grids[dag].release() if job is None else job.release_ns
-            delays.append(start - release)
+            delays.append((start, start - release))
             role.execute(stamped(release), release)
 
         timer = node.create_timer(

@@ -29,7 +29,13 @@ from typing import Any, cast
 from mddag_executor.core.tally import quantiles_us
 from mddag_executor.live import current_job
 from mddag_executor.live.bench.campaign import BenchError, DECLARED, OURS, ROBOT, Spec
-from mddag_executor.live.bench.executors import make_executor, Starts, UnfinishedSession
+from mddag_executor.live.bench.executors import (
+    make_executor,
+    noting,
+    Start,
+    UnfinishedSession,
+    within,
+)
 from mddag_executor.live.bench.publisher import PublisherProcess
 from mddag_executor.live.measure import ExecutionPlan, judge_sink, Ledger, measure, Mode, totals
 from mddag_executor.live.synthetic import no_job, QOS, quiet_node, SyntheticWorkload
@@ -82,11 +88,10 @@ def run_declared(spec: Spec) -> dict[str, Any]:
     job_of_thread = current_job if spec.executor in OURS else no_job
     workload = SyntheticWorkload(
         task_set, plan, current_job=job_of_thread, process=spec.process)
-    starts = Starts()
-    # before an executor learns of them
-    starts.watch(workload.nodes,
-                 {timer: workload.ledger.delays[dag] for dag, timer in workload.timers.items()})
+    starts: list[Start] = []
     for node in workload.nodes:
+        for subscription in node.subscriptions:
+            subscription.callback = noting(starts, subscription.callback)
         executor.add_node(node)
     session = UnfinishedSession(executor, spec)
     # for all alike: a full collection of what there is by now stops every thread for 25 ms
@@ -97,8 +102,9 @@ def run_declared(spec: Spec) -> dict[str, Any]:
     _check(session, measured)
     # rclpy's EventsExecutor moves a timer on before it queues the call, so that calls in a backlog
     # do not say for which due time they stand: only messages are counted there.
-    begin, end = workload.ledger.window
-    latencies = starts.within(begin.at_ns, end.at_ns, timers=spec.executor != 'events')
+    if spec.executor != 'events':
+        starts += [start for delays in workload.ledger.delays for start in list(delays)]
+    latencies = within(starts, *(reading.at_ns for reading in workload.ledger.window))
     if spec.process is not None:
         return {'ledger': vars(workload.ledger), 'latencies': latencies}
     return result_of(plan, workload.ledger, latencies)
@@ -173,7 +179,7 @@ def run_messages(spec: Spec) -> dict[str, Any]:
     prefix = f'/mddag_bench_{os.getpid()}'
     topics = [f'{prefix}/topic_{i}' for i in range(spec.topics)]
     node = quiet_node('/mddag_bench')
-    starts = Starts()
+    starts: list[Start] = []
     active = [_subscribe(node, topic, starts) for topic in topics]
     for i in range(spec.idle):
         _subscribe(node, f'{prefix}/idle_{i}', starts)
@@ -191,9 +197,9 @@ def run_messages(spec: Spec) -> dict[str, Any]:
         end, cpu_end, dds_end = _clocks()
         published = sum(publisher.finish())
         _drain(session, starts, published)
-        received = len(starts.messages)
+        received = len(starts)
     _check(session, True)
-    latencies = starts.within(begin, end)
+    latencies = within(starts, begin, end)
     callbacks = len(latencies)
     return {
         'window_ns': end - begin, 'callbacks': callbacks,
@@ -228,16 +234,16 @@ def _middleware_cpu_ns() -> int | None:
     return sum(times) if times else None
 
 
-def _subscribe(node: Node, topic: str, starts: Starts) -> Subscription:
-    return node.create_subscription(Header, topic, starts.noting(), QOS)
+def _subscribe(node: Node, topic: str, starts: list[Start]) -> Subscription:
+    return node.create_subscription(Header, topic, noting(starts), QOS)
 
 
-def _drain(session: UnfinishedSession, starts: Starts, published: int) -> None:
+def _drain(session: UnfinishedSession, starts: list[Start], published: int) -> None:
     """Wait until all messages were received, or none has come for a while."""
     last, quiet_since = -1, time.monotonic()
     end = time.monotonic() + DRAIN_S
-    while len(starts.messages) < published and time.monotonic() < end:
-        count = len(starts.messages)
+    while len(starts) < published and time.monotonic() < end:
+        count = len(starts)
         if count != last:
             last, quiet_since = count, time.monotonic()
         elif time.monotonic() - quiet_since > QUIET_S:
