@@ -125,12 +125,9 @@ def main(args: argparse.Namespace) -> int:
         task_set = with_declared(args, task_set)
     elif task_set.processes:
         task_set = replace(task_set, processes=())
-    result, error, _ = run_here(args, task_set)
-    _report(args, result)
-    _leave_threads_behind(error)
-    if error is not None:
-        raise error
-    return 0
+    result, error = run_here(args, task_set)
+    report(args, result)
+    return _end(error)
 
 
 def part(args: argparse.Namespace) -> int:
@@ -148,22 +145,19 @@ def part(args: argparse.Namespace) -> int:
         the_part.leave(names)
         sys.stdout.flush()
         os._exit(0)  # without the ends of programs that were only looked at
-    result, error, rest = run_here(args, task_set)
-    the_part.leave({**result, **rest})
-    _leave_threads_behind(error)
-    if error is not None:
-        raise error
-    return 0
+    result, error = run_here(args, task_set)
+    the_part.leave(result)
+    return _end(error)
 
 
 def run_here(
     args: argparse.Namespace, task_set: TaskSet
-) -> tuple[dict[str, Any], BaseException | None, dict[str, Any]]:
+) -> tuple[dict[str, Any], BaseException | None]:
     """
     Run nodes in this process.
 
-    :return: the result, what a node raised, and what the results of several processes are put
-        together from beside (``parts``).
+    :return: the result (with what those of several processes are put together from, if it is one
+        of these), and what a node raised.
     """
     common.check_output(args.trace)
     workers = defaults.workers(args.workers, task_set)
@@ -193,12 +187,18 @@ def run_here(
             raise
 
 
-def _leave_threads_behind(error: BaseException | None) -> None:
-    """End the process here if a node's thread would keep the interpreter from ending."""
+def _end(error: BaseException | None) -> int:
+    """
+    Return the exit status, or raise what a node raised.
+
+    The process ends here if a node's thread would keep the interpreter from ending.
+    """
+    if error is not None:
+        raise error
     left = [t.name for t in threading.enumerate()
             if not t.daemon and t is not threading.main_thread()]
-    if not left or error is not None:
-        return
+    if not left:
+        return 0
     warn(f'threads that nodes started still run and are left behind: {listed(left)}')
     sys.stdout.flush()
     sys.stderr.flush()
@@ -277,7 +277,7 @@ def _run(
     args: argparse.Namespace, task_set: TaskSet, executor: MultiDeadlineExecutor,
     programs: list[Program], plan: ExecutionPlan | None, signals: Signals,
     ends: Callable[[], None],
-) -> tuple[dict[str, Any], BaseException | None, dict[str, Any]]:
+) -> tuple[dict[str, Any], BaseException | None]:
     """Run until the end; see ``run_here``."""
     from mddag_executor.live.measure import measure
     from mddag_executor.live.session import Session
@@ -307,9 +307,9 @@ def _run(
     result['drift'] = [each.result() for each in watch.drift(result)]
     if not session.clean:
         warn('a callback has not ended in time; it is left behind')
-    rest = {} if args.part is None else {
-        'observed': asdict(watch.observed(result)), 'ledger': ledger and vars(ledger)}
-    return result, session.error, rest
+    if args.part is not None:
+        result.update(observed=asdict(watch.observed(result)), ledger=ledger and vars(ledger))
+    return result, session.error
 
 
 def _run_synthetic(
@@ -421,8 +421,11 @@ class Signals:
             self._session.stop(hurried=True)
 
 
-def _report(args: argparse.Namespace, result: dict[str, Any]) -> None:
-    if common.write_result(args, result):
+def report(args: argparse.Namespace, result: dict[str, Any]) -> bool:
+    """Write the result; return whether tables were printed."""
+    shown = common.write_result(args, result)
+    if shown:
         print(sink_table(result['dags']))
         for line in summary(result):
             print(line)
+    return shown

@@ -21,11 +21,10 @@ from typing import Any
 
 from mddag_executor import defaults
 from mddag_executor.cli import common
-from mddag_executor.cli.run import Signals, warn_of
+from mddag_executor.cli.run import report, Signals, warn_of
 from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
-from mddag_executor.report.live_runs import ended_line, summary
-from mddag_executor.report.tables import sink_table
+from mddag_executor.report.live_runs import ended_line
 from msg_graph import TaskSet
 from msg_graph.edit import load_processes, with_processes
 from msg_graph.errors import listed, shown
@@ -105,10 +104,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
             'trace': _trace_of_dead(_trace(args.trace, run.name, run.nth)) if part is None
             else part['trace']}
             for run, part in zip(supervisor.runs, parts)]}
-    if common.write_result(args, result):
-        print(sink_table(result['dags']))
-        for line in summary(result):
-            print(line)
+    if report(args, result):
         for process in result['processes']:
             if process['died']:
                 print(ended_line(process))
