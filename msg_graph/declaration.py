@@ -1,27 +1,74 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Declarations: from YAML to callbacks, paths and processes, each entry checked by itself.
+Declarations: from YAML, of one file or several, to callbacks, paths and processes.
 
+Theory of operation
+-------------------
 Entries do not depend on each other, so the first error of each is collected and all are raised
 together. What needs more than one entry to judge (publishers, cycles, sinks, sources, …) is
 ``derive``'s.
+
+A declaration may be put together from several files:
+
+1. ``include:`` lists files. Their nodes and paths come before those of the file itself, in that
+   order, each time that the file is listed. ``workers:`` and ``processes:`` of an included file do
+   not count: they are about the whole system.
+2. ``arguments:`` names the arguments of a file, with default values (none: it must be given).
+   ``set:`` of an include gives it, and ``$(name)`` in any value of the file stands for it.
+3. Names in an included file (nodes, topics, services, DAGs and, with dots, paths) are put below
+   the ``namespace:`` of the include. A name that ``remap:`` lists, as it stands in the included
+   file, becomes the other name instead, which the including file knows.
+4. So an included file is worked from the inside out: its own includes, its arguments, then the
+   names, as the file that includes it wants them. The result is a tree like that of one file, and
+   every part of it knows its file and line.
+5. A file is looked for beside the one that includes it, and nowhere outside of the folder of the
+   first file, not by way of symbolic links either. Files that include each other in a cycle are
+   an error, and so is too much of anything: files, depth, entries.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+import os
+import re
+import stat
 
 from msg_graph.duration import format_duration
-from msg_graph.errors import Collector, did_you_mean, GraphError, printable, shown
-from msg_graph.include import Assembler, is_composed, Part, top_of
-from msg_graph.language import CALLBACK_KEYS, Entry, NODE_KEYS, PATH_KEYS, TRIGGERS
+from msg_graph.errors import Collector, did_you_mean, GraphError, listed, printable, shown
+from msg_graph.language import (
+    ARGUMENT,
+    CALLBACK_KEYS,
+    Entry,
+    FILE,
+    INCLUDE,
+    NODE_KEYS,
+    PATH_KEYS,
+    TRIGGERS,
+)
 from msg_graph.model import Callback, Path, Process
-from msg_graph.yamltext import yaml_lines
+from msg_graph.yamltext import (
+    decode,
+    Mapping,
+    MAX_BYTES,
+    MAX_SIZE,
+    parse_yaml,
+    Scalar,
+    Sequence,
+    Tree,
+    yaml_lines,
+)
 import yaml
 
 _WIDTH = 75
+MOST_FILES = 2_000
+MOST_DEPTH = 16
+LONGEST_VALUE = 4_096
+_ARGUMENT_USE = re.compile(r'\$\(([^()]*)\)')
+
+Part = tuple[Tree, str]
+"""An entry of ``nodes:`` or ``paths:``, and the name of its file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,3 +257,255 @@ def _paths(parts: list[Part], entries: dict[str, Entry]) -> list[Path]:
             paths.append(path)
     found.check()
     return paths
+
+
+def top_of(text: str, file: str) -> tuple[Mapping, Entry]:
+    """Return the outermost mapping of a file, as a tree and as an entry."""
+    tree = parse_yaml(text, file)
+    if tree is None or (isinstance(tree, Scalar) and tree.is_null):
+        raise GraphError(
+            file, None, 'the file is empty', "write a declaration that starts with 'mddag: 1'")
+    if not isinstance(tree, Mapping):
+        raise GraphError(
+            file, tree.line, 'this is not a declaration', "write one that starts with 'mddag: 1'")
+    entry = _top(tree, file)
+    entry.get('mddag')
+    return tree, entry
+
+
+def _top(tree: Tree, file: str) -> Entry:
+    return Entry(tree, file, 'the declaration', FILE)
+
+
+def is_composed(entry: Entry) -> bool:
+    """Return whether a declaration is put together, or has arguments."""
+    return entry.has('include') or entry.has('arguments')
+
+
+@dataclass
+class Assembler:
+    """
+    Puts a declaration together.
+
+    :ivar path: of the first file; None where it was read from elsewhere, so that there is nothing
+        to include from.
+    """
+
+    path: str | None
+    _read_trees: dict[str, Mapping] = field(default_factory=dict)
+    _files: int = 0
+    _size: int = 0
+
+    def assemble(self, tree: Mapping, file: str) -> tuple[Entry, list[Part], list[Part]]:
+        """Return the first file with its arguments filled in, and all nodes and paths."""
+        chain = [] if self.path is None else [(os.path.realpath(self.path), file)]
+        return self._file(tree, file, {}, chain)
+
+    def _file(
+        self, tree: Mapping, file: str, given: dict[str, str], chain: list[tuple[str, str]]
+    ) -> tuple[Entry, list[Part], list[Part]]:
+        values = _argument_values(_top(tree, file), tree, given)
+        entry = _top(_substituted(tree, file, values), file)
+        self._size += tree.size
+        if self._size > MAX_SIZE:
+            raise entry.error(
+                None, f'with all includes there are more than {MAX_SIZE} entries',
+                'include less, or split it into several graphs')
+        nodes: list[Part] = []
+        paths: list[Part] = []
+        for place, each in enumerate(entry.get('include') or (), 1):
+            more_nodes, more_paths = self._include(each, file, place, chain)
+            nodes += more_nodes
+            paths += more_paths
+        if entry.has('nodes'):
+            nodes += [(each, file) for each in entry.get('nodes')]
+        paths += [(each, file) for each in entry.get('paths') or ()]
+        return entry, nodes, paths
+
+    def _include(
+        self, tree: Tree, file: str, place: int, chain: list[tuple[str, str]]
+    ) -> tuple[list[Part], list[Part]]:
+        if isinstance(tree, Scalar):
+            short, tree = tree, Mapping(tree.line)
+            tree.entries['file'] = short
+            tree.key_lines['file'] = short.line
+        entry = Entry(tree, file, f'include {place}', INCLUDE)
+        path, name = self._locate(entry, file, chain)
+        values = {key: text for key, text, _ in entry.get('set')}
+        _, nodes, paths = self._file(
+            self._read(entry, path, name), name, values, [*chain, (path, name)])
+        renaming = _Renaming(entry)
+        nodes = [(renaming.node(each), source) for each, source in nodes]
+        paths = [(renaming.path(each), source) for each, source in paths]
+        renaming.check()
+        return nodes, paths
+
+    def _locate(
+        self, entry: Entry, file: str, chain: list[tuple[str, str]]
+    ) -> tuple[str, str]:
+        """Return the real path of an included file, and what errors call it."""
+        text = entry.get('file')
+        if self.path is None:
+            raise entry.error(
+                'file', 'a declaration that is not read from a file includes nothing',
+                'give the path of the declaration')
+        real = os.path.realpath(os.path.join(os.path.dirname(chain[-1][0]), text))
+        root = os.path.realpath(os.path.dirname(self.path) or '.')
+        if os.path.commonpath([real, root]) != root:
+            raise entry.error(
+                'file', f'{shown(text)} lies outside of the folder of the first file',
+                'keep all files of a declaration below one folder')
+        if real in [path for path, _ in chain]:
+            names = ' -> '.join(name for _, name in chain)
+            raise entry.error(
+                'file', f'files include each other in a cycle: {names} -> {text}',
+                'remove one of the includes')
+        self._files += 1
+        if len(chain) > MOST_DEPTH or self._files > MOST_FILES:
+            raise entry.error(
+                'file', f'more than {MOST_DEPTH} levels or {MOST_FILES} files are included',
+                'include less, or split it into several graphs')
+        return real, os.path.normpath(os.path.join(os.path.dirname(file), text))
+
+    def _read(self, entry: Entry, path: str, name: str) -> Mapping:
+        if path not in self._read_trees:
+            try:
+                if not stat.S_ISREG(os.stat(path).st_mode):
+                    raise OSError(0, 'it is no regular file')
+                with open(path, 'rb') as stream:
+                    data = stream.read(MAX_BYTES + 1)
+            except (OSError, ValueError) as error:
+                reason = error.strerror if isinstance(error, OSError) else str(error)
+                raise entry.error('file', f'{shown(name)} cannot be read ({reason})',
+                                  'correct the path') from None
+            self._read_trees[path], _ = top_of(decode(data, name), name)
+        return self._read_trees[path]
+
+
+def _argument_values(entry: Entry, tree: Mapping, given: dict[str, str]) -> dict[str, str]:
+    """
+    Return the values of a file's arguments.
+
+    :param given: those that an include sets; the others have their defaults.
+    """
+    declared = tree.entries.get('arguments', Mapping(tree.line))
+    if not isinstance(declared, Mapping):
+        raise entry.error('arguments', "'arguments' is no mapping",
+                          'write arguments: {name: default value}')
+    values: dict[str, str] = {}
+    for name, value in declared.entries.items():
+        line = declared.key_lines[name]
+        if not ARGUMENT.fullmatch(name):
+            raise GraphError(entry.file, line, f'{shown(name)} is no name for an argument',
+                             "use letters, digits and '_', and no digit first")
+        if not isinstance(value, Scalar):
+            raise GraphError(entry.file, value.line,
+                             f'the default value of the argument {shown(name)} is no text',
+                             'write a text, a number or a time')
+        if value.is_null and name not in given:
+            raise GraphError(entry.file, line, f'the argument {shown(name)} has no value',
+                             "set it with 'set:' of the include, or give it a default here")
+        values[name] = given.get(name, value.text)
+    for name in given:
+        if name not in values:
+            raise entry.error(
+                'arguments', f'an include sets {shown(name)}, which is no argument of this file',
+                did_you_mean(name, values, "add it to 'arguments:'"))
+    return values
+
+
+def _substituted(tree: Tree, file: str, values: dict[str, str]) -> Tree:
+    """Return a tree with arguments replaced by their values."""
+    def change(old: Scalar) -> str:
+        def value(found: re.Match[str]) -> str:
+            if found[1] not in values:
+                raise GraphError(
+                    file, old.line, f'{shown(found[0])} stands for no argument of this file',
+                    did_you_mean(found[1], values, f"add it to 'arguments:' ({listed(values)})"
+                                 if values else "add it to 'arguments:'"))
+            return values[found[1]]
+
+        text = _ARGUMENT_USE.sub(value, old.text)
+        if len(text) > LONGEST_VALUE and text != old.text:
+            raise GraphError(file, old.line, 'with its arguments this value is too long',
+                             f'use at most {LONGEST_VALUE} characters')
+        return text
+
+    return _changed(tree, change)
+
+
+def _changed(tree: Tree, change: Callable[[Scalar], str]) -> Tree:
+    """Return a tree with every text changed; nesting is bounded, so this may recurse."""
+    if isinstance(tree, Scalar):
+        text = change(tree)
+        return tree if text == tree.text else Scalar(tree.line, text, tree.plain)
+    if isinstance(tree, Sequence):
+        return tree.with_items([_changed(item, change) for item in tree.items])
+    return tree.with_entries(
+        {key: _changed(value, change) for key, value in tree.entries.items()})
+
+
+class _Renaming:
+    """
+    Gives names of an included file those that the including one knows (rule 3).
+
+    :param entry: of ``include:``.
+    """
+
+    def __init__(self, entry: Entry) -> None:
+        self._entry = entry
+        self._space: str = entry.get('namespace') or ''
+        self._remap: dict[str, str] = {old: new for old, new, _ in entry.get('remap')}
+        self._lines = {old: line for old, _, line in entry.get('remap')}
+        self._seen: set[str] = set()
+
+    def check(self) -> None:
+        """Raise where a name is remapped that the included file does not have."""
+        for name, line in self._lines.items():
+            if name not in self._seen:
+                raise GraphError(
+                    self._entry.file, line, f'{self._entry.name}: it remaps {shown(name)}, '
+                    'which the included file does not name',
+                    did_you_mean(name, self._seen, "remove it from 'remap:'"))
+
+    def node(self, tree: Tree) -> Tree:
+        """Return an entry of ``nodes`` with its names changed."""
+        tree = _with_changes(tree, ('node',), self._name)
+        callbacks = tree.entries.get('callbacks') if isinstance(tree, Mapping) else None
+        if not isinstance(tree, Mapping) or not isinstance(callbacks, Sequence):
+            return tree
+        return tree.with_entries({**tree.entries, 'callbacks': callbacks.with_items(
+            [_with_changes(_with_changes(each, _NAMED, self._name), ('dag',), self._dag)
+             for each in callbacks.items])})
+
+    def path(self, tree: Tree) -> Tree:
+        """Return an entry of ``paths`` with its names changed."""
+        before = self._space.strip('/').replace('/', '.')
+        tree = _with_changes(tree, ('callbacks',), self._key)
+        return _with_changes(tree, ('name',), lambda text: f'{before}.{text}') if before else tree
+
+    def _name(self, text: str) -> str:
+        if not text.startswith('/'):
+            return text
+        self._seen.add(text)
+        return self._remap.get(text, self._space + text)
+
+    def _key(self, text: str) -> str:
+        node, colon, name = text.rpartition(':')
+        return f'{self._name(node)}{colon}{name}'
+
+    def _dag(self, text: str) -> str:
+        return f'{self._space}/{text.lstrip("/")}' if self._space else text
+
+
+_NAMED = ('subscription', 'service', 'sync', 'publishes', 'reads')
+
+
+def _with_changes(tree: Tree, keys: tuple[str, ...], change: Callable[[str], str]) -> Tree:
+    """Return an entry with the texts at some keys changed."""
+    if not isinstance(tree, Mapping):
+        return tree
+    return tree.with_entries({
+        key: value if key not in keys else _changed(
+            value, lambda old: old.text if old.is_null else change(old.text))
+        for key, value in tree.entries.items()})

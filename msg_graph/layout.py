@@ -24,9 +24,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from msg_graph.declaration import is_composed, top_of
 from msg_graph.derive import loads
 from msg_graph.errors import GraphError
-from msg_graph.include import is_composed, top_of
 from msg_graph.model import TaskSet
 from msg_graph.yamltext import Scalar, Sequence, Tree
 import yaml

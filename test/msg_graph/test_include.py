@@ -12,7 +12,7 @@ import re
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from msg_graph import GraphError, load, loads, TaskSet
-from msg_graph.include import MOST_DEPTH
+from msg_graph.declaration import MOST_DEPTH
 from msg_graph.layout import format_text, without_lines
 import pytest
 
