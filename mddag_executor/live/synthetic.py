@@ -77,9 +77,18 @@ QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=10)
 SENSORS_NODE = '/mddag_sensors'
 WARM_UP_S = 1.0
+JOIN_LIMIT = 64
+"""Incomplete joins that a sync vertex keeps; the oldest is dropped and counted."""
+SENSOR = '#sensor '
+"""What the ``frame_id`` of a stand-in sensor's message starts with; its topic follows."""
 _LEAD_NS = 20_000_000
 _CLOCKS_NS = 1_000_000
 """Well above what the clocks of two processes differ by, and below any period."""
+
+Emulate = Callable[[int], None]
+"""Executes for that many nanoseconds in the calling thread."""
+CurrentJob = Callable[[], Any]
+"""Returns None, or what has the ``release_ns`` of the job that the calling thread runs."""
 
 
 def quiet_node(full_name: str, context: Context | None = None, **parameters: bool) -> Node:
@@ -93,14 +102,6 @@ def quiet_node(full_name: str, context: Context | None = None, **parameters: boo
             'start_type_description_service': False, **parameters}.items()])
 
 
-Emulate = Callable[[int], None]
-"""
-Executes for that many nanoseconds in the calling thread.
-
-A sleeper's attribute ``busy_below_ns`` says up to which execution time it takes CPU for it.
-"""
-
-
 def typical_oversleep_ns(samples: int = 100, asked_ns: int = 300_000) -> int:
     """Measure by how much time.sleep() is late on this machine when it is idle: the median, ns."""
     late = []
@@ -111,7 +112,7 @@ def typical_oversleep_ns(samples: int = 100, asked_ns: int = 300_000) -> int:
     return max(0, int(statistics.median(late)))
 
 
-def sleeper(oversleep_ns: int | None = None) -> Emulate:
+def sleeper(oversleep_ns: int) -> Emulate:
     """
     Make a function that takes a worker for some time without taking CPU.
 
@@ -120,20 +121,18 @@ def sleeper(oversleep_ns: int | None = None) -> Emulate:
     timer slack is 50 us) is waited out busily.  When the machine is overloaded, executions get
     longer: that is so for real callbacks too, and it is not hidden.
 
-    :param oversleep_ns: the typical oversleep; None measures it (30 ms).
+    :param oversleep_ns: the typical oversleep.
     """
-    typical = typical_oversleep_ns() if oversleep_ns is None else oversleep_ns
     monotonic_ns, sleep = time.monotonic_ns, time.sleep
 
     def emulate(execution_ns: int) -> None:
-        if execution_ns > typical:
-            sleep((execution_ns - typical) * 1e-9)
+        if execution_ns > oversleep_ns:
+            sleep((execution_ns - oversleep_ns) * 1e-9)
             return
         end = monotonic_ns() + execution_ns
         while monotonic_ns() < end:
             pass
 
-    emulate.busy_below_ns = typical  # type: ignore[attr-defined]
     return emulate
 
 
@@ -175,21 +174,6 @@ def native() -> Emulate:
             each += ((took - few) / iterations - each) / 16
 
     return emulate
-
-
-def emulator(body: Body) -> Emulate:
-    """Return what executes a body."""
-    return sleeper() if body == 'sleep' else spinner() if body == 'spin' else native()
-
-
-JOIN_LIMIT = 64
-"""Incomplete joins that a sync vertex keeps; the oldest is dropped and counted."""
-
-SENSOR = '#sensor '
-"""What the ``frame_id`` of a stand-in sensor's message starts with; its topic follows."""
-
-CurrentJob = Callable[[], Any]
-"""Returns None, or what has the ``release_ns`` of the job that the calling thread runs."""
 
 
 def no_job() -> None:
@@ -376,9 +360,15 @@ class SyntheticWorkload:
             self.ledger.tolerance_ns = _CLOCKS_NS
         self._current_job = current_job
         self._context = context
-        self._emulate = {body: emulator(body) for body in sorted(
-            {plan.body(vertex) for vertex in task_set.vertices})}
-        self.ledger.busy_below_ns = getattr(self._emulate.get('sleep'), 'busy_below_ns', 0)
+        self._emulate: dict[Body, Emulate] = {}
+        bodies = {plan.body(vertex) for vertex in task_set.vertices}
+        if 'sleep' in bodies:
+            self.ledger.busy_below_ns = typical_oversleep_ns()  # takes 30 ms
+            self._emulate['sleep'] = sleeper(self.ledger.busy_below_ns)
+        if 'spin' in bodies:
+            self._emulate['spin'] = spinner()
+        if 'native' in bodies:
+            self._emulate['native'] = native()
         # Timers on the steady clock: steps of the system's clock move no release.
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._nodes: dict[str, Node] = {}
