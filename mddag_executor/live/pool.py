@@ -120,8 +120,9 @@ class Pool:
             running = current.running
             if running is None:
                 own = self._hand_out(now, current.intake)
-            elif not (running.goes_on and running.engine is self.engine):
-                self._hand_out(now)  # else it goes on with it soon
+            elif not (running.published and running.engine is self.engine
+                      and running.work is not None and not running.work.entity.ends_soon.debt):
+                self._hand_out(now)  # else who has published goes on with it soon
         if own is not None:
             self._run_here(own)
 
@@ -157,11 +158,9 @@ class Pool:
         try:
             yield
         finally:
-            running = current.running
             with self.lock:
                 self._batches -= 1
-                if running is None or not (running.goes_on and running.engine is self.engine):
-                    self._hand_out(self.tick())
+                self._hand_out(self.tick())
 
     def tick(self) -> int:
         """Return the engine's time now; the caller holds the lock."""
@@ -371,7 +370,6 @@ class Pool:
             work.cpu_ns += thread_time_ns()
         end = monotonic_ns() + offset
         current.running = None
-        seat.goes_on = False
         if seat.published:
             after = end - offset - seat.published
             if entity.ends_soon.debt or after > SOON_NS:

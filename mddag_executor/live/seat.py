@@ -47,15 +47,12 @@ class Seat:
     :ivar thread: its thread where that is one of the pool's own.
     :ivar waits: whether its callback waits for a service, and has lent its worker.
     :ivar published: when the callback that runs published first (monotonic ns); 0: not yet.
-    :ivar goes_on: whether that is expected to end soon, and its thread goes on with what it has
-        started.
     :ivar relieved: whether another thread does what it, an intake's, would do otherwise.
     """
 
     __slots__ = (
         'worker', 'wake', 'work', 'ended', 'thread', 'vtid', 'cpu_clock', 'waits', 'relieved',
-        'reading', 'began_ns', 'others_before', 'engine', '_clock', '_lend', 'published',
-        'goes_on')
+        'reading', 'began_ns', 'others_before', 'engine', '_clock', '_lend', 'published')
 
     def __init__(
         self, engine: Engine, clock: TraceClock, worker: int,
@@ -80,7 +77,6 @@ class Seat:
         self._clock = clock
         self._lend = lend
         self.published = 0
-        self.goes_on = False
 
     def publish(
         self, send: Any, publisher: Any, msg: Any, state: PublisherState, begin: int
@@ -96,7 +92,6 @@ class Seat:
         engine.jobs.publish(send, publisher, msg, state, work.origin or NO_ORIGIN, begin)
         if not self.published:
             self.published = monotonic_ns()
-            self.goes_on = not work.entity.ends_soon.debt
 
     def lend(self) -> AbstractContextManager[None]:
         """Lend its worker while entered: the callback waits for a service."""
