@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Relative deadlines for sinks, where nobody has given them."""
 
-from mddag_executor.assign.proportional import proportional, scaled
 from mddag_executor.assign.search import (
     AssignError,
     Found,
     least_runs,
     measure,
     Measured,
+    proportional,
+    scaled,
     Search,
 )
 

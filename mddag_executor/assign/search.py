@@ -1,10 +1,13 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Deadlines by search: the tightest scale at which the simulated acceptance stays above a target.
+Deadlines for sinks: in proportion to critical paths, or the tightest that are mostly kept.
 
 Theory of operation
 -------------------
+A sink's critical path is the longest path from the source to it, by a budget (mean, 99 % quantile
+or maximum) of the execution times.  Deadlines are rounded up to whole us.  The *search*:
+
 1. Every sink's deadline is its critical path times one scale.  A scale is *good* when the lower
    end of the 95 % confidence interval of the acceptance is at or above the target.
 2. All scales are tried with the same draws of execution times, so that their difference is not
@@ -25,10 +28,12 @@ from dataclasses import dataclass, field, replace
 import math
 from typing import Any
 
-from mddag_executor.assign.proportional import scaled
+from mddag_executor.analysis.model import tasks_of
 from mddag_executor.errors import MddagError
 from mddag_executor.simulate.evaluate import evaluate, Experiment, uses_compiled
 from mddag_executor.simulate.evaluation import wilson, Z_95
+from msg_graph import TaskSet
+from msg_graph.duration import whole_us
 from msg_graph.edit import with_deadlines
 
 PRECISION = 0.01
@@ -81,6 +86,46 @@ class Found:
     deadlines: dict[str, int]
     tried: list[tuple[float, Measured]]
     check: Measured
+
+
+def proportional(
+    task_set: TaskSet, budget: str, factor: float = 1.0, base: str = 'period'
+) -> dict[str, int]:
+    """
+    Return a deadline (ns) for each sink by its callback's key.
+
+    The sink of a DAG with the longest critical path gets the base times the factor, the others
+    less in proportion to theirs.  A callback that is several sinks gets the shortest of theirs.
+
+    :param base: ``period``, or ``deadline``: the longest that the DAG has so far.
+    :raises mddag_executor.analysis.model.AnalysisError: an execution time is not declared.
+    """
+    deadlines: dict[str, int] = {}
+    for task in tasks_of(task_set, budget):
+        longest = max(length for _, _, length in task.sinks)
+        whole = task.period if base == 'period' else task.deadline
+        for index, _, length in task.sinks:
+            share = length / longest if longest else 1.0
+            key = task.dag.vertices[index].callback.key
+            deadline = whole_us(whole * factor * share)
+            deadlines[key] = min(deadline, deadlines.get(key, deadline))
+    return deadlines
+
+
+def scaled(task_set: TaskSet, budget: str, scale: float) -> dict[str, int]:
+    """
+    Return a deadline (ns) for each sink by its callback's key: its critical path times a scale.
+
+    A callback that is several sinks gets the longest of theirs.
+
+    :raises mddag_executor.analysis.model.AnalysisError: an execution time is not declared.
+    """
+    deadlines: dict[str, int] = {}
+    for task in tasks_of(task_set, budget):
+        for index, _, length in task.sinks:
+            key = task.dag.vertices[index].callback.key
+            deadlines[key] = max(whole_us(length * scale), deadlines.get(key, 0))
+    return deadlines
 
 
 def least_runs(target: float) -> int:

@@ -41,14 +41,7 @@ def main(args: argparse.Namespace) -> int:
     policies = options.policies(args.policies)
     if args.duration > _LONGEST_NS:
         raise UsageError('--duration: that is too long: give at most 60s')
-    result = _measure(args, policies)
-    if common.write_result(args, result):
-        _show(result)
-    return 0
-
-
-def _measure(args: argparse.Namespace, policies: tuple[str, ...]) -> dict[str, Any]:
-    from mddag_executor.simulate.measure_core import time_core
+    from mddag_executor.simulate.measure import time_core
     task_set = common.load_workload(args.graph)
     workers = defaults.workers(args.workers, task_set)
     rows: list[dict[str, Any]] = []
@@ -58,18 +51,13 @@ def _measure(args: argparse.Namespace, policies: tuple[str, ...]) -> dict[str, A
             rows.append(time_core(
                 task_set, name, workers=workers, duration_ns=args.duration, seed=args.seed,
                 repeat=args.repeat))
-    return {'graph': task_set.file, 'workers': workers, 'duration_ns': args.duration,
-            'seed': args.seed, 'core': rows}
-
-
-def _show(result: dict[str, Any]) -> None:
-    print(table(
-        ('policy', 'preemptive', 'events', 'vertex jobs', 'us an event', 'us a vertex job',
-         'us a vertex job, live calls'),
-        [(row['policy'], 'yes' if row['preemptive'] else 'no', row['events'], row['vertex_jobs'],
-          _us(row['us_per_event']), _us(row['us_per_vertex_job']),
-          _us(row['live_us_per_vertex_job'])) for row in result['core']]))
-
-
-def _us(value: float | None) -> str | None:
-    return None if value is None else f'{value:.2f}'
+    common.show(args, {
+        'graph': task_set.file, 'workers': workers, 'duration_ns': args.duration,
+        'seed': args.seed, 'core': rows}, [table(
+            ('policy', 'preemptive', 'events', 'vertex jobs', 'us an event', 'us a vertex job',
+             'us a vertex job, live calls'),
+            [(row['policy'], 'yes' if row['preemptive'] else 'no', row['events'],
+              row['vertex_jobs'], *(None if row[us] is None else f'{row[us]:.2f}' for us in (
+                  'us_per_event', 'us_per_vertex_job', 'live_us_per_vertex_job')))
+             for row in rows])])
+    return 0

@@ -9,6 +9,7 @@ The machine decides about the figures, and whatever else it does: all are median
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from mddag_executor import defaults
@@ -48,21 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Measure and print."""
     from mddag_executor.simulate.compiling import available
+    from mddag_executor.simulate.evaluate import Experiment
+    from mddag_executor.simulate.measure import time_runs, time_vertex_jobs
     policies = options.policies(args.policies)
     if max(args.vertices) > 100_000:
         raise UsageError('--vertices: that is too many: give at most 100000')
     cores = CORES if available() else CORES[1:]
-    result = _measure(args, policies, cores)
-    if common.write_result(args, result):
-        _show(result, cores)
-    return 0
-
-
-def _measure(
-    args: argparse.Namespace, policies: tuple[str, ...], cores: tuple[str, ...]
-) -> dict[str, Any]:
-    from mddag_executor.simulate.evaluate import Experiment
-    from mddag_executor.simulate.measure import time_runs, time_vertex_jobs
     task_set = common.load_workload(args.graph)
     experiment = Experiment(task_set, policies, workers=defaults.workers(None, task_set))
     jobs = args.jobs or sorted({1, defaults.processors()})
@@ -82,18 +74,22 @@ def _measure(
                 line.update(len(runs) + len(sizes), f'{core} core, {size} vertices')
                 sizes.append(time_vertex_jobs(
                     size, core=core, vertex_jobs=_VERTEX_JOBS[core], repeat=args.repeat))
-    return {'graph': task_set.file, 'runs': runs, 'vertex_jobs': sizes,
-            'peak_memory_mb': peak}
+    common.show(args, {
+        'graph': task_set.file, 'runs': runs, 'vertex_jobs': sizes, 'peak_memory_mb': peak,
+    }, _lines(runs, sizes, peak, cores))
+    return 0
 
 
-def _show(result: dict[str, Any], cores: tuple[str, ...]) -> None:
-    print(table(
+def _lines(
+    runs: list[dict[str, Any]], sizes: list[dict[str, Any]], peak: float, cores: Sequence[str]
+) -> Iterator[str]:
+    yield table(
         ('core', 'at a time', 'runs', 'ms a run and policy', 'runs a second'),
         [(row['core'], row['jobs'], row['runs'], f'{row["ms"]:.3f}', round(row['runs_per_s']))
-         for row in result['runs']]))
-    found = {(row['vertices'], row['core']): row['ns'] for row in result['vertex_jobs']}
-    sizes = list(dict.fromkeys(row['vertices'] for row in result['vertex_jobs']))
-    print(table(
+         for row in runs])
+    found = {(row['vertices'], row['core']): row['ns'] for row in sizes}
+    yield table(
         ('vertices', *(f'ns a vertex job, {core}' for core in cores)),
-        [(size, *(round(found[size, core]) for core in cores)) for size in sizes]))
-    print(f'peak memory of the runs: {result["peak_memory_mb"]:.0f} MB')
+        [(size, *(round(found[size, core]) for core in cores))
+         for size in dict.fromkeys(row['vertices'] for row in sizes)])
+    yield f'peak memory of the runs: {peak:.0f} MB'

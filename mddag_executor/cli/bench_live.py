@@ -37,7 +37,6 @@ from mddag_executor.resources import find
 from mddag_executor.text import counted
 
 HELP = 'measure executors of rclpy nodes, this one and those of rclpy, side by side'
-DESCRIPTION = 'Measure executors of rclpy nodes, this one and those of rclpy, side by side.'
 EXAMPLE = """\
 mddag bench live --load autoware --utilisation 0.3,0.6,0.8 --seconds 10
 mddag bench live --load autoware --executors rad-events,multi --policies rad,fifo,rm,wc,gedf
@@ -114,10 +113,7 @@ def main(args: argparse.Namespace) -> int:
     for result in results:
         if graph is not None:
             result['graph'] = args.graph or graph
-    if common.write_result(args, results):
-        print(result_table(results))
-        for line in notes(results):
-            print(line)
+    common.show(args, results, (result_table(results), *notes(results)))
     return 0
 
 

@@ -12,7 +12,7 @@ starts, so a mistyped path costs nothing.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 import json
 import os
@@ -330,6 +330,13 @@ def write_result(args: argparse.Namespace, result: Any) -> bool:
     if args.json is not None:
         write_json(args.json, result)
     return wants_tables(args)
+
+
+def show(args: argparse.Namespace, result: Any, lines: Iterable[str]) -> None:
+    """Write a result where `--json` says, and print its lines for people if those are wanted."""
+    if write_result(args, result):
+        for line in lines:
+            print(line)
 
 
 def wants_tables(args: argparse.Namespace) -> bool:

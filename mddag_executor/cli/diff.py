@@ -73,12 +73,7 @@ def main(args: argparse.Namespace) -> int:
         first, second = (files.enter_context(common.input_recording(run)) for run in runs)
         before, after = _results(args, first, second, task_set)
     difference = diff.compare(before, after, args.tolerance)
-    if common.write_result(args, difference):
-        print(diff.sinks_table(difference))
-        if args.callbacks:
-            print(diff.callbacks_table(difference))
-        for line in diff.summary(difference):
-            print(line)
+    common.show(args, difference, diff.lines(difference, args.callbacks))
     if not args.fail_on_worse:
         return 0
     if not difference['worse'] and not difference['compared']:

@@ -185,9 +185,7 @@ def _write(args: argparse.Namespace, outcome: Evaluation) -> None:
         from mddag_executor.simulate.plot import draw
         with common.output_file(args.plot) as file:
             draw(outcome, file, args.plot)
-    if common.write_result(args, outcome.result()):
-        print(table(*ratio_table(outcome)))
-        print(_summary(outcome))
+    common.show(args, outcome.result(), (table(*ratio_table(outcome)), _summary(outcome)))
 
 
 def _summary(outcome: Evaluation) -> str:

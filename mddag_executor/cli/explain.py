@@ -9,6 +9,7 @@ The run is judged as `replay` does it; `mddag_executor.replay.causes` says what 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded
@@ -51,11 +52,8 @@ def main(args: argparse.Namespace) -> int:
     explainer = outcome.explainer
     assert explainer is not None
     result = explainer.result(sink, args.job)
-    if common.write_result(args, result):
-        if sink is None and args.job is None:
-            _show(outcome, explainer)
-        else:
-            _show_jobs(result['jobs'])
+    every = sink is None and args.job is None
+    common.show(args, result, _lines(outcome, explainer) if every else _job_lines(result['jobs']))
     return 0
 
 
@@ -69,7 +67,7 @@ def _sink(name: str, task_set: TaskSet) -> int:
     return sinks[name]
 
 
-def _show(outcome: Replay, explainer: Explainer) -> None:
+def _lines(outcome: Replay, explainer: Explainer) -> Iterator[str]:
     from mddag_executor.report.explained import (
         causes_line,
         causes_table,
@@ -80,26 +78,23 @@ def _show(outcome: Replay, explainer: Explainer) -> None:
     from mddag_executor.report.tables import verdicts_line
     summary = explainer.summary()
     if summary['missed']:
-        print(causes_table(summary))
-        print('Where that time went:')
-        print(sinks_table(explainer.mostly()))
+        yield causes_table(summary)
+        yield 'Where that time went:'
+        yield sinks_table(explainer.mostly())
         if summary['stalls']:
-            print(stalls_table(summary['stalls'], outcome.run.start or 0))
+            yield stalls_table(summary['stalls'], outcome.run.start or 0)
         worst = explainer.worst()
         if worst is not None:
-            for line in job_lines(worst):
-                print(line)
-    print(verdicts_line(outcome.tally.result()['dags']))
-    for line in causes_line(summary):
-        print(line)
+            yield from job_lines(worst)
+    yield verdicts_line(outcome.tally.result()['dags'])
+    yield from causes_line(summary)
 
 
-def _show_jobs(jobs: list[dict[str, Any]]) -> None:
+def _job_lines(jobs: list[dict[str, Any]]) -> Iterator[str]:
     from mddag_executor.report.explained import job_lines
     for each in jobs[:MOST_SHOWN]:
-        for line in job_lines(each):
-            print(line)
+        yield from job_lines(each)
     if not jobs:
-        print('no such job missed its deadline')
+        yield 'no such job missed its deadline'
     elif len(jobs) > MOST_SHOWN:
-        print(f'{len(jobs) - MOST_SHOWN} more: see --job or --json')
+        yield f'{len(jobs) - MOST_SHOWN} more: see --job or --json'

@@ -14,12 +14,13 @@ from dataclasses import fields, replace
 import os
 from pathlib import Path
 import shutil
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING, TypeVar
 
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress
 from mddag_executor.errors import InputError, UsageError
-from mddag_executor.generate import BASES, METHODS, Options
+from mddag_executor.generate.options import option_of, Options
+from msg_graph.duration import exact_duration
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,7 +31,7 @@ mddag generate --sets 400 --utilisation 0.1:1.0 --sinks 2:4 --tightness 0.3:1.0 
 mddag evaluate sets --policies rad,gedf,rm,fifo --plot sets.svg"""
 
 _MOST_SETS = 100_000
-_DEFAULT = Options()
+T = TypeVar('T')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,61 +41,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the declaration ('-': standard output, the default); with --sets a new folder")
     add('--sets', type=options.positive_int, metavar='N',
         help='make N task sets, OUT/set_0000.yaml and so on (default: one, OUT itself)')
-    add('--utilisation', type=_numbers, default=(0.5, 0.5), metavar='U[:U]',
-        help='utilisation: the load of all DAGs divided by the workers, with mean execution '
-        'times; with --sets two bounds, over which the sets are spread evenly (default: 0.5)')
-    add('--workers', type=options.positive_int, default=_DEFAULT.workers, metavar='M',
-        help='declared number of workers (default: %(default)s)')
-    _add_pair(add, '--dags', options.positive_int, _DEFAULT.dags, 'number of DAGs')
-    _add_pair(add, '--vertices', options.positive_int, _DEFAULT.vertices,
-              'number of callbacks of each DAG')
-    _add_pair(add, '--sinks', options.positive_int, _DEFAULT.sinks,
-              'number of sinks of each DAG, each with its own deadline')
-    add('--edge-probability', type=options.number, default=_DEFAULT.edge_probability, metavar='P',
-        help='probability of an edge between two callbacks of a DAG (default: %(default)s)')
-    add('--or-share', type=options.number, default=_DEFAULT.or_share, metavar='P',
-        help='share of the callbacks with several predecessors that run once for each message '
-        '(OR), and so are several vertices; the others join the messages (default: %(default)s)')
-    add('--method', choices=METHODS, default=_DEFAULT.method,
-        help='how the utilisation is distributed over DAGs and callbacks: Dirichlet-rescale or '
-        'UUniFast(-Discard) (default: %(default)s)')
-    add('--max-dag-load', '--max-dag-utilisation', type=options.number, dest='most_per_dag',
-        default=_DEFAULT.most_per_dag, metavar='L',
-        help='the largest load of one DAG, in cores; the second name is the older one '
-        '(default: %(default)s)')
-    add('--periods', type=_periods, default=_DEFAULT.periods_ns, dest='periods_ns',
-        metavar='TIME,TIME…',
-        help='each DAG gets one of these (default: 10ms,20ms,50ms,100ms,200ms)')
-    add('--tightness', type=_numbers, default=_DEFAULT.tightness, metavar='F[:F]',
-        help='each deadline divided by its base, drawn between the bounds (default: 0.5:1.0)')
-    add('--deadline-of', choices=BASES, default=_DEFAULT.deadline_of,
-        help="the base: the DAG's period, or the longest path to the sink (default: %(default)s)")
-    add('--spread', type=options.number, default=_DEFAULT.spread, metavar='F',
-        help='execution times are uniform within this share of their mean on either side '
-        '(default: %(default)s, constant)')
-    options.add_seed(
-        parser, 'seed; the same seed and options give the same files', int, _DEFAULT.seed)
+    for each in fields(Options):
+        default: Any = each.default
+        about, shown = each.metadata, default
+        if each.name == 'utilisation':
+            default = default, default
+        elif isinstance(default, tuple):
+            shown = ':'.join(dict.fromkeys(map(str, default)))
+        if each.name == 'periods_ns':
+            shown = ','.join(map(exact_duration, default))
+        older = ['--max-dag-utilisation'] if each.name == 'most_per_dag' else []
+        what: dict[str, Any] = {'choices': about['choices']} if about['choices'] else {
+            'type': _KINDS.get(each.name, options.number), 'metavar': about['metavar']}
+        add(option_of(each), *older, dest=each.name, default=default, **what,
+            help=f'{about["what"]} (default: {shown})')
 
 
-def _add_pair(
-    add: Callable[..., object], option: str, kind: Callable[[str], int], default: tuple[int, int],
-    what: str,
-) -> None:
-    def pair(text: str) -> tuple[int, int]:
+def _pair(kind: Callable[[str], T]) -> Callable[[str], tuple[T, T]]:
+    def pair(text: str) -> tuple[T, T]:
         low, _, high = text.partition(':')
         return kind(low), kind(high or low)
 
-    shown = f'{default[0]}' if default[0] == default[1] else f'{default[0]}:{default[1]}'
-    add(option, type=pair, default=default, metavar='N[:N]', help=f'{what} (default: {shown})')
+    return pair
 
 
-def _numbers(text: str) -> tuple[float, float]:
-    low, _, high = text.partition(':')
-    return options.number(low), options.number(high or low)
-
-
-def _periods(text: str) -> tuple[int, ...]:
-    return tuple(options.list_of(options.duration)(text))
+_KINDS: dict[str, Callable[[str], Any]] = {
+    **dict.fromkeys(('dags', 'vertices', 'sinks'), _pair(options.positive_int)),
+    **dict.fromkeys(('utilisation', 'tightness'), _pair(options.number)),
+    'workers': options.positive_int, 'seed': int,
+    'periods_ns': lambda text: tuple(options.list_of(options.duration)(text))}
 
 
 def main(args: argparse.Namespace) -> int:

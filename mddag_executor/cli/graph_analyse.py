@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 import tempfile
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
-from mddag_executor.cli.text import Cell, Progress, table
+from mddag_executor.cli.text import Progress, table
 from mddag_executor.errors import UsageError
 from mddag_executor.text import counted
 
@@ -71,11 +70,11 @@ def main(args: argparse.Namespace) -> int:
             lambda tests: line.update(tests, 'tests'))
     if args.sag is not None or args.sag_binary is not None:
         analysis = _sag(args, task_set, analysis)
-    if common.write_result(args, analysis.result()):
-        about = ((v.name, v.source, v.scheduler, v.assumption) for v in analysis.verdicts)
-        print(table(_HEADER, _rows(analysis)))
-        print(table(_ABOUT, about))
-        print(_summary(analysis))
+    found = analysis.verdicts
+    common.show(args, analysis.result(), (
+        table(_HEADER, ((v.name, v.kind, v.verdict, v.figure, v.reason) for v in found)),
+        table(_ABOUT, ((v.name, v.source, v.scheduler, v.assumption) for v in found)),
+        _summary(analysis)))
     return 0
 
 
@@ -100,11 +99,6 @@ def _sag(args: argparse.Namespace, task_set: TaskSet, analysis: Analysis) -> Ana
             line.update(jobs.size, 'jobs')
             answer = sag.ask(args.sag_binary, folder, analysis.workers, args.sag_timeout)
     return with_sag(analysis, tasks, jobs, answer)
-
-
-def _rows(analysis: Analysis) -> Iterator[list[Cell]]:
-    for each in analysis.verdicts:
-        yield [each.name, each.kind, each.verdict, each.figure, each.reason]
 
 
 def _summary(analysis: Analysis) -> str:

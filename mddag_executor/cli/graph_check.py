@@ -43,8 +43,7 @@ def main(args: argparse.Namespace) -> int:
     """Check."""
     task_set = common.load_graph(args.graph)
     result = check_result(task_set)
-    if common.write_result(args, result):
-        print(table(_HEADER, _rows(result)) + '\n' + _summary(task_set, result))
+    common.show(args, result, (table(_HEADER, _rows(result)), _summary(task_set, result)))
     return 0
 
 

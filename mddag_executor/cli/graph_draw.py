@@ -28,9 +28,8 @@ stand in the order of the file.
 The ending of OUT says what it becomes: .svg, .png and .pdf need Graphviz (Debian, Ubuntu:
 'sudo apt install graphviz'); .dot (Graphviz's language) and .mmd (Mermaid) need nothing.
 Viewers of Mermaid limit its size: raise maxEdges and maxTextSize there for large graphs.
-Graphs of more than 1000 vertices are laid out more plainly, and quickly: a node's name stands in
-its vertices' boxes instead of in a frame, lines are straight, and PNG has at most 16000 dots in a
-row. (OUT.dot then holds the positions; Graphviz only draws it.)"""
+Graphs of more than 1000 vertices are laid out more plainly, and quickly: DAGs stand in rows, lines
+are straight, and PNG has at most 16000 dots in a row."""
 
 _BY_GRAPHVIZ = ('.svg', '.png', '.pdf')
 _ENDINGS = (*_BY_GRAPHVIZ, '.dot', '.mmd')

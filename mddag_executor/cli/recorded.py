@@ -5,7 +5,7 @@ What `replay`, `export` and `diff` share: how recordings of every kind become ru
 
 A trace of this executor and an imported recording are replayed as they were recorded, or, with
 `--reschedule`, as the scheduler core would have run them; an ordinary bag has no jobs, so it can
-only be rescheduled.
+only be rescheduled: its messages are the releases.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from mddag_executor.cli import bags, common, options
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress
 from mddag_executor.errors import UsageError
 
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 _WITH = 'with --reschedule: '
 _ONLY_RESCHEDULED = (
     'workers', 'cpus', 'processes', 'policy', 'preemptive', 'overheads', 'execution_times', 'seed')
+_RECORDED = -1
+"""Overheads as they were recorded."""
 
 
 def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
@@ -42,15 +44,29 @@ def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
     options.add_policy(parser, _WITH, 'as recorded')
     options.add(
         parser, '--preemptive', only=_WITH, otherwise='as recorded, where the policy can')
-    bags.add_arguments(parser)
+    add('--overheads', type=_overheads, metavar='WHICH',
+        help=f'{_WITH}the time that noticing, dispatch and transport take: recorded (default), '
+        'none, or a time for each dispatch (50us); of a bag: none (default) or a time')
+    options.add(parser, '--execution-times', '--seed',
+                only='with --reschedule of an ordinary bag: ')
     parser.set_defaults(skip=0)     # for verbs without --skip
+
+
+def _overheads(text: str) -> int:
+    if text == 'recorded':
+        return _RECORDED
+    return 0 if text == 'none' else options.duration(text)
 
 
 def check(args: argparse.Namespace) -> None:
     """Check the arguments."""
     if args.processes == '0':
         raise UsageError('--processes 0: give 1 or more, or a file')
-    bags.check(args)
+    if args.execution_times is not None and args.seed is not None:
+        raise UsageError(
+            '--seed: nothing is drawn where --execution-times are given: leave one out')
+    if args.execution_times is not None and args.graph is None:
+        raise UsageError('--execution-times: they are of a declaration: give a GRAPH')
     if args.reschedule:
         if getattr(args, 'callbacks', False):
             raise UsageError(
@@ -82,9 +98,15 @@ def is_bag(path: Recording) -> bool:
 def check_declared(path: Recording, name: str) -> None:
     """Find out whether a recording says which deadlines there are, where no graph is given."""
     if is_bag(path):
-        raise bags.no_graph(name)
+        raise _no_graph(name)
     from mddag_executor.replay.run import open_run
     open_run(path, None, name, needs_declaration=True)
+
+
+def _no_graph(name: str) -> UsageError:
+    return UsageError(
+        f'{name}: no run of this executor is recorded in it, so there are no jobs: to take its '
+        'messages as releases give a GRAPH and --reschedule')
 
 
 def as_recorded(
@@ -109,23 +131,43 @@ def rescheduled(
     args: argparse.Namespace, path: Recording, name: str, task_set: TaskSet | None
 ) -> Reschedule:
     """Run the scheduler over a recording of any kind."""
-    if isinstance(path, str) and is_bag(path):
-        if args.processes is not None:
-            raise UsageError('--processes: an ordinary bag does not say what computes: leave the '
-                             'option out')
-        return bags.reschedule_bag(args, path, name, task_set)
-    if args.execution_times is not None:
-        raise UsageError('--execution-times: a trace has its own: leave the option out')
-    if args.seed is not None:
-        raise UsageError('--seed: a trace has its own execution times, so nothing is drawn: leave '
-                         'the option out')
+    if is_bag(path):
+        return _rescheduled_bag(args, path, name, task_set)
+    for option, has in (('execution-times', 'a trace has its own'),
+                        ('seed', 'a trace has its own execution times, so nothing is drawn')):
+        if getattr(args, option.replace('-', '_')) is not None:
+            raise UsageError(f'--{option}: {has}: leave the option out')
     from mddag_executor.replay import reschedule
-    recorded = args.overheads in (None, bags.RECORDED)
+    recorded = args.overheads in (None, _RECORDED)
     with Progress('replaying') as line:
         return reschedule(
             path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
             overheads=recorded, dispatch_overhead=0 if recorded else args.overheads, name=name,
             progress=line.events, skip=args.skip, cpus=args.cpus, processes=_processes(args))
+
+
+def _rescheduled_bag(
+    args: argparse.Namespace, path: Recording, name: str, task_set: TaskSet | None
+) -> Reschedule:
+    from mddag_executor.replay.bags_reschedule import reschedule_bag
+    from mddag_executor.simulate import read_execution_times
+    assert isinstance(path, str)
+    if args.processes is not None:
+        raise UsageError('--processes: an ordinary bag does not say what computes: leave the '
+                         'option out')
+    if task_set is None or not args.reschedule:
+        raise _no_graph(name)
+    if args.overheads == _RECORDED:
+        raise UsageError('--overheads: a bag has none: give a time for each dispatch')
+    times = None
+    if args.execution_times is not None:
+        times_name, text = common.read_text(args.execution_times)
+        times = read_execution_times(task_set, text, times_name)
+    with Progress('replaying'):
+        return reschedule_bag(
+            path, task_set, policy=args.policy, workers=args.workers,
+            preemptive=bool(args.preemptive), times=times, seed=args.seed or 0,
+            dispatch_overhead=args.overheads or 0, name=name, skip=args.skip, cpus=args.cpus)
 
 
 def _processes(

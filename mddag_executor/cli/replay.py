@@ -13,6 +13,7 @@ An ordinary bag (a folder with metadata.yaml, or one of its files) has no jobs; 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded, verdicts
@@ -69,13 +70,11 @@ def main(args: argparse.Namespace) -> int:
     if args.report is not None:
         from mddag_executor.report.html import of_outcome
         common.write_report(args.report, lambda: of_outcome(outcome, watch))
-    if common.write_result(args, result):
-        _show(args, result)
-        verdicts.show(args, result)
+    common.show(args, result, _lines(args, result))
     return status
 
 
-def _show(args: argparse.Namespace, result: dict[str, Any]) -> None:
+def _lines(args: argparse.Namespace, result: dict[str, Any]) -> Iterator[str]:
     from mddag_executor.report.replays import (
         comparison_table,
         recorded_tables,
@@ -84,19 +83,18 @@ def _show(args: argparse.Namespace, result: dict[str, Any]) -> None:
     )
     from mddag_executor.report.tables import drift_lines, sink_table
     if result['rescheduled'] and result['recorded'] is None:
-        print(sink_table(result['dags']))
-        for note in result['notes']:
-            print(printable(note))
-        print('transport, dispatch and other load are not in a bag: they are left out '
-              '(--overheads)')
+        yield sink_table(result['dags'])
+        yield from map(printable, result['notes'])
+        yield ('transport, dispatch and other load are not in a bag: they are left out '
+               '(--overheads)')
     elif result['rescheduled']:
-        print('Rescheduled, beside what was recorded:')
-        print(comparison_table(result['dags'], result['recorded']['dags']))
+        yield 'Rescheduled, beside what was recorded:'
+        yield comparison_table(result['dags'], result['recorded']['dags'])
     elif result['dags'] or 'recorded_callbacks' not in result:
-        print(sink_table(result['dags']))
-        print('Where the response times went: means, and the worst job of each sink:')
-        print(times_table(result['dags']))
-    for line in recorded_tables(result, args.callbacks):
-        print(line)
-    for line in (*summary(result), *drift_lines(result.get('drift', ()))):
-        print(line)
+        yield sink_table(result['dags'])
+        yield 'Where the response times went: means, and the worst job of each sink:'
+        yield times_table(result['dags'])
+    yield from recorded_tables(result, args.callbacks)
+    yield from summary(result)
+    yield from drift_lines(result.get('drift', ()))
+    yield from verdicts.lines(args, result)

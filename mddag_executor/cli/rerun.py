@@ -9,6 +9,7 @@ Exit status: 0 done; 1 with `--expect` when the outputs differ; 2 bad input, or 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import replace
 import os
@@ -77,11 +78,10 @@ def main(args: argparse.Namespace) -> int:
     values = result.result()
     if found is not None:
         values['differences'] = [each._asdict() for each in found]
-    tables = common.write_result(args, values)
-    if tables:
-        _show(args, result, values)
-    for difference in found or ():
-        print(printable(difference.line()), file=sys.stdout if tables else sys.stderr)
+    differences = [printable(each.line()) for each in found or ()]
+    common.show(args, values, (*_lines(args, result, values), *differences))
+    if not common.wants_tables(args):
+        print(*differences, sep='\n', end='\n' * bool(found), file=sys.stderr)
     return int(bool(found))
 
 
@@ -132,17 +132,19 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
         return result, compare(result, args.expect, args.tolerance)
 
 
-def _show(args: argparse.Namespace, result: Result, values: dict[str, Any]) -> None:
+def _lines(
+    args: argparse.Namespace, result: Result, values: dict[str, Any]
+) -> Iterator[str]:
     from mddag_executor.report.tables import sink_table
-    print(sink_table(values['dags']))
+    yield sink_table(values['dags'])
     speed = result.virtual_ns / 1e9 / max(result.elapsed_s, 1e-9)
-    print(f'{counted(result.callbacks, "callback")}, {result.virtual_ns / 1e9:.3f} s in '
-          f'{result.elapsed_s:.3f} s ({speed:.1f} times as fast as real time)')
-    print(f'{counted(sum(result.counts.values()), "message")} published, {result.digest}')
+    yield (f'{counted(result.callbacks, "callback")}, {result.virtual_ns / 1e9:.3f} s in '
+           f'{result.elapsed_s:.3f} s ({speed:.1f} times as fast as real time)')
+    yield f'{counted(sum(result.counts.values()), "message")} published, {result.digest}'
     if result.recorded_topics:
         same = len(result.recorded_topics) - len(result.recorded)
-        print(f'{counted(len(result.recorded_topics), "topic")} recorded, too, {same} the same')
+        yield f'{counted(len(result.recorded_topics), "topic")} recorded, too, {same} the same'
     for difference in result.recorded:
-        print(f'not as recorded: {printable(difference.line())}')
+        yield f'not as recorded: {printable(difference.line())}'
     if args.expect is not None and not values['differences']:
-        print(f'the same as {printable(args.expect)}')
+        yield f'the same as {printable(args.expect)}'

@@ -19,7 +19,6 @@ from mddag_executor.cli.text import format_ns, printable, Progress
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
-    from mddag_executor.simulate import Load, Settings, SimulatedRun
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -47,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Simulate and print what came of the deadlines."""
-    from mddag_executor.simulate import periodic_load, Settings, utilisation
+    from mddag_executor.simulate import periodic_load, Settings, simulate, utilisation
     task_set = common.load_graph(args.graph)
     workers = defaults.workers(args.workers, task_set)
     times = execution_times(args, task_set, workers)
@@ -56,8 +55,10 @@ def main(args: argparse.Namespace) -> int:
         preemptive=bool(args.preemptive), judge=args.judge,
         stop_at_first_miss=args.stop_at_first_miss, cpus=args.cpus)
     load = periodic_load(task_set, times, args.duration)
-    run = _simulate(task_set, load, settings, utilisation(task_set, times, workers),
-                    log=args.trace is not None or args.report is not None)
+    with Progress('simulating', settings.duration_ns) as line:
+        run = simulate(
+            task_set, load, settings, utilisation=utilisation(task_set, times, workers),
+            log=args.trace is not None or args.report is not None, progress=line.update)
     if args.trace is not None:
         from mddag_executor.replay.run_writer import write_trace
         with common.output_trace(args.trace) as path:
@@ -65,12 +66,11 @@ def main(args: argparse.Namespace) -> int:
     if args.report is not None:
         from mddag_executor.report.html import of_run
         common.write_report(args.report, lambda: of_run(task_set, load, run))
-    result = _result(args, task_set, run)
-    if common.write_result(args, result):
-        from mddag_executor.report.tables import sink_table
-        print(sink_table(result['dags']))
-        for line in summary(result):
-            print(line)
+    result = {
+        **run.result(), 'file': task_set.file, 'judge': run.settings.judge,
+        'seed': args.seed if args.execution_times is None else None, 'ended_ns': run.ended_ns,
+        'trace': args.trace}
+    common.show(args, result, _lines(result))
     if not args.fail_on_miss:
         return 0
     return verdicts.exit_status(
@@ -96,26 +96,10 @@ def execution_times(
     return times
 
 
-def _simulate(
-    task_set: TaskSet, load: Load, settings: Settings, utilisation: float, log: bool
-) -> SimulatedRun:
-    from mddag_executor.simulate import simulate
-    with Progress('simulating', settings.duration_ns) as line:
-        return simulate(
-            task_set, load, settings, utilisation=utilisation, log=log, progress=line.update)
-
-
-def _result(args: argparse.Namespace, task_set: TaskSet, run: SimulatedRun) -> dict[str, Any]:
-    drawn = args.execution_times is None
-    return {
-        **run.result(), 'file': task_set.file, 'judge': run.settings.judge,
-        'seed': args.seed if drawn else None, 'ended_ns': run.ended_ns,
-        'trace': args.trace}
-
-
-def summary(result: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines that stand below the table of a run."""
-    from mddag_executor.report.tables import never_due_lines, verdicts_line
+def _lines(result: dict[str, Any]) -> Iterator[str]:
+    """Yield the table of a run, and the lines below it."""
+    from mddag_executor.report.tables import never_due_lines, sink_table, verdicts_line
+    yield sink_table(result['dags'])
     jobs = sum(dag['jobs'] for dag in result['dags'].values())
     yield (f'{result["policy"]}, {counted(result["workers"], "worker")}, '
            f'{"preemptive" if result["preemptive"] else "not preemptive"}, '

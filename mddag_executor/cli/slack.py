@@ -58,6 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Find the slack and print it."""
     from mddag_executor.replay.slack import find_slack, slack_result
+    from mddag_executor.report.slack import lines, page
     common.recording_and_graph(args)
     is_graph = str(args.trace).lower().endswith(_GRAPHS)
     problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
@@ -66,10 +67,8 @@ def main(args: argparse.Namespace) -> int:
         slack = find_slack(problem, line.update, args.jobs or defaults.processors())
     result = slack_result(slack, task_set, dags, problem.settings.processes)
     if args.report is not None:
-        from mddag_executor.report.slack import page
         common.write_text(args.report, ''.join(page(result, str(args.trace))))
-    if common.write_result(args, result):
-        _show(result)
+    common.show(args, result, lines(result))
     if args.fail_under is None:
         return 0
     return int(bool(result['left_out']) or any(
@@ -122,13 +121,3 @@ def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
     run = simulated(task_set, load, settings)
     problem = Problem(load, settings, Tables.build(task_set), task_set.places_of_vertices())
     return problem, task_set, run.result()['dags']
-
-
-def _show(result: dict[str, Any]) -> None:
-    from mddag_executor.report.slack import margins_table, slack_table, summary
-    print('How many times as long each callback may take, alone:')
-    print(slack_table(result))
-    print('How much before their deadlines the sinks complete as things are:')
-    print(margins_table(result))
-    for line in summary(result):
-        print(line)

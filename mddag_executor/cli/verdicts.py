@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 import sys
 from typing import Any
 
@@ -81,13 +81,13 @@ def unproven(place: str, what: str, remedy: str = _NEVER_DUE) -> int:
     return 1
 
 
-def show(args: argparse.Namespace, result: dict[str, Any]) -> None:
-    """Print which sinks are not within what is tolerated, where that was said."""
+def lines(args: argparse.Namespace, result: dict[str, Any]) -> Iterator[str]:
+    """Yield which sinks are not within what is tolerated, where that was said."""
     if args.tolerate_ratio is None and args.tolerate_burst is None:
         return
     tolerance = Tolerance(args.tolerate_ratio, args.tolerate_burst)
     broken = tolerance.verdicts(result['dags'])
     for (_, sink), why in broken.items():
-        print(f'not tolerated: {printable(sink)}: {why}')
+        yield f'not tolerated: {printable(sink)}: {why}'
     if not broken:
-        print('all misses, if any, are within what is tolerated')
+        yield 'all misses, if any, are within what is tolerated'

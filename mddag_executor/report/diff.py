@@ -166,8 +166,11 @@ def callbacks_table(difference: Mapping[str, Any]) -> str:
                   'mean wait', 'then'), rows)
 
 
-def summary(difference: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines below the tables: one for each run, and the verdict."""
+def lines(difference: Mapping[str, Any], callbacks: bool) -> Iterator[str]:
+    """Yield the tables, that of callbacks if wanted, a line for each run, and the verdict."""
+    yield sinks_table(difference)
+    if callbacks:
+        yield callbacks_table(difference)
     for mark in ('a', 'b'):
         run = difference[mark]
         pool = f'imported, {counted(run["workers"], "thread")}' if run['imported'] else (

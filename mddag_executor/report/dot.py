@@ -9,17 +9,22 @@ to the backslash (`\n`, `\N`, `\G`, …), to nothing else, and an HTML-like labe
 
 A queue edge begins at a text that says what is read and from whom, beside the reader: a line from
 the writer would cross the pictures of other DAGs.  So no line joins the DAGs.  Graphviz then puts
-them above one another, the first lowest: they are written from the last to the first.
+them above one another, the first lowest, or fills rows from the lowest one up: they are written in
+that order.
+
+``dot`` takes minutes for thousands of boxes, as it weighs each against all others.  So of a picture
+with more than ``_MANY`` it is to lay out each DAG by itself, to spend less on it, to draw straight
+lines, and to put the DAGs into rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import zip_longest
+import math
 import re
 
-from mddag_executor.report.layered import place, Rectangle
-from mddag_executor.report.picture import Arrow, Box, DagFrame, Picture
+from mddag_executor.report.picture import Box, DagFrame, Picture
 from mddag_executor.report.text import printable
 
 _SHAPES = {
@@ -35,15 +40,15 @@ _MOST_WRITERS = 3
 _QUEUE = 'style=dotted, color="#2244bb", penwidth=1.6, arrowhead=open'
 _STUB = 'shape=plaintext, fontsize=9, fontcolor="#2244bb", margin="0.02,0.02"'
 _PIECES = re.compile(r'[^/_]*[/_]?')
-_MOST_PIXELS = 16_000
 _MANY = 1_000
-"""With more boxes than this the layout is our own, and Graphviz only draws."""
+_IN_ROWS = ('pack=true, splines=line, nslimit=0.1, nslimit1=0.1, mclimit=0.1, size="166,166", '
+            'packmode=array_c')
+"""166 inches are 16,000 dots: viewers take no wider PNG."""
 
 
 def to_dot(picture: Picture) -> str:
     """Return the DOT text of a picture."""
-    boxes = sum(len(node.boxes) for dag in picture.dags for node in dag.nodes)
-    return '\n'.join(_placed_lines(picture) if boxes > _MANY else _lines(picture)) + '\n'
+    return '\n'.join(_lines(picture)) + '\n'
 
 
 def quoted(text: str) -> str:
@@ -68,19 +73,34 @@ def _wrapped(name: str, width: int = _WIDTH) -> list[str]:
 
 def _lines(picture: Picture) -> Iterator[str]:
     yield 'digraph mddag {'
-    yield '  graph [rankdir=LR, compound=true, newrank=false, ranksep=0.35, nodesep=0.1,'
+    yield '  graph [rankdir=LR, compound=true, ranksep=0.35, nodesep=0.1,'
     yield '    fontname="Helvetica", labelloc=t, labeljust=l, fontsize=20,'
+    columns = 1
+    if sum(len(node.boxes) for dag in picture.dags for node in dag.nodes) > _MANY:
+        columns = math.isqrt(len(picture.dags) // 2) + 1
+        yield f'    {_IN_ROWS}{columns},'
+    else:
+        yield '    newrank=false,'
     yield f'    label={quoted(picture.title)}]'
     yield '  node [fontname="Helvetica", fontsize=12, margin="0.08,0.04", height=0.3]'
     yield '  edge [arrowsize=0.7]'
     stubs = _stubs(picture)
     yield from _legend(picture)
-    for dag in reversed(picture.dags):
+    for dag in _upwards(picture.dags, columns):
         yield from _dag(dag, stubs)
     for arrow in picture.arrows:
         if not arrow.queue:
-            yield _arrow(arrow)
+            yield (f'  {quoted(arrow.start)} -> {quoted(arrow.end)} '
+                   f'[tooltip={quoted(arrow.note)}]')
     yield '}'
+
+
+def _upwards(dags: Sequence[DagFrame], columns: int) -> Iterator[DagFrame]:
+    """Yield DAGs row by row, the lowest row, in which the legend comes first, at first."""
+    end, room = len(dags), max(1, columns - 1)
+    while end > 0:
+        yield from dags[max(0, end - room):end]
+        end, room = end - room, columns
 
 
 def _stubs(picture: Picture) -> dict[str, list[list[str]]]:
@@ -99,44 +119,6 @@ def _stubs(picture: Picture) -> dict[str, list[list[str]]]:
             shown.append(f'… ({len(found) - _MOST_WRITERS} more)')
         stubs.setdefault(reader, []).append([*_wrapped(what, _WIDE), *shown])
     return stubs
-
-
-def _placed_lines(picture: Picture) -> Iterator[str]:
-    """Yield the lines of a picture with positions, for the layout `nop2`, which only draws."""
-    placed = place(picture)
-    legend = placed[0].at
-    yield 'digraph mddag {'
-    width = max(d.at.x + d.at.width / 2 for d in placed)
-    dots = max(24, min(96, round(_MOST_PIXELS * 72 / width)))
-    yield ('  graph [layout=nop2, splines=line, outputorder=edgesfirst, fontname="Helvetica", '
-           f'dpi={dots}]')
-    yield '  node [fontname="Helvetica", fontsize=10, fixedsize=true]'
-    yield '  edge [arrowsize=0.6]'
-    top = legend.y + legend.height / 2
-    yield (f'  "title" [label={_label([picture.title], _LEFT)}, shape=plaintext, fontsize=24, '
-           f'{_at(Rectangle(300, top + 110, 600, 30))}]')
-    meaning = ' '.join((*_LEGEND, 'Dotted arrows are queue edges: data that is read later.'))
-    yield (f'  "legend" [label={_label([meaning], _LEFT)}, shape=plaintext, fontsize=12, '
-           f'{_at(Rectangle(len(meaning) * 3.3, top + 72, len(meaning) * 6.6, 20))}]')
-    for number, (colour, text) in enumerate(picture.legend):
-        at = Rectangle(60 + 110 * number, top + 35, 100, 24)
-        yield (f'  "k{number}" [label={quoted(text)}, shape=box, style="filled", '
-               f'color={quoted(colour)}, fillcolor={quoted(colour)}, {_at(at)}]')
-    for dag in placed:  # frames first: what comes later is drawn over them
-        yield (f'  {quoted(dag.frame.mark)} [label={_label(["", dag.frame.title], _LEFT)}, '
-               'shape=box, style="rounded,bold", color="#444444", labelloc=t, fontsize=14, '
-               f'{_at(dag.at)}]')
-    for dag in placed:
-        for box, lines, at in dag.boxes:
-            yield f'  {_box(box, lines)[:-1]}, {_at(at)}]'
-    for arrow in picture.arrows:
-        yield _arrow(arrow)
-    yield '}'
-
-
-def _at(at: Rectangle) -> str:
-    return (f'pos="{at.x:.1f},{at.y:.1f}", width={at.width / 72:.3f}, '
-            f'height={at.height / 72:.3f}')
 
 
 def _dag(dag: DagFrame, stubs: dict[str, list[list[str]]]) -> Iterator[str]:
@@ -159,19 +141,10 @@ def _dag(dag: DagFrame, stubs: dict[str, list[list[str]]]) -> Iterator[str]:
     yield '  }'
 
 
-def _box(box: Box, lines: Iterable[str] | None = None) -> str:
+def _box(box: Box) -> str:
     sink = ', peripheries=2' if box.sink else ''
-    return (f'{quoted(box.mark)} [label={_label(lines or box.lines)}, {_SHAPES[box.kind]}, '
+    return (f'{quoted(box.mark)} [label={_label(box.lines)}, {_SHAPES[box.kind]}, '
             f'fillcolor={quoted(box.colour)}{sink}, tooltip={quoted(box.note)}]')
-
-
-def _arrow(arrow: Arrow) -> str:
-    ends = f'  {quoted(arrow.start)} -> {quoted(arrow.end)}'
-    note = f'tooltip={quoted(arrow.note)}'
-    if not arrow.queue:
-        return f'{ends} [{note}]'
-    # A queue edge often leads back; it must not pull the boxes out of their order.
-    return f'{ends} [{_QUEUE}, constraint=false, {note}]'
 
 
 _LEGEND = (

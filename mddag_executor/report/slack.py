@@ -21,19 +21,17 @@ _COLOURS = ((1.1, '#d7191c'), (1.5, '#fd8d3c'), (2.0, '#fec44f'), (5.0, '#9ecae1
 _BEST = '#3182bd'
 
 
-def slack_table(result: Mapping[str, Any]) -> str:
-    """Return a table of the callbacks after which something breaks, the tightest first."""
+def lines(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the tables of callbacks, the tightest first, and of sinks, and the lines below."""
     short = _short(result)
-    return table(('callback', 'may take', 'then misses'), [
+    yield 'How many times as long each callback may take, alone:'
+    yield table(('callback', 'may take', 'then misses'), [
         [short[name], _times(one['factor']), short[one['breaks']]]
         for name, one in _tightest(result)])
-
-
-def margins_table(result: Mapping[str, Any]) -> str:
-    """Return a table of how much before its deadline each sink completes."""
-    short = _short(result)
-    return table(('sink', 'deadline', 'least margin', 'of it', '99 % have', 'median'), [
+    yield 'How much before their deadlines the sinks complete as things are:'
+    yield table(('sink', 'deadline', 'least margin', 'of it', '99 % have', 'median'), [
         [short[name], *_margins(sink)] for name, sink in result['sinks'].items()])
+    yield from _summary(result)
 
 
 def _margins(sink: Mapping[str, Any]) -> list[Cell]:
@@ -45,7 +43,7 @@ def _margins(sink: Mapping[str, Any]) -> list[Cell]:
             format_ns(margin['p1'], 3), format_ns(margin['median'], 3)]
 
 
-def summary(result: Mapping[str, Any]) -> Iterator[str]:
+def _summary(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the tables."""
     if len(result['left_out']) == len(result['sinks']):
         yield 'every sink misses deadlines as things are: nothing is left that could break'
@@ -79,7 +77,7 @@ def page(result: Mapping[str, Any], title: str) -> Iterator[str]:
            '<link rel="icon" href="data:,">\n'
            f'<style>{_STYLE.read_text(encoding="utf-8")}</style></head><body>\n'
            f'<h1>{heading}</h1>\n')
-    for line in summary(result):
+    for line in _summary(result):
         yield f'<p class="note">{escape(line)}</p>\n'
     short = _short(result)
     yield ('<h2>How many times as long each callback may take, alone</h2>\n<p class="note">The '

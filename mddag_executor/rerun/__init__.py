@@ -25,9 +25,8 @@ from mddag_executor.live.loading import Program, resolve, ros_arguments
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.outputs import Output
-from mddag_executor.rerun.recording import Recording
 from mddag_executor.rerun.run import PATIENCE_S, Rerun, Result, Settings
-from mddag_executor.rerun.sources import open_source
+from mddag_executor.rerun.sources import open_source, Recording
 from msg_graph import load, TaskSet
 
 __all__ = [

@@ -20,7 +20,7 @@ import math
 from typing import Any, NamedTuple
 
 from mddag_executor.rerun.outputs import Output
-from mddag_executor.rerun.recording import Recorded
+from mddag_executor.rerun.sources import Recorded
 from mddag_executor.rerun.types import type_name
 from rclpy.serialization import deserialize_message
 

@@ -17,7 +17,7 @@ from collections.abc import Collection, Iterator
 from mddag_executor.rerun.errors import RerunError
 from mddag_executor.rerun.loop import Loop, RECORDED
 from mddag_executor.rerun.messages import Messages
-from mddag_executor.rerun.recording import Recorded, Recording
+from mddag_executor.rerun.sources import Recorded, Recording
 from mddag_executor.rerun.types import type_name
 from rclpy.serialization import serialize_message
 from rclpy.time import Time

@@ -45,14 +45,13 @@ from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.executor import NodeHolder, RerunHost
 from mddag_executor.rerun.loop import ENDED, Loop
 from mddag_executor.rerun.messages import Messages
-from mddag_executor.rerun.outputs import Output, Outputs
+from mddag_executor.rerun.outputs import Output, Outputs, VirtualTraceWriter
 from mddag_executor.rerun.playing import CLOCK, Playing
 from mddag_executor.rerun.services import Services
 from mddag_executor.rerun.sources import Source
 from mddag_executor.rerun.strands import Stuck
 from mddag_executor.rerun.timers import Timers
 from mddag_executor.rerun.times import AsRecorded
-from mddag_executor.rerun.trace import VirtualTraceWriter
 from msg_graph import TaskSet
 import rclpy
 from rclpy.exceptions import ROSInterruptException

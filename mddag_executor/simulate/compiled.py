@@ -27,11 +27,11 @@ from mddag_executor.simulate.compiling import (
     keeps_entries,
 )
 from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.draws import Times
+from mddag_executor.simulate.draws import Bools, Times
 from mddag_executor.simulate.engine import LogEntry, Orders
+from mddag_executor.simulate.experiment import Judge, load_without_costs
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.machine import Machine
-from mddag_executor.simulate.workload import periodic_load
 from msg_graph import TaskSet
 import numpy as np
 import numpy.typing as npt
@@ -83,36 +83,26 @@ def compile_here(name: str) -> None:
         np.zeros(0, dtype=np.bool_))
 
 
-class CompiledJudge:
-    """
-    Simulates runs in compiled code (see ``experiment.Judge``); several threads may call it.
+def compiled_judge(task_set: TaskSet, duration_ns: int) -> Judge:
+    """Return what simulates runs in compiled code; several threads may call it."""
+    built = Tables.build(task_set)
+    tables = [LentTuple(built, number) for number in range(len(POLICIES))]
+    without_costs = LentTuple(load_without_costs(task_set, duration_ns))
 
-    :param duration_ns: of each run.
-    """
-
-    def __init__(self, task_set: TaskSet, duration_ns: int) -> None:
-        built = Tables.build(task_set)
-        load = periodic_load(
-            task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
-        self._columns = built.n_vertices
-        self._duration_ns = duration_ns
-        self._tables = [LentTuple(built, number) for number in range(len(POLICIES))]
-        self._load = LentTuple(load._replace(
-            cost_base=[built.first_vertex[dag.index] for dag in task_set.dags]))
-
-    def __call__(self, settings: Settings, times: Times) -> npt.NDArray[np.bool_]:
-        """Return which of the runs met every deadline."""
-        row = find_policy(settings.policy)
-        load = self._load.copy()  # whose costs become each run's
+    def judge(settings: Settings, times: Times) -> Bools:
+        load = without_costs.copy()  # whose costs become each run's
         working = EmptyMemory(len(State._fields))
         times = np.ascontiguousarray(times, dtype=np.int64)
         accepted = np.zeros(len(times), dtype=np.bool_)
         _entries()[ACCEPT_RUNS](
-            self._tables[list(POLICIES).index(settings.policy)].address, load.address,
-            working.address, times.ctypes.data, self._columns * _WORD, settings.workers,
-            int(settings.preempts), int(row.polling), settings.dispatch_overhead_ns,
-            settings.switch_overhead_ns, self._duration_ns, settings.judge == 'horizon', accepted)
+            tables[list(POLICIES).index(settings.policy)].address, load.address,
+            working.address, times.ctypes.data, built.n_vertices * _WORD, settings.workers,
+            int(settings.preempts), int(find_policy(settings.policy).polling),
+            settings.dispatch_overhead_ns, settings.switch_overhead_ns, duration_ns,
+            settings.judge == 'horizon', accepted)
         return accepted
+
+    return judge
 
 
 def run_once(

@@ -17,11 +17,11 @@ however many there are of them, in whichever process it is done, and whatever wa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 import time
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from mddag_executor import defaults
 from mddag_executor.core import policy as find_policy
@@ -36,6 +36,7 @@ from mddag_executor.simulate.draws import (
     Times,
     utilisations,
 )
+from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.run import check
 from mddag_executor.simulate.schedule import schedule, Settings
 from mddag_executor.simulate.workload import declared_holds, periodic_load
@@ -96,11 +97,30 @@ class Chunk(NamedTuple):
         return max(1, round(len(self.utilisation) * seconds / max(self.took_s, 1e-6)))
 
 
-class Judge(Protocol):
-    """Simulates runs of a task set."""
+Judge = Callable[[Settings, Times], Bools]
+"""Simulates runs of a task set; returns which of those with these times met every deadline."""
 
-    def __call__(self, settings: Settings, times: Times) -> Bools:
-        """Return which of the runs with these execution times met every deadline."""
+
+def plain_judge(task_set: TaskSet, duration_ns: int) -> Judge:
+    """Return what simulates runs in plain Python."""
+    tables = Tables.build(task_set)
+    without_costs = load_without_costs(task_set, duration_ns)
+
+    def judge(settings: Settings, times: Times) -> Bools:
+        accepted = np.zeros(len(times), dtype=np.bool_)
+        for row in range(len(times)):
+            load = without_costs._replace(costs=times[row].tolist())
+            decisions = schedule(tables, load, settings).decisions
+            accepted[row] = not any(is_miss(decision[0]) for decision in decisions)
+        return accepted
+
+    return judge
+
+
+def load_without_costs(task_set: TaskSet, duration_ns: int) -> Load:
+    """Return the load that all runs have but for their execution times."""
+    return periodic_load(
+        task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
 
 
 class Evaluator:
@@ -116,10 +136,15 @@ class Evaluator:
         self._experiments = experiments
         self._runs = runs
         self._compiled = compiled
-        self._one = lru_cache(_MOST_AT_HAND)(self._make)
+        self._parts = lru_cache(_MOST_AT_HAND)(self._make)
 
-    def _make(self, index: int) -> _One:
-        return _One(self._experiments[index], self._compiled)
+    def _make(self, index: int) -> tuple[Draws, Judge]:
+        one = self._experiments[index]
+        draws = Draws(one.task_set, one.seed, one.samples)
+        if self._compiled and not declared_holds(one.task_set):
+            from mddag_executor.simulate.compiled import compiled_judge
+            return draws, compiled_judge(one.task_set, one.duration_ns)
+        return draws, plain_judge(one.task_set, one.duration_ns)
 
     def check(self) -> None:
         """Find out whether all experiments can be done."""
@@ -136,55 +161,19 @@ class Evaluator:
         while at < end:
             index, run_index = divmod(at, self._runs)
             some = min(end - at, self._runs - run_index)
-            parts.append(self._one(index)(index * STRIDE + run_index, some))
+            parts.append(self._some(index, index * STRIDE + run_index, some))
             at += some
         utilisation, possible, accepted = zip(*parts)
         return Chunk(
             first, np.concatenate(utilisation), np.concatenate(possible),
             np.concatenate(accepted, axis=1), time.monotonic() - begin)
 
-
-class _One:
-    """Evaluates runs of one experiment, by their numbers."""
-
-    def __init__(self, experiment: Experiment, compiled: bool) -> None:
-        self._experiment = experiment
-        self._settings = [experiment.settings(name) for name in experiment.policies]
-        self._draws = Draws(experiment.task_set, experiment.seed, experiment.samples)
-        self.judge: Judge
-        if compiled and not declared_holds(experiment.task_set):
-            from mddag_executor.simulate.compiled import CompiledJudge
-            self.judge = CompiledJudge(experiment.task_set, experiment.duration_ns)
-        else:
-            self.judge = PlainJudge(experiment.task_set, experiment.duration_ns)
-
-    def __call__(self, first: int, count: int) -> tuple[Floats, Bools, Bools]:
-        experiment = self._experiment
-        times = self._draws.times(first, count)
-        accepted = np.array([self.judge(settings, times) for settings in self._settings])
+    def _some(self, index: int, first: int, count: int) -> tuple[Floats, Bools, Bools]:
+        """Evaluate runs of one experiment, by their numbers."""
+        one = self._experiments[index]
+        draws, judge = self._parts(index)
+        times = draws.times(first, count)
         return (
-            utilisations(experiment.task_set, times, experiment.workers),
-            feasible(
-                experiment.task_set, times, experiment.workers, experiment.duration_ns),
-            accepted)
-
-
-class PlainJudge:
-    """Simulates runs in plain Python."""
-
-    def __init__(self, task_set: TaskSet, duration_ns: int) -> None:
-        self._tables = Tables.build(task_set)
-        load = periodic_load(
-            task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
-        self._load = load._replace(
-            cost_base=[self._tables.first_vertex[dag.index] for dag in task_set.dags])
-
-    def __call__(self, settings: Settings, times: Times) -> Bools:
-        """Return which of the runs met every deadline."""
-        tables = self._tables
-        accepted = np.zeros(len(times), dtype=np.bool_)
-        for row in range(len(times)):
-            load = self._load._replace(costs=times[row].tolist())
-            decisions = schedule(tables, load, settings).decisions
-            accepted[row] = not any(is_miss(decision[0]) for decision in decisions)
-        return accepted
+            utilisations(one.task_set, times, one.workers),
+            feasible(one.task_set, times, one.workers, one.duration_ns),
+            np.array([judge(one.settings(name), times) for name in one.policies]))

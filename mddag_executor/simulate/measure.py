@@ -1,21 +1,42 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""How long simulation takes: for each run of an experiment, and for each job of a vertex."""
+"""
+How long simulation takes for each run, for each job of a vertex, and the core for each event.
+
+Theory of operation
+-------------------
+``time_core`` has two drivers of the same core in plain Python.  *Simulated*: ``engine.run`` over a
+periodic load in virtual time, with as many workers and as much waiting as the workload makes;
+whatever the engine takes is counted in.  *Live calls*: the live executor's calls of the core for
+each callback (release, ready, take, complete), leg by leg, one callback after the other, without
+clock, threads and messages.
+
+An *event* is something that the core gets or decides: a release, a completion, a start or a
+preemption.  Times are CPU time of the thread, medians over repetitions; the garbage collector is
+off meanwhile, as its share depends on what else the process holds.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+import gc
 from statistics import median
 import time
 from typing import Any
 
 from mddag_executor import defaults
+from mddag_executor.core import Scheduler, Tables
+from mddag_executor.core.state import IDLE
 from mddag_executor.generate import generate, Options
-from mddag_executor.simulate.compiled import ACCEPT_RUNS, CompiledJudge, prepare
+from mddag_executor.simulate.compiled import ACCEPT_RUNS, compiled_judge, prepare
 from mddag_executor.simulate.draws import Draws
+from mddag_executor.simulate.engine import END
 from mddag_executor.simulate.evaluate import evaluate
-from mddag_executor.simulate.experiment import Experiment, Judge, PlainJudge
-from mddag_executor.simulate.schedule import Settings
+from mddag_executor.simulate.experiment import Experiment, plain_judge
+from mddag_executor.simulate.load import Load
+from mddag_executor.simulate.schedule import schedule, Settings
+from mddag_executor.simulate.workload import draw_execution_times, periodic_load
 from msg_graph import loads, TaskSet
 import numpy as np
 
@@ -72,18 +93,99 @@ def time_vertex_jobs(
     task_set = random_task_set(n_vertices)
     rate = sum(len(dag.vertices) / dag.period_ns for dag in task_set.dags)
     duration_ns = max(max(_PERIODS_NS), round(vertex_jobs / rate))
-    judge: Judge = PlainJudge(task_set, duration_ns)
+    judge = plain_judge(task_set, duration_ns)
     if core == 'compiled':
         prepare(ACCEPT_RUNS)
-        judge = CompiledJudge(task_set, duration_ns)
+        judge = compiled_judge(task_set, duration_ns)
     settings = Settings('rad', WORKERS, duration_ns, True, 'completions', True)
     done = sum(-(-duration_ns // dag.period_ns) * len(dag.vertices) for dag in task_set.dags)
     times = Draws(task_set, 0).times(0, 1)
+    accepted = judge(settings, times)
+    assert np.all(accepted)  # else it ended early
+    return {'vertices': len(task_set.vertices), 'core': core, 'vertex_jobs': done,
+            'ns': 1e9 * _seconds(lambda: judge(settings, times), repeat) / done}
+
+
+def time_core(
+    task_set: TaskSet, policy: str, *, workers: int, duration_ns: int, seed: int = 0,
+    repeat: int = 5,
+) -> dict[str, Any]:
+    """
+    Measure the core under a policy, in its own mode of the paper's experiment.
+
+    :param duration_ns: of virtual time.
+    :param seed: of the execution times.
+    :return: for machines: counts, and us of CPU time for each event and vertex job.
+    :raises mddag_executor.core.PolicyError: when there is no such policy.
+    :raises SimulationError: when a callback declares no execution time.
+    """
+    settings = Settings(policy, workers, duration_ns, preemptive=None)
+    tables = Tables.build(task_set)
+    load = periodic_load(task_set, draw_execution_times(task_set, seed), duration_ns)
+
+    def simulate() -> None:
+        schedule(tables, load, settings)
+
+    log = schedule(tables, load, settings, log=True).log
+    vertex_jobs = sum(kind == END for _, kind, *_ in log)
+    events = len(log) + len(load.times)
+    taken = _seconds(simulate, repeat)
+    legs = Tables.build(task_set, legs=True)
+    live_jobs = drive_live(legs, policy, load)
+    live = _seconds(lambda: drive_live(legs, policy, load), repeat)
+    return {
+        'policy': policy, 'preemptive': settings.preempts, 'vertex_jobs': vertex_jobs,
+        'events': events, 'repeat': repeat, 'us_per_event': _us(taken, events),
+        'us_per_vertex_job': _us(taken, vertex_jobs),
+        'live_us_per_vertex_job': _us(live, live_jobs)}
+
+
+def _us(seconds: float, count: int) -> float | None:
+    return 1e6 * seconds / count if count else None
+
+
+def _seconds(work: Callable[[], object], repeat: int) -> float:
+    """Return the median CPU time of some work, s."""
     taken = []
     for _ in range(repeat):
-        begin = time.thread_time()
-        accepted = judge(settings, times)
-        taken.append(time.thread_time() - begin)
-        assert np.all(accepted)  # else it ended early
-    return {'vertices': len(task_set.vertices), 'core': core, 'vertex_jobs': done,
-            'ns': 1e9 * median(taken) / done}
+        gc.collect()
+        gc.disable()
+        try:
+            begin = time.thread_time()
+            work()
+            taken.append(time.thread_time() - begin)
+        finally:
+            gc.enable()
+    return median(taken)
+
+
+def drive_live(tables: Tables, policy: str, load: Load) -> int:
+    """
+    Make the core's calls of a live run: the jobs that are released at one instant, till their end.
+
+    :param tables: with legs.
+    :return: the number of vertex jobs that completed.
+    """
+    core = Scheduler(tables, 1, policy, propagate=False)
+    completed = 0
+    first, successors = tables.first_successor, tables.successors
+    state = core.state
+    for i, (now, dag, job) in enumerate(zip(load.times, load.dags, load.jobs)):
+        core.ready(core.source(core.release(dag, job, now, now)), now)
+        if i + 1 < len(load.times) and load.times[i + 1] == now:
+            continue
+        x = core.take(0, now)
+        while x >= 0:
+            slot, vertex = state.x_slot[x], state.x_vertex[x]
+            if core.complete(x, now):
+                completed += 1
+                for after in successors[first[vertex]:first[vertex + 1]]:
+                    # Some leg of it: that which nobody has made ready yet.
+                    leg = core.execution(slot, after)
+                    while state.x_state[leg] != IDLE:
+                        leg += 1
+                    core.ready(leg, now)
+            if state.decisions:
+                core.decisions()
+            x = core.take(0, now)
+    return completed

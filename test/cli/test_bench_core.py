@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mddag_executor.core import POLICIES, Tables
 from mddag_executor.simulate import draw_execution_times, periodic_load
-from mddag_executor.simulate.measure_core import drive_live, time_core
+from mddag_executor.simulate.measure import drive_live, time_core
 from msg_graph import load, loads, TaskSet
 import pytest
 

@@ -107,6 +107,29 @@ def test_dags_stand_in_the_order_of_the_file_and_the_legend_below(name: str) -> 
     assert tops == sorted(tops, reverse=True)
 
 
+@pytest.mark.needs('graphviz')
+def test_dags_of_a_large_picture_stand_in_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = 'mddag: 1\nnodes:\n' + '\n'.join(
+        f'- {{node: /n{i}, callbacks: [{{name: t, timer: 10ms, dag: d{i}, publishes: [/t{i}]}}, '
+        f'{{name: s, subscription: /t{i}, deadline: 9ms, reads: [/t{(i + 1) % 9}]}}]}}'
+        for i in range(9))
+    small = to_dot(drawn(text))
+    monkeypatch.setattr(dot, '_MANY', 10)
+    large = to_dot(drawn(text))
+    assert 'pack=' not in small and 'packmode=array_c3' in large
+    laid = json.loads(subprocess.run(
+        ['dot', '-Tjson0'], input=large.encode(), capture_output=True, check=True).stdout)
+    boxes = {each['label'].partition(',')[0]: each['bb'].split(',') for each in laid['objects']
+             if each['name'].startswith('cluster_d') and 'every' in each['label']}
+    left, low = ([float(boxes[f'd{i}'][k]) for i in range(9)] for k in (0, 1))
+    rows = [[0], [1, 2, 3], [4, 5, 6], [7, 8]]
+    for row in rows:
+        assert [left[i] for i in row] == sorted(left[i] for i in row)
+    for above, below in zip(rows, rows[1:]):
+        assert min(low[i] for i in above) > max(low[i] for i in below)
+    assert len(laid['edges']) == large.count(' -> ')
+
+
 def test_mermaid() -> None:
     lines = [line.strip() for line in to_mermaid(drawn()).splitlines()]
     assert lines[0] == 'flowchart LR'

@@ -20,9 +20,8 @@ from mddag_executor.rerun import (
     RerunError,
     Result,
 )
-from mddag_executor.rerun.recording import Recording
 from mddag_executor.rerun.run import Rerun, Settings
-from mddag_executor.rerun.sources import Source
+from mddag_executor.rerun.sources import Recording, Source
 from mddag_executor.rerun.types import canonical
 from msg_graph import load
 import pytest

@@ -22,7 +22,7 @@ from mddag_executor import progress
 from mddag_executor.core import POLICIES, Tables
 from mddag_executor.simulate import compiled, compiling, Load, schedule, Settings, simulate
 from mddag_executor.simulate.draws import Draws
-from mddag_executor.simulate.experiment import PlainJudge
+from mddag_executor.simulate.experiment import plain_judge
 from mddag_executor.simulate.load import as_arrays, FAILS, RUNS, SKIPPED
 from msg_graph import load, loads
 import numpy as np
@@ -159,8 +159,8 @@ def test_runs_do_not_disturb_one_another(
     times = np.array(data.draw(st.lists(
         st.lists(st.integers(1, 9), min_size=columns, max_size=columns), min_size=1,
         max_size=6)), dtype=np.int64) * TICK
-    found = compiled.CompiledJudge(case.task_set, settings.duration_ns)(settings, times)
-    assert found.tolist() == PlainJudge(
+    found = compiled.compiled_judge(case.task_set, settings.duration_ns)(settings, times)
+    assert found.tolist() == plain_judge(
         case.task_set, settings.duration_ns)(settings, times).tolist()
 
 
@@ -190,7 +190,7 @@ def test_times_of_a_day() -> None:
 def test_memory_is_given_back() -> None:
     """Thousands of runs need no more memory than some."""
     task_set = load(CONFIG / 'autoware.yaml')
-    judge = compiled.CompiledJudge(task_set, 300_000_000)
+    judge = compiled.compiled_judge(task_set, 300_000_000)
     times = Draws(task_set, 1).times(0, 50)
     settings = Settings(workers=3, preemptive=True, judge='completions')
 
