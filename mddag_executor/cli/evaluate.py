@@ -14,6 +14,7 @@ import argparse
 from collections.abc import Sequence
 from contextlib import ExitStack
 import csv
+from importlib.util import find_spec
 import io
 from pathlib import Path
 import time
@@ -23,10 +24,11 @@ from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, Progress, table, warn
 from mddag_executor.core import POLICIES
-from mddag_executor.errors import InputError
+from mddag_executor.errors import InputError, UsageError
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
+    from mddag_executor.simulate.cluster import Cluster
     from mddag_executor.simulate.draws import Samples
     from mddag_executor.simulate.evaluate import Evaluation
     from msg_graph import TaskSet
@@ -139,12 +141,18 @@ def _evaluate(
     jobs, cluster = args.jobs or defaults.processors(), None
     with ExitStack() as stack:
         if args.dask is not None:
-            from mddag_executor.simulate.cluster import Cluster
-            cluster = stack.enter_context(Cluster(args.dask, jobs))
+            cluster = stack.enter_context(_cluster(args.dask, jobs))
         line = stack.enter_context(Progress('evaluating', runs * len(task_sets)))
         return evaluate(
             experiments, runs, jobs=jobs, core=args.core, cluster=cluster, checkpoint=checkpoint,
             progress=_Clock(line, runs * len(task_sets)))
+
+
+def _cluster(address: str, jobs: int) -> Cluster:
+    if find_spec('distributed') is None:
+        raise UsageError("--dask: Dask is not there: install 'mddag_executor[dask]' with pip")
+    from mddag_executor.simulate.cluster import Cluster
+    return Cluster(address, jobs)
 
 
 class _Clock:

@@ -62,12 +62,14 @@ def main(args: argparse.Namespace) -> int:
     """Place nodes."""
     from mddag_executor.assign.placed import cost_of, improve, Predictor, PUBLISH_NS
     from mddag_executor.assign.placement import Placing
+    from msg_graph import Process
     from msg_graph.edit import with_processes
     if args.trace and args.utilisation is not None:
         raise UsageError('--utilisation: recorded execution times are not scaled: leave it out')
     task_set = common.load_graph(args.graph)
     workers = defaults.workers(args.workers, task_set)
-    times, judged = _times(args, task_set, workers)
+    times, judged = _recorded(args.trace, task_set) if args.trace else (
+        _drawn(args, task_set, workers, args.seed), task_set)
     placing = Placing(judged, args.processes, times, _groups(args.together), _groups(args.apart))
     cpus = args.cpus or defaults.processors()
     predictor = Predictor(judged, workers, cpus, args.policy, args.duration,
@@ -84,7 +86,7 @@ def main(args: argparse.Namespace) -> int:
             'policy': args.policy, 'tried': tried,
             **{name: _predicted(args, task_set, cpus, predictor, where, times)
                for name, where in (('predicted', processes),
-                                   ('one_process', _one(placing.nodes)))},
+                                   ('one_process', (Process('all', tuple(placing.nodes)),)))},
             'factor': _factor(predictor, processes, times),
             'draws': _draws(args, task_set, workers, predictor, processes)}
     common.write_text(args.output, with_processes(task_set, processes).text)
@@ -98,20 +100,6 @@ def main(args: argparse.Namespace) -> int:
 
 def _groups(given: Sequence[str]) -> list[list[str]]:
     return [[node.strip() for node in group.split(',')] for group in given]
-
-
-def _one(nodes: Sequence[str]) -> tuple[Process, ...]:
-    from msg_graph import Process
-    return (Process('all', tuple(nodes)),)
-
-
-def _times(
-    args: argparse.Namespace, task_set: TaskSet, workers: int
-) -> tuple[list[list[int]], TaskSet]:
-    """Return the execution time of each vertex, and the task set with who computes in Python."""
-    if args.trace:
-        return _recorded(args.trace, task_set)
-    return _drawn(args, task_set, workers, args.seed), task_set
 
 
 def _drawn(

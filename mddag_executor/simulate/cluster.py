@@ -10,8 +10,8 @@ that come later or come back.  A task is just place and number of its runs, so w
 lost the scheduler hands its tasks to others, and nothing else is lost.  A worker uses the compiled
 core if this machine would and numba is there; the results are the same.
 
-Dask (the extra ``dask``) is imported when a cluster is asked for.  Its own log is silenced: what
-concerns the user becomes one error.
+Dask is the extra ``dask``: this module is imported when a cluster is asked for.  Dask's own log is
+silenced: what concerns the user becomes one error.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from concurrent.futures import CancelledError, Future
-from importlib.util import find_spec
 import logging
 import tempfile
 import threading
@@ -29,6 +28,9 @@ from typing import Any
 import uuid
 import warnings
 
+import dask.config
+from distributed import Client, get_worker, KilledWorker, LocalCluster, Security, WorkerPlugin
+from distributed.comm import connect
 from mddag_executor import __version__
 from mddag_executor.errors import MddagError
 from mddag_executor.simulate.errors import SimulationError
@@ -59,9 +61,6 @@ class Cluster:
     """
 
     def __init__(self, address: str, jobs: int) -> None:
-        if find_spec('distributed') is None:
-            raise ClusterError(
-                "--dask: Dask is not there: install 'mddag_executor[dask]' with pip")
         for name in ('distributed', 'tornado.application', 'asyncio'):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         self.address = address
@@ -71,7 +70,6 @@ class Cluster:
         self._folder = tempfile.TemporaryDirectory(
             prefix='mddag-dask-', ignore_cleanup_errors=True)
         try:
-            import dask.config
             with dask.config.set({'temporary-directory': self._folder.name}):
                 self._connect(jobs)
         except BaseException:
@@ -79,7 +77,6 @@ class Cluster:
             raise
 
     def _connect(self, jobs: int) -> None:
-        from distributed import Client, LocalCluster
         target: Any = self.address
         if self.address == LOCAL:
             target = self._local = LocalCluster(
@@ -146,15 +143,14 @@ class _ClusterPool(Pool):
     ) -> None:
         self._client = client
         self._address = address
-        self._plugin = _plugin_class()(
-            _Doer(tuple(experiments), runs, compiled, __version__, address == LOCAL))
+        self._doer = _Doer(tuple(experiments), runs, compiled, address == LOCAL)
         self._executor = client.get_executor(pure=False)
         self._seen_s = self._looked_s = time.monotonic()
         self.jobs = max(1, sum(client.nthreads().values()))
 
     def __enter__(self) -> Pool:
         try:
-            self._client.register_plugin(self._plugin, self._plugin.name)
+            self._client.register_plugin(self._doer, self._doer.name)
         except MddagError:
             raise
         except Exception as error:
@@ -167,18 +163,17 @@ class _ClusterPool(Pool):
                  trace: TracebackType | None) -> None:
         self._executor.shutdown(wait=False)
         try:
-            self._client.unregister_worker_plugin(self._plugin.name)
+            self._client.unregister_worker_plugin(self._doer.name)
         except Exception:  # noqa: B902 - the cluster is gone, or its last worker is
             pass
 
     def submit(self, first: int, count: int) -> Future[Chunk]:
         """Let a worker do runs."""
-        future: Future[Chunk] = self._executor.submit(_work, self._plugin.name, first, count)
+        future: Future[Chunk] = self._executor.submit(_work, self._doer.name, first, count)
         return future
 
     def failure(self, error: BaseException) -> MddagError | None:
         """Report a cluster that is gone, or that kills what it is given."""
-        from distributed import KilledWorker
         if isinstance(error, KilledWorker):
             return ClusterError(
                 f'--dask {self._address}: several workers died on the same runs: give them more '
@@ -206,8 +201,6 @@ class _ClusterPool(Pool):
 
 async def _identity(address: str) -> object:
     """Return what a Dask server calls itself: Scheduler, Worker, Nanny."""
-    from distributed import Security
-    from distributed.comm import connect
     comm = await connect(
         address, timeout=CONNECT_S, **Security().get_connection_args('client'))
     try:
@@ -223,22 +216,22 @@ def _said(error: BaseException) -> str:
     return ' '.join(text.split())[:160]
 
 
-class _Doer:
+class _Doer(WorkerPlugin):  # type: ignore[misc, unused-ignore]
     """What a worker needs to do chunks; made here, used there."""
 
     def __init__(
-        self, experiments: tuple[Experiment, ...], runs: int, compiled: bool, version: str,
-        is_local: bool,
+        self, experiments: tuple[Experiment, ...], runs: int, compiled: bool, is_local: bool
     ) -> None:
+        self.name = f'mddag-{uuid.uuid4().hex}'
         self._experiments = experiments
         self._runs = runs
         self._compiled = compiled
-        self._version = version
+        self._version = __version__
         self._is_local = is_local
         self._evaluator: Evaluator | None = None
 
-    def set_up(self) -> None:
-        """Do what a worker does when it gets this."""
+    def setup(self, worker: Any) -> None:
+        """Make a worker ready that gets this."""
         if self._version != __version__:
             raise ClusterError(
                 f'--dask: a worker has mddag_executor {__version__}, and this is {self._version}: '
@@ -261,26 +254,7 @@ class _Doer:
         return self._evaluator(first, count)
 
 
-def _plugin_class() -> Any:
-    """Return the class of the plugin, whose base is Dask's."""
-    from distributed import WorkerPlugin
-
-    class DoerPlugin(WorkerPlugin):  # type: ignore[misc, unused-ignore]
-        """Brings the experiments to a worker."""
-
-        def __init__(self, doer: _Doer) -> None:
-            self.name = f'mddag-{uuid.uuid4().hex}'
-            self.doer = doer
-
-        def setup(self, worker: Any) -> None:
-            """Make the worker ready."""
-            self.doer.set_up()
-
-    return DoerPlugin
-
-
 def _work(name: str, first: int, count: int) -> Chunk:
     """Do a chunk; this is what runs on a worker."""
-    from distributed import get_worker
-    doer: _Doer = get_worker().plugins[name].doer
+    doer: _Doer = get_worker().plugins[name]
     return doer(first, count)

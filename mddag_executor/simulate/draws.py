@@ -17,6 +17,7 @@ Run r of seed s takes its uniform numbers from a counter-based generator (Philox
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 import zipfile
@@ -98,7 +99,7 @@ class Draws:
         for vertex in task_set.vertices:
             callback = vertex.callback
             if samples is not None:
-                self._pickers.append(_Measured(samples[callback.key]))
+                self._pickers.append(partial(_from_measured, samples[callback.key]))
             elif callback.execution_time is None:
                 raise InputError(
                     task_set.file, f'{callback.key} declares no execution_time',
@@ -108,7 +109,7 @@ class Draws:
                     task_set.file, f'the execution_time of {callback.key} is 0',
                     'give a time above zero', line=callback.line)
             else:
-                self._pickers.append(_Table(callback.execution_time))
+                self._pickers.append(partial(_from_table, callback.execution_time))
 
     def times(self, first: int, count: int) -> Times:
         """Return the execution times of ``count`` runs from number ``first`` on."""
@@ -123,33 +124,22 @@ class Draws:
         return times
 
 
-class _Measured:
-    """One of the measured values."""
-
-    def __init__(self, values: Times) -> None:
-        self._values = values
-
-    def __call__(self, uniform: Floats) -> Times:
-        return self._values[(uniform * len(self._values)).astype(np.int64)]
+def _from_measured(values: Times, uniform: Floats) -> Times:
+    return values[(uniform * len(values)).astype(np.int64)]
 
 
-class _Table:
-    """``ExecutionTime.draw`` for many numbers at once, with the same results to the bit."""
-
-    def __init__(self, table: ExecutionTime) -> None:
-        self._percent = np.array(table.percent, dtype=np.float64)
-        self._quantiles = np.array(table.quantiles_ns, dtype=np.int64)
-
-    def __call__(self, uniform: Floats) -> Times:
-        percent, quantiles = self._percent, self._quantiles
-        if len(percent) == 1:
-            return np.full(uniform.shape, max(1, int(quantiles[0])), dtype=np.int64)
-        at = np.clip(uniform * 100.0, percent[0], percent[-1])
-        above = np.clip(np.searchsorted(percent, at, side='right'), 1, len(percent) - 1)
-        low, high = percent[above - 1], percent[above]
-        first, second = quantiles[above - 1], quantiles[above]
-        drawn = np.rint(first + (second - first) * (at - low) / (high - low)).astype(np.int64)
-        return np.maximum(drawn, 1)
+def _from_table(table: ExecutionTime, uniform: Floats) -> Times:
+    """Do what ``ExecutionTime.draw`` does for many numbers, with the same results to the bit."""
+    percent = np.array(table.percent, dtype=np.float64)
+    quantiles = np.array(table.quantiles_ns, dtype=np.int64)
+    if len(percent) == 1:
+        return np.full(uniform.shape, max(1, int(quantiles[0])), dtype=np.int64)
+    at = np.clip(uniform * 100.0, percent[0], percent[-1])
+    above = np.clip(np.searchsorted(percent, at, side='right'), 1, len(percent) - 1)
+    low, high = percent[above - 1], percent[above]
+    first, second = quantiles[above - 1], quantiles[above]
+    drawn = np.rint(first + (second - first) * (at - low) / (high - low)).astype(np.int64)
+    return np.maximum(drawn, 1)
 
 
 def utilisations(task_set: TaskSet, times: Times, workers: int) -> Floats:

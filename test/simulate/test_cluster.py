@@ -156,9 +156,3 @@ def test_addresses(
         with pytest.raises(ClusterError) as caught:
             Cluster(address, 1)
     assert str(caught.value).startswith(f'--dask {address}: {problem}')
-
-
-def test_without_dask(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, 'find_spec', lambda name: None)
-    with pytest.raises(ClusterError, match=r"install 'mddag_executor\[dask\]' with pip"):
-        Cluster('local', 1)
