@@ -27,7 +27,7 @@ from mddag_executor.text import counted
 from msg_graph import Process, TaskSet
 
 TRANSPORT_NS = 150_000
-"""What a message costs the interpreters of its publisher and of each subscriber, between two."""
+"""What a message between two processes costs the interpreter of each of them."""
 
 
 class Placing:

@@ -36,7 +36,7 @@ R = TypeVar('R', bound='str | Traces')
 STDIN = '<stdin>'
 _MCAP = b'\x89MCAP'
 MOST_BYTES = 64 << 20
-"""Of declarations, architecture files and tables of execution times; traces are not read so."""
+"""The largest declaration, architecture file or table of execution times."""
 _read_already: object = None  # the stream that was standard input when it was read
 
 

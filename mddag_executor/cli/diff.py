@@ -24,7 +24,6 @@ from mddag_executor.cli import common, options, recorded, verdicts
 from mddag_executor.cli.text import warn
 
 if TYPE_CHECKING:
-    from mddag_executor.replay import Replay, Reschedule
     from mddag_executor.replay.run import Recording
     from msg_graph import TaskSet
 
@@ -101,7 +100,7 @@ def _results(
 
 def _has_declaration(trace: Trace) -> bool:
     from mddag_executor.replay.run import is_own
-    path, name = trace      # several can be joined only where each has one
+    path, name = trace      # several traces can be joined only where each has a declaration
     return not isinstance(path, str) or (not recorded.is_bag(path) and is_own(path, name))
 
 
@@ -110,12 +109,8 @@ def _result(
 ) -> tuple[dict[str, Any], TaskSet]:
     """Return the result of a run, and the declaration that judged it."""
     path, name = trace
-    outcome: Replay | Reschedule
-    if reschedule or recorded.is_bag(path):
-        outcome = recorded.rescheduled(args, path, name, task_set)
-    else:
-        outcome = recorded.as_recorded(
-            path, name, task_set, doing=f'replaying {name}', skip=args.skip)
+    outcome = recorded.outcome_of(
+        args, path, name, task_set, reschedule, doing=f'replaying {name}')
     warn(*outcome.warnings)
     return outcome.result(), outcome.task_set
 

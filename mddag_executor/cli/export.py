@@ -84,16 +84,17 @@ def _export(
     args: argparse.Namespace, path: Recording, name: str, task_set: TaskSet | None, target: Target
 ) -> list[str]:
     """Write what a recording holds; return what is missing or doubtful of it."""
+    from mddag_executor.replay import Reschedule
     from mddag_executor.report.export import Exporter
     exporter = Exporter(target)
-    if args.reschedule or recorded.is_bag(path):
-        computed = recorded.rescheduled(args, path, name, task_set)
-        exporter.of_computed(computed.computed())
-        return computed.warnings
-    if args.rows == 'jobs' and task_set is None:
+    if args.rows == 'jobs' and task_set is None and not args.reschedule:
         recorded.check_declared(path, name)
-    outcome = recorded.as_recorded(path, name, task_set, exporter.of, doing='exporting')
-    exporter.finish()
+    outcome = recorded.outcome_of(
+        args, path, name, task_set, args.reschedule, exporter.of, 'exporting')
+    if isinstance(outcome, Reschedule):
+        exporter.of_computed(outcome.computed())
+    else:
+        exporter.finish()
     return outcome.warnings
 
 

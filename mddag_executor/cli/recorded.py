@@ -127,7 +127,18 @@ def as_recorded(
             jobs=jobs)
 
 
-def rescheduled(
+def outcome_of(
+    args: argparse.Namespace, path: Recording, name: str, task_set: TaskSet | None,
+    reschedule: bool, more: Callable[[Replay], Sequence[Observer]] | None = None,
+    doing: str = 'replaying',
+) -> Replay | Reschedule:
+    """Reschedule a recording if that is wanted or it is a bag; else replay it as recorded."""
+    if reschedule or is_bag(path):
+        return _rescheduled(args, path, name, task_set)
+    return as_recorded(path, name, task_set, more, doing, args.skip)
+
+
+def _rescheduled(
     args: argparse.Namespace, path: Recording, name: str, task_set: TaskSet | None
 ) -> Reschedule:
     """Run the scheduler over a recording of any kind."""

@@ -14,14 +14,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from mddag_executor.cli import common, options, recorded, verdicts
 from mddag_executor.cli.text import printable, warn
-
-if TYPE_CHECKING:
-    from mddag_executor.replay import Replay, Reschedule
-    from msg_graph.drift import Drift
 
 EXAMPLE = """\
 mddag replay run.mcap
@@ -46,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Replay a trace and print what came of its deadlines."""
+    from mddag_executor.replay import Replay
     common.recording_and_graph(args)
     verdicts.check(args)
     recorded.check(args)
@@ -54,14 +51,9 @@ def main(args: argparse.Namespace) -> int:
         if args.report is not None:
             from mddag_executor.report.html import Watch
             watch = Watch()
-        drift: list[Drift] = []
-        outcome: Replay | Reschedule
-        if args.reschedule or recorded.is_bag(path):
-            outcome = recorded.rescheduled(args, path, name, task_set)
-        else:
-            outcome = recorded.as_recorded(
-                path, name, task_set, None if watch is None else watch.of, skip=args.skip)
-            drift = outcome.drift()
+        outcome = recorded.outcome_of(
+            args, path, name, task_set, args.reschedule, None if watch is None else watch.of)
+        drift = outcome.drift() if isinstance(outcome, Replay) else []
     warn(*outcome.warnings)
     result = outcome.result()
     if not args.reschedule:

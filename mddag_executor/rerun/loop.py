@@ -46,13 +46,13 @@ from mddag_executor.rerun.strands import Strands
 from mddag_executor.rerun.times import Times
 
 DRAIN_NS = 10_000_000_000
-"""So long what has begun may go on after the end of the recording."""
+"""What has begun may go on this long after the end of the recording."""
 POLL_NS = 1_000_000
-"""How often who waits for something unknown looks again, or for the interpreter asks again."""
+"""How often a waiting callback looks again, or asks again for the interpreter."""
 MOST_LOOKS = 1000
-"""Who looks so often at the time at one instant waits for it to pass."""
+"""A callback that looks at the time this often at one instant waits for time to pass."""
 MOST_AT_ONCE = 20_000
-"""So many callbacks at one instant are a circle in which nothing takes any time."""
+"""More callbacks at one instant than this go in a circle in which nothing takes time."""
 
 _WORKER_BITS = 48
 _LENT = 1 << 20
@@ -392,7 +392,7 @@ class Loop:
         """
         Note that the calling strand has looked at the time, or whether something has come.
 
-        Who does so all the time waits for time to pass, and so it does.
+        A strand that looks all the time waits for time to pass: so time passes.
         """
         if self._looked_at != self.now:
             self._looked_at, self._looks = self.now, 0

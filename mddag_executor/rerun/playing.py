@@ -3,8 +3,8 @@
 """
 The recorded messages arrive at their recorded times.
 
-Of a recording is loaded what nodes subscribe to, and what they publish, to be compared.  Where a
-node subscribes to a further topic later, that is loaded then, and its messages come from then on.
+What nodes subscribe to is loaded from the recording, and what they publish, to be compared.  A
+topic to which a node subscribes later is loaded then, and its messages come from then on.
 
 Where somebody subscribes to ``/clock``, and it is neither recorded nor published by a node, it
 gives virtual time.

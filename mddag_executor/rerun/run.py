@@ -76,7 +76,7 @@ class Settings:
     :ivar cpus: that callbacks which compute share; None: as many as are needed.
     :ivar seed: of Python's ``random``, of numpy's legacy generator and of what is drawn.
     :ivar all_clocks: whether steady and system clocks and Python's ``time`` are virtual, too.
-    :ivar patience_s: a callback that uses no CPU for so long is blocked for ever.
+    :ivar patience_s: a callback that uses no CPU for this long is blocked for ever.
     """
 
     workers: int = defaults.WORKERS
@@ -303,10 +303,10 @@ class Rerun:
                 'nodes that it declares')
 
     def _check_topics(self) -> None:
-        there = {*self._source.topics, *self._messages.offered, CLOCK}
+        known = {*self._source.topics, *self._messages.offered, CLOCK}
         for callback in self._task_set.callbacks:
             for topic in callback.topics:
-                if callback.key in self._hosted and topic not in there:
+                if callback.key in self._hosted and topic not in known:
                     raise RerunError(
                         f'{self._source.name}: {topic}, which {callback.key} needs, is not '
                         'recorded: record it, or run the node that publishes it with --node')

@@ -39,7 +39,7 @@ from mddag_executor.live.thread_clock import is_runnable
 
 _LOOK_S = 0.05
 _END_S = 2.0
-"""So much real time strands have to end when the run is over."""
+"""Strands have this much real time to end when the run is over."""
 
 
 class Strand:
@@ -256,7 +256,7 @@ class Strands:
         """
         Run all until the run is over, watched by the calling thread, which is no strand.
 
-        :param patience_s: a strand that uses no CPU for so long is stuck.
+        :param patience_s: a strand that uses no CPU for this long is stuck.
         :param tick: called now and then.
         :raises Stuck: where one is; its thread is left behind.
         :raises BaseException: what ended the run.

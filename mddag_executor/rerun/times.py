@@ -43,15 +43,15 @@ class SameInEachJob:
         return self._times[vertex]
 
     def transport(self, dag: int, before: int, after: int, release: int) -> int:
-        """Return that messages take no time."""
+        """Return 0: messages take no time."""
         return 0
 
     def computed(self, dag: int, vertex: int, release: int) -> int:
-        """Return that all of it is computing."""
+        """Return all of its time: it computes throughout."""
         return self._times[vertex]
 
     def holds(self, vertex: int) -> bool:
-        """Return that nothing is recorded."""
+        """Return False: nothing is recorded."""
         return False
 
 

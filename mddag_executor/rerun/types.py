@@ -72,7 +72,7 @@ def _walk_of(kind: Any) -> Walk:
 
 
 class _Numbers:
-    """Walks over so many numbers of one width."""
+    """Walks over ``count`` numbers of one width."""
 
     def __init__(self, width: int, count: int) -> None:
         self.width = width

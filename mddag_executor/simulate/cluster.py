@@ -39,10 +39,10 @@ from mddag_executor.simulate.pools import Pool
 
 LOCAL = 'local'
 CONNECT_S = 3.0
-"""So long an address has to answer."""
+"""An address has this long to answer."""
 
-_WORKER_S = 10.0  # so long the first worker may take to come
-_ALONE_S = 60.0  # so long an evaluation waits without any
+_WORKER_S = 10.0  # the first worker may take this long to come
+_ALONE_S = 60.0  # an evaluation waits this long without any worker
 _REMEDY = 'check the address, and that the scheduler runs'
 
 
@@ -125,7 +125,7 @@ class Cluster:
 
     @property
     def jobs(self) -> int:
-        """Count the threads that the workers have now."""
+        """Return how many threads the workers have now."""
         return sum(self._client.nthreads().values())
 
     def pool(self, experiments: Sequence[Experiment], runs: int, compiled: bool) -> Pool:

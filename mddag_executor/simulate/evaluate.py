@@ -37,7 +37,7 @@ Progress = Callable[[int], None]
 
 _MOST_RUNS = 10 ** 8
 _KEEP_S = 5.0
-"""So often what is done is kept."""
+"""What is done is kept this often."""
 
 # Roughly, to choose the core that is sooner done: plain Python's time for each vertex job.
 _PLAIN_S = 6e-6

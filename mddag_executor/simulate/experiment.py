@@ -44,7 +44,7 @@ from msg_graph import TaskSet
 import numpy as np
 
 STRIDE = 2 ** 40
-"""So far apart are the numbers of the first runs of two task sets."""
+"""The numbers of the first runs of two task sets are this far apart."""
 
 _MOST_AT_HAND = 64  # evaluators of task sets that are kept
 

@@ -52,7 +52,7 @@ def time_runs(
     """
     Measure how long each run and policy of an experiment takes.
 
-    :param repeat: do it so often, with draws of their own, and take the medians.
+    :param repeat: how often to do it, each time with its own draws; the medians are taken.
     :return: for machines; ``ms`` is wall-clock time for each run and policy.
     """
     evaluate(experiment, jobs, jobs=jobs, core=core)  # compiled or loaded, memory in place
@@ -87,7 +87,7 @@ def time_vertex_jobs(
     """
     Measure how long each job of a vertex takes under ``rad``, in a random task set.
 
-    :param vertex_jobs: about how many to simulate; each DAG has one job at least.
+    :param vertex_jobs: about how many to simulate; each DAG has at least one job.
     :return: for machines; ``ns`` of CPU time is the median over the repetitions.
     """
     task_set = random_task_set(n_vertices)
