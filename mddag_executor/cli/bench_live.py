@@ -37,6 +37,7 @@ from mddag_executor.resources import find
 from mddag_executor.text import counted
 
 HELP = 'measure executors of rclpy nodes, this one and those of rclpy, side by side'
+DESCRIPTION = 'Measure executors of rclpy nodes, this one and those of rclpy, side by side.'
 EXAMPLE = """\
 mddag bench live --load autoware --utilisation 0.3,0.6,0.8 --seconds 10
 mddag bench live --load autoware --executors rad-events,multi --policies rad,fifo,rm,wc,gedf

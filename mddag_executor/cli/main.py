@@ -35,7 +35,7 @@ from types import ModuleType
 from typing import Any, NamedTuple, NoReturn
 
 from mddag_executor import __version__
-from mddag_executor.cli.options import add_verb, add_verbs, as_sentence
+from mddag_executor.cli.options import add_verb, add_verbs
 from mddag_executor.cli.text import one_line
 from mddag_executor.errors import MddagError, UsageError
 
@@ -122,7 +122,7 @@ def build_parser(chosen: str | None) -> Parser:
     verbs = parser.add_subparsers(dest='verb', metavar='VERB', required=True, title='verbs')
     for name, verb in VERBS.items():
         if name == chosen:
-            sentence = as_sentence(verb.summary)
+            sentence = f'{verb.summary[:1].upper()}{verb.summary[1:]}.'
             if verb.verbs:
                 add_verbs(verbs, name, verb.verbs, verb.summary, sentence)
             else:

@@ -285,13 +285,7 @@ def add_verbs(
     inner = parser.add_subparsers(
         dest=f'{verb}_verb', metavar='VERB', required=True, title='verbs')
     for name, module in modules.items():
-        add_verb(inner, name, module, module.HELP, getattr(
-            module, 'DESCRIPTION', as_sentence(module.HELP)))
-
-
-def as_sentence(summary: str) -> str:
-    """Return a one-line help as a sentence."""
-    return f'{summary[:1].upper()}{summary[1:]}.'
+        add_verb(inner, name, module, module.HELP, module.DESCRIPTION)
 
 
 def _add_parser(
