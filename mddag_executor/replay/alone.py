@@ -15,17 +15,10 @@ What the model does not explain stays in the time, so that a schedule like the r
 the recorded response times.  A long recording goes window by window, each with its best try.
 
 That is right where as many run beside one another as in the recording.  Where fewer do, what the
-model leaves over has to be told apart.  What a callback waits for itself is told by its executions
-that hardly any other ran beside: the median, of those whose worker went on and of those whose
-worker had slept.  Where there are too few, those that waited least tell it: of a callback that
-*computes* (its executions that wait least wait for less than they compute) beyond what others
-explain, else of all that was recorded.  What one waited for more than that, while others ran, is
-*theirs*: with one worker none of it is left.
-
-With several, it is left to those beside whom no more ran than can.  The others of their *kind*
-(it computes with the lock, without it, or waits) are to lose the same part of the time beside
-others as these do; so each ns beside more than can costs them the same, as much as makes it so.
-(What is lost is little for most and much for a few, so they do not all lose the same part.)
+model leaves over has to be told apart.  The part ``LEAST`` of a callback's executions wait hardly
+for others: what each of them waits, every one waits for itself.  What one waits for beyond that,
+no longer than others ran, is *theirs*.  It is taken off in proportion to the time in which more
+ran than can: with one worker none of it is left.
 """
 
 from __future__ import annotations
@@ -40,12 +33,10 @@ from mddag_executor.simulate.schedule import prepare
 import numpy as np
 import numpy.typing as npt
 
-LEAST = 0.05
-"""So many of a callback's executions are those that wait least."""
-HARDLY = 0.1
-"""Others hardly ran beside one if they did for no more than this part of its time."""
 ENOUGH = 5
-"""So many executions that hardly any other ran beside are enough."""
+"""So many executions are enough to say what is usual."""
+LEAST = 0.2
+"""So many of a callback's executions wait for nothing but what it waits for itself."""
 TURNS = 8
 WINDOW = 50_000
 """So many executions the model runs at once, and more until nothing runs: up to as many again."""
@@ -109,7 +100,8 @@ def alone(ran: Recorded, cpus: int = 0, workers: int = NEVER) -> Ints:
             took[disturbed] = _explained(
                 ran.of(disturbed), cpus, TURNS * len(took) // len(disturbed))
     if workers < NEVER:
-        took -= _spared(ran, took, some, more)
+        took -= np.rint(
+            _theirs(ran, took, some) * more / np.maximum(1, some)).astype(np.int64)
     return took
 
 
@@ -144,15 +136,6 @@ def colder(callback: Ints, warm: Flags, took: Ints) -> Ints:
     found[found < 0] = np.median(known) if len(known) else 0
     more: Ints = np.where(warm, -found, np.minimum(found, took // 2))
     return more
-
-
-def computing(callback: Ints, took: Ints, cpu: Ints) -> Flags:
-    """Return by execution whether its callback computes; ``cpu`` is -1 where it is not known."""
-    computes = np.zeros(len(took), dtype=np.bool_)
-    for which in _by_callback(callback, cpu >= 0):
-        waited = np.quantile(np.maximum(0, took[which] - cpu[which]), LEAST)
-        computes[which] = waited <= np.median(cpu[which])
-    return computes
 
 
 def _by_callback(callback: Ints, those: Flags) -> Iterator[Ints]:
@@ -219,55 +202,14 @@ def _interpreters(n: int) -> Tables:
         first_sink=[0] * (n + 1), first_successor=[0] * (n + 1))
 
 
-def _spared(ran: Recorded, took: Ints, some: Ints, more: Ints) -> Ints:
-    """
-    Return what executions that take so long do not wait where fewer run at once.
-
-    :param some: for how long others ran beside them; ``more``: more than can.
-    """
-    computes = computing(ran.callback, ran.took, ran.cpu)
-    theirs = _theirs(ran, took, some, computes)
-    if (some == more).all():
-        return theirs
-    spared = np.minimum(0, theirs)
-    few = more <= HARDLY * some
-    waits = np.maximum(0, theirs)
-    for kind in (ran.locks, computes & ~ran.locks, ~computes & ~ran.locks):
-        many = np.flatnonzero(kind & ~few & (theirs > 0))
-        if not len(many):
-            continue
-        cost = min(0.5, waits[kind & few].sum() / max(1, some[kind & few].sum()))
-        lost = cost * some[many] / ran.took[many]
-        left = ((took[many] - waits[many]) * lost / (1 - lost)).sum()
-        spared[many] = np.minimum(waits[many], np.rint(
-            more[many] * _rate(waits[many], more[many], left)))
-    return spared
-
-
-def _rate(waits: Ints, more: Ints, left: float) -> float:
-    """Return what a time costs if so much of all waits is left without it, none below 0."""
-    each = waits / more
-    order = np.argsort(-each)
-    waited, passed = np.cumsum(waits[order]), np.cumsum(more[order])
-    last = np.searchsorted(waited - each[order] * passed, left, 'right') - 1
-    return max(0.0, float((waited[last] - left) / passed[last]))
-
-
-def _theirs(ran: Recorded, took: Ints, beside: Ints, computes: Flags) -> Ints:
+def _theirs(ran: Recorded, took: Ints, beside: Ints) -> Ints:
     """Return what executions that take so long waited for others, which ran ``beside`` them."""
     waited = took - ran.least
-    usual = np.zeros(len(took), dtype=np.int64)
-    for kinds in (ran.callback, 2 * ran.callback + ran.warm):
-        for which in _by_callback(kinds, ran.cpu >= 0):
-            by_itself = which[beside[which] <= HARDLY * ran.took[which]]
-            if len(by_itself) >= ENOUGH:
-                usual[which] = np.median(waited[by_itself])
-            elif kinds is ran.callback:
-                least = np.where(computes, waited - beside, ran.took - ran.least)
-                usual[which] = np.quantile(np.maximum(0, least)[which], LEAST)
-    theirs: Ints = np.minimum(waited, 0) + np.where(
-        ran.cpu >= 0, np.clip(waited - np.maximum(0, usual), 0, beside), 0)
-    return theirs
+    theirs = np.zeros_like(took)
+    for which in _by_callback(ran.callback, ran.cpu >= 0):
+        theirs[which] = waited[which] - np.quantile(waited[which], LEAST)
+    lost: Ints = np.clip(theirs, 0, beside)
+    return lost
 
 
 def _beside(begins: Ints, ends: Ints, others: int = 1) -> Ints:

@@ -21,8 +21,7 @@ Theory of operation
   DAG, ready when it was in the recording.  Callback groups of undeclared callbacks are not kept.
 * Where CPU times are recorded, an execution time is what the execution would have taken alone (see
   ``alone``), and the load says what it computed and whether it held the interpreter: as recorded,
-  or as the declaration says.  What the executor did not take for one that holds it, though the
-  callback usually does, computes with Python's lock all the same; only nobody waits for it.
+  or as the declaration says.
 * *Transport*: a message is there some time after the callback that published it has ended (or
   before that: it published early).  That is the time from its end to the successor's readiness.
 * *Dispatch*: the time from when an execution could have started to when it did (see
@@ -44,6 +43,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Sequence
 from itertools import accumulate
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
@@ -87,28 +87,39 @@ class RecordedLoad(NamedTuple):
     intakes: Costs | None = None
 
 
-class _Jobs:
-    """
-    The jobs of one DAG, flat: by job, by job and vertex, or by job and edge; ns, or unknown.
+_JOB, _VERTEX, _EDGE = range(3)
+_COLUMNS = {
+    'release': (_JOB, 'q'), 'noticed': (_JOB, 'q'), 'round': (_JOB, 'q'),
+    'took': (_VERTEX, 'q'), 'start': (_VERTEX, 'q'), 'end': (_VERTEX, 'q'),
+    'cpu': (_VERTEX, 'q'), 'dispatch': (_VERTEX, 'i'), 'held': (_VERTEX, 'h'),
+    'arrived': (_EDGE, 'q')}
+"""What is known by job, by job and vertex, or by job and edge; ns, or unknown."""
 
-    The columns are of array, and of numpy once all jobs are there (see ``LoadBuilder._close``).
-    """
 
-    COLUMNS = ('release', 'noticed', 'round', 'took', 'start', 'end', 'cpu', 'dispatch', 'held',
-               'arrived')
+class _Jobs(SimpleNamespace):
+    """
+    The jobs of one DAG.
+
+    Each of ``_COLUMNS`` is an attribute: flat, of array, and of numpy once all jobs are there (see
+    ``LoadBuilder._close``).
+    """
 
     def __init__(self, dag: Dag, n_edges: int) -> None:
+        super().__init__(**{name: array(code) for name, (_, code) in _COLUMNS.items()})
         self.size = len(dag.vertices)
         self.n_edges = n_edges
         self.publishers = [v.index for v in dag.vertices for _ in v.successors]     # by edge
         self.numbers: list[int] = []
         self.row: dict[int, int] = {}
-        self.release, self.noticed, self.round = (array('q') for _ in range(3))
-        self.took, self.start, self.end, self.cpu, self.dispatch, self.held = (
-            array(code) for code in 'qqqqih')
-        self.arrived = array('q')
-        self._new = [array(code, [_UNKNOWN]) * self.size for code in 'qqqqih']
-        self._new.append(array('q', [_UNKNOWN]) * n_edges)
+        self.new_row = [
+            (getattr(self, name), array(code, [_UNKNOWN]) * (
+                n_edges if by == _EDGE else self.size))
+            for name, (by, code) in _COLUMNS.items() if by != _JOB]
+
+    def rows(self, name: str) -> Any:
+        """Return a column as an array with a row for each job."""
+        return np.asarray(getattr(self, name)).reshape(
+            len(self.numbers), self.n_edges if _COLUMNS[name][0] == _EDGE else self.size)
 
     def add(self, job: int, release: int, now: int, number: int) -> None:
         """Add a job, and the round of timers that it was noticed in (or none)."""
@@ -117,8 +128,7 @@ class _Jobs:
         self.release.append(release)
         self.noticed.append(max(release, now))
         self.round.append(number)
-        for column, new in zip((self.took, self.start, self.end, self.cpu, self.dispatch,
-                                self.held, self.arrived), self._new):
+        for column, new in self.new_row:
             column.extend(new)
 
 
@@ -279,10 +289,9 @@ class LoadBuilder(Observer):
             self._others.append(self._leg[1])
             self._leg = None
         self._close()
-        locks = self._locks()
         process = process or self._process
         anew = anew and bool((self._whole['cpu'] >= 0).any())
-        every, usual, warmth, late, intakes = self._alone(locks, workers, anew)
+        every, usual, warmth, late, intakes = self._alone(workers, anew)
         if anew:
             self._skipped.clear()
         delays, transport = self._transports(overheads, process, intakes)
@@ -305,7 +314,6 @@ class LoadBuilder(Observer):
             'holds': np.concatenate([held, more]) if held.any() else [],
             'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
             # where as many run beside one another, workers go on as they did
-            'locks': np.concatenate([locks, more]),
             'warmth': np.concatenate([warmth, more]) if overheads and workers < NEVER else [],
             'delays': delays, 'delay_stride': [jobs.n_edges for jobs in self._jobs],
             'delay_base': [0, *accumulate(
@@ -322,7 +330,8 @@ class LoadBuilder(Observer):
         self._whole: dict[str, Any] = {}
         for jobs in self._jobs:
             jobs.row.clear()
-        for name in _Jobs.COLUMNS:
+            jobs.new_row.clear()
+        for name in _COLUMNS:
             parts = [np.asarray(getattr(jobs, name)) for jobs in self._jobs]
             whole = self._whole[name] = np.concatenate(parts)
             for jobs, part in zip(self._jobs, np.split(whole, np.cumsum([*map(len, parts)]))):
@@ -345,8 +354,7 @@ class LoadBuilder(Observer):
         unknown: dict[str, None] = {}
         estimated = 0
         for dag, jobs in zip(self._task_set.dags, self._jobs):
-            took, cpu, held = (np.asarray(each).reshape(-1, jobs.size) for each in (
-                jobs.took, jobs.cpu, jobs.held))
+            took, cpu, held = map(jobs.rows, ('took', 'cpu', 'held'))
             took[[row for of, row in self._skipped if of == dag.index]] = 0
             missing = took < 0
             estimated += int(missing.sum())
@@ -380,20 +388,6 @@ class LoadBuilder(Observer):
             fates[bases[dag] + row * self._jobs[dag].size + source] = SKIPPED
         return fates
 
-    def _locks(self) -> Any:
-        """
-        Return which executions computed with Python's lock.
-
-        Those that hold the interpreter, and those of callbacks that usually do: the executor did
-        not know it yet, or thought once that one waits.
-        """
-        callback = self._by_execution(self._callbacks)
-        held, known = self._whole['held'] > 0, self._whole['cpu'] >= 0
-        n_held, n_known = (
-            np.bincount(callback[which], minlength=len(self._task_set.callbacks))
-            for which in (known & held, known))
-        return known & (held | (2 * n_held >= np.maximum(1, n_known))[callback])
-
     def _by_execution(self, by_vertex: Sequence[int]) -> Any:
         numbers = np.array(by_vertex, dtype=np.int32)   # there may be millions
         return np.concatenate([
@@ -401,7 +395,7 @@ class LoadBuilder(Observer):
             for first, jobs in zip(self._first, self._jobs)])
 
     def _alone(
-        self, locks: Any, workers: int, anew: bool
+        self, workers: int, anew: bool
     ) -> tuple[Any, int | None, Any, Any, Costs | None]:
         """
         Make times those that executions would have taken alone (see ``alone``).
@@ -413,8 +407,9 @@ class LoadBuilder(Observer):
             what the executor takes for it; and what intakes take, if ``anew``.
         """
         intakes = None
-        number, took, start, cpu = (
-            self._whole[name] for name in ('dispatch', 'took', 'start', 'cpu'))
+        number, took, start, cpu, held = (
+            self._whole[name] for name in ('dispatch', 'took', 'start', 'cpu', 'held'))
+        locks = (held > 0) & (cpu >= 0)
         every = self._dispatches.late(number[locks & (number >= 0)])
         warm = np.append(self._dispatches.warm(), True)[number]
         known = number[number >= 0]
@@ -424,7 +419,7 @@ class LoadBuilder(Observer):
         del self._dispatches, number, known
         self._drop('dispatch')
         if workers < NEVER:
-            self._notice_sooner(start - late, locks, workers)
+            self._notice_sooner(start - late, workers)
         ran: Any = (took >= 0) & (start >= 0)
         if ran.all():
             ran = slice(None)   # which copies nothing: there may be millions
@@ -452,13 +447,11 @@ class LoadBuilder(Observer):
             late[ran] = cost - took[ran]
         return every, usual, warmth, late, intakes
 
-    def _notice_sooner(self, could: Any, locks: Any, workers: int) -> None:
+    def _notice_sooner(self, could: Any, workers: int) -> None:
         """
-        Take off rounds what they were late since more executions ran than can.
+        Take off rounds what they were late since more executions ran than can when they were due.
 
-        One is *disturbed* if more ran when it was due, or one more began before it was noticed.
-        It becomes as late as those others are for which as many ran as can, or fewer: rank by
-        rank.  Whether one of them computed with Python's lock makes a difference.
+        They become as late as those others are for which just as many ran as can: rank by rank.
 
         :param could: when executions could have started.
         """
@@ -466,33 +459,19 @@ class LoadBuilder(Observer):
             self._whole[name] for name in ('round', 'noticed', 'start', 'end'))
         of = np.flatnonzero(number >= 0)
         due, ends, home = self._when_due()
-        first = ends.copy()
-        np.minimum.at(first, number[of], noticed[of])
         process = self._by_execution(self._process)
         taken = ends - due
         for here in np.unique(home):
             mine = (start >= 0) & (end >= 0) & (process == here)
-
-            def running(at: Any, which: Any) -> Any:
-                return (np.searchsorted(np.sort(could[which]), at, 'right')
-                        - np.searchsorted(np.sort(end[which]), at, 'right'))
-
-            begun = np.sort(could[mine])
-            crowded = begun[running(begun, mine) > workers]
-            at_due, computing = running(due, mine), running(due, mine & locks) > 0
-            disturbed = (at_due > workers) | (at_due > 0) & (
-                np.searchsorted(crowded, first) > np.searchsorted(crowded, due, 'right'))
-            for how in (computing, ~computing):
-                those = np.flatnonzero(disturbed & how & (home == here))
-                usual = taken[:0]
-                for most in range(workers, -1, -1):
-                    if len(usual) < ENOUGH:
-                        usual = taken[~disturbed & how & (at_due == most) & (home == here)]
-                those = those[np.argsort(taken[those], kind='stable')]
-                if len(usual) >= ENOUGH and len(those):
-                    ranks = (np.arange(len(those)) + 0.5) / len(those)
-                    more = np.maximum(0, taken[those] - np.quantile(usual, ranks))
-                    ends[those] -= np.rint(more).astype(np.int64)
+            running = (np.searchsorted(np.sort(could[mine]), due, 'right')
+                       - np.searchsorted(np.sort(end[mine]), due, 'right'))
+            those = np.flatnonzero((running > workers) & (home == here))
+            those = those[np.argsort(taken[those], kind='stable')]
+            usual = taken[(running == workers) & (home == here)]
+            if len(usual) >= ENOUGH and len(those):
+                ranks = (np.arange(len(those)) + 0.5) / len(those)
+                more = np.maximum(0, taken[those] - np.quantile(usual, ranks))
+                ends[those] -= np.rint(more).astype(np.int64)
         self._rounds = array('q', ends.tobytes())
         noticed[of] = np.minimum(noticed[of], ends[number[of]])
 
@@ -515,8 +494,7 @@ class LoadBuilder(Observer):
         to = [[self._process[b] for a, b in edge_numbers(self._tables)
                if self._tables.dag_of[a] == dag.index] for dag in self._task_set.dags]
         for jobs, crosses, places in zip(self._jobs, self._crossings(self._process), to):
-            end = np.asarray(jobs.end).reshape(len(jobs.numbers), jobs.size)
-            arrived = np.asarray(jobs.arrived).reshape(len(end), jobs.n_edges)
+            end, arrived = map(jobs.rows, ('end', 'arrived'))
             for edge, (crossed, _) in enumerate(crosses):
                 sent = np.minimum(end[:, jobs.publishers[edge]], arrived[:, edge])
                 known = sent >= 0
@@ -566,9 +544,7 @@ class LoadBuilder(Observer):
         measured: dict[bool, list[Any]] = {False: [np.zeros(0)], True: [np.zeros(0)]}
         changed: list[tuple[Any, bool]] = []
         for jobs, crosses in zip(self._jobs, self._crossings(process)):
-            start, end, arrived = (
-                np.asarray(column).reshape(len(jobs.numbers), size) for column, size in (
-                    (jobs.start, jobs.size), (jobs.end, jobs.size), (jobs.arrived, jobs.n_edges)))
+            start, end, arrived = map(jobs.rows, ('start', 'end', 'arrived'))
             ended = end[:, jobs.publishers]
             found = arrived - ended
             known = (arrived >= start[:, jobs.publishers]) & (ended >= 0)
