@@ -48,7 +48,6 @@ from mddag_executor.trace.trace_file import TraceFile
 INSTALL = 'apt install python3-bt2'
 _HELPER = Path(__file__).with_name('ctf_helper.py')
 _CACHE = 'caret_converted'
-_FRAME_LIMIT = 1 << 30      # bytes; a longer one is no frame
 _RECORD = 'check the recording, or record it anew'
 
 Row = list[Any]
@@ -182,7 +181,7 @@ def _rows_of(interpreter: str, path: str) -> Generator[Row, None, None]:
     assert process.stdout is not None
     ready = False
     try:
-        for row in _frames(process.stdout):
+        for row in _read(process.stdout):
             if row[0] == 'error':
                 raise TraceError(path, f'cannot be read ({row[1]})', _RECORD)
             if row[0] == 'end':
@@ -197,20 +196,16 @@ def _rows_of(interpreter: str, path: str) -> Generator[Row, None, None]:
         process.wait()
 
 
-def _frames(stream: IO[bytes]) -> Iterator[Row]:
-    """Yield the rows of all frames, up to where the stream ends or is none of the helper's."""
-    while True:
-        head = stream.read(4)
-        if len(head) < 4:
-            return
-        length, = struct.unpack('>I', head)
-        data = stream.read(length) if length <= _FRAME_LIMIT else b''
-        if len(data) < length:
-            return
+def _read(stream: IO[bytes]) -> Iterator[Row]:
+    """Yield all rows, up to where the stream ends or has a line that is none of the helper's."""
+    for line in stream:
         try:
-            yield from json.loads(data)
+            row = json.loads(line)
         except ValueError:
             return
+        if not isinstance(row, list) or not row:
+            return
+        yield row
 
 
 def _end_of(process: subprocess.Popen[bytes]) -> str:

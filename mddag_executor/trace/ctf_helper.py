@@ -8,8 +8,7 @@ Theory of operation:
 1. This file runs as a program of its own, in whichever Python has the module `bt2`; it imports
    nothing of this project and runs from Python 3.9 on. babeltrace2 may also abort the process on
    damaged input; that then ends this process only.
-2. Standard output is a row of frames: the length as 4 bytes (big endian), then a JSON list of
-   rows. A row is one of
+2. Standard output has a row a line, in JSON:
    `["missing", reason]` (no bt2 here; the only row), `["ready", version]` (the first row),
    `["class", number, name, [[field, type], ...]]` (before the first event of it),
    `["event", number, timestamp, vpid, vtid, procname, [value, ...]]`,
@@ -28,38 +27,22 @@ from importlib import import_module
 import json
 import os
 import signal
-import struct
 import sys
 from typing import Any, BinaryIO
 
-BATCH = 256     # events in a frame
-PATIENCE_S = 60     # for the next frame; on some damage babeltrace2 2.0 never comes back
+PATIENCE_S = 60     # for the next row; on some damage babeltrace2 2.0 never comes back
 
 Member = tuple[str, str, Callable[[Any], Any]]      # name, type, and what gets it from the payload
 
 
-class Frames:
-    """Gathers rows and writes them as frames."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        """Write to a binary stream."""
-        self._stream = stream
-        self._rows: list[Any] = []
-
-    def add(self, *row: Any) -> None:
-        """Add a row."""
-        self._rows.append(row)
-        if len(self._rows) >= BATCH:
-            self.flush()
-
-    def flush(self) -> None:
-        """Write what there is."""
-        data = json.dumps(self._rows, separators=(',', ':')).encode('ascii')
+def rows_to(stream: BinaryIO) -> Callable[..., None]:
+    """Return what writes a row to a binary stream."""
+    def add(*row: Any) -> None:
         signal.alarm(0)             # the importer may take its time
-        self._stream.write(struct.pack('>I', len(data)) + data)
-        self._stream.flush()
+        stream.write(json.dumps(row, separators=(',', ':')).encode('ascii') + b'\n')
         signal.alarm(PATIENCE_S)    # SIGALRM ends the process, whatever it is at
-        self._rows = []
+
+    return add
 
 
 def plain(field: Any) -> Any:
@@ -143,10 +126,10 @@ def _within(place: int, get: Callable[[Any], Any]) -> Callable[[Any], Any]:
 class Session:
     """The events of a session, as rows."""
 
-    def __init__(self, bt2: Any, frames: Frames) -> None:
-        """Write to `frames`."""
+    def __init__(self, bt2: Any, add: Callable[..., None]) -> None:
+        """Give each row to `add`."""
         self._bt2 = bt2
-        self._frames = frames
+        self._add = add
         # By the address of the event's class, which is kept so that none gets its address.
         self._known: dict[int, tuple[int, Any, list[Callable[[Any], Any]]]] = {}
 
@@ -168,7 +151,7 @@ class Session:
         number, _, getters = known
         payload = event.payload_field
         context = event.common_context_field
-        self._frames.add(
+        self._add(
             'event', number, message.default_clock_snapshot.ns_from_origin,
             *[_pick(context, names) for names in _IDENTITY], [get(payload) for get in getters])
 
@@ -177,7 +160,7 @@ class Session:
         number = len(self._known)
         known = number, cls, [get for _, _, get in fields]
         self._known[cls.addr] = known
-        self._frames.add('class', number, cls.name or '', [field[:2] for field in fields])
+        self._add('class', number, cls.name or '', [field[:2] for field in fields])
         return known
 
     def _discarded(self, message: Any) -> None:
@@ -188,7 +171,7 @@ class Session:
             time = message.end_default_clock_snapshot.ns_from_origin
         except (AttributeError, ValueError):
             time = -1       # the stream has no times for it
-        self._frames.add('discarded', time, -1 if count is None else count)
+        self._add('discarded', time, -1 if count is None else count)
 
 
 # Process, thread and name: of user space first, then of the kernel.
@@ -212,26 +195,24 @@ def reason(error: BaseException) -> str:
 
 def main(session: str) -> int:
     """Read a session; the outcome is the last row."""
-    # What a library prints must not come between the frames.
-    stream = os.fdopen(os.dup(1), 'wb')
-    os.dup2(2, 1)
-    frames = Frames(stream)
-    try:
-        bt2 = import_module('bt2')      # which type checkers need not have
-    except Exception as error:      # also a binding that does not fit its library
-        frames.add('missing', f'{type(error).__name__}: {error}')
-        frames.flush()
-        return 0
-    frames.add('ready', str(getattr(bt2, '__version__', '')))
-    frames.flush()
-    try:
-        Session(bt2, frames).read(session)
-        frames.add('end')
-    except BrokenPipeError:
-        return 1        # the importer has gone
-    except Exception as error:      # whatever it is: the other side has to say it
-        frames.add('error', reason(error))
-    frames.flush()
+    # What a library prints must not come between the rows.
+    with os.fdopen(os.dup(1), 'wb') as stream:
+        os.dup2(2, 1)
+        add = rows_to(stream)
+        try:
+            bt2 = import_module('bt2')      # which type checkers need not have
+        except Exception as error:      # also a binding that does not fit its library
+            add('missing', f'{type(error).__name__}: {error}')
+            return 0
+        add('ready', str(getattr(bt2, '__version__', '')))
+        stream.flush()
+        try:
+            Session(bt2, add).read(session)
+            add('end')
+        except BrokenPipeError:
+            os._exit(1)     # the importer has gone
+        except Exception as error:      # whatever it is: the other side has to say it
+            add('error', reason(error))
     return 0
 
 

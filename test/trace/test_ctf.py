@@ -156,10 +156,9 @@ def test_cut_metadata_is_found_before_babeltrace_reads_it(tmp_path: Path) -> Non
 
 
 HELPER = """\
-import json, os, struct, sys
-rows = {rows}
-data = json.dumps(rows).encode()
-sys.stdout.buffer.write(struct.pack('>I', len(data)) + data)
+import json, os, sys
+for row in {rows}:
+    print(json.dumps(row))
 sys.stdout.flush()
 {then}
 """
