@@ -5,24 +5,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from mddag_executor.replay.beside import pays, play_beside
+from mddag_executor.replay.communications import Communications
 from mddag_executor.replay.drift import DriftObserver
 from mddag_executor.replay.explain import Explainer
 from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.own import OwnRun
-from mddag_executor.replay.own_paths import OwnPaths
+from mddag_executor.replay.paths import Paths
 from mddag_executor.replay.run import open_run, Recording, Run
 from mddag_executor.replay.usage import GroupWaits, share, Usage
 from mddag_executor.text import counted
 from msg_graph import TaskSet
 from msg_graph.derive import no_garbage
 from msg_graph.drift import Drift
-
-if TYPE_CHECKING:
-    from mddag_executor.replay.imported_figures import Communications, ImportedPaths
 
 Progress = Callable[[int], None]
 
@@ -50,9 +48,9 @@ class Replay:
         self.judge = Judge(run.task_set, run.same, waits, skip)
         self.usage = Usage(run.task_set, waits)
         self.tally = self.judge.tally
-        self._seen: Communications | None = None
-        self._paths: ImportedPaths | OwnPaths | None = None
-        self._drift: DriftObserver | None = None
+        self._seen = None if run.declared else Communications(run.who)
+        self._paths = Paths(run) if paths else None
+        self._drift = DriftObserver(run) if paths else None
         self.explainer = Explainer(run, self.judge, jobs) if paths else None
         with no_garbage():
             if paths and not jobs and more is None and isinstance(run, OwnRun) and pays(run):
@@ -60,14 +58,6 @@ class Replay:
                     run, waits, [self.judge, self.usage, *filter(None, [self.explainer])],
                     progress)
             else:
-                if not isinstance(run, OwnRun):
-                    from mddag_executor.replay import imported_figures
-                    self._seen = imported_figures.Communications(run.who)
-                    self._paths = imported_figures.ImportedPaths(run) if paths else None
-                elif paths:
-                    self._paths = OwnPaths(run)
-                if paths:
-                    self._drift = DriftObserver(run)
                 observers = [waits, self.judge, self.usage, self._paths, self._drift, self._seen,
                              self.explainer, *(more(self) if more is not None else ())]
                 run.play([each for each in observers if each is not None], progress)

@@ -25,13 +25,13 @@ from mddag_executor.errors import MddagError
 from mddag_executor.replay.drift import DriftObserver
 from mddag_executor.replay.happenings import Batch, KINDS, Observer, tell_end
 from mddag_executor.replay.own import OwnRun, STOP
-from mddag_executor.replay.own_paths import OwnPaths
+from mddag_executor.replay.paths import Paths
 from mddag_executor.replay.run import open_run
 from mddag_executor.replay.usage import GroupWaits
 from mddag_executor.resources import import_environment
 
 LEAST_EVENTS = 1_000_000
-Played = tuple[OwnRun, OwnPaths, DriftObserver]
+Played = tuple[OwnRun, Paths, DriftObserver]
 _PROGRAM = 'from mddag_executor.replay.beside import serve; serve()'
 
 
@@ -126,7 +126,7 @@ def serve() -> None:
             run = open_run(*pickle.load(sys.stdin.buffer))
             assert isinstance(run, OwnRun)
             waits = GroupWaits(run.who)
-            paths, drift = OwnPaths(run), DriftObserver(run)
+            paths, drift = Paths(run), DriftObserver(run)
             run.play([waits, _Sender(send, waits), paths, drift],
                      lambda events: send('progress', events))
             paths.book.results()

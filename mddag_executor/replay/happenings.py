@@ -39,10 +39,12 @@ BATCH = 16_384
 NOW, PROCESS, THREAD, FIELD = range(4)
 
 #: Kinds of what happens; ``Observer`` has a method for each, and says what is in a row.
-KINDS = ('released', 'started', 'ran', 'completed', 'ended', 'withdrawn', 'failed', 'missed',
-         'published')
-RELEASED, STARTED, RAN, COMPLETED, ENDED, WITHDRAWN, FAILED, MISSED, PUBLISHED = range(len(KINDS))
-_WIDTHS = (4, 7, 9, 13, 4, 2, 4, 5, 7)
+KINDS = ('released', 'started', 'completed', 'ended', 'withdrawn', 'failed', 'missed',
+         'ran', 'published', 'began', 'over', 'sent', 'took')
+# Those before ``RAN`` concern the core.
+(RELEASED, STARTED, COMPLETED, ENDED, WITHDRAWN, FAILED, MISSED,
+ RAN, PUBLISHED, BEGAN, OVER, SENT, TOOK) = range(len(KINDS))
+_WIDTHS = (4, 7, 13, 4, 2, 4, 5, 9, 7, 7, 4, 5, 4)
 
 
 class Piece(NamedTuple):
@@ -186,6 +188,24 @@ class Observer:
         self, publisher: int, callback: int, dag: int, vertex: int, job: int, ready: int, now: int
     ) -> None:
         """Note a publication; the DAG is -1 where no declared callback did it."""
+
+    # What the linker of an imported recording found.  Executions (runs) and messages have numbers,
+    # -1: there is none; the vertex is any of the declared callback that ran.
+
+    def began(
+        self, callback: int, vertex: int, run: int, start: int, message: int, publisher: int,
+        sent: int,
+    ) -> None:
+        """Note that an execution began, and for which message, by whom and when it was sent."""
+
+    def over(self, callback: int, vertex: int, run: int, end: int) -> None:
+        """Note that an execution ended."""
+
+    def sent(self, publisher: int, vertex: int, run: int, message: int, time: int) -> None:
+        """Note a publication; the vertex is that of a callback of the publisher's node."""
+
+    def took(self, callback: int, vertex: int, run: int, message: int) -> None:
+        """Note that a running callback took a message itself."""
 
     def decided(self, decisions: Sequence[Decision]) -> None:
         """Note what the judge's core has decided."""

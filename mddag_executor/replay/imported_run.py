@@ -39,13 +39,17 @@ from mddag_executor.replay.doubts import Doubts
 from mddag_executor.replay.entities import Callback, Entities, Event, INIT_EVENTS
 from mddag_executor.replay.happenings import (
     Batches,
+    BEGAN,
     COMPLETED,
     ENDED,
     Observer,
+    OVER,
     PUBLISHED,
     RAN,
     RELEASED,
+    SENT,
     STARTED,
+    TOOK,
     WITHDRAWN,
 )
 from mddag_executor.replay.linker import (
@@ -120,7 +124,7 @@ class ImportedRun(LinkObserver):
         self._workers: dict[tuple[int, int], int] = {}
         self._timers = _Timers()
         self._fallbacks: Counter[str] = Counter()
-        self._number = 0
+        self._number = self._messages = 0
         self._graph()
 
     def _graph(self) -> None:
@@ -129,6 +133,9 @@ class ImportedRun(LinkObserver):
         self._source: dict[str, tuple[int, int]] = {}
         self._next: dict[tuple[int, str], int] = {}
         self._sizes: dict[int, int] = {}
+        vertices = {v.callback.key: number for number, v in enumerate(self.task_set.vertices)}
+        self._vertex = {number: vertices[target.callback.key]
+                        for number, target in self.targets.items()}
         # by the vertices before and after, and the place of the topic
         self._leg: dict[tuple[int, int, int], int] = {}
         first = 0
@@ -168,7 +175,6 @@ class ImportedRun(LinkObserver):
         """Give the observers everything, with the numbers of callbacks in place of addresses."""
         self._batches = Batches(observers)
         self._add = self._batches.add
-        self._links = [each for each in observers if isinstance(each, LinkObserver)]
         count = 0
         take = self._linker.take
         with named_errors(self._reader.path, self.name):
@@ -196,12 +202,19 @@ class ImportedRun(LinkObserver):
             self._assign(run, target, message)
         if self.start is None or run.ready < self.start:
             self.start = run.ready
-        for observer in self._links:
-            observer.began(run, message)
+        run.number = self._number = self._number + 1
+        callback = run.callback.number
+        number = publisher = time = -1
+        if message is not None:
+            number = message.number
+            if message.publisher is not None and message.time:
+                publisher, time = message.publisher.number, message.time
+        self._add(BEGAN, callback, self._vertex.get(callback, -1), run.number, run.start, number,
+                  publisher, time)
         if target is not None and run.of is not None:
             dag, vertex, job = run.of
             self._active[(dag, job)] += 1
-            self._add(STARTED, dag, vertex, job, run.ready, run.start, run.callback.number, -1)
+            self._add(STARTED, dag, vertex, job, run.ready, run.start, callback, -1)
 
     def _ready(self, run: Execution, message: Publication | None) -> int:
         if run.callback.kind == 'timer':
@@ -253,21 +266,20 @@ class ImportedRun(LinkObserver):
 
     def over(self, run: Execution) -> None:
         """Report an execution that has ended, and of what it completes."""
-        for observer in self._links:
-            observer.over(run)
+        callback = run.callback.number
+        self._add(OVER, callback, self._vertex.get(callback, -1), run.number, run.end)
         dag, vertex, job = run.of if run.of is not None else (-1, -1, -1)
         worker = self._workers.setdefault(run.thread, len(self._workers))
-        self._add(RAN, run.callback.number, dag, vertex, job, worker, run.ready, run.start,
+        self._add(RAN, callback, dag, vertex, job, worker, run.ready, run.start,
                   run.end, 1)
-        if run.callback.number not in self.targets or dag < 0:
+        if dag < 0:
             return
         self._active[(dag, job)] -= 1
         whole = self._is_whole(vertex, job, run.leg)
         if whole:
             self._doubts.done(dag, vertex, job)
-        self._number += 1
         self._add(COMPLETED, dag, vertex, job, run.leg, int(whole), run.end, run.ready,
-                  run.start, run.end, run.end - run.start, self._number, -1, 0)
+                  run.start, run.end, run.end - run.start, run.number, -1, 0)
 
     def _is_whole(self, vertex: int, job: int, leg: int) -> bool:
         """Return whether an execution completes its vertex: of a sync's legs the last one does."""
@@ -317,18 +329,25 @@ class ImportedRun(LinkObserver):
         of = None if message.run is None else message.run.of
         if of is not None and (message.stamp or message.within):
             self._doubts.sent(of[0], of[2], message.topic)
-        if message.publisher is not None:
-            run = message.run
-            self._add(PUBLISHED, message.publisher.number,
-                      -1 if run is None else run.callback.number, *(of or (-1, -1, -1)),
-                      -1 if run is None else run.ready, message.time)
-        for observer in self._links:
-            observer.sent(message)
+        message.number = self._messages = self._messages + 1
+        publisher, run = message.publisher, message.run
+        if publisher is None:
+            return
+        callback, ready, vertex, number = -1, -1, -1, -1
+        if run is not None:
+            callback, ready, number = run.callback.number, run.ready, run.number
+            target = self.targets.get(callback)
+            if target is not None and publisher.node is not None and (
+                    target.callback.node == publisher.node.name):
+                vertex = self._vertex[callback]
+        self._add(PUBLISHED, publisher.number, callback, *(of or (-1, -1, -1)), ready,
+                  message.time)
+        self._add(SENT, publisher.number, vertex, number, message.number, message.time)
 
     def took(self, run: Execution, message: Publication) -> None:
-        """Hand on that a callback took a message itself."""
-        for observer in self._links:
-            observer.took(run, message)
+        """Report that a callback took a message itself."""
+        callback = run.callback.number
+        self._add(TOOK, callback, self._vertex.get(callback, -1), run.number, message.number)
 
     # --- what to say -----------------------------------------------------------------------------
 

@@ -43,7 +43,6 @@ from mddag_executor.replay.happenings import (
     FAILED,
     MISSED,
     Observer,
-    PUBLISHED,
     RAN,
     RELEASED,
     STARTED,
@@ -175,7 +174,7 @@ class Judge(Observer):
         Of what completed and started also the job as one number, the place of its vertex among
         the executions of a job, the leg, the time, and its link; -1 without one.
         """
-        places = np.flatnonzero((batch.order != RAN) & (batch.order != PUBLISHED))
+        places = np.flatnonzero(batch.order < RAN)
         kinds = batch.order[places]
         table = np.zeros((5, len(places)), dtype=np.int64)
         for kind, link in ((COMPLETED, self.chains.first), (STARTED, self.chains.first_started)):

@@ -50,7 +50,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from mddag_executor.replay.entities import Callback, Entities, Publisher
-from mddag_executor.replay.happenings import Observer
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.channels import Layout
 
@@ -133,7 +132,7 @@ class Publication:
         return self.publisher.topic if self.publisher is not None else ''
 
 
-class LinkObserver(Observer):
+class LinkObserver:
     """Gets what the linker finds, in the order of time, and does nothing with it."""
 
     def began(self, run: Execution, message: Publication | None) -> None:

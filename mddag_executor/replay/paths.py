@@ -27,19 +27,46 @@ By default, as in CARET, a path's time runs from the first publication to the st
 callback's execution; ``whole`` figures run from the start of the first callback's execution to the
 end of the last one's.
 
+Which message an execution of a job ran for is known from the job: it is the one that the vertex
+before it published in the same job.  The topic that started a leg of a sync callback is its
+subscription's.  A simulated trace has no publications: there every topic is published when the
+callback ends.  In an imported recording the linker has found the messages.  An execution of
+several pieces (a coroutine) is one, from its first start to its last end.
+
 A *place* is a position in a path, a *step* an execution or a publication there.  Steps are made
 for many events at once: place by place along each path, as what a place needs is known once the
-place before it is done.  Flows that are over are counted and forgotten (see ``path_forest`` and
-``path_stream``).
+place before it is done.  Flows that are over are counted and forgotten (see ``path_flows``).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
-from mddag_executor.replay.happenings import Ints
-from mddag_executor.replay.path_forest import END, F_PATH, Forest, NEVER, NONE, PARENT
-from mddag_executor.replay.path_stream import PathFigures
+from mddag_executor.replay.happenings import (
+    Batch,
+    BEGAN,
+    different,
+    Ints,
+    Observer,
+    OVER,
+    PUBLISHED,
+    RAN,
+    SENT,
+    STARTED,
+    TOOK,
+)
+from mddag_executor.replay.linker import KEEP
+from mddag_executor.replay.path_flows import (
+    END,
+    F_PATH,
+    Forest,
+    NEVER,
+    NONE,
+    PARENT,
+    PathFigures,
+)
+from mddag_executor.replay.run import Run
 from msg_graph import Callback, Path, TaskSet
 import numpy as np
 
@@ -52,6 +79,7 @@ KEPT = 1024
 LAG_NS = 1_000_000_000
 """Nothing comes later than this after it happened."""
 _ORDER = 40     # bits of an event's number in the order
+_JOB = 42   # bits: no execution is ready more than an hour before one of the job before it
 
 # Columns of the input; all begin with the place in the order and the callback's number.
 S_RUN, S_TIME, S_TOPIC, S_MESSAGE, S_VERTEX, _N_STARTED = range(2, 8)
@@ -76,6 +104,8 @@ class _Place:
         self.callback = callback
         self.node = node
         self.sync = sync
+        # by vertex of the callback: those of the callback before it that lead to it
+        self.before: dict[int, list[int]] = {}
         self.hop: Hop | None = None             # to it
         self.hop_topics: list[int] = []         # of it
         self.topics: list[int] = []             # behind it
@@ -94,9 +124,12 @@ class PathBook:
     numbers that differ; -1 stands for none.
 
     :param kept: how many executions and messages of a place may still be referred to.
+    :param by_job: whether executions come with their job in place of their message; the number of
+        a message is then ``message``.
     """
 
-    def __init__(self, task_set: TaskSet, kept: int = KEPT) -> None:
+    def __init__(self, task_set: TaskSet, kept: int = KEPT, by_job: bool = False) -> None:
+        self._by_job, self._n_vertices = by_job, len(task_set.vertices)
         self.paths: list[Path] = list(task_set.paths)
         self.hops = [hops(task_set, path) for path in self.paths]
         self.callbacks = task_set.places()
@@ -106,6 +139,9 @@ class PathBook:
         self.topics = {topic: i for i, topic in enumerate(sorted(
             {topic for path in self.hops for hop in path for topic in hop.topics}))}
         self.on_path = {key for path in self.paths for key in path.callbacks}
+        # by vertex
+        self._topics_of = [[self.topics[topic] for topic in v.callback.topics
+                            if topic in self.topics] for v in task_set.vertices]
         self._figures = [PathFigures() for _ in self.paths]
         self._places = [self._place(task_set, number, position)
                         for number, path in enumerate(self.paths)
@@ -129,6 +165,11 @@ class PathBook:
         if position:
             place.hop = path_hops[position - 1]
             place.hop_topics = [self.topics[topic] for topic in place.hop.topics]
+            before = self.paths[number].callbacks[position - 1]
+            place.before = {
+                v: [v - vertex.index + p for p in vertex.predecessors
+                    if task_set.vertices[v - vertex.index + p].callback.key == before]
+                for v, vertex in enumerate(task_set.vertices) if vertex.callback.key == key}
         if position < len(path_hops):
             place.topics = [self.topics[topic] for topic in path_hops[position].topics]
         return place
@@ -144,7 +185,7 @@ class PathBook:
 
         :param length: how many places there are.
         :param started: executions: callback, run, start, the topic that started it, the message
-            (or what ``message_of`` makes it of), the vertex.
+            (or the job), the vertex.
         :param ended: callback, run, end.
         :param published: the callback (-1: outside of executions), its node, run, topic,
             message, time.
@@ -163,9 +204,23 @@ class PathBook:
             self._round()
             self._settle(False)
 
-    def messages_of(self, place: int, started: Ints) -> list[Ints]:
+    def message(self, job: Ints, vertex: Ints | int, topic: Ints | int) -> Ints:
+        """Return the numbers of the messages that vertices publish in jobs."""
+        return (job * self._n_vertices + vertex) * (len(self.topics) + 1) + topic
+
+    def _messages_for(self, place: _Place, started: Ints) -> list[Ints]:
         """Return what may have started executions at a place; what is known later counts."""
-        return [started[:, S_MESSAGE]]
+        if not self._by_job:
+            return [started[:, S_MESSAGE]]
+        found: list[Ints] = []
+        for vertex in different(started[:, S_VERTEX]):
+            mine = started[:, S_VERTEX] == vertex
+            topics, job = started[:, S_TOPIC], started[:, S_MESSAGE]
+            for before in place.before.get(vertex, ()):
+                for topic in self._topics_of[vertex]:
+                    fits = mine & ((topics == topic) | (topics == NONE))
+                    found.append(np.where(fits, self.message(job, before, topic), NONE))
+        return found
 
     # --- steps -----------------------------------------------------------------------------------
 
@@ -212,7 +267,7 @@ class PathBook:
         if place.hop is not None:
             last = self._places[number - 1]
             if place.hop.kind == 'trigger':
-                for messages in self.messages_of(number, rows):
+                for messages in self._messages_for(place, rows):
                     found = _message(last.messages, messages, rows[:, 0])
                     parent = np.where(found != NONE, found, parent)
             else:
@@ -285,7 +340,7 @@ class PathBook:
         Return by path its figures, all times in ns, once all input is there.
 
         ``flows`` counts the inputs and ``arrived`` those whose flow reached the last callback.
-        ``response_time`` has CARET's cases (see ``path_stream``) from the first publication to the
+        ``response_time`` has CARET's cases (see ``path_flows``) from the first publication to the
         start of the last callback, ``whole`` those from the start of the first to the end of the
         last.  ``reaction_time`` is the worst case with external latency, ``data_age`` that of
         every output.  Median and p99 are exact up to 32,768 response times; where there are more,
@@ -299,6 +354,122 @@ class PathBook:
                             **figures.result()}
                 for path, hops, figures in zip(self.paths, self.hops, self._figures)}
         return self._results
+
+
+class Paths(Observer):
+    """
+    Tells a book what happens in a run.
+
+    :param run: which knows who publishes and takes what.
+    :ivar book: has the figures of the paths.
+    """
+
+    def __init__(self, run: Run) -> None:
+        task_set, self._who, self._by_job = run.task_set, run.who, run.declared
+        self.book = book = PathBook(task_set, KEPT if self._by_job else KEEP, self._by_job)
+        self._n_dags, self._n_vertices = max(1, len(task_set.dags)), len(task_set.vertices) + 1
+        # by vertex; the last stands for none
+        self._callback = np.array([
+            *(book.callbacks[v.callback.key] if v.callback.key in book.on_path else NONE
+              for v in task_set.vertices), NONE])
+        self._takes_topics = np.array(
+            [*(bool(v.callback.topics) for v in task_set.vertices), False])
+        self._publishes = [[book.topics[topic] for topic in v.callback.publishes
+                            if topic in book.topics] for v in task_set.vertices]
+
+    def take(self, batch: Batch) -> None:
+        """Tell it what callbacks on paths did."""
+        if self.book:
+            self.book.add(len(batch.order) + 1,
+                          *(self._of_jobs(batch) if self._by_job else self._of_links(batch)))
+
+    def _of_links(self, batch: Batch) -> tuple[Ints, ...]:
+        """Return what the linker of an imported recording found."""
+        began, ended, took = (self._on_paths(batch, kind, 1) for kind in (BEGAN, OVER, TOOK))
+        callback, vertex, run, start, message = began[:, 2:7].T
+        publisher, vertex_of, run_of, sent, time = batch.columns(SENT).T
+        return (
+            np.column_stack((began[:, :2], run, start, self._topics(vertex, callback), message,
+                             vertex)),
+            ended[:, [0, 1, 4, 5]],
+            self._sent(batch.places(SENT), publisher, vertex_of, run_of, lambda row, _: sent[row],
+                       time),
+            took[:, [0, 1, 4, 5]])
+
+    def _of_jobs(self, batch: Batch) -> tuple[Ints, ...]:
+        """Return what ran in jobs."""
+        started, ran = (
+            self._on_paths(batch, kind, column) for kind, column in ((STARTED, 1), (RAN, 2)))
+        dag, vertex, job, ready, start, callback, _ = started[:, 2:].T
+        begun = np.column_stack((
+            started[:, :2], self._run(vertex, job, ready), start, self._topics(vertex, callback),
+            job * self._n_dags + dag, vertex))
+        ended = np.column_stack((
+            ran[:, :2], self._run(ran[:, 4], ran[:, 5], ran[:, 7]), ran[:, 9]))
+        if not self._who.every_publisher:     # what is published is not recorded
+            return begun, ended, self._at_ends(ended, ran)
+        publisher, _, dag, vertex, job, ready, time = batch.columns(PUBLISHED).T
+
+        def message(row: Ints, topic: Ints) -> Ints:
+            return np.where(dag[row] < 0, NONE, self.book.message(
+                job[row] * self._n_dags + dag[row], vertex[row], topic))
+
+        return begun, ended, self._sent(
+            batch.places(PUBLISHED), publisher, vertex, self._run(vertex, job, ready), message,
+            time)
+
+    def _on_paths(self, batch: Batch, kind: int, column: int) -> Ints:
+        """Return the rows of a kind of vertices on paths, behind place and callback's number."""
+        rows = batch.columns(kind)
+        callback = self._callback[rows[:, column]]
+        chosen = np.flatnonzero(callback != NONE)
+        return np.column_stack((batch.places(kind)[chosen], callback[chosen], rows[chosen]))
+
+    def _run(self, vertex: Ints, job: Ints, ready: Ints) -> Ints:
+        """Return the numbers of executions: nearly ascending, which is quick to sort."""
+        return (ready + (job << _JOB)) * self._n_vertices + vertex
+
+    def _topics(self, vertex: Ints, callbacks: Ints) -> Ints:
+        """Return the numbers of callbacks' topics: -2 of one that no path leads over."""
+        different, which = np.unique(callbacks, return_inverse=True)
+        topics = [self._who.topic(callback) for callback in different.tolist()]
+        numbers = np.array([self.book.topics.get(topic, -2) if topic else NONE
+                            for topic in topics], dtype=np.int64)
+        return np.where(self._takes_topics[vertex], numbers[which], NONE)
+
+    def _at_ends(self, ended: Ints, ran: Ints) -> Ints:
+        """Return what is published when a callback ends, of which nothing is recorded."""
+        parts = [np.empty((0, _N_PUBLISHED), dtype=np.int64)]
+        for vertex, mine in by_column(np.column_stack((ended, ran[:, [3, 5, 4]])), 6).items():
+            place, callback, run, time, dag, job, _ = mine.T
+            parts += [np.column_stack(np.broadcast_arrays(
+                place, callback, NONE, run, topic,
+                self.book.message(job * self._n_dags + dag, vertex, topic), time))
+                for topic in self._publishes[vertex]]
+        found = np.concatenate(parts)
+        return found[np.argsort(found[:, 0], kind='stable')]
+
+    def _sent(
+        self, places: Ints, publisher: Ints, vertex: Ints, run: Ints,
+        message: Callable[[Ints, Ints], Ints], time: Ints,
+    ) -> Ints:
+        """
+        Return what is published on topics that paths lead over.
+
+        :param message: returns the numbers of the messages in some rows, of their topics.
+        """
+        different, which = np.unique(publisher, return_inverse=True)
+        known = [self._who.every_publisher.get(number) for number in different.tolist()]
+        topic, node = np.array(
+            [(NONE, NONE) if each is None else (
+                self.book.topics.get(each.topic, NONE),
+                self.book.nodes.get(each.node.name if each.node is not None else '', NONE))
+             for each in known], dtype=np.int64).reshape(-1, 2)[which].T
+        callback = self._callback[vertex]
+        row = np.flatnonzero((topic != NONE) & ((callback != NONE) | (vertex < 0)))
+        return np.column_stack((
+            places[row], callback[row], node[row], run[row], topic[row],
+            message(row, topic[row]), time[row]))
 
 
 def by_column(rows: Ints, column: int) -> dict[int, Ints]:

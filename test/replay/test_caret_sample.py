@@ -10,13 +10,11 @@ import os
 from pathlib import Path
 from typing import Any
 
-from mddag_executor.replay import happenings, imported_figures, paths, replay, reschedule
-from mddag_executor.replay.imported_figures import ImportedPaths
-from mddag_executor.replay.imported_run import ImportedRun
-from mddag_executor.replay.linker import Execution, LinkObserver, Publication
-from mddag_executor.replay.paths import PathBook
+from mddag_executor.replay import happenings, paths, replay, reschedule
+from mddag_executor.replay.linker import Execution, Linker, LinkObserver, Publication
+from mddag_executor.replay.paths import PathBook, Paths
 from mddag_executor.replay.run import open_run
-from mddag_executor.trace import import_ctf
+from mddag_executor.trace import import_ctf, TraceReader
 from msg_graph import loads, TaskSet
 import pytest
 
@@ -98,9 +96,12 @@ class Links(LinkObserver):
 @pytest.fixture(scope='module')
 def seen(trace: Path, graph: TaskSet) -> tuple[Links, PathBook]:
     run = open_run(trace, graph)
-    assert isinstance(run, ImportedRun)
-    seen, found = Links(), ImportedPaths(run)
-    run.play([seen, found])
+    seen, found = Links(), Paths(run)
+    run.play([found])
+    linker = Linker(run.who, seen)
+    for event in TraceReader(trace).layout_events(linker.events):
+        linker.take(event)
+    linker.finish()
     assert run.warnings == []
     return seen, found.book
 
@@ -173,7 +174,7 @@ def test_the_same_when_what_is_over_is_forgotten(
     left = note_steps(monkeypatch)
     monkeypatch.setattr(paths, 'SETTLE', 100)
     monkeypatch.setattr(happenings, 'BATCH', 50)
-    monkeypatch.setattr(imported_figures, 'KEEP', 4)
+    monkeypatch.setattr(paths, 'KEEP', 4)
     assert replay(trace, graph).result()['paths'] == expected
     assert len(left) > 3 and max(left) < 200, left
 

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from mddag_executor.replay.drafting import System
 from mddag_executor.replay.imported_run import ImportedRun
-from mddag_executor.replay.linker import Execution, LinkObserver, Publication
+from mddag_executor.replay.linker import Execution, Linker, LinkObserver, Publication
 from mddag_executor.replay.run import open_run
+from mddag_executor.trace import TraceReader
 import pytest
 
 from .recorded import BEGIN, MS, Recorded, STYLES, US
@@ -46,7 +47,11 @@ def linked(path: Path) -> tuple[Links, list[str]]:
     """Return what the linker says of a recording, and the warnings."""
     got = Links()
     run = open_run(path)
-    run.play([got])
+    linker = Linker(run.who, got)
+    for event in TraceReader(path).layout_events(linker.events):
+        linker.take(event)
+    linker.finish()
+    run.play([])
     return got, [line.removeprefix(f'{path}: ') for line in run.warnings]
 
 

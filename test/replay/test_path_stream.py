@@ -12,9 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import quantile
 from mddag_executor.replay import paths, replay
-from mddag_executor.replay.path_forest import NEVER
-from mddag_executor.replay.path_stream import CaseBook
-from mddag_executor.replay.paths import PathBook
+from mddag_executor.replay.path_flows import CaseBook, NEVER
 from mddag_executor.replay.spread import QUANTILE_ERROR, Spread
 from mddag_executor.trace import reading
 from msg_graph import loads
@@ -144,7 +142,7 @@ def test_a_forest_that_is_kept_small(
     expected = all_paths(trace)
     monkeypatch.setattr(paths, 'LAG_NS', 0)
     monkeypatch.setattr(paths, 'SETTLE', 50)
-    monkeypatch.setattr(PathBook.__init__, '__defaults__', (30,))
+    monkeypatch.setattr(paths, 'KEPT', 30)
     monkeypatch.setattr(reading, '_BATCH', 1)
     settled = note_steps(monkeypatch)
     assert all_paths(trace).split('\n') == expected.split('\n')
