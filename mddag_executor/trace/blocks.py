@@ -34,6 +34,7 @@ import zlib
 
 import lz4.frame
 from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Header, Statistics
 from mddag_executor.trace import records
 from mddag_executor.trace.errors import TraceError
 import zstandard
@@ -99,15 +100,13 @@ def open_data(stream: BinaryIO, path: str) -> tuple[int, str]:
     head = stream.read(records.RECORD.size)
     if len(head) == records.RECORD.size:
         opcode, length = records.RECORD.unpack(head)
-        cursor = records.Cursor(stream.read(min(length, 1 << 16)))
-        library = ''
+        content = records.Content(stream.read(min(length, 1 << 16)))
         try:
-            cursor.string()     # profile
-            library = cursor.string()
+            library: str = Header.read(content).library
         except ValueError:
-            pass
+            opcode = 0
         # A wrong length might lead past the first chunk.
-        if opcode == Opcode.HEADER and cursor.position == length:
+        if opcode == Opcode.HEADER and content.count == length:
             return len(magic) + len(head) + int(length), library
     raise TraceError(path, 'ends or is damaged before its first event', _REMEDY)
 
@@ -240,14 +239,13 @@ def scan(stream: BinaryIO, start: int, size: int) -> Iterator[Block]:
 def _chunk(stream: BinaryIO, position: int, end: int) -> Block:
     """Return the chunk whose record starts at a position, from its head alone."""
     head = stream.read(min(end - stream.tell(), _CHUNK_OVERHEAD))
-    cursor = records.Cursor(head)
+    content = records.Content(head)
     try:
-        start_time, _, size, crc = records.CHUNK_HEAD.unpack(cursor.take(records.CHUNK_HEAD.size))
-        compression = cursor.string()
-        length = cursor.uint64()
+        start_time, _, size, crc = records.CHUNK_HEAD.unpack(content.read(records.CHUNK_HEAD.size))
+        compression, length = content.read_prefixed_string(), content.read8()
     except ValueError:
         raise Damage('the head of a chunk is damaged', position) from None
-    data_offset = position + records.RECORD.size + cursor.position
+    data_offset = position + records.RECORD.size + content.count
     if data_offset + length != end or size > MAX_CHUNK or length > MAX_CHUNK + _CHUNK_OVERHEAD:
         raise Damage('the lengths in the head of a chunk are wrong', position)
     return Block(position, end, start_time, True, compression, data_offset, length, size, crc)
@@ -384,19 +382,15 @@ def _parse_summary(stream: BinaryIO, start: int, end: int, moved: bool) -> Summa
     while start < end:
         stream.seek(start)
         opcode, length = records.RECORD.unpack(stream.read(records.RECORD.size))
-        if opcode in (Opcode.STATISTICS, Opcode.CHANNEL) or (
-                moved and opcode == Opcode.CHUNK_INDEX):
-            cursor = records.Cursor(stream.read(min(length, 1 << 20)))
-            if opcode == Opcode.CHUNK_INDEX:
-                head = cursor.take(records.CHUNK_INDEX_HEAD.size)
-                first, _, offset, size = records.CHUNK_INDEX_HEAD.unpack(head)
-                index.append((offset, first, size))
-            elif opcode == Opcode.STATISTICS:
-                head = cursor.take(records.STATISTICS_HEAD.size)
-                messages, _, _, _, _, chunks, _, _ = records.STATISTICS_HEAD.unpack(head)
-            else:
-                cursor.take(4)
-                topics.add(cursor.string())
+        content = records.Content(stream.read(min(length, 1 << 20)))
+        if opcode == Opcode.CHUNK_INDEX and moved:
+            chunk = ChunkIndex.read(content)
+            index.append((chunk.chunk_start_offset, chunk.message_start_time, chunk.chunk_length))
+        elif opcode == Opcode.STATISTICS:
+            found = Statistics.read(content)
+            messages, chunks = found.message_count, found.chunk_count
+        elif opcode == Opcode.CHANNEL:
+            topics.add(Channel.read(content).topic)
         start += records.RECORD.size + length
     if start != end:
         raise ValueError('the summary does not end at the footer')

@@ -22,18 +22,21 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import re
 import struct
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
+from mcap.records import Channel, Schema
 from mddag_executor.trace import cdr
 from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.events import Event, Fixed
-from mddag_executor.trace.records import Cursor
+from mddag_executor.trace.records import Content
 from mddag_executor.trace.schema import EVENTS, PREAMBLE
 import numpy as np
 
 Decoder = tuple[Event, Callable[[bytes], Event]]
 
 _TOPIC = re.compile(r'/trace/([A-Za-z][A-Za-z0-9_]*)/([A-Za-z][A-Za-z0-9_]*)')
+_NO_SCHEMA = Schema(0, b'', '', '')
+_T = TypeVar('_T', Channel, Schema)
 DEFINITIONS_LIMIT = 64 * 1024 * 1024        # bytes of all schemas and channels
 
 
@@ -68,8 +71,8 @@ class Channels:
         """Keep what to decode: the named events, or all."""
         self._names = names
         self._as_table = as_table
-        self._schemas: dict[int, bytes] = {}
-        self._channels: dict[int, bytes] = {}
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
         self._size = 0
         #: The topics of the channels.
         self.topics: dict[int, Topic] = {}
@@ -88,11 +91,8 @@ class Channels:
 
         :raises ValueError: where it is malformed, or defines a known schema anew
         """
-        cursor = Cursor(content)
-        cursor.take(2)
-        for _ in ('name', 'encoding', 'data'):
-            cursor.block()
-        self._keep(self._schemas, content)
+        schema = Schema.read(Content(content))
+        self._keep(self._schemas, schema, content)
 
     def add_channel(self, content: bytes) -> None:
         """
@@ -100,10 +100,15 @@ class Channels:
 
         :raises ValueError: where it is malformed, or defines a known channel anew
         """
-        number = self._keep(self._channels, content)
+        channel = Channel.read(Content(content))
+        self._keep(self._channels, channel, content)
+        number = channel.id
         if number in self.topics:
             return
-        topic = self.topics[number] = self._topic(content)
+        schema = self._schemas.get(channel.schema_id, _NO_SCHEMA)
+        topic = self.topics[number] = Topic(
+            channel.topic, channel.message_encoding, schema.name, schema.encoding,
+            schema.data.decode(errors='replace'))
         match = _TOPIC.fullmatch(topic.name)
         name = f'{match[1]}:{match[2]}' if match else ''
         if match is None or (self._names is not None and name not in self._names):
@@ -125,14 +130,12 @@ class Channels:
             raise ValueError(decoder)
         return decoder
 
-    def _keep(self, kept: dict[int, bytes], content: bytes) -> int:
-        number = Cursor(content).uint16()
-        if kept.setdefault(number, content) != content:
+    def _keep(self, kept: dict[int, _T], record: _T, content: bytes) -> None:
+        if kept.setdefault(int.from_bytes(content[:2], 'little'), record) != record:
             raise ValueError('a schema or channel changes its meaning')
         self._size += len(content)
         if self._size > DEFINITIONS_LIMIT:
             raise ValueError('the schemas are too large')
-        return number
 
     def _decode(self, number: int, name: str, fields: dict[str, FieldType]) -> None:
         """Make the decoder of a channel of events; raise ValueError if there can be none."""
@@ -167,17 +170,6 @@ class Channels:
                 'names': names, 'formats': formats, 'itemsize': struct.calcsize('<' + fixed),
                 'offsets': [end - struct.calcsize(code) for end, code in zip(ends, formats)]}), {
                     field: defaults[field] for field in missing}
-
-    def _topic(self, content: bytes) -> Topic:
-        """Return what a channel record says; raise ValueError where it is malformed."""
-        cursor = Cursor(content)
-        cursor.take(2)
-        schema = Cursor(self._schemas.get(cursor.uint16(), bytes(14)))
-        name, encoding = cursor.string(), cursor.string()
-        cursor.block()
-        schema.take(2)
-        return Topic(name, encoding, *(
-            schema.block().decode(errors='replace') for _ in ('name', 'encoding', 'data')))
 
 
 def _fields_of(topic: Topic) -> dict[str, FieldType]:

@@ -25,6 +25,7 @@ from typing import Any
 import zlib
 
 from mcap.opcode import Opcode
+from mcap.records import Chunk
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.bags import Bag
@@ -128,10 +129,10 @@ def inside(data: bytearray, rng: random.Random) -> None:
     """Change the records in a chunk, and give it the right size, CRC and compression again."""
     chunks = [span for span in spans(bytes(data)) if span[0] == Opcode.CHUNK]
     _, start, end = rng.choice(chunks)
-    cursor = records.Cursor(bytes(data[start + records.RECORD.size:end]))
-    begin, last, size, _ = records.CHUNK_HEAD.unpack(cursor.take(records.CHUNK_HEAD.size))
-    cursor.string()
-    content = bytearray(zstandard.decompress(cursor.take(cursor.uint64()), size))
+    chunk = Chunk.read(records.Content(bytes(data[start + records.RECORD.size:end])))
+    begin, last, size = (
+        chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size)
+    content = bytearray(zstandard.decompress(chunk.data, size))
     for _ in range(rng.choice((1, 1, 4))):
         where = rng.randrange(len(content))
         if rng.random() < 0.5:
