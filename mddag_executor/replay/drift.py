@@ -25,7 +25,7 @@ from mddag_executor.replay.happenings import (
     RELEASED,
     STARTED,
 )
-from mddag_executor.replay.matching import declared_keys
+from mddag_executor.replay.mapping import declared_keys
 from mddag_executor.replay.run import Run
 from msg_graph import TaskSet
 from msg_graph.drift import Drift, drift, Observed, Releases

@@ -6,7 +6,7 @@ An imported recording as a run: releases, executions, completions, ends of jobs.
 Theory of operation
 -------------------
 A first pass over the trace finds out who is who (``entities``) and which of them the declaration
-means (``matching``).  The second links executions and messages (``linker``); jobs are made from
+means (``mapping``).  The second links executions and messages (``linker``); jobs are made from
 what is linked, and go to the observers.
 
 1. *Releases.*  A timer is due at t_init + n * period (rcl keeps that grid, also after it was late
@@ -59,7 +59,7 @@ from mddag_executor.replay.linker import (
     Losses,
     Publication,
 )
-from mddag_executor.replay.matching import Matching, Target
+from mddag_executor.replay.mapping import Matching, Target
 from mddag_executor.replay.recording import Head, named_errors, no_run
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader

@@ -1,10 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-From the recorded declaration to the one that judges.
+What a recording has, in the terms of the declaration that judges.
 
-Theory of operation
--------------------
+Theory of operation: recorded with a declaration
+------------------------------------------------
 Events name DAGs and vertices by their index in the declaration that was recorded.  The one that
 judges may be another: other deadlines, another order, more or fewer callbacks.
 
@@ -15,18 +15,30 @@ judges may be another: other deadlines, another order, more or fewer callbacks.
 
 What stands for nothing ran as a callback that no DAG declares.  What nothing stands for has never
 run: its jobs were not released, its sinks not completed.
+
+Theory of operation: imported
+-----------------------------
+Callbacks are matched by node and by what starts them; ``msg_graph.binding`` has the rules.  A
+node that was started more than once, or in several processes, is matched each time; of several
+callbacks that look the same the first one declared is the first one made.
+
+Nothing in a recording of CARET or ros2_tracing says more.  There, where a node's timers have other
+periods than declared, but there are as many of them, they are matched by order, and that is said.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence, Set
+from typing import NamedTuple
 
 from mddag_executor.core import legs_of
+from mddag_executor.replay.entities import Callback, Entities, Node
 from mddag_executor.replay.recording import ReplayError
 from mddag_executor.text import counted, listed
-from msg_graph import Dag, TaskSet, Vertex
-from msg_graph.binding import entities_of, Entity, meant
+from msg_graph import Callback as Declared
+from msg_graph import Dag, format_duration, TaskSet, Vertex
+from msg_graph.binding import Binder, entities_of, Entity, meant
 
 
 class Mapping:
@@ -148,3 +160,88 @@ def report_missing(
     return [f'{name}: not in it: {len(absent)} of the {len(judge.callbacks)} callbacks of '
             f'{judge.file}, which count as never completed: {listed([c.key for c in absent])}'
             + ('' if question is None else f': {question}')]
+
+
+class Target(NamedTuple):
+    """A declared callback that a recorded one stands for, and the leg of it that it is."""
+
+    callback: Declared
+    leg: int
+    topic: str
+
+
+def nodes_of(who: Entities) -> list[list[Callback]]:
+    """Return the timers, subscriptions and services of each node, as they were made."""
+    found: dict[Node, list[Callback]] = {}
+    for each in sorted(who.made, key=lambda c: (c.made, c.number)):
+        if each.node is not None:
+            found.setdefault(each.node, []).append(each)
+    return list(found.values())
+
+
+def match(callbacks: list[Callback], declared: TaskSet) -> dict[int, Target]:
+    """Return by number which declared callbacks those of a node are."""
+    binder = Binder(declared)
+    found: dict[int, Target] = {}
+    for each in callbacks:
+        bound = None if each.entity is None or not each.number else binder.bind(each.entity)
+        if bound is not None:
+            leg = bound.topics.index(each.start) if each.start in bound.topics else 0
+            found[each.number] = Target(bound, leg, each.start if bound.topics else '')
+    return found
+
+
+def declared_keys(who: Entities, declared: TaskSet) -> dict[int, str]:
+    """Return by callback's number the key of the declared one that it is."""
+    return {number: target.callback.key for callbacks in nodes_of(who)
+            for number, target in match(callbacks, declared).items()}
+
+
+class Matching:
+    """
+    Which declared callbacks those of an imported recording are.
+
+    :param who: is who in it.
+    :param threads: the processes and threads that ran callbacks.
+    :param judge: the declaration that judges; None: there is none.
+    """
+
+    def __init__(
+        self, name: str, who: Entities, threads: Set[tuple[int, int]], judge: TaskSet | None
+    ) -> None:
+        self.task_set = judge or TaskSet((), (), (), (), None, '', '')
+        self.warnings: list[str] = []
+        #: By number of a recorded callback.
+        self.target: dict[int, Target] = {}
+        self._other_periods: list[str] = []
+        if judge is None:
+            return
+        for callbacks in nodes_of(who):
+            self.target.update(self._match(callbacks, judge))
+        found = {target.callback.key for target in self.target.values()}
+        self.warnings += report_missing(
+            name, judge, found, [c.label for c in who.every if c.kind != 'service'],
+            [c.entity for c in who.every if c.entity is not None and c.number not in self.target])
+        if self._other_periods:
+            self.warnings.append(
+                f'{name}: {counted(len(self._other_periods), "timer")} with another '
+                f'period than declared: {listed(self._other_periods)}')
+        processes = len({pid for pid, _ in threads})
+        if processes > 1:
+            self.warnings.append(
+                f'{name}: {processes} processes ran callbacks, each with workers of its own: '
+                f'{counted(len(threads), "thread")} are taken together')
+
+    def _match(self, callbacks: list[Callback], judge: TaskSet) -> dict[int, Target]:
+        found = match(callbacks, judge)
+        node, known = callbacks[0].node_name, {t.callback.key for t in found.values()}
+        timers = [c for c in judge.callbacks
+                  if c.node == node and c.kind == 'timer' and c.key not in known]
+        left = [c for c in callbacks
+                if c.kind == 'timer' and c.number and c.number not in found]
+        for one, callback in zip(timers, left) if len(timers) == len(left) else ():
+            found[callback.number] = Target(one, 0, '')
+            self._other_periods.append(
+                f'{one.key} ({format_duration(callback.period)} instead of '
+                f'{format_duration(one.timer_period_ns or 0)})')
+        return found
