@@ -190,7 +190,6 @@ def _flows(table: Ints, last: Mask, leaves: Ints) -> Ints:
     return flows
 
 
-
 class CaseBook:
     """Counts the response times of flows from their starts to their ends, in all cases."""
 
