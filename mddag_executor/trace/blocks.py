@@ -28,11 +28,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from io import BytesIO
 import struct
 from typing import BinaryIO
 import zlib
 
 import lz4.frame
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Header, Statistics
 from mddag_executor.trace import records
@@ -56,6 +58,25 @@ class Damage(Exception):
         super().__init__(what)
         self.what = what
         self.offset = offset
+
+
+class Content(ReadDataStream):
+    """
+    The content of a record, for mcap's readers.
+
+    Whatever is asked for beyond the end raises ValueError, so no length in a file is trusted.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(BytesIO(data))
+
+    def read(self, length: int) -> bytes:
+        """Return the next bytes."""
+        data = self._stream.read(length)
+        if len(data) < length:
+            raise ValueError('a record is shorter than what it should hold')
+        self._count += length
+        return data
 
 
 @dataclass(frozen=True)
@@ -100,7 +121,7 @@ def open_data(stream: BinaryIO, path: str) -> tuple[int, str]:
     head = stream.read(records.RECORD.size)
     if len(head) == records.RECORD.size:
         opcode, length = records.RECORD.unpack(head)
-        content = records.Content(stream.read(min(length, 1 << 16)))
+        content = Content(stream.read(min(length, 1 << 16)))
         try:
             library: str = Header.read(content).library
         except ValueError:
@@ -239,7 +260,7 @@ def scan(stream: BinaryIO, start: int, size: int) -> Iterator[Block]:
 def _chunk(stream: BinaryIO, position: int, end: int) -> Block:
     """Return the chunk whose record starts at a position, from its head alone."""
     head = stream.read(min(end - stream.tell(), _CHUNK_OVERHEAD))
-    content = records.Content(head)
+    content = Content(head)
     try:
         start_time, _, size, crc = records.CHUNK_HEAD.unpack(content.read(records.CHUNK_HEAD.size))
         compression, length = content.read_prefixed_string(), content.read8()
@@ -382,7 +403,7 @@ def _parse_summary(stream: BinaryIO, start: int, end: int, moved: bool) -> Summa
     while start < end:
         stream.seek(start)
         opcode, length = records.RECORD.unpack(stream.read(records.RECORD.size))
-        content = records.Content(stream.read(min(length, 1 << 20)))
+        content = Content(stream.read(min(length, 1 << 20)))
         if opcode == Opcode.CHUNK_INDEX and moved:
             chunk = ChunkIndex.read(content)
             index.append((chunk.chunk_start_offset, chunk.message_start_time, chunk.chunk_length))

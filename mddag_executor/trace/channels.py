@@ -26,9 +26,9 @@ from typing import NamedTuple, TypeVar
 
 from mcap.records import Channel, Schema
 from mddag_executor.trace import cdr
+from mddag_executor.trace.blocks import Content
 from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.events import Event, Fixed
-from mddag_executor.trace.records import Content
 from mddag_executor.trace.schema import EVENTS, PREAMBLE
 import numpy as np
 

@@ -4,7 +4,7 @@
 Building blocks of an MCAP file, beside those of the package mcap.
 
 mcap reads and writes all records but messages and their indexes, which are many. What is read may
-be damaged: no length in it is believed (``Content``).
+be damaged: no length in it is believed (``blocks.Content``).
 
 Source: the MCAP format specification (https://mcap.dev/spec). A file is the magic, a header
 record, the data section (ended by a data-end record), the summary section, a footer and the magic
@@ -14,10 +14,7 @@ numbers are little endian, a string is its length in bytes (4 bytes) and UTF-8.
 
 from __future__ import annotations
 
-from io import BytesIO
 import struct
-
-from mcap.data_stream import ReadDataStream
 
 MAGIC = b'\x89MCAP0\r\n'
 LIBRARY = 'mddag_executor'
@@ -33,22 +30,3 @@ UINT32 = struct.Struct('<I')
 def record(opcode: int, content: bytes) -> bytes:
     """Return a whole record."""
     return RECORD.pack(opcode, len(content)) + content
-
-
-class Content(ReadDataStream):
-    """
-    The content of a record, for mcap's readers.
-
-    Whatever is asked for beyond the end raises ValueError, so no length in a file is trusted.
-    """
-
-    def __init__(self, data: bytes) -> None:
-        super().__init__(BytesIO(data))
-
-    def read(self, length: int) -> bytes:
-        """Return the next bytes."""
-        data = self._stream.read(length)
-        if len(data) < length:
-            raise ValueError('a record is shorter than what it should hold')
-        self._count += length
-        return data

@@ -30,6 +30,7 @@ from mddag_executor.errors import MddagError
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.bags import Bag
 from mddag_executor.trace import records
+from mddag_executor.trace.blocks import Content
 from msg_graph import GraphError
 import pytest
 import zstandard
@@ -129,7 +130,7 @@ def inside(data: bytearray, rng: random.Random) -> None:
     """Change the records in a chunk, and give it the right size, CRC and compression again."""
     chunks = [span for span in spans(bytes(data)) if span[0] == Opcode.CHUNK]
     _, start, end = rng.choice(chunks)
-    chunk = Chunk.read(records.Content(bytes(data[start + records.RECORD.size:end])))
+    chunk = Chunk.read(Content(bytes(data[start + records.RECORD.size:end])))
     begin, last, size = (
         chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size)
     content = bytearray(zstandard.decompress(chunk.data, size))
