@@ -43,8 +43,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Sequence
 from itertools import accumulate
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.memory import give_back
@@ -96,7 +95,7 @@ _COLUMNS = {
 """What is known by job, by job and vertex, or by job and edge; ns, or unknown."""
 
 
-class _Jobs(SimpleNamespace):
+class _Jobs:
     """
     The jobs of one DAG.
 
@@ -105,7 +104,8 @@ class _Jobs(SimpleNamespace):
     """
 
     def __init__(self, dag: Dag, n_edges: int) -> None:
-        super().__init__(**{name: array(code) for name, (_, code) in _COLUMNS.items()})
+        for name, (_, code) in _COLUMNS.items():
+            setattr(self, name, array(code))
         self.size = len(dag.vertices)
         self.n_edges = n_edges
         self.publishers = [v.index for v in dag.vertices for _ in v.successors]     # by edge
@@ -115,6 +115,10 @@ class _Jobs(SimpleNamespace):
             (getattr(self, name), array(code, [_UNKNOWN]) * (
                 n_edges if by == _EDGE else self.size))
             for name, (by, code) in _COLUMNS.items() if by != _JOB]
+
+    if TYPE_CHECKING:
+        def __getattr__(self, name: str) -> Any:
+            """Say that there are the columns, too."""
 
     def rows(self, name: str) -> Any:
         """Return a column as an array with a row for each job."""
