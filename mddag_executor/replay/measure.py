@@ -244,12 +244,12 @@ class Agreement(NamedTuple):
 
     dag: str
     sink: str
-    jobs: int
-    recorded_median: int
-    predicted_median: int
-    ideal_median: int
-    recorded_p99: int
-    predicted_p99: int
+    jobs: float
+    recorded_median: float
+    predicted_median: float
+    ideal_median: float
+    recorded_p99: float
+    predicted_p99: float
 
     @property
     def median_error(self) -> float:

@@ -88,7 +88,7 @@ def test_accuracy_on_the_command_line(
 ) -> None:
     """With simulated runs instead of live ones, which are predicted exactly."""
     def record(graph: str, args: Any, utilisation: float, workers: int, path: str) -> None:
-        write_long_trace(path, load(graph), 2000, workers, utilisation)
+        write_long_trace(path, load(graph), 3000, workers, utilisation)
 
     monkeypatch.setattr(bench_replay, '_record', record)
     out = tmp_path / 'out.json'
