@@ -310,11 +310,12 @@ class MultiDeadlineExecutor(BareExecutor):
             return task
         task, work = make_task(
             self._task_entity, self, self._pool.resume, self._unclaimed, callback, args, kwargs)
-        if self._spinning.locked():
+        is_spinning = self._spinning.locked()
+        if is_spinning:
             self._pool.report(self._engine.ready, work)
         else:
             self._new_tasks.append(work)
-        if not self._pool.running:
+        if not (is_spinning and self._pool.running):  # a spin that has just begun may not look
             self._ring()
         return task
 
@@ -365,8 +366,8 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._freeze_gc = False
                 gc.collect()
                 gc.freeze()
+            self._submit_tasks()  # as in rclpy, before what else is ready
             self._start_intake()
-            self._submit_tasks()
             self._pool.interpreter.looks_late = True
             self._pool.start()
             self._stop_watch.start()

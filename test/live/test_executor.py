@@ -236,6 +236,21 @@ def test_tasks_functions_coroutines_and_futures_across_them(make_executor):
     assert waiting.result() == 'value!' and order == ['waits', 'has it']
 
 
+def test_a_task_made_before_spin_runs_before_messages_that_wait(make_executor, make_node):
+    """As rclpy's executors have it."""
+    node, ran = make_node(), []
+    node.create_subscription(Header, '/topic', lambda _: ran.append('message'), 10)
+    publisher = node.create_publisher(Header, '/topic', 10)
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    publish_when_matched(publisher, Header())
+    time.sleep(0.1)
+    executor.create_task(ran.append, 'task')
+    with Spinning(executor):
+        assert wait_for(lambda: len(ran) == 2)
+    assert ran == ['task', 'message']
+
+
 def test_create_task_wakes_an_idle_executor(make_executor, monkeypatch):
     monkeypatch.setattr('mddag_executor.live.executor.LOOK_AFTER_S', 60.0)
     executor = make_executor()
@@ -415,14 +430,20 @@ def test_bad_arguments_say_what_to_do(ros_context, kwargs, says):
 
 
 def test_a_destroyed_subscription_does_not_run_what_it_has_queued(make_executor, make_node):
-    node, got, gate = make_node(), [], threading.Event()
+    node, got, begun, gate = make_node(), [], threading.Event(), threading.Event()
     executor = make_executor(num_workers=1)
     executor.add_node(node)
     subscription = node.create_subscription(Header, '/topic', got.append, 10)
     publisher = node.create_publisher(Header, '/topic', 10)
+
+    def hold() -> None:
+        begun.set()
+        gate.wait(5.0)
+
     with Spinning(executor):
         assert wait_for(lambda: publisher.get_subscription_count() > 0)
-        executor.create_task(gate.wait, 5.0)
+        executor.create_task(hold)
+        assert begun.wait(15.0)
         publisher.publish(Header())
         assert wait_for(lambda: executor.statistics()['queue'] == 1)
         node.destroy_subscription(subscription)
