@@ -19,9 +19,9 @@ window, sequence number, and the job, on a topic of its own.  Both have the same
     returned: a message may lie in the windows of all.  Between processes nobody could say when
     that is so; so what several processes publish on one topic is a doubt (``contested``).
 3.  A message that may come from another process and belongs to no publication that is known waits
-    for its announcement, which is under way: for ``WAIT_S`` at the least.  Then it runs as
-    undeclared, and is counted.  Publications of one publisher are announced in their order, so its
-    messages stay in order.
+    for its announcement, which is under way: for ``WAIT_S`` at the least, and until the look after
+    that, as the process may just have been stopped.  Then it runs as undeclared, and is counted.
+    Publications of one publisher are announced in their order, so its messages stay in order.
 4.  Announced publications are looked up with those of this process, by one rule (``Jobs.find``):
     a doubt between two is decided by the sequence number, where both publishers' are known to be
     counted from one, or not at all.
@@ -87,6 +87,7 @@ class Announcements:
         self._token = int.from_bytes(os.urandom(8), 'little')
         self._publishers: dict[tuple[int, int], RemotePublisher] = {}
         self._waiting: list[tuple[float, Work]] = []
+        self._overdue: list[tuple[float, Work]] = []  # with the last look
         self._lock = threading.Lock()
         digest = hashlib.sha256(task_set.text.encode()).hexdigest()[:8]
         names = [each.name for each in task_set.processes]
@@ -212,7 +213,9 @@ class Announcements:
             return
         now = time.monotonic()
         with self._lock:
-            late = [entry for entry in self._waiting if entry[0] <= now]
+            before = self._overdue
+            self._overdue = [entry for entry in self._waiting if entry[0] <= now]
+            late = [entry for entry in self._overdue if entry in before]
             for entry in late:
                 self._waiting.remove(entry)
             found = [(work, self._find(work, counted=True)) for _, work in late]
