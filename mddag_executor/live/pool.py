@@ -358,7 +358,8 @@ class Pool:
             habit.runs += 1
             if habit.runs >= habit.due and habit.is_to_be_measured():
                 self.interpreter.begins(seat, habit)
-        work.is_known = self.is_settled
+        # In this order: what was dispatched just before it was removed is not settled, either.
+        work.is_known = self.is_settled and not entity.removed
         traced = engine.record is not None
         if traced:
             work.cpu_ns -= thread_time_ns()
