@@ -106,7 +106,10 @@ class Registry:
         present: dict[int, Entity] = {}
         added: list[Entity] = []
         for node, lists in found.by_node.items():
-            name = self._name(node)
+            try:
+                name = self._name(node)
+            except InvalidHandle:
+                continue  # destroyed between being listed and looked at
             for kind, some in zip(KINDS, lists):
                 for rclpy_entity in some:
                     entity = self.by_id.get(id(rclpy_entity))
@@ -146,7 +149,7 @@ class Registry:
             return False  # destroyed meanwhile
 
     def _name(self, node: Any) -> str:
-        """Return a node's name, also when it has been destroyed and not removed."""
+        """Return a node's name, also when it has been destroyed since and not removed."""
         name: str | None = self._names.get(node)
         if name is None:
             name = self._names[node] = node.get_fully_qualified_name()

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 import threading
 import time
 from typing import Any
@@ -453,3 +454,18 @@ def test_a_destroyed_subscription_does_not_run_what_it_has_queued(make_executor,
             gate.release()
             assert wait_for(lambda: is_idle(executor) and not publisher.get_subscription_count())
     assert got == []
+
+
+def test_a_node_that_is_destroyed_before_the_executor_looks_at_it_harms_nobody(
+        make_executor, make_node):
+    node, ran = make_node(), []
+    node.create_timer(0.001, lambda: ran.append(1))
+    executor = make_executor()
+    executor.add_node(node)
+    for spins in (False, True):
+        with Spinning(executor) if spins else nullcontext():
+            for number in range(20):
+                gone = rclpy.create_node(f'gone_{number}', context=node.context)
+                executor.add_node(gone)
+                gone.destroy_node()
+            assert not spins or wait_for(lambda: len(ran) > 10)
