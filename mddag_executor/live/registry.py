@@ -103,8 +103,8 @@ class Registry:
         :param keep: whether entities that are gone stay known for now.
         :return: those that are new, and those that are gone.
         """
-        present: dict[int, Entity] = {}
-        added: list[Entity] = []
+        new: list[tuple[str, Any, str]] = []
+        known: dict[int, Entity] = {}
         for node, lists in found.by_node.items():
             try:
                 name = self._name(node)
@@ -114,16 +114,18 @@ class Registry:
                 for rclpy_entity in some:
                     entity = self.by_id.get(id(rclpy_entity))
                     if entity is None or entity.rclpy is not rclpy_entity or self._retimed(entity):
-                        entity = self._new_entity(kind, rclpy_entity, name)
-                        if entity is None:
-                            continue
-                        added.append(entity)
-                    present[id(rclpy_entity)] = entity
+                        new.append((kind, rclpy_entity, name))
+                    else:
+                        known[id(rclpy_entity)] = entity
         if keep:
-            present = {**self.by_id, **present}
-        gone = [e for key, e in self.by_id.items() if present.get(key) is not e]
-        for entity in gone:
-            self._unbind(entity)
+            replaced = {id(rclpy_entity) for _, rclpy_entity, _ in new}
+            known = {key: each for key, each in self.by_id.items() if key not in replaced}
+        gone = [each for key, each in self.by_id.items() if key not in known]
+        for each in gone:  # first, as what is new may be their callback's next entity
+            self._unbind(each)
+        made = [self._new_entity(*wanted) for wanted in new]
+        added = [each for each in made if each is not None]
+        present = {**known, **{id(each.rclpy): each for each in added}}
         self.by_id = present
         self._retired.extend(gone)
         self._fold()

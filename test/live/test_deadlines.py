@@ -389,6 +389,24 @@ def test_a_lost_message_expires_its_job(make_executor, make_node):
     assert dag['jobs'] - 3 <= dag['ends']['expired'] == found['expired']
 
 
+def test_nodes_that_are_made_anew_at_once_stay_declared(make_executor, make_node):
+    """Also when the executor sees the old ones go and the new ones come with one look."""
+    executor = make_executor(loads(CHAIN))
+    chain = Chain(make_node)
+    for node in chain.nodes.values():
+        executor.add_node(node)
+    executor.spin_once(0.0)
+    for node in chain.nodes.values():
+        executor.remove_node(node)
+        node.destroy_node()
+    chain = Chain(make_node)
+    chain.start(executor)
+    with Spinning(executor):
+        assert wait_for(lambda: len(chain.jobs['last']) >= 10)
+    assert sinks(executor)['/sink:last']['completed'] >= 9  # the last may be about to end
+    assert executor.statistics()['undeclared'] == 0
+
+
 def test_a_timer_that_overruns_skips_and_says_so(make_executor, make_node):
     node, calls = make_node(), []
 
