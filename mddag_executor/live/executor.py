@@ -252,8 +252,14 @@ class MultiDeadlineExecutor(BareExecutor):
         return added
 
     def remove_node(self, node: Node) -> None:
-        """Stop running a node's callbacks."""
+        """
+        Stop running a node's callbacks; another executor may then have it.
+
+        While somebody spins, what was taken of its messages and not run yet is dropped.
+        """
         super().remove_node(node)
+        if self._pool.running:
+            self._hand_over()
         self.wake()
 
     def add_callback_group(self, group: CallbackGroup, node: Node) -> None:

@@ -16,9 +16,10 @@ executor is to run.
 A node notifies its one executor when entities come and go.  So that the owners of its groups hear
 of it too, they are notified beside it, from when somebody first adds a group.
 
-The middleware calls one listener for each entity, so an entity changes hands in this order: the
-executor that had it lets go (its intake has taken back its listener), then the other one takes
-over.  What the first has taken and not run yet is dropped and counted; what runs there goes on.
+The middleware calls one listener for each entity, so an entity changes hands in this order, with
+its group or its node: the executor that had it lets go (its intake has taken back its listener),
+then the other one takes over.  What the first has taken and not run yet is dropped and counted;
+what runs there goes on.
 
 Only executors of this kind know of all this: one of rclpy's own that has the node too would go on
 running the group.

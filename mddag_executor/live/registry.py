@@ -31,6 +31,7 @@ from mddag_executor.live.entity import (
 )
 from mddag_executor.live.groups import decides_itself, Gate
 from mddag_executor.live.intake.entities import EMPTY, EntitySet, snapshot
+from mddag_executor.live.seat import current
 from mddag_executor.live.work import Work
 from msg_graph import binding, Callback, TaskSet
 from msg_graph.duration import exact_duration
@@ -349,12 +350,17 @@ class Upkeep:
             self._refresh_at = end + REFRESH_REST * (end - start)
 
     def hand_over(self) -> None:
-        """Take nothing more of what another executor gets, and only then forget it."""
+        """
+        Take nothing more of what another executor may get, and only then forget it.
+
+        Two that look after one entity disturb each other: it has one listener, and a waitable one
+        place in a wait set. A thread of an intake itself does not wait for the intakes.
+        """
         with self._lock:
             self._look()
             self._register(keep=True)
             self._inform_intakes()
-            end = time.monotonic() + HAND_OVER_S
+            end = time.monotonic() + (HAND_OVER_S if current.intake is None else 0.0)
             while not all(each.settled() for each in list(self._intakes)):
                 if time.monotonic() > end:
                     break

@@ -8,6 +8,7 @@ import threading
 import time
 from typing import Any
 
+from builtin_interfaces.msg import Time
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.executors import SingleThreadedExecutor
@@ -173,6 +174,30 @@ def test_no_message_is_lost_or_doubled_by_a_change_of_hands(make_executor, make_
         assert wait_for(lambda: len(got) + sum(
             sum(e.statistics()['dropped'].values()) for e in (first, second)) >= 300)
     assert len(set(got)) == len(got)
+
+
+def test_a_node_changes_hands_while_both_spin(make_executor, make_node):
+    """Its QoS events have one place in a wait set, which two threads would dispute."""
+    nodes = [make_node(f'node_{number}') for number in range(3)]
+    got: list[int] = []
+    for node in nodes:
+        node.create_subscription(Header, '/shared', lambda m: got.append(m.stamp.sec), 1000)
+    publisher = nodes[0].create_publisher(Header, '/shared', 1000)
+    executors = [make_executor(), make_executor()]
+    with Spinning(executors[0]) as first, Spinning(executors[1]) as second:
+        assert wait_for(lambda: all(executor.is_spinning for executor in executors))
+        for move in range(200):
+            for number, node in enumerate(nodes):
+                one, other = executors[::1 if (move + number) % 2 else -1]
+                one.remove_node(node)
+                other.add_node(node)
+            publisher.publish(Header())
+            time.sleep(0.001 * (move % 5))
+        assert wait_for(lambda: publisher.get_subscription_count() == len(nodes))
+        got.clear()
+        publisher.publish(Header(stamp=Time(sec=7)))
+        assert wait_for(lambda: got.count(7) == len(nodes))
+    assert first.error is second.error is None
 
 
 def test_a_group_is_one_executors_at_most(make_executor, make_node):
