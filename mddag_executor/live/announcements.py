@@ -87,7 +87,7 @@ class Announcements:
         self._token = int.from_bytes(os.urandom(8), 'little')
         self._publishers: dict[tuple[int, int], RemotePublisher] = {}
         self._waiting: list[tuple[float, Work]] = []
-        self._overdue: list[tuple[float, Work]] = []  # with the last look
+        self._looked_at = 0.0  # monotonic, s
         self._lock = threading.Lock()
         digest = hashlib.sha256(task_set.text.encode()).hexdigest()[:8]
         names = [each.name for each in task_set.processes]
@@ -211,11 +211,9 @@ class Announcements:
         """Give on what has waited for too long (rule 3)."""
         if not self._waiting:
             return
-        now = time.monotonic()
         with self._lock:
-            before = self._overdue
-            self._overdue = [entry for entry in self._waiting if entry[0] <= now]
-            late = [entry for entry in self._overdue if entry in before]
+            late = [entry for entry in self._waiting if entry[0] <= self._looked_at]
+            self._looked_at = time.monotonic()
             for entry in late:
                 self._waiting.remove(entry)
             found = [(work, self._find(work, counted=True)) for _, work in late]

@@ -260,7 +260,8 @@ class MultiDeadlineExecutor(BareExecutor):
         super().remove_node(node)
         if self._pool.running:
             self._hand_over()
-        self.wake()
+        else:
+            self.wake()
 
     def add_callback_group(self, group: CallbackGroup, node: Node) -> None:
         """

@@ -104,8 +104,8 @@ class Registry:
         :param keep: whether entities that are gone stay known for now.
         :return: those that are new, and those that are gone.
         """
+        present = dict(self.by_id) if keep else {}
         new: list[tuple[str, Any, str]] = []
-        known: dict[int, Entity] = {}
         for node, lists in found.by_node.items():
             try:
                 name = self._name(node)
@@ -113,20 +113,19 @@ class Registry:
                 continue  # destroyed between being listed and looked at
             for kind, some in zip(KINDS, lists):
                 for rclpy_entity in some:
-                    entity = self.by_id.get(id(rclpy_entity))
+                    key = id(rclpy_entity)
+                    entity = self.by_id.get(key)
                     if entity is None or entity.rclpy is not rclpy_entity or self._retimed(entity):
+                        present.pop(key, None)
                         new.append((kind, rclpy_entity, name))
                     else:
-                        known[id(rclpy_entity)] = entity
-        if keep:
-            replaced = {id(rclpy_entity) for _, rclpy_entity, _ in new}
-            known = {key: each for key, each in self.by_id.items() if key not in replaced}
-        gone = [each for key, each in self.by_id.items() if key not in known]
+                        present[key] = entity
+        gone = [each for key, each in self.by_id.items() if key not in present]
         for each in gone:  # first, as what is new may be their callback's next entity
             self._unbind(each)
-        made = [self._new_entity(*wanted) for wanted in new]
+        made = [self._new_entity(*each) for each in new]
         added = [each for each in made if each is not None]
-        present = {**known, **{id(each.rclpy): each for each in added}}
+        present.update((id(each.rclpy), each) for each in added)
         self.by_id = present
         self._retired.extend(gone)
         self._fold()
