@@ -99,7 +99,6 @@ class Pool(NamedTuple):
     some: Spans
     shared: Spans
     stalls: list[tuple[int, int]]
-    origin: int
     knows_workers: bool
 
 
@@ -165,7 +164,7 @@ def find(
     spans = _spans(rows, chain, is_source)
     kinds, of = spans[:, _S_KIND], spans[:, _S_MISS]
     begins, ends = np.array(pool.stalls, dtype=np.int64).reshape(-1, 2).T
-    stalls = Spans(begins, ends, pool.origin)
+    stalls = Spans(begins, ends)
     stood = stalls.within(spans[:, _S_BEGIN], spans[:, _S_END])
     left = spans[:, _S_END] - spans[:, _S_BEGIN] - stood
     times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)

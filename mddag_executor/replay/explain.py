@@ -224,15 +224,14 @@ class Explainer(Observer):
 
     def _one(self, misses: Misses, pieces: Ints, usual: Usual) -> None:
         """Explain some misses, and count their causes."""
-        origin = int(misses.rows[:, M_RELEASE].min())
         start, end = pieces[:, _START], pieces[:, _END]
-        first = int(start.min()) if len(pieces) else origin
+        first = min(start.min(initial=_NO_END), misses.rows[:, M_RELEASE].min())
         since, held = self._table(_HELD).T
         pool = Pool(
-            Spans(*crowded(start, end, max(1, self._workers)), origin),
-            Spans(*(crowded(since, held, 1) if len(held) else crowded(start, end, 1)), origin),
-            Spans(*crowded(since, held, 2), origin),
-            [stall for stall in self.stalls if stall[1] >= min(first, origin)], origin,
+            Spans(*crowded(start, end, max(1, self._workers))),
+            Spans(*(crowded(since, held, 1) if len(held) else crowded(start, end, 1))),
+            Spans(*crowded(since, held, 2)),
+            [stall for stall in self.stalls if stall[1] >= first],
             self._workers > 0)
         found = find(
             misses, pool, usual, Never(self._dropped, self._table(_STARTED)),
@@ -247,11 +246,9 @@ class Explainer(Observer):
                      & (rows[:, M_UNTIL] > begin)).sum())
             self._in_stalls[stall] = self._in_stalls.get(stall, 0) + n
         if self._keeps:
-            self._found.append((found, self._behind(found, pieces, origin)))
+            self._found.append((found, self._behind(found, pieces)))
 
-    def _behind(
-        self, found: Found, pieces: Ints, origin: int
-    ) -> dict[int, list[tuple[int, int]]]:
+    def _behind(self, found: Found, pieces: Ints) -> dict[int, list[tuple[int, int]]]:
         chosen = to_explain(found)
         if not len(chosen):
             return {}
@@ -270,7 +267,7 @@ class Explainer(Observer):
         runs = {}
         for callback, first, last in zip(callbacks.tolist(), borders, borders[1:]):
             mine = pieces[order[first:last]]
-            runs[callback] = Spans(mine[:, _START], mine[:, _END], origin)
+            runs[callback] = Spans(mine[:, _START], mine[:, _END])
         return behind(found.parts, chosen, runs, same_group)
 
     def _forget(self, until: int) -> None:
