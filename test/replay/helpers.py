@@ -120,6 +120,20 @@ def legs_to(task_set: TaskSet, tables: Tables) -> dict[int, list[tuple[int, int]
     return found
 
 
+def begin_trace(path: Path, declaration: str, workers: int = 1) -> TraceFile:
+    """Begin the trace of a run that goes by a declaration."""
+    file = TraceFile(path)
+    file.add('task_set', START_TIME, 1, 1, declaration, 'g.yaml', 'rad', workers, 100 * MS, 64,
+             False, 2)
+    return file
+
+
+def end_trace(file: TraceFile, time: int) -> None:
+    """End a run, and its trace."""
+    file.add('shutdown', time, 1, 1, time)
+    file.finish()
+
+
 def add_execution(
     file: TraceFile, start: int, end: int, dag: int, vertex: int, job: int, worker: int = 0, *,
     ready: int | None = None, vpid: int = 1, thread: int = 10, address: int = 9,

@@ -15,11 +15,19 @@ from mddag_executor.cli import main as program
 from mddag_executor.core.tally import total
 from mddag_executor.replay import replay
 from mddag_executor.replay.causes import CAUSES, REMEDIES
-from mddag_executor.trace import TraceFile
 from msg_graph import loads, TaskSet
 import pytest
 
-from .helpers import add_execution, Chances, MS, small, START_TIME, VirtualRun
+from .helpers import (
+    add_execution,
+    begin_trace,
+    Chances,
+    end_trace,
+    MS,
+    small,
+    START_TIME,
+    VirtualRun,
+)
 
 QUIET = Chances(0, 0, 0, 0, 0, 0, 0)
 VICTIM = """\
@@ -268,20 +276,6 @@ nodes:
 """
 
 
-def begin(path: Path, declaration: str = ONE_WORKER, workers: int = 1) -> TraceFile:
-    """Begin a trace that an executor records which runs `declaration`."""
-    file = TraceFile(path)
-    file.add('task_set', START_TIME, 1, 1, declaration, 'g.yaml', 'rad', workers, 100 * MS, 64,
-             False, 2)
-    return file
-
-
-def end(file: TraceFile, time: int) -> None:
-    """End the run, and the file."""
-    file.add('shutdown', time, 1, 1, time)
-    file.finish()
-
-
 def explain(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
     """Return what `mddag explain --json -` prints."""
     assert program.main(['explain', *arguments, '--json', '-']) == 0
@@ -296,7 +290,7 @@ def test_misses_of_one_cause_have_it_however_long_the_run_is(
     # every minute the short one waits 50 ms for the only worker, or for the machine to go on
     path = tmp_path / 'run.mcap'
     minutes = 60
-    with begin(path) as file:
+    with begin_trace(path, ONE_WORKER) as file:
         for job in range(minutes):
             release = START_TIME + job * MINUTE
             start = release + 50 * MS
@@ -309,7 +303,7 @@ def test_misses_of_one_cause_have_it_however_long_the_run_is(
                 add_execution(file, release, start, 0, 0, job, address=7)
             file.add('job_release', start, 1, 1, 1, job, release)
             add_execution(file, start, start + MS, 1, 0, job, ready=ready, address=8)
-        end(file, START_TIME + minutes * MINUTE)
+        end_trace(file, START_TIME + minutes * MINUTE)
     result = explain(capsys, str(path))
     assert result['missed'] == result['causes'][cause] == len(result['jobs']) == minutes
     for job in result['jobs']:
