@@ -12,7 +12,8 @@ The joined trace has the events of all in the order of time, and is replayed lik
    trace's clock exactly; those of others by an offset that is given, or that messages show
    (``clocks``), else they are taken as they are.
 2. *Who is who.*  Addresses, which are those of one process, get the number of the trace above
-   their 48 bits; workers are counted through.
+   their 48 bits; workers are counted through.  A process or thread with a number that another
+   trace has already, as in containers or on another machine, gets a number of its own.
 3. *Jobs* are numbered anew, in the order of their first release.  A release is that of a job that
    another process has released already if it is the same, to ``SAME_RELEASE``; of a DAG whose jobs
    header stamps join, also if it follows that within the DAG's period: the stamp is taken later
@@ -60,6 +61,7 @@ _ENDS = ('mddag:expire', 'mddag:abort')
 _OF_DAG = ('mddag:deadline', 'mddag:drop', 'mddag:fail', _DISPATCH, _COMPLETE, *_ENDS)
 _TIMES = {'release', 'ready', 'reference_deadline', 'completed', 'deadline', 'begin', 'end'}
 _NO_ADDRESSES = {'queue_depth', 'message_timestamp'}
+_LINUX_IDS = 1 << 22    # Linux numbers processes and threads below this
 
 Event = tuple[Any, ...]
 
@@ -73,6 +75,25 @@ def label_of(path: str) -> str:
 def names_of(paths: Iterable[str]) -> set[str]:
     """Return what an offset may call traces: by their paths, or their processes."""
     return {name for path in paths for name in (path, label_of(path))}
+
+
+class _Numbers:
+    """Numbers of processes, or of threads: each belongs to one trace."""
+
+    def __init__(self) -> None:
+        self._given: dict[tuple[int, int], int] = {}
+        self._used: set[int] = set()
+
+    def of(self, place: int, number: int) -> int:
+        """Return the number in the joined trace, by the trace's place and the number in it."""
+        found = self._given.get((place, number))
+        if found is None:
+            found = number
+            while found in self._used:
+                found += _LINUX_IDS
+            self._given[place, number] = found
+            self._used.add(found)
+        return found
 
 
 class _Part:
@@ -253,6 +274,7 @@ class Joined:
         begin = min(part.first for part in self._parts)
         judges_from = max(self._judging(), default=0)
         end = judged = 0
+        processes, threads = _Numbers(), _Numbers()
         with TraceFile(path) as file:
             file.add(TASK_SET, begin, 0, 0, head.yaml, head.file, head.policy, self._workers,
                      head.default_deadline, head.max_active_jobs, head.preemptive, head.cpus)
@@ -267,7 +289,9 @@ class Joined:
                     joined = self._of_whole_run(part, event)
                     if joined is not None:
                         end = max(end, event[1])
-                        file.add(*joined)
+                        name, time, process, thread, *fields = joined
+                        file.add(name, time, processes.of(part.place, process),
+                                 threads.of(part.place, thread), *fields)
             if any(part.end is not None for part in self._parts):
                 file.add(_SHUTDOWN, max(end, judged), 0, 0, judged)
         self._check_run()

@@ -16,6 +16,8 @@ from mddag_executor.replay.joining import label_of
 from mddag_executor.trace import TraceFile
 import pytest
 
+from ..cli.helpers import caller
+
 MS = 1_000_000
 BASE = 10 ** 18
 GRAPH = """
@@ -33,10 +35,12 @@ class Trace:
     """The trace of a process that runs one vertex; its clock is late by some ns."""
 
     def __init__(self, folder: Path, name: str, vertex: int, late: int = 0, graph: str = GRAPH,
-                 judges_from: int = 0, dag: int = 0, boot: str = '', begin: int = 0) -> None:
+                 judges_from: int = 0, dag: int = 0, boot: str = '', begin: int = 0,
+                 pid: int | None = None) -> None:
         self.path = str(folder / f'run.{name}.mcap')
         self.file = TraceFile(self.path)
-        self.vertex, self.late, self.pid, self.job = vertex, late, 100 + vertex + dag, 0
+        self.vertex, self.late, self.job = vertex, late, 0
+        self.pid = 100 + vertex + dag if pid is None else pid
         self.dag = dag
         self.add('task_set', begin, graph, 'graph.yaml', 'rad', 2, 100 * MS, 64, False, 2)
         self.add('caret_init', begin, BASE - late, 'jazzy')
@@ -446,6 +450,29 @@ def test_the_command_takes_several_traces(tmp_path: Path, mddag: Any) -> None:
         ['/a:tick', '0'], ['/b:take', '2']]
     refused = mddag('replay', paths[0], '-', paths[1])
     assert refused.returncode == 2 and 'standard input' in refused.stderr
+
+
+def test_processes_of_containers_may_have_the_same_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = []
+    for pids in ((101, 102), (7, 7)):
+        traces = [Trace(tmp_path, name, vertex, pid=pid)
+                  for vertex, (name, pid) in enumerate(zip(('up', 'down'), pids))]
+        for i in range(9):      # /b:take begins while /a:tick still runs
+            traces[0].runs(i * 10 * MS, i * 10 * MS, 6 * MS)
+            traces[1].runs(i * 10 * MS, i * 10 * MS + 4 * MS, 3 * MS, ready=i * 10 * MS + 3 * MS)
+        paths = [trace.end(100 * MS) for trace in traces]
+        for verb, *more in (('replay', '--callbacks'), ('replay', '--reschedule'),
+                            ('explain',), ('slack',)):
+            status, out, _ = caller(verb)(capsys, *paths, *more, '--json', '-')
+            assert status == 0
+            found.append(json.loads(out))
+    apart, same = found[:4], found[4:]
+    assert {name: (use['executions'], use['busy_ns'])
+            for name, use in same[0]['callbacks'].items()} == {
+        '/a:tick': (9, 54 * MS), '/b:take': (9, 27 * MS)}
+    assert same == apart
 
 
 def test_machines_are_compared_by_way_of_others_and_by_what_is_given() -> None:
