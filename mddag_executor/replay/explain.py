@@ -23,6 +23,7 @@ from mddag_executor.core.tally import VERDICTS
 from mddag_executor.replay.causes import (
     behind,
     CAUSES,
+    delayed_by,
     find,
     Found,
     MACHINE,
@@ -33,8 +34,6 @@ from mddag_executor.replay.causes import (
     P_VERTEX,
     PARTS,
     Pool,
-    RAN_LONG,
-    RAN_USUALLY,
     to_explain,
     Usual,
 )
@@ -71,7 +70,7 @@ _MOST_DROPS = 1_000_000
 _PIECES, _TOOK, _RELEASED, _STARTED, _TIMES, _STOPS, _HELD = range(7)
 _WIDTHS = (5, 3, 3, 4, 1, 2, 2)
 # Columns of pieces.
-_CALLBACK, _VERTEX, _SHARE, _START, _END = range(5)
+_CALLBACK, _VERTEX, _WORKER, _START, _END = range(5)     # worker -1: it lent its worker
 
 
 class Typical:
@@ -151,7 +150,7 @@ class Explainer(Observer):
         pieces, done, started = (batch.columns(kind) for kind in (RAN, COMPLETED, STARTED))
         done = done[done[:, 10] >= 0]
         released = batch.columns(RELEASED)
-        self._keep(_PIECES, pieces[:, [0, 2, 8, 6, 7]])
+        self._keep(_PIECES, pieces[:, [0, 2, 4, 6, 7]])
         # of a sync the last message makes it run; the others are only kept
         last = done[done[:, 4] != 0]
         self._keep(_TOOK, np.column_stack((last[:, 1], last[:, 8] - last[:, 7], last[:, 11])))
@@ -224,8 +223,8 @@ class Explainer(Observer):
 
     def _one(self, misses: Misses, pieces: Ints, usual: Usual) -> None:
         """Explain some misses, and count their causes."""
-        start, end = pieces[:, _START], pieces[:, _END]
-        first = min(start.min(initial=_NO_END), misses.rows[:, M_RELEASE].min())
+        start, end = pieces[pieces[:, _WORKER] >= 0][:, [_START, _END]].T
+        first = min(pieces[:, _START].min(initial=_NO_END), misses.rows[:, M_RELEASE].min())
         since, held = self._table(_HELD).T
         pool = Pool(
             Spans(*crowded(start, end, max(1, self._workers))),
@@ -240,11 +239,10 @@ class Explainer(Observer):
         rows = found.misses
         np.add.at(self._counts, (rows[:, M_SINK], found.causes), 1)
         machine = found.causes == MACHINE
-        for stall in pool.stalls:
-            begin, end_of = stall
-            n = int((machine & (rows[:, M_RELEASE] < 2 * end_of - begin)
-                     & (rows[:, M_UNTIL] > begin)).sum())
-            self._in_stalls[stall] = self._in_stalls.get(stall, 0) + n
+        for stall in sorted(pool.stalls, key=lambda stall: stall[0] - stall[1]):    # longest first
+            mine = machine & delayed_by(rows, stall)
+            machine &= ~mine    # each miss counts once
+            self._in_stalls[stall] = self._in_stalls.get(stall, 0) + int(mine.sum())
         if self._keeps:
             self._found.append((found, self._behind(found, pieces)))
 
@@ -264,11 +262,14 @@ class Explainer(Observer):
         callbacks, which = np.unique(pieces[:, _CALLBACK], return_inverse=True)
         order = np.argsort(which, kind='stable')
         borders = np.searchsorted(which[order], np.arange(len(callbacks) + 1)).tolist()
-        runs = {}
+        runs, on_workers = {}, {}
         for callback, first, last in zip(callbacks.tolist(), borders, borders[1:]):
             mine = pieces[order[first:last]]
-            runs[callback] = Spans(mine[:, _START], mine[:, _END])
-        return behind(found.parts, chosen, runs, same_group)
+            runs[callback] = on_workers[callback] = Spans(mine[:, _START], mine[:, _END])
+            if (mine[:, _WORKER] < 0).any():
+                mine = mine[mine[:, _WORKER] >= 0]
+                on_workers[callback] = Spans(mine[:, _START], mine[:, _END])
+        return behind(found.parts, chosen, runs, on_workers, same_group)
 
     def _forget(self, until: int) -> None:
         """Forget what is older than the block before."""
@@ -371,8 +372,7 @@ class Explainer(Observer):
             sinks = found.misses[:, M_SINK].tolist()
             causes = found.causes.tolist()
             counts.update(zip(sinks, causes))
-            cause, kind = found.causes[found.parts[:, P_MISS]], found.parts[:, P_CAUSE]
-            mine = np.flatnonzero((kind == cause) | ((kind == RAN_USUALLY) & (cause == RAN_LONG)))
+            mine = np.flatnonzero(found.parts[:, P_CAUSE] == found.causes[found.parts[:, P_MISS]])
             for i, part in zip(mine.tolist(), found.parts[mine].tolist()):
                 key = sinks[part[P_MISS]], causes[part[P_MISS]]
                 at.setdefault(key, Counter())[part[P_VERTEX]] += part[P_NS]

@@ -57,8 +57,8 @@ _BITS = 48
 _INIT, _SHUTDOWN = 'ros2_caret:caret_init', 'mddag:shutdown'
 _JUDGE_FROM, _HOSTED, _RELEASE = 'mddag:judge_from', 'mddag:hosted', 'mddag:job_release'
 _COMPLETE, _DISPATCH = 'mddag:complete', 'mddag:dispatch'
-_ENDS = ('mddag:expire', 'mddag:abort')
-_OF_DAG = ('mddag:deadline', 'mddag:drop', 'mddag:fail', _DISPATCH, _COMPLETE, *_ENDS)
+_ENDS = ('mddag:expire', 'mddag:abort', 'mddag:fail')
+_OF_DAG = ('mddag:deadline', 'mddag:drop', _DISPATCH, _COMPLETE, *_ENDS)
 _TIMES = {'release', 'ready', 'reference_deadline', 'completed', 'deadline', 'begin', 'end'}
 _NO_ADDRESSES = {'queue_depth', 'message_timestamp'}
 _LINUX_IDS = 1 << 22    # Linux numbers processes and threads below this
@@ -171,7 +171,9 @@ class _Part:
         return address | self.place << _BITS if 0 < address < 1 << _BITS else address
 
     def _worker(self, worker: int) -> int:
-        if 0 <= worker < self.head.workers:
+        if worker < 0:      # it was lent
+            return worker
+        if worker < self.head.workers:
             return self.first_worker + worker
         return self.first_spare + worker
 
