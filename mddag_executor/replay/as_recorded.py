@@ -48,7 +48,7 @@ class Replay:
         self.judge = Judge(run.task_set, run.same, waits, skip)
         self.usage = Usage(run.task_set, waits)
         self.tally = self.judge.tally
-        self._seen = None if run.declared else Communications(run.who)
+        self._seen = Communications(run.who) if run.imported else None
         self._paths = Paths(run) if paths else None
         self._drift = DriftObserver(run) if paths else None
         self.explainer = Explainer(run, self.judge, jobs) if paths else None

@@ -40,6 +40,7 @@ from mddag_executor.replay import clocks
 from mddag_executor.replay.recording import (
     declared,
     Head,
+    is_declared,
     named_errors,
     read_head,
     ReplayError,
@@ -107,6 +108,10 @@ class _Part:
             if head is None:
                 raise ReplayError(
                     name, 'it was not recorded by this executor', 'replay it by itself')
+            if not is_declared(head):
+                raise ReplayError(
+                    name, 'it was recorded without a declaration, so its jobs have no names that '
+                    'other traces know', 'replay it by itself, with a GRAPH')
             self.head: Head = head
             self.clock = self.judges_from = 0
             self.end: int | None = None

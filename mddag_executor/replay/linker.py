@@ -463,8 +463,12 @@ class Linker:
                 last.rcl and address not in (0, last.message, last.written)):
             return
         last.stamp = stamp
-        known = self._by_stamp.setdefault(last.topic, {})
-        known[stamp] = None if stamp in known else last
+        self._know(last.topic, stamp, last)
+
+    def _know(self, topic: str, stamp: int, message: Publication | None) -> None:
+        """Note of which publication a source timestamp is; None: of one of several."""
+        known = self._by_stamp.setdefault(topic, {})
+        known[stamp] = None if stamp in known else message
         if len(known) > KEEP:
             del known[next(iter(known))]
 

@@ -175,7 +175,7 @@ def no_declaration(path: Path) -> None:
     (b'PK\x03\x04' * 100, 'is no MCAP file: give a trace'),
     (nothing_recorded, 'no run of this executor is recorded in it (it has no event '
      'mddag:task_set): record a run with mddag run'),
-    (no_declaration, 'it was recorded without a declaration, so there are no jobs: record'),
+    (no_declaration, 'it was recorded without a declaration, so there are no jobs: give the GRAPH'),
 ])
 @pytest.mark.parametrize('options', [[], ['--reschedule']])
 def test_what_is_no_trace_is_one_line(

@@ -34,6 +34,7 @@ from msg_graph import loads, TaskSet
 
 START_TIME = 1_732_166_766_000_000_000
 MS = 1_000_000
+US = 1_000
 VPID = 77
 
 SMALL = """\
