@@ -145,7 +145,9 @@ class _OwnLinker(Linker):
         super()._end(event, thread, state)
 
     def _drop(self, event: Event, thread: Thread, state: Any) -> None:
-        self.dropped[event[self._fields['reason']]] += 1
+        place = self._fields.get('reason')
+        if place is not None:
+            self.dropped[str(event[place])] += 1
 
     def _shut_down(self, event: Event, thread: Thread, state: Any) -> None:
         self.ended = event[1], self._get(event, 'end')
@@ -164,6 +166,8 @@ class UndeclaredRun(ImportedRun):
     def __init__(self, reader: TraceReader, name: str, head: Head, task_set: TaskSet) -> None:
         ready: dict[Address, array[int]] = {}
         for event in reader.events({_DISPATCH}, sorted=True):
+            if None in event:
+                continue
             ready.setdefault((event[2], event[4]), array('q')).append(event[9])
         super().__init__(reader, name, task_set, head, _OwnLinker)
         # by address and time when it became ready: pieces to come; and what is known of the others
