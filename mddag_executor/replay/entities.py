@@ -89,11 +89,10 @@ class Callback:
     :ivar grid: from when on its timer's periods count, ns; None where that is not recorded.
     :ivar group: number of its mutually exclusive group; -1 for another one, None: not known.
     :ivar symbol: of its function; empty where that is not recorded.
-    :ivar address: process and address of its callback.
     """
 
     __slots__ = ('number', 'node', 'kind', 'start', 'period', 'made', 'grid', 'group', 'symbol',
-                 'label', 'address', 'rmw')
+                 'label', 'rmw')
 
     def __init__(self, node: Node | None, kind: str, start: str = '', period: int = 0,
                  made: int = 0, grid: int | None = None) -> None:
@@ -107,7 +106,6 @@ class Callback:
         self.group: int | None = None
         self.symbol = ''
         self.label = ''
-        self.address: Address | None = None
         self.rmw: Address | None = None
 
     @property
@@ -300,7 +298,6 @@ class Entities:
     def _callback(self, kind: str, f: Fields, of: Addresses[Callback], holder: int) -> None:
         pid, time, address = f['_vpid'], f['_timestamp'], f['callback']
         callback = of.nearest(pid, holder, time) or Callback(None, kind, made=time)
-        callback.address = pid, address
         self.callbacks.add(pid, address, time, callback)
         if not callback.number:
             self._number(callback, address)
@@ -385,10 +382,3 @@ def _complete(name: str, fields: Fields) -> bool:
 def _as_dict(fields: Iterable[str], event: Event) -> Fields:
     return {'_timestamp': event[1], '_vpid': event[2], '_vtid': event[3],
             **dict(zip(fields, event[4:]))}
-
-
-def as_table(event: Event) -> Event:
-    """Return an event of ``layout_events`` with the table's fields; None is one that it lacks."""
-    kind = EVENTS[event[0].name]
-    values = {**kind.defaults, **dict(zip(event[0].fields, event[4:]))}
-    return (event[0].name, *event[1:4], *(values.get(field) for field, _ in kind.fields))
