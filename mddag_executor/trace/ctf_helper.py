@@ -133,11 +133,11 @@ class Session:
         # By the address of the event's class, which is kept so that none gets its address.
         self._known: dict[int, tuple[int, Any, list[Callable[[Any], Any]]]] = {}
 
-    def read(self, path: str) -> None:
-        """Write a row for each event below a folder, in the order of time."""
+    def read(self, paths: list[str]) -> None:
+        """Write a row for each event below some folders, in the order of time."""
         bt2 = self._bt2
         discarded = (bt2._DiscardedEventsMessageConst, bt2._DiscardedPacketsMessageConst)
-        for message in bt2.TraceCollectionMessageIterator(path):
+        for message in bt2.TraceCollectionMessageIterator(paths):
             if type(message) is bt2._EventMessageConst:
                 self._event(message)
             elif isinstance(message, discarded):
@@ -193,8 +193,8 @@ def reason(error: BaseException) -> str:
     return ' '.join(str(text or error or type(error).__name__).split())
 
 
-def main(session: str) -> int:
-    """Read a session; the outcome is the last row."""
+def main(sessions: list[str]) -> int:
+    """Read the sessions of a run; the outcome is the last row."""
     # What a library prints must not come between the rows.
     with os.fdopen(os.dup(1), 'wb') as stream:
         os.dup2(2, 1)
@@ -207,7 +207,7 @@ def main(session: str) -> int:
         add('ready', str(getattr(bt2, '__version__', '')))
         stream.flush()
         try:
-            Session(bt2, add).read(session)
+            Session(bt2, add).read(sessions)
             add('end')
         except BrokenPipeError:
             os._exit(1)     # the importer has gone
@@ -220,4 +220,4 @@ if __name__ == '__main__':
     # The folder of this file is no place to import from: its modules are the project's.
     _here = os.path.dirname(os.path.abspath(__file__))
     sys.path[:] = [_path for _path in sys.path if os.path.abspath(_path or '.') != _here]
-    sys.exit(main(sys.argv[1]))
+    sys.exit(main(sys.argv[1:]))
