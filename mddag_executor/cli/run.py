@@ -37,7 +37,7 @@ from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.report.live_runs import summary
 from mddag_executor.report.tables import sink_table
 from mddag_executor.report.text import listed
-from msg_graph import loads
+from msg_graph import loads, NO_GRAPH
 
 if TYPE_CHECKING:
     from mddag_executor.live.executor import MultiDeadlineExecutor
@@ -49,7 +49,8 @@ if TYPE_CHECKING:
 
 EXAMPLE = """\
 mddag run graph.yaml --node my_package/driver --node my_package.filter:main --trace run.mcap
-mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20s"""
+mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20s
+mddag run --node my_package/driver --node my_package/filter --trace run.mcap"""
 
 # SIGINTs within this time are one: who ends a process group sends it to all processes of it, and
 # `ros2 launch`, where it reads from no terminal, then once more to those that it started.
@@ -104,7 +105,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='if one of several processes ends by itself: end the run, continue without it, or '
         'start it again (default: end)')
     add('--part', help=argparse.SUPPRESS)  # the folder of a run of several processes
-    options.add(parser, 'graph', '--workers', '--json', '--ros-args')
+    parser.add_argument(
+        'graph', metavar='GRAPH', nargs='?', type=options.Input,
+        help="the declaration, a YAML file ('-': standard input); with --node it may be left out: "
+        'then nothing is judged, and a trace shows what there is to declare')
+    options.add(parser, '--workers', '--json', '--ros-args')
 
 
 def _or_off(text: str) -> int:
@@ -117,7 +122,7 @@ def main(args: argparse.Namespace) -> int:
     _check_arguments(args)
     if args.part is not None:
         return part(args)
-    task_set = common.load_graph(args.graph)
+    task_set = NO_GRAPH if args.graph is None else common.load_graph(args.graph)
     if args.processes not in (None, '1') or (task_set.processes and args.processes is None):
         from mddag_executor.cli.run_processes import run_processes, with_declared
         if args.process is None:
@@ -212,6 +217,10 @@ def _check_arguments(args: argparse.Namespace) -> None:
         raise UsageError('--trace -: a trace is not written to standard output: name a file')
     if args.processes is not None and args.processes.isdecimal() and not int(args.processes):
         raise UsageError('--processes 0: give 1 or more, or a file')
+    needs_graph = next((name for name in ('synthetic', 'processes', 'process')
+                        if getattr(args, name) not in (None, '1')), None)
+    if args.graph is None and needs_graph is not None:
+        raise UsageError(f'--{needs_graph}: it is about the nodes of a declaration: give a GRAPH')
     if args.synthetic is None and args.utilisation is not None:
         raise UsageError(
             '--utilisation: it scales synthetic nodes only: add --synthetic or leave it out')
@@ -301,7 +310,7 @@ def _run(
         else:
             _run_programs(args, task_set, session, executor, programs, seconds, progress)
     result = {
-        'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
+        'file': task_set.file or None, 'nodes': args.node, 'synthetic': args.synthetic,
         **executor.statistics(),
         'measured': None if ledger is None or plan is None else measure(ledger, plan)}
     result['drift'] = [each.result() for each in watch.drift(result)]
@@ -424,8 +433,9 @@ class Signals:
 def report(args: argparse.Namespace, result: dict[str, Any]) -> bool:
     """Write the result; return whether tables were printed."""
     shown = common.write_result(args, result)
-    if shown:
+    if shown and result['dags']:
         print(sink_table(result['dags']))
+    if shown:
         for line in summary(result):
             print(line)
     return shown

@@ -89,10 +89,11 @@ class Callback:
     :ivar grid: from when on its timer's periods count, ns; None where that is not recorded.
     :ivar group: number of its mutually exclusive group; -1 for another one, None: not known.
     :ivar symbol: of its function; empty where that is not recorded.
+    :ivar address: process and address of its callback, of several the last one.
     """
 
     __slots__ = ('number', 'node', 'kind', 'start', 'period', 'made', 'grid', 'group', 'symbol',
-                 'label', 'rmw')
+                 'label', 'address', 'rmw')
 
     def __init__(self, node: Node | None, kind: str, start: str = '', period: int = 0,
                  made: int = 0, grid: int | None = None) -> None:
@@ -106,6 +107,7 @@ class Callback:
         self.group: int | None = None
         self.symbol = ''
         self.label = ''
+        self.address: Address | None = None
         self.rmw: Address | None = None
 
     @property
@@ -298,6 +300,7 @@ class Entities:
     def _callback(self, kind: str, f: Fields, of: Addresses[Callback], holder: int) -> None:
         pid, time, address = f['_vpid'], f['_timestamp'], f['callback']
         callback = of.nearest(pid, holder, time) or Callback(None, kind, made=time)
+        callback.address = pid, address
         self.callbacks.add(pid, address, time, callback)
         if not callback.number:
             self._number(callback, address)
