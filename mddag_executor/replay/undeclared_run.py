@@ -204,6 +204,8 @@ class UndeclaredRun(ImportedRun):
 
     def _release(self, run: Execution, dag: Dag, target: Target) -> int:
         callback = run.callback
+        if callback.kind == 'service':
+            return run.ready        # when a request was taken is not recorded by itself
         if callback.kind != 'timer':
             return super()._release(run, dag, target)
         if callback.grid is None:

@@ -220,6 +220,24 @@ def test_the_pieces_of_a_coroutine_are_one_execution(
     assert result['warnings'] == []
 
 
+def test_a_request_is_released_when_it_was_ready_also_for_a_coroutine(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Run(tmp_path)
+    run.graph.write_text(GRAPH + """\
+  - node: /detect
+    callbacks: [{name: ask, service: /ask, period: 1s, deadline: 20ms}]
+""")
+    run.add('rcl_service_init', 0, 1, 40, 3, 40, '/ask')
+    run.add('rclcpp_service_callback_added', 0, 1, 40, 14)
+    run.runs(14, 100 * MS, 103 * MS, 104 * MS)
+    run.runs(14, 100 * MS, 120 * MS, 121 * MS)      # resumed
+    run.runs(14, 200 * MS, 201 * MS, 202 * MS)
+    sink = run.result(capsys)['dags']['/detect']['sinks']['/detect:ask']
+    assert (sink['completed'], sink['late']) == (2, 1)
+    assert (sink['response_ns']['min'], sink['response_ns']['max']) == (2 * MS, 21 * MS)
+
+
 def test_timers_are_released_on_their_grid_if_they_keep_to_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
