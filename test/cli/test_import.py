@@ -111,6 +111,7 @@ def test_several_sessions_are_named_one_by_one(
         capsys, 'ctf', tmp_path / 'one', tmp_path / 'elsewhere', '-o', out)
     assert (status, errors) == (0, '')
     assert [event['callback'] for event in read_events(out)] == [1, 2, 3, 4]
+    out.unlink()
     status, _, errors = call(
         capsys, 'ctf', tmp_path / 'one', tmp_path / 'one' / 'kernel', '-o', out)
     assert (status, errors.count('\n')) == (2, 1)
