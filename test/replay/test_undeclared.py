@@ -12,7 +12,7 @@ from mddag_executor.trace import EVENTS, TraceFile, TraceReader
 import pytest
 
 from ..cli.helpers import caller
-from .helpers import begin_trace, end_trace, MS, START_TIME, US
+from ..replay.helpers import begin_trace, end_trace, MS, START_TIME, US
 
 DEMO = Path(__file__).parents[2] / 'bags' / 'demo_short.mcap'
 GRAPH = """\
