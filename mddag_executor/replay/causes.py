@@ -25,8 +25,8 @@ The cause of a miss is that of which there is most, beyond what is usual.  Two r
 
 * What waited while, or soon after, the machine stood still had to wait for the backlog: up to the
   length of the stalls it counts as the machine's.
-* If all of that together is less than the lateness, the usual times are too long for the deadline:
-  all of the time in which callbacks ran is *ran long*, and a usual release lag counts, too.
+* If all of that together is less than the lateness, the usual times are too long for the deadline,
+  and they count, too: what callbacks usually take as *ran long*.
 
 A job whose callback raised has *failed*; one that expired for want of a message has *lost* it.
 Where a timer's release was skipped because the callback still waited for the one before, that
@@ -143,11 +143,16 @@ class Never(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Misses (rows as in ``Misses``), their causes, and the parts of their times in order."""
+    """
+    Misses (rows as in ``Misses``), their causes, and the parts of their times in order.
+
+    :ivar too_short: of which misses the deadline is too short for what is usual.
+    """
 
     misses: Ints
     causes: Ints
     parts: Ints
+    too_short: Any
 
 
 def find(
@@ -185,16 +190,14 @@ def find(
     sinks = rows[:, M_SINK]
     unusual = _unusual(total, usual.lags[dag_of[sinks]])
     short = _too_short(rows, unusual.sum(axis=1), deadline[sinks])
-    for each, which in ((times, short[of]), (total, short)):
-        each[which, RAN_LONG] += each[which, RAN_USUALLY]
-        each[which, RAN_USUALLY] = 0
     amounts = np.where(short[:, np.newaxis], total[:, :len(CAUSES)], unusual)
+    amounts[short, RAN_LONG] += total[short, RAN_USUALLY]
     causes = _causes(rows, total, amounts, pool, never, is_source)
     which, cause = np.nonzero(times)
     parts = np.column_stack((
         spans[which][:, [_S_MISS, _S_VERTEX]], cause, spans[which][:, [_S_BEGIN, _S_END]],
         times[which, cause]))
-    return Found(rows, causes, parts)
+    return Found(rows, causes, parts, short)
 
 
 # A span of time of a miss, at a vertex; of a wait how much of it was for the group, of a run its

@@ -34,6 +34,8 @@ from mddag_executor.replay.causes import (
     P_VERTEX,
     PARTS,
     Pool,
+    RAN_LONG,
+    RAN_USUALLY,
     to_explain,
     Usual,
 )
@@ -372,7 +374,10 @@ class Explainer(Observer):
             sinks = found.misses[:, M_SINK].tolist()
             causes = found.causes.tolist()
             counts.update(zip(sinks, causes))
-            mine = np.flatnonzero(found.parts[:, P_CAUSE] == found.causes[found.parts[:, P_MISS]])
+            of, kind = found.parts[:, P_MISS], found.parts[:, P_CAUSE]
+            cause = found.causes[of]
+            mine = np.flatnonzero((kind == cause) | (
+                (kind == RAN_USUALLY) & (cause == RAN_LONG) & found.too_short[of]))
             for i, part in zip(mine.tolist(), found.parts[mine].tolist()):
                 key = sinks[part[P_MISS]], causes[part[P_MISS]]
                 at.setdefault(key, Counter())[part[P_VERTEX]] += part[P_NS]

@@ -383,7 +383,7 @@ def test_only_misses_in_stops_are_said_to_be_in_them(
 def test_the_mean_of_a_cause_is_that_of_its_parts(
     deadline: int, usual: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # the callback takes 2 ms, but 20 ms in the last job; 2 ms are too long for 1 ms
+    # the callback takes 2 ms, but 20 ms in the last job; a deadline of 1 ms is too short for it
     path = tmp_path / 'run.mcap'
     with begin_trace(path, LENT.replace('50ms', f'{deadline}ms')) as file:
         for job in range(9):
@@ -395,8 +395,8 @@ def test_the_mean_of_a_cause_is_that_of_its_parts(
     result = explain(capsys, str(path))
     assert result['causes']['ran long'] == result['missed'] == (1 if deadline == 12 else 9)
     parts = [part for job in result['jobs'] for part in job['parts']]
-    assert {part['cause'] for part in parts} == {'ran long', *(['ran'] if usual else [])}
-    mean = sum(part['ns'] for part in parts if part['cause'] == 'ran long') // result['missed']
+    counted = ['ran long'] if usual else ['ran long', 'ran']
+    mean = sum(part['ns'] for part in parts if part['cause'] in counted) // result['missed']
     assert program.main(['explain', str(path)]) == 0
     row, = (line for line in capsys.readouterr().out.splitlines()
             if line.split()[1:4] == ['x:late', 'ran', 'long'])
