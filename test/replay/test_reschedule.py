@@ -26,7 +26,7 @@ from msg_graph import loads, TaskSet
 import pytest
 
 from ..cli.helpers import caller
-from .helpers import (
+from ..replay.helpers import (
     add_execution,
     begin_trace,
     Chances,
@@ -38,7 +38,7 @@ from .helpers import (
     VirtualRun,
     VPID,
 )
-from .simulated import executions, loose, write_simulated
+from ..replay.simulated import executions, loose, write_simulated
 
 JOBS = 12
 
