@@ -49,6 +49,7 @@ from mddag_executor.replay.recording import (
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceFile, TraceReader
 from mddag_executor.trace.errors import renamed
+from mddag_executor.trace.numbers import Numbers
 from mddag_executor.trace.schema import EVENTS
 from msg_graph import Dag, Process
 
@@ -62,7 +63,6 @@ _ENDS = ('mddag:expire', 'mddag:abort', 'mddag:fail')
 _OF_DAG = ('mddag:deadline', 'mddag:drop', _DISPATCH, _COMPLETE, *_ENDS)
 _TIMES = {'release', 'ready', 'reference_deadline', 'completed', 'deadline', 'begin', 'end'}
 _NO_ADDRESSES = {'queue_depth', 'message_timestamp'}
-_LINUX_IDS = 1 << 22    # Linux numbers processes and threads below this
 
 Event = tuple[Any, ...]
 
@@ -76,25 +76,6 @@ def label_of(path: str) -> str:
 def names_of(paths: Iterable[str]) -> set[str]:
     """Return what an offset may call traces: by their paths, or their processes."""
     return {name for path in paths for name in (path, label_of(path))}
-
-
-class _Numbers:
-    """Numbers of processes, or of threads: each belongs to one trace."""
-
-    def __init__(self) -> None:
-        self._given: dict[tuple[int, int], int] = {}
-        self._used: set[int] = set()
-
-    def of(self, place: int, number: int) -> int:
-        """Return the number in the joined trace, by the trace's place and the number in it."""
-        found = self._given.get((place, number))
-        if found is None:
-            found = number
-            while found in self._used:
-                found += _LINUX_IDS
-            self._given[place, number] = found
-            self._used.add(found)
-        return found
 
 
 class _Part:
@@ -281,7 +262,7 @@ class Joined:
         begin = min(part.first for part in self._parts)
         judges_from = max(self._judging(), default=0)
         end = judged = 0
-        processes, threads = _Numbers(), _Numbers()
+        processes, threads = Numbers(), Numbers()
         with TraceFile(path) as file:
             file.add(TASK_SET, begin, 0, 0, head.yaml, head.file, head.policy, self._workers,
                      head.default_deadline, head.max_active_jobs, head.preemptive, head.cpus)

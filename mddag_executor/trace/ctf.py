@@ -18,8 +18,9 @@ Theory of operation:
    integers become bool, unsigned times int64 of the same bits. Any other event, and any other
    fields, come with the types that they have in the session. A name that ROS does not allow is
    changed; one that the preamble or the table has for something else gets `_` at its end.
-4. Contexts `vpid` and `vtid` are the preamble. Before the first event of a thread, and where its
-   name changes, stands an event `mddag:process` with its `procname`.
+4. Contexts `vpid` and `vtid` are the preamble.  If sessions of several computers or containers
+   have the same numbers, those of later ones are changed (`numbers`).  Before the first event of a
+   thread, and where its name changes, stands an event `mddag:process` with its `procname`.
 5. What the tracer discarded is an event `mddag:lost` at the end of the gap; a packet that was
    lost counts as one event at least, and a warning says so.
 """
@@ -27,7 +28,7 @@ Theory of operation:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 import json
 import os
@@ -42,8 +43,9 @@ from typing import Any, IO, NamedTuple
 
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.cdr import FieldType
-from mddag_executor.trace.ctf_helper import PATIENCE_S
+from mddag_executor.trace.ctf_helper import PATIENCE_S, SESSION
 from mddag_executor.trace.errors import TraceError
+from mddag_executor.trace.numbers import Numbers
 from mddag_executor.trace.schema import EVENTS, EventType, PREAMBLE, PROVIDERS
 from mddag_executor.trace.trace_file import TraceFile
 
@@ -90,10 +92,11 @@ def import_ctf(
     name = ', '.join(paths)
     if len(set(real)) < len(real):
         raise TraceError(name, 'a session is named twice', 'name each once')
-    formats = [_check_sessions(path, each) for path, each in zip(paths, found)]
+    sessions = [_check_sessions(path, each) for path, each in zip(paths, found)]
+    places = {each: place for place, (_, several) in enumerate(sessions) for each in several}
     with TraceFile(output) as file:
-        importer = _Importer(name, file)
-        for row in _rows(name, paths, any(formats)):
+        importer = _Importer(name, file, places)
+        for row in _rows(name, paths, any(is_ctf_2 for is_ctf_2, _ in sessions)):
             importer.take(row)
             if progress is not None and row[0] == 'event' and importer.result.events % 5000 == 0:
                 progress(importer.result.events)
@@ -124,30 +127,32 @@ def _metadata_of(path: str) -> list[str]:
     return sorted(found)
 
 
-def _check_sessions(path: str, found: Sequence[str]) -> bool:
+def _check_sessions(path: str, found: Sequence[str]) -> tuple[bool, set[tuple[str, ...]]]:
     """
-    Return whether one of the traces of a session is CTF 2.
+    Return whether one of the traces of a session is CTF 2, and what they say of the session.
 
     :param found: the metadata files below the folder.
     :raises TraceError: where the folder holds several sessions, or metadata is damaged.
     """
     # What the metadata says may differ between the traces of a session's folder: the first counts.
     sessions: dict[str, tuple[str, ...]] = {}
+    every: set[tuple[str, ...]] = set()
     is_ctf_2 = False
     for metadata in found:
         text = _metadata_text(metadata)
         is_ctf_2 = is_ctf_2 or text.startswith(_CTF_2)
         known = dict(_ENVIRONMENT.findall(text))
         if 'trace_name' in known:
-            sessions.setdefault(_session_folder(os.path.relpath(metadata, path)), tuple(
-                known.get(name, '') for name in _IDENTITY))
+            said = tuple(known.get(name, '') for name in SESSION)
+            sessions.setdefault(_session_folder(os.path.relpath(metadata, path)), said)
+            every.add(said)
     folders = {identity: folder for folder, identity in sessions.items()}
     if len(folders) > 1:
         raise TraceError(
             path, f'it holds {len(folders)} sessions: {listed(sorted(folders.values()))}',
             'name the folder of one, or, if they are of one run on several computers, each of '
             'their folders')
-    return is_ctf_2
+    return is_ctf_2, every
 
 
 def _session_folder(metadata: str) -> str:
@@ -162,7 +167,6 @@ def _session_folder(metadata: str) -> str:
 # the folders in that of a session are called.
 _ENVIRONMENT = re.compile(
     r'"?\b(trace_name|trace_creation_datetime|hostname)\b"?\s*[=:]\s*"((?:[^"\\]|\\.)*)"')
-_IDENTITY = ('hostname', 'trace_name', 'trace_creation_datetime')
 _PARTS = {'ust', 'kernel', 'archives'}
 # A sequence of JSON texts (RFC 7464) begins with this character.
 _CTF_2 = '\x1e'
@@ -302,20 +306,34 @@ def _end_of(process: subprocess.Popen[bytes]) -> str:
 
 
 class _Kind(NamedTuple):
-    """How the events of a class are written; `unread` is a provider that replay does not know."""
+    """
+    How the events of a class are written.
+
+    :ivar unread: a provider that replay does not know.
+    :ivar place: of the session that they are of.
+    """
 
     key: str
     converts: Sequence[Callable[[Any], Any] | None]
     unread: str | None
+    place: int
 
 
 class _Importer:
-    """Writes the rows of a session as events."""
+    """
+    Writes the rows of the sessions of a run as events.
 
-    def __init__(self, path: str, file: TraceFile) -> None:
+    :param places: by what a trace says of its session, which one of them that is.
+    """
+
+    def __init__(
+        self, path: str, file: TraceFile, places: Mapping[tuple[str, ...], int]
+    ) -> None:
         self.result = Imported()
         self._path = path
         self._file = file
+        self._places = places
+        self._processes, self._threads = Numbers(), Numbers()
         self._kinds: dict[int, _Kind] = {}
         self._originals: dict[str, str] = {}        # full name in the trace: that in the session
         self._changed: dict[str, str] = {}
@@ -338,10 +356,12 @@ class _Importer:
         if vpid is None or vtid is None:
             self._nameless += 1
             vpid, vtid = vpid or 0, vtid or 0
+        kind = self._kinds[number]
+        vpid = self._processes.of(kind.place, vpid)
+        vtid = self._threads.of(kind.place, vtid)
         if procname and self._procnames.get((vpid, vtid)) != procname:
             self._procnames[vpid, vtid] = procname
             self._file.extend((('mddag:process', time, vtid, procname),), vpid)
-        kind = self._kinds[number]
         if kind.converts:
             values = [value if convert is None else convert(value)
                       for convert, value in zip(kind.converts, values)]
@@ -358,14 +378,18 @@ class _Importer:
         self.result.discarded += max(count, 1)
         self._file.extend((('mddag:lost', max(time, self._time), 0, max(count, 1)),), 0)
 
-    def _class(self, number: int, original: str, fields: list[tuple[str, str]]) -> None:
+    def _class(
+        self, number: int, original: str, fields: list[tuple[str, str]],
+        session: Sequence[str] = (),
+    ) -> None:
         event, converts = event_type(self._name(original), fields)
         for (given, _), (name, _) in zip(fields, event.fields):
             if given != name and given not in dict(PREAMBLE):
                 self._changed[f'{original}.{given}'] = name
         unread = None if event.provider in PROVIDERS else event.provider
         self._kinds[number] = _Kind(
-            self._file.define(event), converts if any(converts) else (), unread)
+            self._file.define(event), converts if any(converts) else (), unread,
+            self._places.get(tuple(session), 0))
 
     def _name(self, original: str) -> str:
         """Return the full name of an event; different ones stay different."""

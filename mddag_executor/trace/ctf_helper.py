@@ -147,7 +147,7 @@ class Session:
         event = message.event
         known = self._known.get(event.cls.addr)
         if known is None:
-            known = self._define(event.cls)
+            known = self._define(event)
         number, _, getters = known
         payload = event.payload_field
         context = event.common_context_field
@@ -155,12 +155,15 @@ class Session:
             'event', number, message.default_clock_snapshot.ns_from_origin,
             *[_pick(context, names) for names in _IDENTITY], [get(payload) for get in getters])
 
-    def _define(self, cls: Any) -> tuple[int, Any, list[Callable[[Any], Any]]]:
+    def _define(self, event: Any) -> tuple[int, Any, list[Callable[[Any], Any]]]:
+        cls = event.cls         # which belongs to one trace
+        environment = event.stream.trace.environment
+        session = [str(environment[name]) if name in environment else '' for name in SESSION]
         fields = members(cls.payload_field_class)
         number = len(self._known)
         known = number, cls, [get for _, _, get in fields]
         self._known[cls.addr] = known
-        self._add('class', number, cls.name or '', [field[:2] for field in fields])
+        self._add('class', number, cls.name or '', [field[:2] for field in fields], session)
         return known
 
     def _discarded(self, message: Any) -> None:
@@ -173,6 +176,9 @@ class Session:
             time = -1       # the stream has no times for it
         self._add('discarded', time, -1 if count is None else count)
 
+
+# What tells sessions apart in the environment of their traces.
+SESSION = ('hostname', 'trace_name', 'trace_creation_datetime')
 
 # Process, thread and name: of user space first, then of the kernel.
 _IDENTITY = (('vpid', 'pid'), ('vtid', 'tid'), ('procname',))

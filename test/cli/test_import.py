@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 import sys
 
@@ -116,6 +117,28 @@ def test_several_sessions_are_named_one_by_one(
         capsys, 'ctf', tmp_path / 'one', tmp_path / 'one' / 'kernel', '-o', out)
     assert (status, errors.count('\n')) == (2, 1)
     assert errors.endswith(': a session is named twice: name each once\n')
+
+
+@pytest.mark.needs('babeltrace2')
+def test_processes_of_several_containers_may_have_the_same_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # in both containers process 1 runs a callback of the same address, at overlapping times
+    kinds = [(f'ros2:callback_{what}', [('callback', 'u64')]) for what in ('start', 'end')]
+    for name, made, late in (('camera', '12:00:01', 0), ('control', '12:00:02', 3)):
+        events = [(what, 10 * k + late + 6 * what, 1, 1, name, 0x5550)
+                  for k in range(5) for what in (0, 1)]
+        session(tmp_path / name / 'ust', kinds, events, environment={
+            'trace_name': 'drive', 'trace_creation_datetime': made, 'hostname': 'robot'})
+    out = tmp_path / 'out.mcap'
+    status, text, errors = call(
+        capsys, 'ctf', tmp_path / 'camera', tmp_path / 'control', '-o', out)
+    assert (status, errors) == (0, '') and 'from 2 processes' in text
+    status, text, _ = caller('replay')(capsys, out, '--json', '-')
+    assert status == 0
+    result = json.loads(text)
+    assert [(use['executions'], use['unfinished'], use['busy_ns'])
+            for use in result['recorded_callbacks'].values()] == [(5, 0, 30), (5, 0, 30)]
 
 
 @pytest.mark.parametrize('version, reads', [
