@@ -26,6 +26,7 @@ from typing import Any
 
 from mddag_executor.live.compat import callback_type, WITH_INFO
 from mddag_executor.live.entity import Entity
+from mddag_executor.live.intake.entities import alive
 from mddag_executor.live.jobs import header_stamp, Origin
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.work import Work
@@ -126,6 +127,8 @@ class Messages:
                 new.append(inlet)
             self._known[id(entity)] = inlet
             self._inlets.setdefault(inlet.topic, []).append(inlet)
+        # a destroyed publisher serves no late subscription
+        self._outlets = {p: outlet for p, outlet in self._outlets.items() if alive(p)}
         for outlet in self._outlets.values():
             outlet.inlets = None
         self.offered, self._publishers = {}, {}

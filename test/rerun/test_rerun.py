@@ -322,6 +322,27 @@ def test_late_subscriptions_get_what_is_latched(bag: str, graph: Path) -> None:
     assert seen == ['a map']
 
 
+def test_a_destroyed_publisher_serves_no_late_subscription(bag: str, graph: Path) -> None:
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    seen: list[str] = []
+
+    def fill(node: Node) -> None:
+        destroyed = node.create_publisher(String, '/map', latched)
+        destroyed.publish(String(data='old'))
+        node.create_publisher(String, '/map', latched).publish(String(data='new'))
+
+        def take(message: Header) -> None:
+            if message.frame_id == '2':
+                node.destroy_publisher(destroyed)
+            elif message.frame_id == '4':
+                node.create_subscription(String, '/map', lambda m: seen.append(m.data), latched)
+
+        node.create_subscription(Header, '/points', take, 10)
+
+    rerun(bag, graph, [node_with(fill)])
+    assert seen == ['new']
+
+
 def test_a_subscription_that_comes_later(tmp_path: Path, graph: Path) -> None:
     bag = write_bag(tmp_path / 'in.mcap', [
         message for i in range(6) for message in (
