@@ -62,7 +62,8 @@ def rerun(
     :param nodes: as for ``mddag run --node``; or classes of nodes, or functions that return nodes.
     :param times: ``recorded``, ``declared``, or a file (see ``sources.open_source``).
     :param output: a file that gets the outputs as a bag; ``trace``: one that gets the run.
-    :param patience_s: a callback that uses no CPU for this long is blocked for ever.
+    :param patience_s: a callback or thread that waits for this long, and not in virtual time, ends
+        the run.
     :raises mddag_executor.errors.MddagError: on whatever keeps the run from going on; a
         ``CallbackFailed`` for what a callback raised, which is its cause.
     :raises msg_graph.GraphError: when the declaration is wrong.
