@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 import gc
 import os
 import threading
@@ -51,6 +51,7 @@ from mddag_executor.live.rates import RateWatch
 from mddag_executor.live.receiver import Receiver
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry, Upkeep
+from mddag_executor.live.seat import current
 from mddag_executor.live.settings import Thresholds
 from mddag_executor.live.shutdown import call_at_shutdown, halt_at_exit, is_over
 from mddag_executor.live.statistics import statistics
@@ -331,6 +332,24 @@ class MultiDeadlineExecutor(BareExecutor):
         take = self._new_tasks.pop if TASKS_NEWEST_FIRST else self._new_tasks.popleft
         while self._new_tasks:
             self._pool.report(self._engine.ready, take())
+
+    # --- what a host of programs needs -----------------------------------------------------------
+
+    def on_callback_ended(
+        self, listener: Callable[[Any, BaseException | None], bool]
+    ) -> None:
+        """
+        Have a function called after each callback, in its thread.
+
+        :param listener: gets rclpy's entity (None: a task), and what its callback raised, or None;
+            returns whether it takes care of that, so that it does not end ``spin``.
+        """
+        self._pool.callback_ended = listener
+
+    def lend(self) -> AbstractContextManager[None]:
+        """Return what lends the worker of the calling callback, if it is one, while entered."""
+        running = current.running
+        return nullcontext() if running is None else running.lend()
 
     # --- spinning --------------------------------------------------------------------------------
 

@@ -85,6 +85,8 @@ class Pool:
         self.relieve_intake: Callable[[bool], None] = lambda relieved: None
         # entered while a callback that runs in the calling thread of spin_once waits
         self.pump: Callable[[], AbstractContextManager[None]] = nullcontext
+        # called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
+        self.callback_ended: Callable[[Any, BaseException | None], bool] | None = None
         self._fail = fail
         self._context_ended = context_ended
         self._prepare_thread = prepare_thread
@@ -408,9 +410,12 @@ class Pool:
         if waits_for is not None:
             self._resume_when_done(work, waits_for)
         elif raised is not None:  # now, when its job has failed for whoever catches it
-            if not isinstance(raised, (Destroyed, Refused)):
+            if not isinstance(raised, (Destroyed, Refused)) and (
+                    self.callback_ended is None or not self.callback_ended(entity.rclpy, raised)):
                 self._fail(raised)
             raised = None   # it refers to this frame
+        elif self.callback_ended is not None:
+            self.callback_ended(entity.rclpy, None)
         if engine.verdicts.misses:
             engine.verdicts.report_misses()
         return let_run
