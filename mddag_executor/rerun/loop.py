@@ -112,6 +112,7 @@ class Loop:
     :ivar callbacks: how many callbacks have run.
     :ivar computing: shares CPUs and the interpreter, where these are few.
     :ivar changed: whether there may be new entities, or some are gone.
+    :ivar on_ended: called with rclpy's entity when its callback has ended.
     """
 
     def __init__(
@@ -126,6 +127,7 @@ class Loop:
         self.callbacks = 0
         self.changed = True
         self.computing: Computing | None = None
+        self.on_ended: Callable[[Any], object] = lambda entity: None
         self.strands = Strands(self._step, over)
         self._times = times
         self._refresh = refresh
@@ -333,6 +335,7 @@ class Loop:
             each.record(execution.thread)  # before its callback's end
         if waits_for is None:
             engine.finished(work, start, now, now, execution.thread, worker)
+            self.on_ended(work.entity.rclpy)
         else:
             engine.suspended(work, start, now, execution.thread, worker)
             self._resumed.add(work)

@@ -24,13 +24,13 @@ from typing import Any, BinaryIO
 from mddag_executor import defaults
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE_JOBS
+from mddag_executor.hosting.host import Guest
+from mddag_executor.hosting.loading import describe, Program, ros_arguments
 from mddag_executor.live import hooks
 from mddag_executor.live.compat import instead, Replacements
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import WAITABLE
-from mddag_executor.live.hosting import Guest
 from mddag_executor.live.intake.entities import is_qos_event, snapshot
-from mddag_executor.live.loading import describe, Program, ros_arguments
 from mddag_executor.live.other_processes import OtherProcesses
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
@@ -193,7 +193,7 @@ class Rerun:
             loop, self._holder, self._messages, source.topics,
             lambda: {} if recording is None else recording.kinds, self._warn)
         self._timers = Timers(loop, source.first_release)
-        self._host = RerunHost(self._holder, loop.stop, loop)
+        self._host = RerunHost(loop)
         if self._recorder is not None:
             self._recorder.entities((), [self._holder.task_entity])
 
@@ -289,14 +289,16 @@ class Rerun:
 
     def _begin(self) -> None:
         """Start the programs, one after the other; each runs until it waits for something."""
-        self._host.start(self._programs(), ros_arguments(self._settings.ros_args))
+        self._host.start(
+            self._holder, self._programs(), ros_arguments(self._settings.ros_args),
+            self._loop.stop)
         self._loop.at(self._loop.start, ENDED, self._started)
 
     def _started(self) -> None:
         """Begin to deliver, when each program has come to where it waits for something."""
         self._started_s = time.monotonic() - self._begun
         gc.freeze()  # else each full collection looks at all that the nodes are made of
-        if all(guest.settled.is_set() for guest in self._host.guests) and not self._hosted:
+        if all(guest.settled for guest in self._host.guests) and not self._hosted:
             raise RerunError(self._none_hosted())
         self._check_topics()
         if self._source.pauses:
@@ -352,8 +354,7 @@ class Rerun:
         self._failed = [guest for guest in self._host.guests if guest.error is not None]
         self.warnings += self._loop.blocked()
         self._engine.finish(self._loop.now)
-        self._host.close()
-        self._holder.context.try_shutdown()
+        self._host.shut_down()
 
     def _blocked(self, stuck: Stuck) -> RerunError:
         at = (self._loop.now - self._loop.start) / 1e9

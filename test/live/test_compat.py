@@ -290,6 +290,18 @@ def test_who_is_called_by_spin_knows(ros_context, make_node):
     assert found == [False, True]
 
 
+def test_a_node_keeps_its_executor_beside_another_one(make_node, ros_context):
+    node = make_node()
+    kept, runs = (SingleThreadedExecutor(context=ros_context) for _ in range(2))
+    kept.add_node(node)
+    with compat.executor_kept(node):
+        runs.add_node(node)
+    assert node.executor is kept
+    assert kept.get_nodes() == runs.get_nodes() == [node]
+    for executor in (kept, runs):
+        executor.shutdown()
+
+
 def test_changes_of_a_node_are_told(make_node, monkeypatch):
     monkeypatch.setattr(rclpy.node.Node, '_wake_executor', rclpy.node.Node._wake_executor)
     calls = []

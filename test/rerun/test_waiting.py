@@ -368,7 +368,7 @@ def test_spin_until_future_complete_with_a_timeout(bag: str, graph: Path) -> Non
         rclpy.shutdown()
 
     rerun(bag, graph, [main])
-    assert seen == [(250.0, 'timeout'), (700.0, 7), (1000.0, 'three steps'), (1100.0, 'executor')]
+    assert seen == [(250.0, 'timeout'), (700.0, 7), (910.0, 'three steps'), (1010.0, 'executor')]
 
 
 def test_a_program_waits_for_a_service_of_the_next_one(bag: str, graph: Path) -> None:

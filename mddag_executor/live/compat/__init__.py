@@ -17,7 +17,7 @@ latter.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import AbstractContextManager, contextmanager, ExitStack, nullcontext
 from functools import partial
 import inspect
 from operator import attrgetter
@@ -337,6 +337,16 @@ def is_called_by_spin() -> bool:
     That runs one callback at a time, in every version.
     """
     return sys._getframe(2).f_code is rclpy.spin.__code__
+
+
+@contextmanager
+def executor_kept(node: Any) -> Iterator[None]:
+    """Have another executor run a node, as it is added to that; ``node.executor`` stays."""
+    before, node._Node__executor_weakref = node._Node__executor_weakref, None
+    try:
+        yield
+    finally:
+        node._Node__executor_weakref = before
 
 
 def on_changes(listener: Callable[[Any], None]) -> None:
