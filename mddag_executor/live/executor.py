@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import gc
 import os
 import threading
@@ -53,6 +53,7 @@ from mddag_executor.live.rates import RateWatch
 from mddag_executor.live.receiver import Receiver
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry, Upkeep
+from mddag_executor.live.seat import current
 from mddag_executor.live.settings import Thresholds
 from mddag_executor.live.shutdown import call_at_shutdown, halt_at_exit, is_over
 from mddag_executor.live.statistics import statistics
@@ -174,6 +175,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._attention = Bell()
         self._spinning = threading.Lock()
         self._finished = False
+        self._ended_by_callback = False
         # reentrant: a signal's handler may end the run in the thread that ends it
         self._ending = threading.RLock()
         self._freeze_gc = freeze_gc
@@ -233,7 +235,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._intake_kind = intake
         # What is ready still would run before the spin notices.
         call_at_shutdown(self.context, self._pool.start_no_more)
-        call_at_shutdown(self.context, self.wake)
+        call_at_shutdown(self.context, self._context_ends)
         halt_at_exit(self)
 
     def _nodes_to_look_after(self) -> list[Any]:
@@ -242,6 +244,14 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _context_ended(self) -> bool:
         return is_over(self.context)
+
+    def _context_ends(self) -> None:
+        """Take note of who ends the context: one of this executor's callbacks, or not."""
+        running = current.running
+        self._ended_by_callback = (
+            running is not None and running.engine is self._engine
+            or self._notifier is not None and self._notifier.is_calling())
+        self.wake()
 
     # --- nodes and callback groups ---------------------------------------------------------------
 
@@ -353,12 +363,16 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         Run callbacks on the pool until shutdown.
 
-        :raises ExternalShutdownException: when the context ends.
+        It returns also when a callback ends the context (``rclpy.shutdown``), and at once when
+        that has ended before.
+
+        :raises ExternalShutdownException: when something else ends the context.
         :raises RuntimeError: when the executor spins already.
         :raises Exception: what a callback raised.
         """
         with short_switch_interval(self._engine.preempts):
             self._spin(lambda: False, None)
+        self._raise_error()  # of the callback that has ended the context, after that
 
     def spin_until_future_complete(
         self, future: Future, timeout_sec: float | None = None
@@ -376,9 +390,8 @@ class MultiDeadlineExecutor(BareExecutor):
         if not self._spinning.acquire(blocking=False):
             raise RuntimeError('Executor is already spinning')
         try:
-            if self.is_ending():
+            if self.is_ending() or is_over(self.context):
                 return
-            self._check_context()
             if self._freeze_gc:
                 self._freeze_gc = False
                 gc.collect()
@@ -396,7 +409,8 @@ class MultiDeadlineExecutor(BareExecutor):
                     self._settle()
                     self._raise_error()  # of what ran before it was done
                     return
-                self._check_context()
+                if self._was_ended():
+                    return
                 self._look_after()
                 rest = self._upkeep.rest_s()
                 if rest == 0.0:
@@ -410,8 +424,8 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._stop_watch.wait(left)
             self._raise_error()
         except RCL_ERRORS:
-            self._check_context()
-            raise
+            if not self._was_ended():
+                raise
         finally:
             self._pool.interpreter.looks_late = False
             self._pool.pause()
@@ -451,6 +465,20 @@ class MultiDeadlineExecutor(BareExecutor):
         if self._notifier is not None:
             self._notifier.start()
         self._miss_log.write()
+
+    def _was_ended(self) -> bool:
+        """
+        Return whether a callback has ended the context.
+
+        :raises ExternalShutdownException: when something else has.
+        """
+        if not is_over(self.context):
+            return False
+        with suppress(InvalidHandle):
+            self.context.ok()  # it has a lock, so whoever is just ending it has noted that now
+        if not self._ended_by_callback:
+            raise ExternalShutdownException()
+        return True
 
     def _check_context(self) -> None:
         if is_over(self.context):
@@ -502,8 +530,11 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _raise_error(self) -> None:
         self._unclaimed.look()
-        if self._errors:
-            raise self._errors.popleft()
+        while self._errors:
+            error = self._errors.popleft()
+            # what others raised just because a callback has ended their context
+            if not (self._ended_by_callback and isinstance(error, RCL_ERRORS)):
+                raise error
 
     @contextmanager
     def _pump(self) -> Iterator[None]:
