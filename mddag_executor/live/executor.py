@@ -62,6 +62,7 @@ from mddag_executor.live.tasks import make_task, Unclaimed
 from mddag_executor.live.verdicts import DeadlineMiss
 from mddag_executor.live.work import QuickCallback, Work
 from msg_graph import TaskSet
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, TimeoutObject
 from rclpy.logging import get_logger
@@ -109,15 +110,16 @@ class MultiDeadlineExecutor(BareExecutor):
     :param on_deadline_miss: called with each ``DeadlineMiss``, in a thread of its own; what it
         raises comes out of the spin.  If it takes too long, misses are counted and not reported
         (``unreported_misses`` in ``statistics()``).
-    :param default_deadline: relative deadline of undeclared callbacks: ns, or text as ``100ms``.
+    :param default_deadline: relative deadline of undeclared callbacks: ns, text as ``100ms``, or
+        an rclpy ``Duration``.
     :param intake: ``events``, ``waitset`` or ``auto`` (events where this rclpy has them).
     :param worker_policy: real-time policy of the workers, ``SCHED_FIFO`` or ``SCHED_RR``.
     :param worker_priority: their priority under it.
     :param worker_cpus: the CPUs that they may use.
     :param freeze_gc: when the first spin begins, collect garbage and have the collector leave
         alone what there is by then (``gc.freeze``): for programs that make their nodes first.
-    :param diagnostics_period: how often to publish on ``/diagnostics`` while it spins: ns, or text
-        as ``1s``; None or 0: not at all.
+    :param diagnostics_period: how often to publish on ``/diagnostics`` while it spins: as
+        ``default_deadline``; None or 0: not at all.
     :param thresholds: what makes a status of the diagnostics worse than OK.
     :param process: which of the declared ``processes`` this is; what runs in the others is not
         counted as missing.
@@ -125,6 +127,7 @@ class MultiDeadlineExecutor(BareExecutor):
         ``live.cpu_order``); off, and said in the log, where the user may not.
     :param preempt: whether callbacks that compute in Python pause for more urgent ones (Python
         3.12 and newer; ``statistics()['preemption']`` says whether they do).
+    :param num_threads: ``num_workers`` under the name that ``MultiThreadedExecutor`` has for it.
     :raises msg_graph.GraphError: when the declaration is not right.
     :raises mddag_executor.errors.MddagError: on an unknown policy, intake or thread setting, a
         value of the wrong kind, and when the trace cannot be written.
@@ -140,21 +143,22 @@ class MultiDeadlineExecutor(BareExecutor):
         context: Context | None = None,
         trace: str | None = None,
         on_deadline_miss: Callable[[DeadlineMiss], None] | None = None,
-        default_deadline: int | str = DEFAULT_DEADLINE_NS,
+        default_deadline: int | str | Duration = DEFAULT_DEADLINE_NS,
         intake: str = 'auto',
         max_active_jobs: int = MAX_ACTIVE_JOBS,
         worker_policy: str | None = None,
         worker_priority: int | None = None,
         worker_cpus: set[int] | None = None,
         freeze_gc: bool = False,
-        diagnostics_period: int | str | None = None,
+        diagnostics_period: int | str | Duration | None = None,
         thresholds: Thresholds | None = None,
         process: str | None = None,
         preempt: bool = False,
         cpu_order: bool = False,
+        num_threads: int | None = None,
     ) -> None:
         task_set, num_workers, deadline_ns = settings.resolve(
-            graph, num_workers, default_deadline, intake)
+            graph, num_workers, default_deadline, intake, num_threads)
         prepare = settings.thread_setting(worker_policy, worker_priority, worker_cpus)
         every_ns = settings.diagnostics_period_ns(diagnostics_period)
         max_active_jobs = settings.whole_number(
