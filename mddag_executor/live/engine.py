@@ -41,6 +41,7 @@ from mddag_executor.core.rules import progress
 from mddag_executor.core.state import (
     DONE,
     IDLE,
+    JUDGE_FROM,
     N_IDLE,
     OPEN,
     POLLING,
@@ -616,6 +617,11 @@ class Engine:
                 work.entity.waiting.pop(x, None)
                 work.x = -1
                 self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'aborted', now)
+
+    @property
+    def is_judging(self) -> bool:
+        """Return whether there are verdicts about jobs that are released now."""
+        return self._state.scalars[JUDGE_FROM] < NEVER
 
     def set_judging(self, judging: bool, since: int | None, now: int) -> None:
         """Give verdicts about jobs released from now (or a time) on, or about none for now."""

@@ -48,6 +48,7 @@ from mddag_executor.live.intake.events import EventsIntake
 from mddag_executor.live.intake.waitset import ALL_KINDS, WaitSetIntake
 from mddag_executor.live.interpreter import short_switch_interval
 from mddag_executor.live.miss_notifier import MissNotifier
+from mddag_executor.live.name_check import NameCheck
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.rates import RateWatch
 from mddag_executor.live.receiver import Receiver
@@ -216,6 +217,7 @@ class MultiDeadlineExecutor(BareExecutor):
         if self._recorder is not None:
             self._recorder.entities((), [self._task_entity])
         self._rates = RateWatch(self._registry)
+        self._names = NameCheck(task_set, self._registry, process)
         self._groups = Groups(self, self.wake, self._hand_over)
         self._announcements: Announcements | None = None
         self._upkeep = Upkeep(
@@ -469,6 +471,7 @@ class MultiDeadlineExecutor(BareExecutor):
         if self._notifier is not None:
             self._notifier.start()
         self._miss_log.write()
+        self._names.look(self._engine.is_judging)
 
     def _was_ended(self) -> bool:
         """

@@ -216,6 +216,10 @@ class Registry:
             return set()
         return {c.key for c in self.declared if self._task_set.process_of(c.node) != process}
 
+    def unbound(self) -> list[Callback]:
+        """Return the declared callbacks that no entity is bound to now."""
+        return [] if self._binder is None else self._binder.unbound()
+
     def undeclared(self) -> list[binding.Entity]:
         """Return the timers, subscriptions and services there were that are not declared."""
         return list(self._undeclared)
