@@ -9,8 +9,8 @@ A declaration names nodes and topics; a program that calls one of them different
 remapping, a typing error) runs without any verdict.  Two periods after the executor began to
 judge, and ``LEAST_S`` at the least, the declared callbacks are listed that no entity is bound to,
 with the question which undeclared one is meant (``msg_graph.binding.meant``), and the undeclared
-callbacks that have run.  Nothing is said while the executor has no nodes, nor of callbacks that may
-run in another process (``msg_graph.drift``).
+callbacks that have run.  Nothing is said while the executor has no nodes, nor of callbacks that
+may run in another process (``msg_graph.drift``).
 """
 
 from __future__ import annotations

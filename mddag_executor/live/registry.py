@@ -59,8 +59,8 @@ class Registry:
     """
     What is kept for all entities of the executor's nodes.
 
-    Not thread-safe: the executor refreshes it under a lock of its own, and other threads only
-    look entities up.
+    The executor refreshes it under a lock of its own; other threads look entities up, and ask for
+    counts at any time.
 
     :ivar by_id: what is kept for each entity of rclpy, by the ``id`` of that.
     :param passed: called with each execution that a callback group has let through (see
@@ -83,6 +83,7 @@ class Registry:
         # the executor's own subscriptions
         self.own: set[Any] = set()
         # destroyed entities whose last executions are not done yet, and the counts of those before
+        self._counting = threading.Lock()
         self._retired: list[Entity] = []
         self._past: dict[str, dict[str, Any]] = {}
         self._published: dict[str, set[str]] = {}
@@ -126,9 +127,10 @@ class Registry:
         made = [self._new_entity(*each) for each in new]
         added = [each for each in made if each is not None]
         present.update((id(each.rclpy), each) for each in added)
-        self.by_id = present
-        self._retired.extend(gone)
-        self._fold()
+        with self._counting:
+            self.by_id = present
+            self._retired.extend(gone)
+            self._fold()
         self._free_groups()
         return added, gone
 
@@ -170,18 +172,20 @@ class Registry:
 
     def publishes(self) -> dict[str, set[str]]:
         """Return on which topics each declared callback has published."""
-        found = {callback.key: set(self._published.get(callback.key, ()))
-                 for callback in self.declared}
-        for entity in (*self._retired, *self.by_id.values()):
-            if entity.callback is not None:
-                found[entity.callback.key] |= entity.publishes
+        with self._counting:
+            found = {callback.key: set(self._published.get(callback.key, ()))
+                     for callback in self.declared}
+            for entity in (*self._retired, *self.by_id.values()):
+                if entity.callback is not None:
+                    found[entity.callback.key] |= entity.publishes
         return found
 
     def counts(self) -> dict[str, dict[str, Any]]:
         """Return the counts of all entities there have been, by callback (see ``Entity``)."""
-        counts = {name: dict(past) for name, past in self._past.items()}
-        for entity in (*self._retired, *self.by_id.values()):
-            entity.count_into(counts)
+        with self._counting:
+            counts = {name: dict(past) for name, past in self._past.items()}
+            for entity in (*self._retired, *self.by_id.values()):
+                entity.count_into(counts)
         return counts
 
     def computing(self) -> int:
@@ -195,13 +199,14 @@ class Registry:
         Unlike ``counts`` this costs next to nothing for an entity that nobody uses.
         """
         totals = dict.fromkeys(COUNTS, 0)
-        for past in list(self._past.values()):
-            for key in COUNTS:
-                totals[key] += past[key]
-        for entity in (*self._retired, *self.by_id.values()):
-            if entity.ready or entity.skipped:
+        with self._counting:
+            for past in self._past.values():
                 for key in COUNTS:
-                    totals[key] += getattr(entity, key)
+                    totals[key] += past[key]
+            for entity in (*self._retired, *self.by_id.values()):
+                if entity.ready or entity.skipped:
+                    for key in COUNTS:
+                        totals[key] += getattr(entity, key)
         return totals
 
     def hosted(self) -> set[str]:
