@@ -36,8 +36,9 @@ from mddag_executor.live.work import Work
 from msg_graph import binding, Callback, TaskSet
 from msg_graph.duration import exact_duration
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import EventHandler, QoSSubscriptionEventType
 from rclpy.exceptions import InvalidHandle
-from rclpy.qos import HistoryPolicy
+from rclpy.qos import HistoryPolicy, qos_policy_name_from_kind
 
 if TYPE_CHECKING:
     from mddag_executor.live.intake.events import EventsIntake
@@ -50,6 +51,7 @@ REFRESH_REST = 3
 HAND_OVER_S = 2.0
 """For so long an intake is given to take no more of something; it takes a few milliseconds."""
 _MOST_UNDECLARED = 4096
+_INCOMPATIBLE = QoSSubscriptionEventType.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS
 
 KINDS = (TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE)
 """In the order of ``entities.LISTS``."""
@@ -232,6 +234,14 @@ class Registry:
     def subscriptions(self) -> list[Entity]:
         """Return the subscriptions that there are now."""
         return [entity for entity in self.by_id.values() if entity.kind == SUBSCRIPTION]
+
+    def note_event(self, handler: EventHandler, status: Any) -> None:
+        """Take note of a QoS event: of the policy for which a subscription gets nothing."""
+        if status is None or handler.event_type != _INCOMPATIBLE:
+            return
+        for entity in self.subscriptions():
+            if handler in entity.rclpy.event_handlers:
+                entity.incompatible_qos = qos_policy_name_from_kind(status.last_policy_kind)
 
     def timers(self) -> list[Entity]:
         """Return the timers that there are now."""

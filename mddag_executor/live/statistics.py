@@ -34,6 +34,7 @@ def statistics(
     has for each entity what became ready, ran, failed (raised), waits, was dropped (QoS depth,
     destroyed, aborted) or skipped (timers), its busy time in ns, whether it holds the interpreter
     while it runs, and for which part of its time it needs that (None: not known yet).
+    ``incompatible_qos`` is the policy for which a subscription gets nothing from a publisher.
     ``unattributed`` counts messages of declared callbacks whose publication was not found; they
     ran as undeclared ones.  ``stops`` has how often and for how long no thread of the process ran
     while it spun, how many misses these stops explain, and the times of the last ones (ns since
