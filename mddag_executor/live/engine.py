@@ -102,8 +102,6 @@ class Engine:
         self._work: dict[int, Work] = {}
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
-        # when it was judged last which sinks are overdue
-        self._judged_at = 0
         # those that hold the interpreter, in the order in which they began; likewise
         self.holders: list[Work] = []
         # whether who holds the interpreter may have overtaken another
@@ -519,8 +517,11 @@ class Engine:
         x, work.x = work.x, -1
         if work in self.holders:
             self.holders.remove(work)
-        if end < self._judged_at:  # that it was overdue was reported before this was known
-            end = self._judged_at
+        if self.verdicts.tally.overdue and work.origin is not None:
+            deadline = self.verdicts.tally.overdue.get((work.origin.vertex, work.origin.job), -1)
+            if end <= deadline:  # that it was overdue was reported before this was known
+                entity.busy_ns += deadline + 1 - end
+                end = deadline + 1
         end_it = self.scheduler.fail if failed else self.scheduler.complete
         if self.record is None:
             end_it(x, end)
@@ -636,7 +637,6 @@ class Engine:
             return
         self.deadlines.judge(now)
         if self._state.decisions:
-            self._judged_at = now
             self._decided(now)
 
     # --- the end ---------------------------------------------------------------------------------
