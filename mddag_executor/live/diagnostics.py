@@ -7,14 +7,14 @@ Theory of operation
 -------------------
 Once a period a thread of its own reads the executor's counters and publishes one
 ``DiagnosticArray``: a status for each DAG that has a callback in this process, and one for the
-pool.  It takes no lock and touches nothing that a callback's way goes through: counters are read
+pool.  It takes no lock and touches nothing on a callback's way: counters are read
 as they stand (a count that moves on while others are read shows one period later), so neither
 workers nor intake ever wait for it.
 
 A DAG's status says what came of its results (jobs of its sinks) lately.  STALE: nothing has been
 released for a while.  ERROR, WARN: see ``Thresholds``.  The pool's status says WARN when something
 was lost: messages beyond a queue's depth, releases of timers, messages whose job was not found,
-events of the trace.
+events of the trace, misses that ``on_deadline_miss`` was too slow for.
 
 By the conventions of diagnostics names are ``NAME: DAG`` and ``NAME: workers``, the hardware_id is
 the host's name and the process, and values are texts whose units stand in their keys.
@@ -22,8 +22,8 @@ the host's name and the process, and values are texts whose units stand in their
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Sequence
 from contextlib import suppress
 import os
 import socket
@@ -40,6 +40,7 @@ from rclpy.logging import get_logger
 
 if TYPE_CHECKING:
     from diagnostic_msgs.msg import DiagnosticArray
+    from mddag_executor.live.miss_notifier import MissNotifier
     from mddag_executor.live.pool import Pool
     from mddag_executor.live.recorder import Recorder
     from mddag_executor.live.registry import Registry
@@ -68,7 +69,7 @@ class _Seen(NamedTuple):
     results: Counts
     jobs: int
     completed: list[int]
-    causes: Counter[str]
+    in_stops: int
 
 
 class DagWatch:
@@ -76,17 +77,17 @@ class DagWatch:
     Judges the state of one DAG, period by period.
 
     :param every_ns: the period of the diagnostics.
-    :param causes: how many misses of which cause there have been.
+    :param in_stops: by DAG, how many misses stops of the machine explain.
     """
 
     def __init__(
         self, tally: Tally, dag: Dag, thresholds: Thresholds, every_ns: int,
-        causes: Mapping[str, int],
+        in_stops: Sequence[int],
     ) -> None:
         self._tally = tally
         self._dag = dag
         self._thresholds = thresholds
-        self._causes = causes
+        self._in_stops = in_stops
         self._sinks = {tally.vertex_name(v): sink for v, sink in tally.sinks_of(dag).items()}
         self._stale_after = max(thresholds.stale_periods * dag.period_ns, every_ns)
         # what was seen in each period of the window, and before it
@@ -97,7 +98,7 @@ class DagWatch:
         sinks = self._sinks.values()
         return _Seen(
             Counts.total(counts(vars(sink)) for sink in sinks), self._tally.jobs[self._dag.index],
-            [sink.completed for sink in sinks], Counter(self._causes))
+            [sink.completed for sink in sinks], self._in_stops[self._dag.index])
 
     def status(self, now: int) -> Status:
         """Return the state of things; to be called once a period (``now``: monotonic ns)."""
@@ -107,10 +108,8 @@ class DagWatch:
             self._released_at = now
         before, results = self._seen[0], seen.results
         window = results.minus(before.results)
-        since = Counter(seen.causes)
-        since.subtract(before.causes)   # what turns out to be the machine's counts less before
-        causes = ', '.join(f'{n} {cause}' for cause, n in since.most_common() if n > 0)
-        level, message = self._level(results.minus(last.results), window, now, causes)
+        in_stops = seen.in_stops - before.in_stops
+        level, message = self._level(results.minus(last.results), window, now, in_stops)
         ratio = window.missed / window.due if window.due else 0.0
         values = {
             'period_ms': _ms(self._dag.period_ns), 'jobs': str(seen.jobs),
@@ -118,12 +117,12 @@ class DagWatch:
             'late': str(results.late), 'expired': str(results.expired),
             'aborted': str(results.aborted), 'failed': str(results.failed),
             'window_results': str(window.due), 'window_missed': str(window.missed),
-            'window_missed_ratio': f'{ratio:.4f}', 'window_causes': causes,
+            'window_missed_ratio': f'{ratio:.4f}', 'window_in_stops': str(in_stops),
             **self._response_times(last, seen)}
         return Status(f'{self._thresholds.name}: {self._dag.name}', level, message, values)
 
     def _level(
-        self, step: Counts, window: Counts, now: int, causes: str
+        self, step: Counts, window: Counts, now: int, in_stops: int
     ) -> tuple[int, str]:
         limits = self._thresholds
         if self._released_at is None:
@@ -134,8 +133,8 @@ class DagWatch:
         if not window.missed:
             return OK, f'{counted(window.due, "result")} in time'
         message = f'{window.missed} of {window.due} results missed their deadlines'
-        if causes:
-            message += f': {causes}'
+        if in_stops:
+            message += f', {in_stops} as the machine stood still'
         if window.missed >= max(
                 limits.warn_burst, limits.error_ratio * window.due):
             return ERROR, message
@@ -175,9 +174,10 @@ class PoolWatch:
 
     def __init__(
         self, pool: Pool, registry: Registry, recorder: Recorder | None,
-        thresholds: Thresholds,
+        thresholds: Thresholds, notifier: MissNotifier | None = None,
     ) -> None:
         self._engine = pool.engine
+        self._notifier = notifier
         self._pool = pool
         self._registry = registry
         self._recorder = recorder
@@ -189,7 +189,8 @@ class PoolWatch:
         jobs = self._engine.jobs
         return {
             **self._registry.totals(), 'doubtful': jobs.doubtful,
-            'trace_lost': 0 if self._recorder is None else self._recorder.writer.dropped}
+            'trace_lost': 0 if self._recorder is None else self._recorder.writer.dropped,
+            'unreported_misses': 0 if self._notifier is None else self._notifier.unreported}
 
     def status(self, now: int) -> Status:
         """Return the state of things; to be called once a period (``now``: monotonic ns)."""
@@ -202,6 +203,7 @@ class PoolWatch:
         lost = [f'{step[key]} {what}' for key, what in (
             ('dropped', 'dropped'), ('skipped', 'timer releases skipped'),
             ('unattributed', 'messages without a job'), ('trace_lost', 'trace events lost'),
+            ('unreported_misses', 'misses not reported to on_deadline_miss'),
         ) if step[key]]
         failed = self._recorder is not None and self._recorder.writer.error is not None
         if failed:
@@ -216,7 +218,8 @@ class PoolWatch:
             'cpu_ratio': f'{cpu_used / passed:.3f}',
             'cpu_us_per_callback': f'{cpu_used / 1e3 / step["ran"]:.1f}' if step['ran'] else '',
             **{key: str(counts[key]) for key in (
-                'ran', 'dropped', 'skipped', 'unattributed', 'doubtful', 'trace_lost')}}
+                'ran', 'dropped', 'skipped', 'unattributed', 'doubtful', 'trace_lost',
+                'unreported_misses')}}
         return Status(
             f'{self._thresholds.name}: {WORKERS}',
             ERROR if failed else WARN if lost else OK,
@@ -234,7 +237,7 @@ class Diagnostics:
     def __init__(
         self, context: Context, task_set: TaskSet | None, pool: Pool, registry: Registry,
         recorder: Recorder | None, period_ns: int, thresholds: Thresholds,
-        process: str | None = None,
+        process: str | None = None, notifier: MissNotifier | None = None,
     ) -> None:
         self._context = context
         self._registry = registry
@@ -248,8 +251,8 @@ class Diagnostics:
                 dag.vertices[i] for i in (dag.source, *dag.sinks)]
             self._dags.append((
                 {vertex.callback.key for vertex in reported_by},
-                DagWatch(verdicts.tally, dag, thresholds, period_ns, verdicts.causes[dag.index])))
-        self._pool = PoolWatch(pool, registry, recorder, thresholds)
+                DagWatch(verdicts.tally, dag, thresholds, period_ns, verdicts.in_stops)))
+        self._pool = PoolWatch(pool, registry, recorder, thresholds, notifier)
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
 

@@ -34,12 +34,14 @@ from threading import get_native_id
 from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.queues import overtaking_pays
 from mddag_executor.core.rules import progress
 from mddag_executor.core.state import (
     DONE,
     IDLE,
+    JUDGE_FROM,
     N_IDLE,
     OPEN,
     POLLING,
@@ -69,21 +71,20 @@ class Engine:
 
     :param record: where trace events go; None records nothing.
     :param on_miss: gets every miss (see ``Verdicts``).
-    :param fail: gets what ``on_miss`` raises.
     :param process: which of the declared processes this is.
     """
 
     def __init__(
         self, task_set: TaskSet | None, n_workers: int, policy: str, *, default_deadline: int,
         max_active_jobs: int, expire_after: int, record: Record | None = None,
-        on_miss: Callable[[DeadlineMiss], None] | None = None,
-        fail: Callable[[BaseException], None] = lambda error: None, process: str | None = None,
+        on_miss: Callable[[DeadlineMiss], None] | None = None, process: str | None = None,
     ) -> None:
         self.tables = Tables.build(
             task_set, legs=True, groups=False, default_deadline=default_deadline,
             max_active_jobs=max_active_jobs, expire_after=expire_after)
         self.scheduler = Scheduler(self.tables, n_workers, policy, propagate=False)
-        self.verdicts = Verdicts(task_set, self.tables, record, on_miss, fail)
+        self.deadlines = Deadlines(self.tables, self.scheduler.state)
+        self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
         self.jobs = Jobs(task_set)
         self.other_processes = OtherProcesses.of(
             task_set, self.tables, self.scheduler, self.jobs, process)
@@ -281,6 +282,7 @@ class Engine:
         slot = self.scheduler.release(dag, job, release, now)
         if self._state.decisions:
             self._decided(now)
+        self.deadlines.watch(slot)
         self.verdicts.released(dag, job, release, now, is_judged(self._state, slot))
         return slot
 
@@ -515,6 +517,11 @@ class Engine:
         x, work.x = work.x, -1
         if work in self.holders:
             self.holders.remove(work)
+        if self.verdicts.tally.overdue and work.origin is not None:
+            deadline = self.verdicts.tally.overdue.get((work.origin.vertex, work.origin.job), -1)
+            if end <= deadline:  # that it was overdue was reported before this was known
+                entity.busy_ns += deadline + 1 - end
+                end = deadline + 1
         end_it = self.scheduler.fail if failed else self.scheduler.complete
         if self.record is None:
             end_it(x, end)
@@ -605,12 +612,17 @@ class Engine:
         decisions = self.scheduler.decisions()
         if self._finished:  # it was judged already, and the trace is closed
             return
-        for x in self.verdicts.add(decisions, now, self._state):
+        for x in self.verdicts.add(decisions, now):
             work = self._work.pop(x, None)
             if work is not None:  # the core dropped it: what is left of an aborted job
                 work.entity.waiting.pop(x, None)
                 work.x = -1
                 self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'aborted', now)
+
+    @property
+    def is_judging(self) -> bool:
+        """Return whether there are verdicts about jobs that are released now."""
+        return self._state.scalars[JUDGE_FROM] < NEVER
 
     def set_judging(self, judging: bool, since: int | None, now: int) -> None:
         """Give verdicts about jobs released from now (or a time) on, or about none for now."""
@@ -618,6 +630,14 @@ class Engine:
         judge_from(self._state, release)
         if self.record is not None:
             self.record('judge_from', now, get_native_id(), release)
+
+    def judge_overdue(self, now: int) -> None:
+        """Report the sinks whose deadlines are over and which have not completed."""
+        if self._finished:
+            return
+        self.deadlines.judge(now)
+        if self._state.decisions:
+            self._decided(now)
 
     # --- the end ---------------------------------------------------------------------------------
 

@@ -75,7 +75,7 @@ class Entity:
         'kind', 'rclpy', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
         'busy_ns', 'unattributed', 'removed', 'address', 'handle', 'remote_publishers',
-        'awaits', 'is_own',
+        'awaits', 'is_own', 'incompatible_qos',
         'ends_soon', 'is_brief', 'publishes', 'at_once', 'habit', 'since', 'gate', '__weakref__')
 
     def __init__(
@@ -109,6 +109,8 @@ class Entity:
         self.skipped = 0
         self.busy_ns = 0
         self.unattributed = 0
+        # of a subscription: the policy for which a publisher's messages do not come
+        self.incompatible_qos: str | None = None
         # whether its callback ends soon after it has published; whether it always ends at once
         self.ends_soon = Guess(SOON_NS, SOON_RUNS)
         self.is_brief = Guess(BRIEF_NS, BRIEF_RUNS)
@@ -160,12 +162,13 @@ class Entity:
             return
         total = counts.setdefault(self.name, {
             'kind': self.kind, 'declared': self.callback is not None, 'waiting': 0,
-            'holds_interpreter': False, 'interpreter_share': None,
+            'holds_interpreter': False, 'interpreter_share': None, 'incompatible_qos': None,
             **dict.fromkeys(COUNTS, 0)})
         for key in COUNTS:
             total[key] += getattr(self, key)
         total['waiting'] += len(self.waiting)
         total['holds_interpreter'] |= bool(self.habit.holds)
+        total['incompatible_qos'] = total['incompatible_qos'] or self.incompatible_qos
         share = self.habit.share
         if share is not None:
             total['interpreter_share'] = max(total['interpreter_share'] or 0.0, round(share, 3))

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 import gc
 import os
 import threading
@@ -39,6 +39,7 @@ from mddag_executor.live.compat import (
     TASKS_NEWEST_FIRST,
 )
 from mddag_executor.live.cpu_order import CpuOrder, why_not
+from mddag_executor.live.deadline_watch import MissLog
 from mddag_executor.live.diagnostics import Diagnostics
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import Entity, TASK
@@ -46,6 +47,8 @@ from mddag_executor.live.groups import Groups
 from mddag_executor.live.intake.events import EventsIntake
 from mddag_executor.live.intake.waitset import ALL_KINDS, WaitSetIntake
 from mddag_executor.live.interpreter import short_switch_interval
+from mddag_executor.live.miss_notifier import MissNotifier
+from mddag_executor.live.name_check import NameCheck
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.rates import RateWatch
 from mddag_executor.live.receiver import Receiver
@@ -60,6 +63,7 @@ from mddag_executor.live.tasks import make_task, Unclaimed
 from mddag_executor.live.verdicts import DeadlineMiss
 from mddag_executor.live.work import QuickCallback, Work
 from msg_graph import TaskSet
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, TimeoutObject
 from rclpy.logging import get_logger
@@ -104,16 +108,19 @@ class MultiDeadlineExecutor(BareExecutor):
     :param policy: ``rad`` or another of ``mddag_executor.core.POLICIES``.
     :param context: the context that the executor belongs to, or None for the default one.
     :param trace: path of an MCAP file to record to, or None.
-    :param on_deadline_miss: called with a ``DeadlineMiss``, in a worker thread.
-    :param default_deadline: relative deadline of undeclared callbacks: ns, or text as ``100ms``.
+    :param on_deadline_miss: called with each ``DeadlineMiss``, in a thread of its own; what it
+        raises comes out of the spin.  If it takes too long, misses are counted and not reported
+        (``unreported_misses`` in ``statistics()``).
+    :param default_deadline: relative deadline of undeclared callbacks: ns, text as ``100ms``, or
+        an rclpy ``Duration``.
     :param intake: ``events``, ``waitset`` or ``auto`` (events where this rclpy has them).
     :param worker_policy: real-time policy of the workers, ``SCHED_FIFO`` or ``SCHED_RR``.
     :param worker_priority: their priority under it.
     :param worker_cpus: the CPUs that they may use.
     :param freeze_gc: when the first spin begins, collect garbage and have the collector leave
         alone what there is by then (``gc.freeze``): for programs that make their nodes first.
-    :param diagnostics_period: how often to publish on ``/diagnostics`` while it spins: ns, or text
-        as ``1s``; None or 0: not at all.
+    :param diagnostics_period: how often to publish on ``/diagnostics`` while it spins: as
+        ``default_deadline``; None or 0: not at all.
     :param thresholds: what makes a status of the diagnostics worse than OK.
     :param process: which of the declared ``processes`` this is; what runs in the others is not
         counted as missing.
@@ -121,6 +128,7 @@ class MultiDeadlineExecutor(BareExecutor):
         ``live.cpu_order``); off, and said in the log, where the user may not.
     :param preempt: whether callbacks that compute in Python pause for more urgent ones (Python
         3.12 and newer; ``statistics()['preemption']`` says whether they do).
+    :param num_threads: ``num_workers`` under the name that ``MultiThreadedExecutor`` has for it.
     :raises msg_graph.GraphError: when the declaration is not right.
     :raises mddag_executor.errors.MddagError: on an unknown policy, intake or thread setting, a
         value of the wrong kind, and when the trace cannot be written.
@@ -136,21 +144,22 @@ class MultiDeadlineExecutor(BareExecutor):
         context: Context | None = None,
         trace: str | None = None,
         on_deadline_miss: Callable[[DeadlineMiss], None] | None = None,
-        default_deadline: int | str = DEFAULT_DEADLINE_NS,
+        default_deadline: int | str | Duration = DEFAULT_DEADLINE_NS,
         intake: str = 'auto',
         max_active_jobs: int = MAX_ACTIVE_JOBS,
         worker_policy: str | None = None,
         worker_priority: int | None = None,
         worker_cpus: set[int] | None = None,
         freeze_gc: bool = False,
-        diagnostics_period: int | str | None = None,
+        diagnostics_period: int | str | Duration | None = None,
         thresholds: Thresholds | None = None,
         process: str | None = None,
         preempt: bool = False,
         cpu_order: bool = False,
+        num_threads: int | None = None,
     ) -> None:
         task_set, num_workers, deadline_ns = settings.resolve(
-            graph, num_workers, default_deadline, intake)
+            graph, num_workers, default_deadline, intake, num_threads)
         prepare = settings.thread_setting(worker_policy, worker_priority, worker_cpus)
         every_ns = settings.diagnostics_period_ns(diagnostics_period)
         max_active_jobs = settings.whole_number(
@@ -171,12 +180,17 @@ class MultiDeadlineExecutor(BareExecutor):
         self._attention = Bell()
         self._spinning = threading.Lock()
         self._finished = False
+        self._ended_by_callback = False
+        # reentrant: a signal's handler may end the run in the thread that ends it
+        self._ending = threading.RLock()
         self._freeze_gc = freeze_gc
+        self._notifier = None if on_deadline_miss is None else MissNotifier(
+            on_deadline_miss, self._fail)
         self._engine = Engine(
             task_set, num_workers, policy, default_deadline=deadline_ns,
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
-            record=self._recorder.record if self._recorder else None, on_miss=on_deadline_miss,
-            fail=self._fail, process=process)
+            record=self._recorder.record if self._recorder else None,
+            on_miss=None if self._notifier is None else self._notifier.post, process=process)
         self._pool = Pool(
             self._engine, self._trace_clock, self._fail, self._context_ended, prepare,
             bool(preempt))
@@ -190,6 +204,8 @@ class MultiDeadlineExecutor(BareExecutor):
             get_logger('mddag_executor').warning(
                 f'preempt: it is off: {self._pool.preemption.reason}')
         self._pool.pump = self._pump
+        self._miss_log = MissLog(self._engine.verdicts)
+        self._pool.after_judging = self._miss_log.write
         self._pool.relieve_intake = self._relieve_intake
         self._stop_watch = StopWatch(
             self._attention, self._stopped, look=self._look_at_late)
@@ -201,6 +217,7 @@ class MultiDeadlineExecutor(BareExecutor):
         if self._recorder is not None:
             self._recorder.entities((), [self._task_entity])
         self._rates = RateWatch(self._registry)
+        self._names = NameCheck(task_set, self._registry, process)
         self._groups = Groups(self, self.wake, self._hand_over)
         self._announcements: Announcements | None = None
         self._upkeep = Upkeep(
@@ -212,7 +229,7 @@ class MultiDeadlineExecutor(BareExecutor):
         if every_ns is not None:
             self._diagnostics = Diagnostics(
                 self.context, task_set, self._pool, self._registry, self._recorder, every_ns,
-                thresholds, process)
+                thresholds, process, self._notifier)
         if process is not None and task_set is not None and (
                 self._engine.other_processes is not None
                 and self._engine.other_processes.announces):
@@ -224,7 +241,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._intake_kind = intake
         # What is ready still would run before the spin notices.
         call_at_shutdown(self.context, self._pool.start_no_more)
-        call_at_shutdown(self.context, self.wake)
+        call_at_shutdown(self.context, self._context_ends)
         halt_at_exit(self)
 
     def _nodes_to_look_after(self) -> list[Any]:
@@ -233,6 +250,14 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _context_ended(self) -> bool:
         return is_over(self.context)
+
+    def _context_ends(self) -> None:
+        """Take note of who ends the context: one of this executor's callbacks, or not."""
+        running = current.running
+        self._ended_by_callback = (
+            running is not None and running.engine is self._engine
+            or self._notifier is not None and self._notifier.is_calling())
+        self.wake()
 
     # --- nodes and callback groups ---------------------------------------------------------------
 
@@ -362,12 +387,16 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         Run callbacks on the pool until shutdown.
 
-        :raises ExternalShutdownException: when the context ends.
+        It returns also when a callback ends the context (``rclpy.shutdown``), and at once when
+        that has ended before.
+
+        :raises ExternalShutdownException: when something else ends the context.
         :raises RuntimeError: when the executor spins already.
         :raises Exception: what a callback raised.
         """
         with short_switch_interval(self._engine.preempts):
             self._spin(lambda: False, None)
+        self._raise_error()  # of the callback that has ended the context, after that
 
     def spin_until_future_complete(
         self, future: Future, timeout_sec: float | None = None
@@ -385,9 +414,8 @@ class MultiDeadlineExecutor(BareExecutor):
         if not self._spinning.acquire(blocking=False):
             raise RuntimeError('Executor is already spinning')
         try:
-            if self.is_ending():
+            if self.is_ending() or is_over(self.context):
                 return
-            self._check_context()
             if self._freeze_gc:
                 self._freeze_gc = False
                 gc.collect()
@@ -395,6 +423,8 @@ class MultiDeadlineExecutor(BareExecutor):
             self._submit_tasks()  # as in rclpy, before what else is ready
             self._start_intake()
             self._pool.interpreter.looks_late = True
+            if self._engine.dag_names:
+                self._pool.watch.start()
             self._pool.start()
             self._stop_watch.start()
             while not self.is_ending():
@@ -403,7 +433,8 @@ class MultiDeadlineExecutor(BareExecutor):
                     self._settle()
                     self._raise_error()  # of what ran before it was done
                     return
-                self._check_context()
+                if self._was_ended():
+                    return
                 self._look_after()
                 rest = self._upkeep.rest_s()
                 if rest == 0.0:
@@ -417,8 +448,8 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._stop_watch.wait(left)
             self._raise_error()
         except RCL_ERRORS:
-            self._check_context()
-            raise
+            if not self._was_ended():
+                raise
         finally:
             self._pool.interpreter.looks_late = False
             self._pool.pause()
@@ -426,6 +457,8 @@ class MultiDeadlineExecutor(BareExecutor):
             if is_over(self.context):
                 self._pool.close(0.5)
                 self._end_run()
+                if self._notifier is not None:
+                    self._notifier.stop()
             self._spinning.release()
 
     def _settle(self) -> None:
@@ -453,6 +486,24 @@ class MultiDeadlineExecutor(BareExecutor):
             self._announcements.look()
         if self._diagnostics is not None:
             self._diagnostics.start()
+        if self._notifier is not None:
+            self._notifier.start()
+        self._miss_log.write()
+        self._names.look(self._engine.is_judging)
+
+    def _was_ended(self) -> bool:
+        """
+        Return whether a callback has ended the context.
+
+        :raises ExternalShutdownException: when something else has.
+        """
+        if not is_over(self.context):
+            return False
+        with suppress(InvalidHandle):
+            self.context.ok()  # it has a lock, so whoever is just ending it has noted that now
+        if not self._ended_by_callback:
+            raise ExternalShutdownException()
+        return True
 
     def _check_context(self) -> None:
         if is_over(self.context):
@@ -504,8 +555,11 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _raise_error(self) -> None:
         self._unclaimed.look()
-        if self._errors:
-            raise self._errors.popleft()
+        while self._errors:
+            error = self._errors.popleft()
+            # what others raised just because a callback has ended their context
+            if not (self._ended_by_callback and isinstance(error, RCL_ERRORS)):
+                raise error
 
     @contextmanager
     def _pump(self) -> Iterator[None]:
@@ -578,6 +632,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._upkeep.add_intake(self._stepping)
         self._upkeep.refresh()
         self._pool.look_around()
+        self._pool.judge_overdue()
         self._stepping.poll(0.0)
         self._submit_tasks()
         if self._pool.run_one():
@@ -611,14 +666,18 @@ class MultiDeadlineExecutor(BareExecutor):
         if not self._pool.close(timeout_sec):
             return False
         self._end_run()
+        reported = self._notifier is None or self._notifier.stop(timeout_sec)
         finished: bool = super().shutdown(timeout_sec)
-        return finished
+        return finished and reported
 
     def _end_run(self) -> None:
-        """Judge what is open and close the trace, once."""
-        if self._finished:
-            return
-        self._finished = True
+        """Judge what is open and close the trace, once; whoever comes second waits for that."""
+        with self._ending:
+            if not self._finished:
+                self._finished = True
+                self._judge_and_close()
+
+    def _judge_and_close(self) -> None:
         if self._diagnostics is not None:
             self._diagnostics.stop()
         self._groups.release()
@@ -628,7 +687,6 @@ class MultiDeadlineExecutor(BareExecutor):
             now = self._pool.tick()
             end = min(now, self._pool.stopped_at or now)
             self._engine.finish(now, end)
-        self._engine.verdicts.report_misses()
         if self._recorder is not None:
             self._recorder.close(now, end)
 
@@ -671,4 +729,5 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def statistics(self) -> dict[str, Any]:
         """Return a snapshot of what has happened so far (see the module ``statistics``)."""
-        return statistics(self._pool, self._registry, self._recorder, self._process)
+        return statistics(
+            self._pool, self._registry, self._recorder, self._process, self._notifier)

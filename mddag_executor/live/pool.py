@@ -40,6 +40,7 @@ from mddag_executor.clocks import TraceClock
 from mddag_executor.core import NEVER
 from mddag_executor.live.compat import UNKNOWN
 from mddag_executor.live.cpu_order import CpuOrder
+from mddag_executor.live.deadline_watch import DeadlineWatch
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import BRIEF_NS, MOST_DEBT, SOON_NS
 from mddag_executor.live.groups import Refused
@@ -101,6 +102,9 @@ class Pool:
         self._refusals = 0
         self.cpu_order: CpuOrder | None = None
         self.preemption = Preemption() if preempt else None
+        self.watch = DeadlineWatch(self.lock, self.judge_overdue, clock.now, fail)
+        # called, without the lock, after it was judged what is overdue
+        self.after_judging: Callable[[], None] = lambda: None
         self.interpreter = Interpreter(
             engine, self.lock, self._seats, self._hand_out_now, self.preemption)
 
@@ -119,6 +123,8 @@ class Pool:
                 now = self._last
             self._last = now
             event(*args, now)
+            if self.engine.deadlines.next < self.watch.at:
+                self.watch.wait_for(self.engine.deadlines.next)
             running = current.running
             if running is None:
                 own = self._hand_out(now, current.intake)
@@ -169,6 +175,15 @@ class Pool:
         self._last = max(self._last, self.clock.now())
         return self._last
 
+    def judge_overdue(self) -> None:
+        """Report the sinks whose deadlines are over; of a run that has ended, as of its end."""
+        with self.lock:
+            now = self.tick()
+            self.engine.judge_overdue(min(now, self.stopped_at or now))
+            if self.running:
+                self.watch.wait_for(self.engine.deadlines.next)
+        self.after_judging()
+
     def resume(self, work: Work) -> None:
         """Make a suspended execution ready to go on."""
         with self.lock:
@@ -192,6 +207,7 @@ class Pool:
                 self._new_thread(worker)
             self.running = True
             self.stopped_at = 0
+            self.watch.wait_for(self.engine.deadlines.next)
             self._hand_out(self.tick())
 
     def pause(self) -> None:
@@ -225,6 +241,7 @@ class Pool:
                 self.preemption.close()
             seats += self._intakes
         self.interpreter.close()
+        self.watch.close()
         deadline = None if timeout is None else monotonic_ns() + int(timeout * 1e9)
         done = True
         for seat in seats:
@@ -268,9 +285,14 @@ class Pool:
             except Exception as error:
                 self._fail(error)
         while not seat.ended:
-            seat.wake.acquire()
-            while seat.work is not None:
-                self._execute(seat)
+            seat.wake.acquire()  # once for each assignment by another thread
+            goes_on = seat.work is not None  # else it was woken to end
+            while goes_on:
+                goes_on = False
+                try:
+                    goes_on = self._execute(seat)
+                except BaseException as error:  # the executor's own: a callback's were handled
+                    self._fail(error)
         seat.cpu_clock.close()
 
     @contextmanager
@@ -325,8 +347,7 @@ class Pool:
 
     def run_one(self) -> bool:
         """Run one ready callback in the calling thread; False when none may run."""
-        ran = False
-        while not ran:
+        while True:
             with self.lock:
                 work = self.engine.dispatch(self.tick())
                 if work is None:
@@ -335,18 +356,21 @@ class Pool:
                 seat.work = work
             seat.vtid = threading.get_native_id()
             before = current.running    # a callback that steps the executor itself
-            ran = self._execute(seat)
+            self._execute(seat)
             current.running = before
-        return True
+            if not seat.refused:
+                return True
 
     def _execute(self, seat: Seat) -> bool:
         """
         Run the seat's execution until it ends or waits; leave a worker's next one in the seat.
 
-        :return: False when its callback group did not let it run.
+        :return: whether there is a next one. What another thread puts into the seat later is not
+            meant: that thread wakes the worker for it.
         """
         work, engine, offset = seat.work, self.engine, self.clock.offset_ns
         assert work is not None
+        goes_on = False
         entity = work.entity
         waits_for: Any = None
         raised: BaseException | None = None
@@ -401,12 +425,12 @@ class Pool:
                 self._leave(seat, now)
             else:
                 seat.work = engine.dispatch(now, seat.worker)
+                goes_on = seat.work is not None
                 if engine.has_more:
                     self._hand_out(now)
                 elif (engine.holders and any(engine.queues) or engine.is_shared
                         or self.interpreter.rings_at):
                     self.interpreter.look_after()
-        let_run = type(raised) is not Refused
         if waits_for is not None:
             self._resume_when_done(work, waits_for)
         elif raised is not None:  # now, when its job has failed for whoever catches it
@@ -416,9 +440,7 @@ class Pool:
             raised = None   # it refers to this frame
         elif self.callback_ended is not None:
             self.callback_ended(entity.rclpy, None)
-        if engine.verdicts.misses:
-            engine.verdicts.report_misses()
-        return let_run
+        return goes_on
 
     def _report_outcome(
         self, seat: Seat, work: Work, waits_for: Any, raised: BaseException | None, start: int,
@@ -427,6 +449,7 @@ class Pool:
         """Give the engine what became of an execution that has not simply ended."""
         engine = self.engine
         if isinstance(raised, Refused):
+            seat.refused = True
             engine.refused(work, now)
             return
         engine.report_alone(now)
@@ -456,8 +479,11 @@ class Pool:
         if waits_for is UNKNOWN or not hasattr(waits_for, 'add_done_callback'):
             with self.lock:
                 self._polled.append(work)
-        else:
+            return
+        try:
             waits_for.add_done_callback(QuickCallback(partial(self.resume, work)))
+        except BaseException as error:  # it may be of a class of the user's
+            self._fail(error)
 
     def is_idle(self) -> bool:
         """Return whether nothing runs and nothing is ready."""

@@ -9,12 +9,13 @@ from typing import Any
 
 from mddag_executor.live.announcements import Announcements
 from mddag_executor.live.compat import ends_sleep
-from mddag_executor.live.entity import Entity
+from mddag_executor.live.entity import Entity, WAITABLE
 from mddag_executor.live.jobs import Announced, header_stamp, Origin, steady_time
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
 from mddag_executor.live.work import Work
+from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 
 
@@ -98,6 +99,8 @@ class Receiver:
         elif entity.source >= 0:
             pool.report(engine.arrived, work, None, self._clock.now(), -1)
         else:
+            if entity.kind == WAITABLE and isinstance(work.rclpy_entity, EventHandler):
+                self._registry.note_event(work.rclpy_entity, work.args[0])
             pool.report(engine.ready, work)
 
     def give(self, work: Work, origin: Origin | Announced | None) -> None:

@@ -36,8 +36,9 @@ from mddag_executor.live.work import Work
 from msg_graph import binding, Callback, TaskSet
 from msg_graph.duration import exact_duration
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import EventHandler, QoSSubscriptionEventType
 from rclpy.exceptions import InvalidHandle
-from rclpy.qos import HistoryPolicy
+from rclpy.qos import HistoryPolicy, qos_policy_name_from_kind
 
 if TYPE_CHECKING:
     from mddag_executor.live.intake.events import EventsIntake
@@ -50,6 +51,7 @@ REFRESH_REST = 3
 HAND_OVER_S = 2.0
 """For so long an intake is given to take no more of something; it takes a few milliseconds."""
 _MOST_UNDECLARED = 4096
+_INCOMPATIBLE = QoSSubscriptionEventType.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS
 
 KINDS = (TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE)
 """In the order of ``entities.LISTS``."""
@@ -59,8 +61,8 @@ class Registry:
     """
     What is kept for all entities of the executor's nodes.
 
-    Not thread-safe: the executor refreshes it under a lock of its own, and other threads only
-    look entities up.
+    The executor refreshes it under a lock of its own; other threads look entities up, and ask for
+    counts at any time.
 
     :ivar by_id: what is kept for each entity of rclpy, by the ``id`` of that.
     :param passed: called with each execution that a callback group has let through (see
@@ -83,6 +85,7 @@ class Registry:
         # the executor's own subscriptions
         self.own: set[Any] = set()
         # destroyed entities whose last executions are not done yet, and the counts of those before
+        self._counting = threading.Lock()
         self._retired: list[Entity] = []
         self._past: dict[str, dict[str, Any]] = {}
         self._published: dict[str, set[str]] = {}
@@ -126,9 +129,10 @@ class Registry:
         made = [self._new_entity(*each) for each in new]
         added = [each for each in made if each is not None]
         present.update((id(each.rclpy), each) for each in added)
-        self.by_id = present
-        self._retired.extend(gone)
-        self._fold()
+        with self._counting:
+            self.by_id = present
+            self._retired.extend(gone)
+            self._fold()
         self._free_groups()
         return added, gone
 
@@ -170,18 +174,20 @@ class Registry:
 
     def publishes(self) -> dict[str, set[str]]:
         """Return on which topics each declared callback has published."""
-        found = {callback.key: set(self._published.get(callback.key, ()))
-                 for callback in self.declared}
-        for entity in (*self._retired, *self.by_id.values()):
-            if entity.callback is not None:
-                found[entity.callback.key] |= entity.publishes
+        with self._counting:
+            found = {callback.key: set(self._published.get(callback.key, ()))
+                     for callback in self.declared}
+            for entity in (*self._retired, *self.by_id.values()):
+                if entity.callback is not None:
+                    found[entity.callback.key] |= entity.publishes
         return found
 
     def counts(self) -> dict[str, dict[str, Any]]:
         """Return the counts of all entities there have been, by callback (see ``Entity``)."""
-        counts = {name: dict(past) for name, past in self._past.items()}
-        for entity in (*self._retired, *self.by_id.values()):
-            entity.count_into(counts)
+        with self._counting:
+            counts = {name: dict(past) for name, past in self._past.items()}
+            for entity in (*self._retired, *self.by_id.values()):
+                entity.count_into(counts)
         return counts
 
     def computing(self) -> int:
@@ -195,13 +201,14 @@ class Registry:
         Unlike ``counts`` this costs next to nothing for an entity that nobody uses.
         """
         totals = dict.fromkeys(COUNTS, 0)
-        for past in list(self._past.values()):
-            for key in COUNTS:
-                totals[key] += past[key]
-        for entity in (*self._retired, *self.by_id.values()):
-            if entity.ready or entity.skipped:
+        with self._counting:
+            for past in self._past.values():
                 for key in COUNTS:
-                    totals[key] += getattr(entity, key)
+                    totals[key] += past[key]
+            for entity in (*self._retired, *self.by_id.values()):
+                if entity.ready or entity.skipped:
+                    for key in COUNTS:
+                        totals[key] += getattr(entity, key)
         return totals
 
     def hosted(self) -> set[str]:
@@ -216,6 +223,10 @@ class Registry:
             return set()
         return {c.key for c in self.declared if self._task_set.process_of(c.node) != process}
 
+    def unbound(self) -> list[Callback]:
+        """Return the declared callbacks that no entity is bound to now."""
+        return [] if self._binder is None else self._binder.unbound()
+
     def undeclared(self) -> list[binding.Entity]:
         """Return the timers, subscriptions and services there were that are not declared."""
         return list(self._undeclared)
@@ -223,6 +234,14 @@ class Registry:
     def subscriptions(self) -> list[Entity]:
         """Return the subscriptions that there are now."""
         return [entity for entity in self.by_id.values() if entity.kind == SUBSCRIPTION]
+
+    def note_event(self, handler: EventHandler, status: Any) -> None:
+        """Take note of a QoS event: of the policy for which a subscription gets nothing."""
+        if status is None or handler.event_type != _INCOMPATIBLE:
+            return
+        for entity in self.subscriptions():
+            if handler in entity.rclpy.event_handlers:
+                entity.incompatible_qos = qos_policy_name_from_kind(status.last_policy_kind)
 
     def timers(self) -> list[Entity]:
         """Return the timers that there are now."""

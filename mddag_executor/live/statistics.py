@@ -12,10 +12,10 @@ from __future__ import annotations
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core.tally import counts, never_due
+from mddag_executor.live.miss_notifier import MissNotifier
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
-from mddag_executor.live.why import CAUSES
 from msg_graph import TaskSet
 from msg_graph.drift import Drift, drift, Observed, Releases
 
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 
 def statistics(
-    pool: Pool, registry: Registry, recorder: Recorder | None, process: str | None = None
+    pool: Pool, registry: Registry, recorder: Recorder | None, process: str | None = None,
+    notifier: MissNotifier | None = None,
 ) -> dict[str, Any]:
     """
     Return the counts of a run.
@@ -33,18 +34,18 @@ def statistics(
     has for each entity what became ready, ran, failed (raised), waits, was dropped (QoS depth,
     destroyed, aborted) or skipped (timers), its busy time in ns, whether it holds the interpreter
     while it runs, and for which part of its time it needs that (None: not known yet).
+    ``incompatible_qos`` is the policy for which a subscription gets nothing from a publisher.
     ``unattributed`` counts messages of declared callbacks whose publication was not found; they
     ran as undeclared ones.  ``stops`` has how often and for how long no thread of the process ran
-    while it spun, how many misses fell into these stops, and the times of the last ones (ns since
-    the epoch).  ``causes`` has how many misses of which cause there are, as far as the executor
-    knows it at once.  ``preemption`` (None unless asked for) has why it is off, or None, and how
-    often a callback was to pause.
+    while it spun, how many misses these stops explain, and the times of the last ones (ns since
+    the epoch).  ``preemption`` (None unless asked for) has why it is off, or None, and how
+    often a callback was to pause.  ``unreported_misses`` counts those that ``on_deadline_miss``
+    was not called with, because it had not returned from earlier ones in time.
     """
     engine = pool.engine
     with pool.lock:
         result = engine.verdicts.tally.result()
         stops = engine.verdicts.stops.result()
-        causes = {cause: sum(of[cause] for of in engine.verdicts.causes) for cause in CAUSES}
         waiting = engine.scheduler.queue_length
         idle = engine.scheduler.idle_workers
         undeclared = engine.undeclared
@@ -60,7 +61,7 @@ def statistics(
     result['never_due'] = never_due(result['dags'])
     return {
         'policy': engine.scheduler.policy.name, 'workers': engine.n_workers,
-        **result, 'stops': stops, 'causes': causes, 'callbacks': callbacks,
+        **result, 'stops': stops, 'callbacks': callbacks,
         'undeclared': undeclared,
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
         'preemption': None if pool.preemption is None else {
@@ -70,6 +71,7 @@ def statistics(
             'unknown': engine.jobs.unknown,
             'doubtful': engine.jobs.doubtful},
         'never_ran': never_ran,
+        'unreported_misses': 0 if notifier is None else notifier.unreported,
         'trace': None if recorder is None else {
             'path': recorder.path, 'lost': recorder.writer.dropped,
             'error': None if recorder.writer.error is None else str(recorder.writer.error)},

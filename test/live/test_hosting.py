@@ -63,8 +63,9 @@ def run(
         finally:
             process.kill()
     assert process.returncode == 0, err
-    # A busy machine skips releases, and this is said.
-    assert [line for line in err.splitlines() if 'cannot keep its rate' not in line] == []
+    # A busy machine skips releases and misses deadlines, and this is said.
+    assert [line for line in err.splitlines() if 'cannot keep its rate' not in line
+            and not re.search(r'\d deadlines? missed', line)] == []
     result: dict[str, Any] = json.loads(Path('result.json').read_text())
     return result, Path('out.txt').read_text()
 
