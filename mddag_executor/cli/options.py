@@ -10,10 +10,8 @@ help are the same, too. Like the verbs' modules this one imports nothing heavy.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
-from importlib import import_module
+from collections.abc import Callable
 import math
-from types import ModuleType
 from typing import Any, TypeVar
 
 from mddag_executor import defaults
@@ -258,40 +256,3 @@ def add_repeat(
     """Declare `--repeat` of a benchmark."""
     parser.add_argument('--repeat', type=positive_int, default=default, metavar='R',
                         help=f'{what} (default: %(default)s)')
-
-
-# --- verbs ---------------------------------------------------------------------------------------
-
-def add_verb(parsers: Any, name: str, module: ModuleType, summary: str, description: str) -> None:
-    """
-    Add a verb, or a verb of a verb, to the parsers that `add_subparsers` returned.
-
-    :param module: has `EXAMPLE`, `add_arguments`, and `main`, which becomes `args.main`.
-    :param summary: for the list of verbs
-    """
-    parser = _add_parser(parsers, name, summary, description, module.EXAMPLE.strip().splitlines())
-    module.add_arguments(parser)
-    parser.set_defaults(main=module.main)
-
-
-def add_verbs(
-    parsers: Any, verb: str, names: Sequence[str], summary: str, description: str
-) -> None:
-    """Add a verb that has verbs; each of these is a module, `VERB_NAME`."""
-    modules = {name: import_module(f'mddag_executor.cli.{verb}_{name.replace("-", "_")}')
-               for name in names}
-    parser = _add_parser(parsers, verb, summary, description,
-                         [module.EXAMPLE.split('\n')[0] for module in modules.values()])
-    inner = parser.add_subparsers(
-        dest=f'{verb}_verb', metavar='VERB', required=True, title='verbs')
-    for name, module in modules.items():
-        add_verb(inner, name, module, module.HELP, module.DESCRIPTION)
-
-
-def _add_parser(
-    parsers: Any, name: str, summary: str, description: str, examples: Sequence[str]
-) -> Any:
-    return parsers.add_parser(
-        name, help=summary, allow_abbrev=False, description=description,
-        epilog='\n  '.join(('example:', *examples)),
-        formatter_class=argparse.RawDescriptionHelpFormatter)
