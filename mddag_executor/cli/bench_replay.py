@@ -187,7 +187,7 @@ def _record(
     done = subprocess.run(
         [sys.executable, '-m', 'mddag_executor', 'run', graph, '--synthetic', args.bodies,
          *scaled, '--workers', str(workers), '--duration', f'{args.seconds + _WARM_UP_S:g}s',
-         '--trace', path],
+         '--trace', path, '--overwrite'],
         capture_output=True, text=True, check=False, timeout=args.seconds + 120)
     if done.returncode != 0 or not os.path.exists(path):
         lines = done.stderr.strip().splitlines()

@@ -15,7 +15,7 @@ exit status is
 | 0 | done |
 | 1 | done, and with `--fail-on-miss` a deadline was missed |
 | 2 | bad input or usage |
-| 70 | a defect of this program or of a node's callback, with its traceback (EX_SOFTWARE) |
+| 70 | a defect of this program or of a node, with its traceback (EX_SOFTWARE) |
 | 130 | interrupted with Ctrl-C |
 | 141 | the reader of the output went away |
 
@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 from mddag_executor import __version__
 from mddag_executor.cli.parsing import group_parser, Parser, verb_parser
 from mddag_executor.cli.text import one_line
-from mddag_executor.errors import MddagError, UsageError
+from mddag_executor.errors import MddagError, UsageError, UserCodeError
 
 EXIT_BAD_INPUT = 2
 EXIT_DEFECT = 70
@@ -171,14 +171,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
             _silence_stdout()
         line = user_line(error)
-        if line is None or os.environ.get('MDDAG_DEBUG') == '1':
+        raised = error.__cause__ if isinstance(error, UserCodeError) else error
+        if line is None or raised is not error or os.environ.get('MDDAG_DEBUG') == '1':
             import traceback
-            traceback.print_exception(type(error), error, error.__traceback__)
+            traceback.print_exception(raised)
         if line is None:
             return EXIT_DEFECT
         for each in _user_lines(error, line):
             print(f'error: {each}', file=sys.stderr)
-        return EXIT_BAD_INPUT
+        return EXIT_BAD_INPUT if raised is error else EXIT_DEFECT
 
 
 def _user_lines(error: BaseException, line: str) -> list[str]:

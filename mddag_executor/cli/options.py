@@ -116,7 +116,10 @@ class Input(str):
 
 
 class Output(str):
-    """A file to write, `-` for standard output; `common.check_files` looks at it early."""
+    """A file to write, `-` for standard output; `common.check_files` checks it early."""
+
+    is_recording = False    # see `output_rules`
+    checked_early = True
 
 
 class Report(Output):
@@ -125,6 +128,30 @@ class Report(Output):
 
 class NamedFile(Output):
     """A file to write that cannot be standard output."""
+
+
+class Bag(Output):
+    """A bag to write."""
+
+    is_recording = True
+
+
+class Trace(NamedFile):
+    """A trace to write."""
+
+    is_recording = True
+
+
+class TraceOfRun(Trace):
+    """What `run` records to: a trace, or a folder of them, which the verb itself checks."""
+
+    checked_early = False
+
+
+class Export(Output):
+    """What `export` writes: a file or a folder, which the verb itself checks."""
+
+    checked_early = False
 
 
 # --- options that several verbs have -------------------------------------------------------------
@@ -186,6 +213,8 @@ _SHARED: dict[str, dict[str, Any]] = {
         'help': 'for recordings of several machines: how far the clock of process NAME (the one '
         "of RUN.NAME.mcap, or a trace) is ahead of the first trace's, for instance 2.5ms, or "
         '-2.5ms if it is behind', 'otherwise': 'estimated from messages in both directions'},
+    '--overwrite': {
+        'action': 'store_true', 'help': 'replace a recording that is there already'},
     '--ros-args': {
         'nargs': argparse.REMAINDER, 'metavar': '…',
         'help': 'pass the rest of the command line to rclpy.init, for instance -r from:=to'},

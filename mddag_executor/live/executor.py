@@ -103,7 +103,8 @@ class MultiDeadlineExecutor(BareExecutor):
     :param num_workers: threads of the pool; by default what the declaration says, else seven.
     :param policy: ``rad`` or another of ``mddag_executor.core.POLICIES``.
     :param context: the context that the executor belongs to, or None for the default one.
-    :param trace: path of an MCAP file to record to, or None.
+    :param trace: path of an MCAP file to record to, or None. A file that is there already is kept:
+        the constructor raises, unless ``overwrite`` is true.
     :param on_deadline_miss: called with a ``DeadlineMiss``, in a worker thread.
     :param default_deadline: relative deadline of undeclared callbacks: ns, or text as ``100ms``.
     :param intake: ``events``, ``waitset`` or ``auto`` (events where this rclpy has them).
@@ -121,6 +122,7 @@ class MultiDeadlineExecutor(BareExecutor):
         ``live.cpu_order``); off, and said in the log, where the user may not.
     :param preempt: whether callbacks that compute in Python pause for more urgent ones (Python
         3.12 and newer; ``statistics()['preemption']`` says whether they do).
+    :param overwrite: whether ``trace`` may replace a file.
     :raises msg_graph.GraphError: when the declaration is not right.
     :raises mddag_executor.errors.MddagError: on an unknown policy, intake or thread setting, a
         value of the wrong kind, and when the trace cannot be written.
@@ -148,6 +150,7 @@ class MultiDeadlineExecutor(BareExecutor):
         process: str | None = None,
         preempt: bool = False,
         cpu_order: bool = False,
+        overwrite: bool = False,
     ) -> None:
         task_set, num_workers, deadline_ns = settings.resolve(
             graph, num_workers, default_deadline, intake)
@@ -164,7 +167,8 @@ class MultiDeadlineExecutor(BareExecutor):
         hooks.install()
         self._trace_clock = TraceClock()
         self._recorder = None if trace is None else Recorder(
-            trace, task_set, policy, num_workers, deadline_ns, max_active_jobs, self._trace_clock)
+            trace, task_set, policy, num_workers, deadline_ns, max_active_jobs, self._trace_clock,
+            overwrite=overwrite)
         self._errors: deque[BaseException] = deque()
         self._process = process
         self._unclaimed = Unclaimed(self._fail)

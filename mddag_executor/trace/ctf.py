@@ -75,6 +75,7 @@ class Imported:
 def import_ctf(
     session: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str], *, progress: Callable[[int], None] | None = None,
+    overwrite: bool = False,
 ) -> Imported:
     """
     Write the events of a CTF session into a trace file.
@@ -83,6 +84,7 @@ def import_ctf(
         Several sessions are one run that was recorded on several computers.
     :param output: the trace; it is not complete when an exception comes up
     :param progress: called now and then with the number of events so far
+    :param overwrite: whether the trace may replace a file that is there
     :raises TraceError: where the session or the file cannot be used, or babeltrace2 is missing
     """
     paths = [os.fspath(path) for path in (
@@ -94,7 +96,7 @@ def import_ctf(
         raise TraceError(name, 'a session is named twice', 'name each once')
     sessions = [_check_sessions(path, each) for path, each in zip(paths, found)]
     places = {each: place for place, (_, several) in enumerate(sessions) for each in several}
-    with TraceFile(output) as file:
+    with TraceFile(output, overwrite=overwrite) as file:
         importer = _Importer(name, file, places)
         for row in _rows(name, paths, any(is_ctf_2 for is_ctf_2, _ in sessions)):
             importer.take(row)

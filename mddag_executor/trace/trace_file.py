@@ -43,6 +43,7 @@ from mcap.records import (
     Schema,
     Statistics,
 )
+from mddag_executor.output_rules import EXISTS, open_recording, REMEDY
 from mddag_executor.trace import cdr, records
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.groups import Group, GROUPS
@@ -152,11 +153,13 @@ class TraceFile:
     """
 
     def __init__(self, path: str | os.PathLike[str], *,
-                 extra_events: Iterable[EventType] = ()) -> None:
+                 extra_events: Iterable[EventType] = (), overwrite: bool = False) -> None:
         """
-        Open the file, over what was there.
+        Open the file.
 
         :param extra_events: events beyond the table, or other fields for one of the table
+        :param overwrite: whether it may replace a file that is there
+        :raises TraceError: when it cannot be written, or must not be replaced
         """
         self.path = os.fspath(path)
         #: Events that are in the file, in whole chunks.
@@ -180,7 +183,9 @@ class TraceFile:
         self._start: int | None = None      # least and greatest time of all messages
         self._end = 0
         try:
-            self._stream = open(self.path, 'wb', buffering=0)
+            self._stream = open_recording(self.path, overwrite)
+        except FileExistsError:
+            raise TraceError(self.path, EXISTS, REMEDY) from None
         except (OSError, ValueError) as error:
             reason = getattr(error, 'strerror', None) or str(error)
             raise TraceError(self.path, f'cannot be written ({reason})',

@@ -87,7 +87,8 @@ def test_another_graph_judges(
 
 @pytest.mark.parametrize(('arguments', 'error'), [
     (['export', 'TRACE', '-o', 'out.xlsx'], 'it is not known what to write'),
-    (['export', 'TRACE', '-o', 'out'], 'let the name end in .pftrace, .csv, .parquet, .mcap or /'),
+    (['export', 'TRACE', '-o', 'out'], '.pftrace, .csv, .parquet, .foxglove.mcap or /'),
+    (['export', 'TRACE', '-o', 'copy.mcap'], 'it is not known what to write'),
     (['export', 'TRACE', '-o', 'out.pftrace', '--rows', 'jobs'], '--rows: '),
     (['export', '-', '-', '-o', 'out.csv'], 'standard input can be only one'),
     (['export', 'GRAPH', '-o', 'out.csv'], 'error: '),
@@ -278,7 +279,7 @@ def test_a_session_for_caret_has_what_its_tracer_sees(
 @pytest.mark.parametrize(('arguments', 'error'), [
     (('--caret', '-o', 'x.csv'), "--caret: it is for a folder: let the name of -o end in '/'"),
     (('--rows', 'jobs', '-o', 'x/'), 'leave GRAPH, --reschedule and --rows out'),
-    (('--rows', 'jobs', '-o', 'x.mcap'), 'a .mcap gets both')])
+    (('--rows', 'jobs', '-o', 'x.foxglove.mcap'), 'a .mcap gets both')])
 def test_options_of_sessions_and_foxglove(
     arguments: tuple[str, ...], error: str, trace: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

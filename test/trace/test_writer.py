@@ -66,7 +66,7 @@ def test_the_clock(tmp_path: Path) -> None:
     with TraceWriter(tmp_path / 'a.mcap') as writer:
         assert abs(writer.now() - time.time_ns()) < 1_000_000_000
         assert writer.now() - writer.clock_offset <= time.monotonic_ns()
-    with TraceWriter(tmp_path / 'a.mcap', clock_offset=0) as writer:
+    with TraceWriter(tmp_path / 'b.mcap', clock_offset=0) as writer:
         before = time.monotonic_ns()
         assert before <= writer.now() <= time.monotonic_ns()
 
