@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded
-from mddag_executor.cli.text import printable, warn
+from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -33,7 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     options.add_recording(parser, "a recorded run, an MCAP file ('-': standard input)")
-    add('--sink', metavar='S', help='only jobs of this sink: /node:callback, or the end of its name, as tables show it')
+    add('--sink', metavar='S',
+        help='only jobs of this sink: /node:callback, or the end of its name, as tables show it')
     add('--job', type=options.or_zero(options.positive_int), metavar='K',
         help='only the job of this number')
     options.add(parser, '--skip', '--json')

@@ -126,7 +126,7 @@ def test_missing_file_and_bad_usage(call: Mddag, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(('text', 'workers', 'says'), [
     ('deadline: 10ms, execution_time: 25ms', 4,
-     '/n:t: the longest path to it takes 25 ms, more than its deadline of 10 ms: no scheduler can '),
+     '/n:t: the longest path to it takes 25 ms, more than its deadline of 10 ms: no scheduler'),
     ('deadline: 10s, execution_time: 5s', 7,
      'g.yaml: a load of 250.000 is more than 7 workers can do: no scheduler can keep the deadlin'),
     ('deadline: 10s, execution_time: 5s', 512,

@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import json
 from pathlib import Path
 import re
+import subprocess
 import sys
 from typing import Any
 
@@ -279,7 +281,7 @@ def test_help_and_start_up_load_neither_ros_nor_numpy(mddag, trace: Path) -> Non
 
 
 def test_a_sink_is_named_as_tables_do_or_by_a_unique_end(
-    call: Mddag, folder: Path
+    call: Callable[..., subprocess.CompletedProcess[str]], folder: Path
 ) -> None:
     Path('g.yaml').write_text("""\
 mddag: 1
