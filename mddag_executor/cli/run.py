@@ -314,15 +314,15 @@ def _run(
             if args.part is None:
                 warn_of(plan, args.ros_args)
             ledger = _run_synthetic(args, session, task_set, plan, seconds, progress)
-    result = {
-        'file': task_set.file or None, 'nodes': args.node, 'synthetic': args.synthetic,
-        **executor.statistics(),
+    counts = executor.statistics()
+    result: dict[str, Any] = {
+        'file': task_set.file or None, 'nodes': args.node, 'synthetic': args.synthetic, **counts,
         'measured': None if ledger is None or plan is None else measure(ledger, plan)}
-    result['drift'] = [each.result() for each in watch.drift(result)]
+    result['drift'] = [each.result() for each in watch.drift(counts)]
     if not session.clean:
         warn('a callback has not ended in time; it is left behind')
     if args.part is not None:
-        result.update(observed=asdict(watch.observed(result)), ledger=ledger and vars(ledger))
+        result.update(observed=asdict(watch.observed(counts)), ledger=ledger and vars(ledger))
     return result, session.error
 
 

@@ -18,7 +18,7 @@ Whatever has been taken and not run yet stays with the core and runs with the ne
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 import gc
 import os
@@ -55,6 +55,7 @@ from mddag_executor.live.seat import current
 from mddag_executor.live.settings import Thresholds
 from mddag_executor.live.shutdown import call_at_shutdown, halt_at_exit, is_over
 from mddag_executor.live.statistics import statistics
+from mddag_executor.live.statistics_types import Statistics
 from mddag_executor.live.stop_watch import StopWatch
 from mddag_executor.live.tasks import make_task, Unclaimed
 from mddag_executor.live.verdicts import DeadlineMiss
@@ -66,6 +67,8 @@ from rclpy.logging import get_logger
 from rclpy.task import Future, Task
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from rclpy.callback_groups import CallbackGroup
     from rclpy.context import Context
     from rclpy.node import Node
@@ -136,14 +139,14 @@ class MultiDeadlineExecutor(BareExecutor):
         *,
         policy: str = 'rad',
         context: Context | None = None,
-        trace: str | None = None,
+        trace: str | os.PathLike[str] | None = None,
         on_deadline_miss: Callable[[DeadlineMiss], None] | None = None,
         default_deadline: int | str = DEFAULT_DEADLINE_NS,
         intake: str = 'auto',
         max_active_jobs: int = MAX_ACTIVE_JOBS,
         worker_policy: str | None = None,
         worker_priority: int | None = None,
-        worker_cpus: set[int] | None = None,
+        worker_cpus: Iterable[int] | None = None,
         freeze_gc: bool = False,
         diagnostics_period: int | str | None = None,
         thresholds: Thresholds | None = None,
@@ -167,7 +170,7 @@ class MultiDeadlineExecutor(BareExecutor):
         hooks.install()
         self._trace_clock = TraceClock()
         self._recorder = None if trace is None else Recorder(
-            trace, task_set, policy, num_workers, deadline_ns, max_active_jobs, self._trace_clock,
+            os.fspath(trace), task_set, policy, num_workers, deadline_ns, max_active_jobs, self._trace_clock,
             overwrite=overwrite)
         self._errors: deque[BaseException] = deque()
         self._process = process
@@ -673,6 +676,11 @@ class MultiDeadlineExecutor(BareExecutor):
             pass  # destroyed meanwhile
         return found
 
-    def statistics(self) -> dict[str, Any]:
-        """Return a snapshot of what has happened so far (see the module ``statistics``)."""
+    def __enter__(self) -> Self:
+        """Return the executor; it is shut down at the end of the block."""
+        super().__enter__()
+        return self
+
+    def statistics(self) -> Statistics:
+        """Return a snapshot of what has happened so far: see ``Statistics`` for its keys."""
         return statistics(self._pool, self._registry, self._recorder, self._process)
