@@ -67,11 +67,10 @@ from rclpy.logging import get_logger
 from rclpy.task import Future, Task
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
-
     from rclpy.callback_groups import CallbackGroup
     from rclpy.context import Context
     from rclpy.node import Node
+    from typing_extensions import Self
 
 LOOK_AFTER_S = 0.1
 """How often ``spin`` looks whether the context is still there (signals only end the context)."""
@@ -170,8 +169,8 @@ class MultiDeadlineExecutor(BareExecutor):
         hooks.install()
         self._trace_clock = TraceClock()
         self._recorder = None if trace is None else Recorder(
-            os.fspath(trace), task_set, policy, num_workers, deadline_ns, max_active_jobs, self._trace_clock,
-            overwrite=overwrite)
+            os.fspath(trace), task_set, policy, num_workers, deadline_ns, max_active_jobs,
+            self._trace_clock, overwrite=overwrite)
         self._errors: deque[BaseException] = deque()
         self._process = process
         self._unclaimed = Unclaimed(self._fail)

@@ -48,8 +48,8 @@ def statistics(
     return {
         'policy': engine.scheduler.policy.name, 'workers': engine.n_workers,
         'deadline_missed': result['deadline_missed'], 'first_miss': result['first_miss'],
-        'never_due': never_due(result['dags']), 'dags': result['dags'], 'stops': stops, 'causes': causes, 'callbacks': callbacks,
-        'undeclared': undeclared,
+        'never_due': never_due(result['dags']), 'dags': result['dags'], 'stops': stops,
+        'causes': causes, 'callbacks': callbacks, 'undeclared': undeclared,
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
         'preemption': None if pool.preemption is None else {
             'reason_off': pool.preemption.reason or None, 'pauses': pool.preemption.count},

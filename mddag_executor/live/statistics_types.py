@@ -13,7 +13,7 @@ from typing import TypedDict
 
 
 class ResponseTimes(TypedDict):
-    """Response times of a sink, from the release to the completion; quantiles of the last 2,000."""
+    """Response times of a sink from the release on; quantiles are those of the last 2,000."""
 
     min: int
     median: int

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, KW_ONLY
 import importlib.util
 from pathlib import Path
+import re
 import sys
 from types import ModuleType
 from typing import Any
@@ -134,6 +135,7 @@ def test_the_defaults_are_a_command_that_mddag_run_takes(description: Descriptio
     assert (args.synthetic, args.utilisation) == ('sleep', 0.6)
     assert (args.workers, args.policy) == (7, 'rad')
     assert args.duration == 20_000_000_000
+    assert re.fullmatch(r'autoware_demo_\d{4}_[\d_]+-[\d_]+\.mcap', args.trace)
 
 
 def test_every_argument_reaches_the_command(description: Description) -> None:
