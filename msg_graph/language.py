@@ -29,7 +29,7 @@ from typing import Any
 
 from msg_graph.duration import DAY, DurationError, MICROSECOND, parse_duration, UNITS
 from msg_graph.errors import did_you_mean, GraphError, listed, shown
-from msg_graph.model import ExecutionTime
+from msg_graph.model import ExecutionTime, MOST_WORKERS
 from msg_graph.yamltext import Mapping, Scalar, Sequence, Tree
 
 Schema = dict[str, Any]
@@ -460,7 +460,7 @@ FILE = {
                      'Arguments of this file, $(name) in its values, with their defaults.'),
     'include': Key(_entries('include'),
                    'Files whose nodes and paths come before those of this one.'),
-    'workers': Key(whole(1, 1024), 'Number of workers that the system is made for.'),
+    'workers': Key(whole(1, MOST_WORKERS), 'Number of workers that the system is made for.'),
     'nodes': Key(_entries('node'),
                  'The nodes; a node may have several entries, and their order counts for ties.',
                  needed=True),

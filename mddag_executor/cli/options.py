@@ -37,6 +37,13 @@ def positive_int(text: str) -> int:
     return _parsed(text, int, lambda value: value >= 1, 'whole number from 1 up')
 
 
+def workers(text: str) -> int:
+    """Return a number of workers."""
+    from msg_graph.model import MOST_WORKERS
+    return _parsed(text, int, lambda value: 1 <= value <= MOST_WORKERS,
+                   f'whole number from 1 to {MOST_WORKERS}')
+
+
 def seed(text: str) -> int:
     """Return a whole number from 0 to 2**64 - 1."""
     return _parsed(
@@ -175,7 +182,7 @@ _SHARED: dict[str, dict[str, Any]] = {
         'help': 'write tables and pictures of the run as one HTML file that needs no network '
         "(needs mddag_executor[report]; '-': to standard output)"},
     '--workers': {
-        'type': positive_int, 'metavar': 'M', 'help': 'threads that run callbacks',
+        'type': workers, 'metavar': 'M', 'help': 'threads that run callbacks',
         'otherwise': f"the declaration's, else {defaults.WORKERS}"},
     '--cpus': {
         'type': positive_int, 'metavar': 'C',

@@ -13,12 +13,11 @@ from typing import TypedDict
 
 
 class ResponseTimes(TypedDict):
-    """Response times of a sink from the release on; quantiles are those of the last 2,000."""
-
     min: int
     median: int
     p99: int
     max: int
+"""Response times of a sink from the release on; quantiles are those of the last 2,000."""
 
 
 class SinkCounts(TypedDict):

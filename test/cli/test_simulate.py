@@ -193,7 +193,7 @@ def changed(**times: Any) -> str:
 
 
 @pytest.mark.parametrize(('arguments', 'times', 'says'), [
-    (['--workers', '0'], None, "--workers: '0' is no whole number from 1 up"),
+    (['--workers', '0'], None, "--workers: '0' is no whole number from 1 to 4096"),
     (['--workers', '-2'], None, '--workers'),
     (['--workers', 'many'], None, '--workers'),
     (['--policy', 'edf'], None,

@@ -300,7 +300,7 @@ def test_bad_input(
 def test_bad_experiments(small: TaskSet) -> None:
     with pytest.raises(PolicyError, match="policy 'edf': there is no such policy"):
         evaluate(Experiment(small, ('rad', 'edf')), 1)
-    with pytest.raises(SimulationError, match='workers: 0 is too few'):
+    with pytest.raises(SimulationError, match='workers: 0 is out of range: give 1 to 4096'):
         evaluate(Experiment(small, workers=0), 1)
     with pytest.raises(SimulationError, match='overhead'):
         evaluate(Experiment(small, overhead_ns=-1), 1)
