@@ -282,13 +282,15 @@ def output_file(path: str) -> Iterator[BinaryIO]:
 def output_trace(path: str) -> Iterator[str]:
     """Give a file that becomes `path` when the block ends well; errors speak of `path`."""
     from mddag_executor.trace import TraceError
+    from mddag_executor.trace.trace_file import KEPT
     with output_file(path) as file:
         try:
             yield file.name
         except TraceError as error:
             if error.file != file.name:
                 raise
-            raise TraceError(path, error.problem, error.remedy) from None
+            # the file is taken away
+            raise TraceError(path, error.problem, error.remedy.removeprefix(KEPT)) from None
 
 
 def write_text(path: str, text: str) -> None:

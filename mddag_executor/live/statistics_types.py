@@ -11,12 +11,8 @@ from __future__ import annotations
 
 from typing import TypedDict
 
-
-class ResponseTimes(TypedDict):
-    min: int
-    median: int
-    p99: int
-    max: int
+ResponseTimes = TypedDict(  # noqa: UP013 - a class would shadow min and max
+    'ResponseTimes', {'min': int, 'median': int, 'p99': int, 'max': int})
 """Response times of a sink from the release on; quantiles are those of the last 2,000."""
 
 

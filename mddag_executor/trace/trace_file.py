@@ -51,6 +51,8 @@ from mddag_executor.trace.schema import camel_case, EVENTS, EventType
 import zstandard
 
 CHUNK_LIMIT = 256 * 1024
+KEPT = 'what was written before is there; '
+"""What the remedy begins with where events are in the file that failed."""
 _TWICE = 'mddag:task_set'
 _COMPRESSION_LEVEL = 1      # of zstd; higher levels cost more than they save on such data
 
@@ -394,7 +396,7 @@ class TraceFile:
             self._cut_back()
             reason = getattr(error, 'strerror', None) or str(error)
             raise TraceError(self.path, f'writing failed ({reason})',
-                             'what was written before is there; free space, then record again'
+                             f'{KEPT if self.written else ""}free space, then try again'
                              ) from None
         self._offset += len(data)
 

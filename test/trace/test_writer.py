@@ -259,7 +259,7 @@ def test_a_disk_that_gets_full(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     output = run_child(LIMITED, path).splitlines()
     assert output[0] == (f'{path}: writing failed ({os.strerror(errno.EFBIG)}): what was written '
-                         'before is there; free space, then record again')
+                         'before is there; free space, then try again')
     recorded, dropped = map(int, output[1].split())
     events, warnings = read(path)
     there = [event for event in events if event[0] == 'ros2:callback_end']
