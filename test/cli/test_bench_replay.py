@@ -148,7 +148,7 @@ def test_slack_holds_where_runs_are_simulated(
     def simulated(graph: str, args: Any, utilisation: Any, workers: int, path: str) -> None:
         assert utilisation is None
         assert program.main(['simulate', graph, '--workers', str(workers), '--duration', '3s',
-                             '--trace', path]) == 0
+                             '--trace', path, '--overwrite']) == 0
 
     monkeypatch.setattr(bench_replay, '_record', simulated)
     assert program.main([

@@ -258,7 +258,8 @@ def test_other_bad_input_is_one_line(
         ([trace, '--reschedule', '--callbacks'], '--callbacks: '),
         ([trace, '--reschedule', '--policy', 'best'], "policy 'best': there is no such policy: "),
         ([trace, '--reschedule', '--workers', '0'], 'mddag replay: argument --workers: '),
-        ([trace, '--reschedule', '--workers', '99999'], 'workers: 99999 is out of range: give'),
+        ([trace, '--reschedule', '--workers', '99999'],
+         "mddag replay: argument --workers: '99999' is no whole number from 1 to 4096"),
         (['-', '-'], '-: standard input can be only one of trace and trace: name a file '),
         ([], 'mddag replay: the following arguments are required: TRACE'),
     ):
