@@ -203,8 +203,7 @@ def _end(error: BaseException | None) -> int:
     The process ends here if a node's thread would keep the interpreter from ending.
     """
     if isinstance(error, Exception):
-        from mddag_executor.hosting.loading import describe
-        raise UserCodeError(f'a node raised {describe(error)}: correct it') from error
+        raise UserCodeError from error
     if error is not None:
         raise error
     left = [t.name for t in threading.enumerate()
