@@ -14,6 +14,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 import tempfile
@@ -70,7 +71,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         names = [process.name for process in task_set.processes]
         _warn_of_contested(task_set)
         for name in names:
-            common.check_output(_trace(args.trace, name))
+            _check_traces(args, name)
         if plan is not None:
             warn_of(plan, args.ros_args, len(names))
 
@@ -210,7 +211,8 @@ def _command(
                '--policy', args.policy, '--intake', args.intake,
                '--diagnostics', f'{args.diagnostics}ns' if args.diagnostics else 'off']
     command += [option for option, asked in (
-        ('--preempt', args.preempt), ('--cpu-order', args.cpu_order)) if asked]
+        ('--preempt', args.preempt), ('--cpu-order', args.cpu_order),
+        ('--overwrite', args.overwrite)) if asked]
     if args.synthetic is None:
         for spec in specs:
             command += ['--node', spec]
@@ -222,6 +224,18 @@ def _command(
         if value is not None:
             command += [option, str(value)]
     return command
+
+
+def _check_traces(args: argparse.Namespace, name: str) -> None:
+    """Find out whether a process can record, also when it is started again."""
+    given = _trace(args.trace, name)
+    common.check_output(given, recording=True, overwrite=args.overwrite)
+    if given is None:
+        return
+    path = Path(given)
+    again = re.compile(rf'{re.escape(path.stem)}\.\d+{re.escape(path.suffix)}')
+    for found in sorted(each for each in path.parent.iterdir() if again.fullmatch(each.name)):
+        common.check_output(str(found), recording=True, overwrite=args.overwrite)
 
 
 def _trace(given: str | None, name: str, nth: int = 1) -> str | None:

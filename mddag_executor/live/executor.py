@@ -18,7 +18,7 @@ Whatever has been taken and not run yet stays with the core and runs with the ne
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 import gc
 import os
@@ -58,6 +58,7 @@ from mddag_executor.live.seat import current
 from mddag_executor.live.settings import Thresholds
 from mddag_executor.live.shutdown import call_at_shutdown, halt_at_exit, is_over
 from mddag_executor.live.statistics import statistics
+from mddag_executor.live.statistics_types import Statistics
 from mddag_executor.live.stop_watch import StopWatch
 from mddag_executor.live.tasks import make_task, Unclaimed
 from mddag_executor.live.verdicts import DeadlineMiss
@@ -73,6 +74,7 @@ if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
     from rclpy.context import Context
     from rclpy.node import Node
+    from typing_extensions import Self
 
 LOOK_AFTER_S = 0.1
 """How often ``spin`` looks whether the context is still there (signals only end the context)."""
@@ -107,7 +109,8 @@ class MultiDeadlineExecutor(BareExecutor):
     :param num_workers: threads of the pool; by default what the declaration says, else seven.
     :param policy: ``rad`` or another of ``mddag_executor.core.POLICIES``.
     :param context: the context that the executor belongs to, or None for the default one.
-    :param trace: path of an MCAP file to record to, or None.
+    :param trace: path of an MCAP file to record to, or None. A file that is there already is kept:
+        the constructor raises, unless ``overwrite`` is true.
     :param on_deadline_miss: called with each ``DeadlineMiss``, in a thread of its own; what it
         raises comes out of the spin.  If it takes too long, misses are counted and not reported
         (``unreported_misses`` in ``statistics()``).
@@ -129,6 +132,7 @@ class MultiDeadlineExecutor(BareExecutor):
     :param preempt: whether callbacks that compute in Python pause for more urgent ones (Python
         3.12 and newer; ``statistics()['preemption']`` says whether they do).
     :param num_threads: ``num_workers`` under the name that ``MultiThreadedExecutor`` has for it.
+    :param overwrite: whether ``trace`` may replace a file.
     :raises msg_graph.GraphError: when the declaration is not right.
     :raises mddag_executor.errors.MddagError: on an unknown policy, intake or thread setting, a
         value of the wrong kind, and when the trace cannot be written.
@@ -142,14 +146,14 @@ class MultiDeadlineExecutor(BareExecutor):
         *,
         policy: str = 'rad',
         context: Context | None = None,
-        trace: str | None = None,
+        trace: str | os.PathLike[str] | None = None,
         on_deadline_miss: Callable[[DeadlineMiss], None] | None = None,
         default_deadline: int | str | Duration = DEFAULT_DEADLINE_NS,
         intake: str = 'auto',
         max_active_jobs: int = MAX_ACTIVE_JOBS,
         worker_policy: str | None = None,
         worker_priority: int | None = None,
-        worker_cpus: set[int] | None = None,
+        worker_cpus: Iterable[int] | None = None,
         freeze_gc: bool = False,
         diagnostics_period: int | str | Duration | None = None,
         thresholds: Thresholds | None = None,
@@ -157,6 +161,7 @@ class MultiDeadlineExecutor(BareExecutor):
         preempt: bool = False,
         cpu_order: bool = False,
         num_threads: int | None = None,
+        overwrite: bool = False,
     ) -> None:
         task_set, num_workers, deadline_ns = settings.resolve(
             graph, num_workers, default_deadline, intake, num_threads)
@@ -173,7 +178,8 @@ class MultiDeadlineExecutor(BareExecutor):
         hooks.install()
         self._trace_clock = TraceClock()
         self._recorder = None if trace is None else Recorder(
-            trace, task_set, policy, num_workers, deadline_ns, max_active_jobs, self._trace_clock)
+            os.fspath(trace), task_set, policy, num_workers, deadline_ns, max_active_jobs,
+            self._trace_clock, overwrite=overwrite)
         self._errors: deque[BaseException] = deque()
         self._process = process
         self._unclaimed = Unclaimed(self._fail)
@@ -727,7 +733,12 @@ class MultiDeadlineExecutor(BareExecutor):
             pass  # destroyed meanwhile
         return found
 
-    def statistics(self) -> dict[str, Any]:
-        """Return a snapshot of what has happened so far (see the module ``statistics``)."""
+    def __enter__(self) -> Self:
+        """Return the executor; it is shut down at the end of the block."""
+        super().__enter__()
+        return self
+
+    def statistics(self) -> Statistics:
+        """Return a snapshot of what has happened so far: see ``Statistics`` for its keys."""
         return statistics(
             self._pool, self._registry, self._recorder, self._process, self._notifier)

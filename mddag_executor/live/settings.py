@@ -19,6 +19,7 @@ from mddag_executor.errors import UsageError
 from msg_graph import load, parse_duration, TaskSet
 from msg_graph.duration import DAY
 from msg_graph.errors import did_you_mean, listed, shown
+from msg_graph.model import MOST_WORKERS
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.exceptions import NotInitializedException
@@ -27,7 +28,6 @@ from rclpy.utilities import get_default_context
 INTAKES = ('auto', 'events', 'waitset')
 THREAD_POLICIES = ('SCHED_OTHER', 'SCHED_BATCH', 'SCHED_FIFO', 'SCHED_RR')
 SHORTEST_DIAGNOSTICS_NS = 10_000_000
-MOST_WORKERS = 4096
 MOST_JOBS = 1_000_000
 
 

@@ -95,7 +95,7 @@ def test_what_is_counted() -> None:
     (['--policies', 'x'], "policy 'x': there is no such policy: choose one of rad, "),
     (['--policies', 'rad,rad'], "--policies: 'rad' stands there twice: "),
     (['--repeat', '0'], "mddag bench core: argument --repeat: '0' is no whole number from 1 up"),
-    (['--workers', '0'], "mddag bench core: argument --workers: '0' is no whole number from 1 up"),
+    (['--workers', '0'], "mddag bench core: argument --workers: '0' is no whole number from 1"),
     (['--duration', '61s'], '--duration: that is too long: '),
     (['--graph', 'nowhere.yaml'], 'nowhere.yaml: '),
     (['--json', 'nowhere/x'], 'nowhere/x: there is no directory nowhere: '),

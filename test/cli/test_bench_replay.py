@@ -10,13 +10,14 @@ from typing import Any
 
 from mddag_executor.cli import bench_replay
 from mddag_executor.cli import main as program
-from mddag_executor.cli.slack_check import is_counted
+from mddag_executor.cli.slack_check import is_counted, with_times
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import replay
 from mddag_executor.replay.measure import measure, READERS, write_long_trace
 from mddag_executor.resources import find
 from mddag_executor.trace import TraceReader
-from msg_graph import load
+from msg_graph import load, loads
+from msg_graph.layout import without_lines
 import pytest
 
 GRAPH = """\
@@ -147,7 +148,7 @@ def test_slack_holds_where_runs_are_simulated(
     def simulated(graph: str, args: Any, utilisation: Any, workers: int, path: str) -> None:
         assert utilisation is None
         assert program.main(['simulate', graph, '--workers', str(workers), '--duration', '3s',
-                             '--trace', path]) == 0
+                             '--trace', path, '--overwrite']) == 0
 
     monkeypatch.setattr(bench_replay, '_record', simulated)
     assert program.main([
@@ -171,3 +172,23 @@ def test_what_a_disturbance_made_late_says_nothing_of_slack(
 ) -> None:
     assert told == is_counted({'late_ns': late, 'parts': [
         {'cause': cause, 'ns': took} for cause, took in parts.items()]})
+
+
+def test_fixed_times_change_nothing_else_of_a_declaration() -> None:
+    task_set = load(find('config/autoware.yaml'))
+    assert without_lines(loads(with_times(task_set, {}), task_set.file)) == without_lines(task_set)
+    odd = loads("""\
+mddag: 1
+workers: 7
+nodes:
+  - node: /n
+    callbacks:
+      - {name: on, timer: 1s, deadline: 1s, execution_time: 1ms, holds_interpreter: true}
+      - {name: 0x10, timer: 1s, dag: 'no', deadline: 1s, execution_time: {quantiles_us: [1, 2]}}
+      - {name: "1e3", timer: 1s, dag: e, deadline: 1s}
+""")
+    after = loads(with_times(odd, {'/n:on': 5_000_000, '/n:0x10': 6_000_000, '/n:1e3': 7}))
+    assert [each.key for each in after.callbacks] == ['/n:on', '/n:0x10', '/n:1e3']
+    assert [each.execution_time and each.execution_time.quantiles_ns
+            for each in after.callbacks] == [(5_000_000,), (6_000_000,), (7,)]
+    assert (after.workers, after.dags[1].name) == (7, 'no')

@@ -183,7 +183,6 @@ def test_what_programs_ask_in_a_terminal_stays_as_it_is(world: Path) -> None:
 
 
 @pytest.mark.parametrize(('spec', 'message'), [
-    ('chat:fails', 'it failed while starting (RuntimeError: no camera found, '),
     ('chat:exits', 'it failed while starting (SystemExit: 3'),
     ('chat:own_context', 'node /alone has a context of its own: let it use the default context'),
     ('chat:other_domain', 'it asks for ROS domain 7, and this process is in another: set '),
