@@ -102,6 +102,7 @@ class CallbackCounts(TypedDict):
     waiting: int
     holds_interpreter: bool
     interpreter_share: float | None
+    incompatible_qos: str | None
 
 
 class Preemption(TypedDict):
@@ -131,8 +132,8 @@ class Statistics(TypedDict):
     A snapshot of a run.
 
     ``never_due`` lists sinks without a job that was due, ``never_ran`` declared callbacks that
-    have not run. ``unreported_misses`` counts misses that ``on_deadline_miss`` was not called with,
-    because it had not returned from earlier ones in time. ``undeclared`` counts executions of undeclared callbacks; ``queue`` is what is ready and
+    have not run. ``unreported_misses`` counts misses that ``on_deadline_miss`` was not called
+    with, because it had not returned from earlier ones in time. ``undeclared`` counts executions of undeclared callbacks; ``queue`` is what is ready and
     waits; ``lent`` counts how often a callback that waits has lent its worker to others.
     """
 
