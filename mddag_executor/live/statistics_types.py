@@ -133,8 +133,9 @@ class Statistics(TypedDict):
 
     ``never_due`` lists sinks without a job that was due, ``never_ran`` declared callbacks that
     have not run. ``unreported_misses`` counts misses that ``on_deadline_miss`` was not called
-    with, because it had not returned from earlier ones in time. ``undeclared`` counts executions of undeclared callbacks; ``queue`` is what is ready and
-    waits; ``lent`` counts how often a callback that waits has lent its worker to others.
+    with, because it had not returned from earlier ones in time. ``undeclared`` counts
+    executions of undeclared callbacks; ``queue`` is what is ready and waits; ``lent`` counts
+    how often a callback that waits has lent its worker to others.
     """
 
     policy: str
