@@ -28,7 +28,7 @@ def test_what_is_nowhere_is_one_line() -> None:
 def install(prefix: Path, folder: str) -> Path:
     """Lay the package out as an installer does; return where the modules are."""
     modules = prefix / folder
-    for name in ('__init__.py', 'errors.py', 'resources.py'):
+    for name in ('__init__.py', 'errors.py', 'lazy.py', 'resources.py'):
         target = modules / 'mddag_executor' / name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes((TOP / 'mddag_executor' / name).read_bytes())
