@@ -36,7 +36,7 @@ LEVELS = {
     'mddag_executor.analysis': 5,
     'mddag_executor.simulate': 5,  # below replay, which reschedules with its engine
     'mddag_executor.assign': 6,
-    'mddag_executor.live': 6,
+    'mddag_executor.executor': 6,
     'mddag_executor.replay': 6,
     'mddag_executor.report': 7,
     'mddag_executor.rerun': 7,
@@ -54,13 +54,13 @@ NOT_IN_CORE = {
 # Offline parts work on a machine without ROS.
 ROS = {'rclpy', 'rcl_interfaces', 'std_msgs', 'diagnostic_msgs', 'builtin_interfaces', 'launch',
        'launch_ros', 'ament_index_python', 'rosidl_parser'}
-MAY_USE_ROS = {'mddag_executor.live', 'mddag_executor.rerun', 'mddag_executor.cli'}
+MAY_USE_ROS = {'mddag_executor.executor', 'mddag_executor.rerun', 'mddag_executor.cli'}
 
 
 def part_of(module: str) -> str | None:
     """Return the part of the program that a module belongs to; None for foreign ones."""
     if module in PASSED_ON:
-        return 'mddag_executor.live'
+        return 'mddag_executor.executor'
     names = module.split('.')
     if names[0] not in ('msg_graph', 'mddag_executor'):
         return None
@@ -139,12 +139,12 @@ def test_every_folder_has_its_level() -> None:
     ('mddag_executor.trace.reader', 'from mddag_executor import core'),
     ('mddag_executor.trace.reader', 'import rclpy'),
     ('mddag_executor.simulate.run', 'from mddag_executor.replay.run import replay'),
-    ('mddag_executor.replay.load', 'from mddag_executor.live.verdicts import Verdicts'),
+    ('mddag_executor.replay.load', 'from mddag_executor.executor.verdicts import Verdicts'),
     ('mddag_executor.simulate.run', 'def f():\n    from std_msgs.msg import Header'),
-    ('mddag_executor.live.executor', 'from mddag_executor.cli.common import write_json'),
+    ('mddag_executor.executor.executor', 'from mddag_executor.cli.common import write_json'),
     ('mddag_executor.report.html', 'import mddag_executor.cli.text'),
     ('mddag_executor.errors', 'from mddag_executor.resources import find'),
-    ('mddag_executor', 'from mddag_executor.live.executor import Worker'),
+    ('mddag_executor', 'from mddag_executor.executor.executor import Worker'),
     ('mddag_executor.trace.reader', 'from mddag_executor import DeadlineMiss'),
 ])
 def test_a_wrong_import_is_found(module: str, text: str) -> None:
@@ -154,7 +154,7 @@ def test_a_wrong_import_is_found(module: str, text: str) -> None:
 @pytest.mark.parametrize(('module', 'text'), [
     ('mddag_executor.core.tables', 'from msg_graph import TaskSet'),
     ('mddag_executor.core.tables', 'from .rules import release\nfrom . import rules'),
-    ('mddag_executor.live.executor', 'import rclpy\nfrom mddag_executor.core import Tables'),
+    ('mddag_executor.executor.executor', 'import rclpy\nfrom mddag_executor.core import Tables'),
     ('mddag_executor.cli.run', 'from mddag_executor.report.table import sinks'),
     ('mddag_executor.replay.load', 'from mddag_executor.simulate.engine import Load'),
     ('mddag_executor.trace.reader', 'from mddag_executor.errors import MddagError'),
@@ -166,7 +166,7 @@ def test_a_right_import_is_none(module: str, text: str) -> None:
 
 # --- rclpy's private names -----------------------------------------------------------------------
 
-COMPAT = 'mddag_executor.live.compat'
+COMPAT = 'mddag_executor.executor.compat'
 BASES = frozenset(('BareExecutor', 'BareTask', 'Executor', 'Task', 'Future', 'Waitable'))
 
 
@@ -255,7 +255,7 @@ def test_only_compat_uses_what_is_private_in_rclpy() -> None:
     private = rclpys_private_names()
     assert {'_guard', '_callback_type', 'take_message', 'call_timer', '_rclpy'} <= private
     texts = {module: path.read_text(encoding='utf-8') for module, path in modules()
-             if module.startswith('mddag_executor.live') and not module.startswith(COMPAT)}
+             if module.startswith('mddag_executor.executor') and not module.startswith(COMPAT)}
     bases = derived(list(texts.values()))
     assert 'MultiDeadlineExecutor' in bases
     assert not [

@@ -21,7 +21,7 @@ from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, Progress, table, warn
 from mddag_executor.core import POLICIES
 from mddag_executor.errors import UsageError
-from mddag_executor.live.bench.campaign import (
+from mddag_executor.executor.bench.campaign import (
     DECLARED,
     EXECUTORS,
     LOADS,
@@ -137,7 +137,7 @@ def _graph(args: argparse.Namespace) -> Iterator[str | None]:
     if args.load not in DECLARED:
         yield None
         return
-    from mddag_executor.live.measure import ExecutionPlan
+    from mddag_executor.executor.measure import ExecutionPlan
     from msg_graph import load, loads
     with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
         path = args.graph or str(find(DECLARED[args.load]))
@@ -191,7 +191,7 @@ def make_specs(
 
 
 def _measure(specs: Sequence[Spec], repeat: int) -> list[dict[str, Any]]:
-    from mddag_executor.live.bench.campaign import run_all
+    from mddag_executor.executor.bench.campaign import run_all
     each = specs[0].seconds + specs[0].warm_up_s + 2.0
     with Progress('measuring', len(specs) * repeat * each) as progress:
         def tick(spec: Spec, made: int, passed: float) -> None:

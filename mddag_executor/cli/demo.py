@@ -7,7 +7,7 @@ Theory of operation: each step is a process of its own, one after the other, so 
 another's threads, caches or nodes beside it: `mddag run --synthetic sleep`, which records; two
 times `mddag replay`; and rclpy's own MultiThreadedExecutor with the same nodes, seed and number of
 threads.  Both executors are measured by the nodes themselves, in the same way
-(`mddag_executor.live.measure`), so the figures side by side mean the same.
+(`mddag_executor.executor.measure`), so the figures side by side mean the same.
 
 With `--processes N` callbacks compute in Python, in N processes.  The steps are `graph place`;
 `run --synthetic spin` of what that wrote, which records; `replay` of all traces; and rclpy's
@@ -31,7 +31,7 @@ from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, format_ns, printable, Progress, run_program, table
 from mddag_executor.core.tally import counts, total
 from mddag_executor.errors import MddagError
-from mddag_executor.live.bench.campaign import Spec
+from mddag_executor.executor.bench.campaign import Spec
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.live_runs import summary
 from mddag_executor.report.tables import (
@@ -164,7 +164,7 @@ def _measured(
     args: argparse.Namespace, graph: Path, executor: str, utilisation: float
 ) -> dict[str, Any]:
     """Run the same nodes on an executor; return what they measured."""
-    from mddag_executor.live.bench.campaign import measure
+    from mddag_executor.executor.bench.campaign import measure
     spec = Spec(
         load='autoware', executor=executor, workers=WORKERS, seconds=args.baseline_seconds,
         seed=args.seed, graph=str(graph), utilisation=utilisation,
@@ -174,7 +174,7 @@ def _measured(
 
 
 def _introduction(args: argparse.Namespace, graph: Path) -> Iterator[str]:
-    from mddag_executor.live.measure import ExecutionPlan
+    from mddag_executor.executor.measure import ExecutionPlan
     from msg_graph import load
     task_set = load(graph)
     plan = ExecutionPlan(task_set, args.seed, args.utilisation, WORKERS)

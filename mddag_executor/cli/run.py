@@ -40,11 +40,11 @@ from mddag_executor.report.text import listed
 from msg_graph import loads
 
 if TYPE_CHECKING:
-    from mddag_executor.live.executor import MultiDeadlineExecutor
-    from mddag_executor.live.loading import Program
-    from mddag_executor.live.measure import ExecutionPlan, Ledger
-    from mddag_executor.live.processes import Supervisor
-    from mddag_executor.live.session import Session
+    from mddag_executor.executor.executor import MultiDeadlineExecutor
+    from mddag_executor.executor.loading import Program
+    from mddag_executor.executor.measure import ExecutionPlan, Ledger
+    from mddag_executor.executor.processes import Supervisor
+    from mddag_executor.executor.session import Session
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -132,13 +132,13 @@ def main(args: argparse.Namespace) -> int:
 
 def part(args: argparse.Namespace) -> int:
     """Run one process of several, and leave what came of it in the folder of the run."""
-    from mddag_executor.live.processes import belong_to_parent, Part
+    from mddag_executor.executor.processes import belong_to_parent, Part
     the_part = Part.read(args.part)
     belong_to_parent(the_part.parent)
     task_set = loads(the_part.text, name=args.graph)
     if args.process is None:
-        from mddag_executor.live.hosting import nodes_of
-        from mddag_executor.live.loading import resolve, ros_arguments
+        from mddag_executor.executor.hosting import nodes_of
+        from mddag_executor.executor.loading import resolve, ros_arguments
         with _rclpy(args.ros_args or []):
             ros = ros_arguments(args.ros_args)
             names = nodes_of([resolve(spec, ros) for spec in args.node], ros)
@@ -164,14 +164,14 @@ def run_here(
     plan = None
     programs: list[Program] = []
     if args.synthetic is not None:
-        from mddag_executor.live.measure import ExecutionPlan
+        from mddag_executor.executor.measure import ExecutionPlan
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
     else:
-        from mddag_executor.live.loading import resolve, ros_arguments
+        from mddag_executor.executor.loading import resolve, ros_arguments
         programs = [resolve(spec, ros_arguments(args.ros_args)) for spec in args.node]
     with dump_when_stuck() as ends, Signals(
             _PART_ENDS_S if args.part else 0) as signals, _rclpy(args.ros_args or []):
-        from mddag_executor.live.executor import MultiDeadlineExecutor
+        from mddag_executor.executor.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
             intake=args.intake, freeze_gc=True, preempt=args.preempt, cpu_order=args.cpu_order,
@@ -206,7 +206,7 @@ def _end(error: BaseException | None) -> int:
 
 
 def _check_arguments(args: argparse.Namespace) -> None:
-    from mddag_executor.live.settings import diagnostics_period_ns
+    from mddag_executor.executor.settings import diagnostics_period_ns
     diagnostics_period_ns(args.diagnostics)
     if args.trace == '-':
         raise UsageError('--trace -: a trace is not written to standard output: name a file')
@@ -279,9 +279,9 @@ def _run(
     ends: Callable[[], None],
 ) -> tuple[dict[str, Any], BaseException | None]:
     """Run until the end; see ``run_here``."""
-    from mddag_executor.live.measure import measure
-    from mddag_executor.live.session import Session
-    from mddag_executor.live.statistics import Watch
+    from mddag_executor.executor.measure import measure
+    from mddag_executor.executor.session import Session
+    from mddag_executor.executor.statistics import Watch
 
     def end_begins() -> None:
         ends()
@@ -316,8 +316,8 @@ def _run_synthetic(
     args: argparse.Namespace, session: Session, task_set: TaskSet, plan: ExecutionPlan,
     seconds: float | None, progress: Progress,
 ) -> Ledger | None:
-    from mddag_executor.live import current_job
-    from mddag_executor.live.synthetic import SyntheticWorkload
+    from mddag_executor.executor import current_job
+    from mddag_executor.executor.synthetic import SyntheticWorkload
     workload = SyntheticWorkload(
         task_set, plan, current_job=current_job, process=args.process)
     for node in workload.nodes:
@@ -333,8 +333,8 @@ def _run_synthetic(
 
 def _begin(args: argparse.Namespace, task_set: TaskSet) -> Callable[..., int | None]:
     """Return what waits until publishers and subscriptions have met, and for other processes."""
-    from mddag_executor.live.processes import Part
-    from mddag_executor.live.session import Session
+    from mddag_executor.executor.processes import Part
+    from mddag_executor.executor.session import Session
     if args.part is None:
         return Session.wait_until_matched
     return partial(Part.read(args.part).start_together, args.process,
@@ -346,9 +346,9 @@ def _run_programs(
     executor: MultiDeadlineExecutor, programs: list[Program], seconds: float | None,
     progress: Progress,
 ) -> None:
-    from mddag_executor.live.hosting import Host
-    from mddag_executor.live.loading import ros_arguments
-    from mddag_executor.live.session import SessionError
+    from mddag_executor.executor.hosting import Host
+    from mddag_executor.executor.loading import ros_arguments
+    from mddag_executor.executor.session import SessionError
     with Host(executor, session.stop) as host:
         executor.set_judging(False)
         try:

@@ -56,9 +56,9 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     :raises msg_graph.GraphError: when the declaration is wrong
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
-    from mddag_executor.live.loading import ros_arguments
-    from mddag_executor.live.measure import ExecutionPlan
-    from mddag_executor.live.processes import left, Part, Run, Supervisor, together
+    from mddag_executor.executor.loading import ros_arguments
+    from mddag_executor.executor.measure import ExecutionPlan
+    from mddag_executor.executor.processes import left, Part, Run, Supervisor, together
     plan = None
     if args.synthetic is not None:
         workers = defaults.workers(args.workers, task_set)
@@ -112,7 +112,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
 
 
 def _warn_of_contested(task_set: TaskSet) -> None:
-    from mddag_executor.live.other_processes import contested, divided
+    from mddag_executor.executor.other_processes import contested, divided
     dags = divided(task_set)
     topics = {t for v in task_set.vertices if v.dag in dags for t in v.callback.publishes}
     for topic in sorted(contested(task_set) & topics):
@@ -178,8 +178,8 @@ def _probe(
     args: argparse.Namespace, folder: str, specs: Sequence[str]
 ) -> Mapping[str, Sequence[str]]:
     """Return the names of the nodes that each SPEC brings."""
-    from mddag_executor.live.loading import ros_arguments
-    from mddag_executor.live.processes import left, ProcessError
+    from mddag_executor.executor.loading import ros_arguments
+    from mddag_executor.executor.processes import left, ProcessError
     # Nobody is to hear of these nodes.
     environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
     with subprocess.Popen(

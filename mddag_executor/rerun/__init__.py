@@ -21,7 +21,7 @@ from typing import Any
 
 from mddag_executor import defaults
 from mddag_executor.core import policy as find_policy
-from mddag_executor.live.loading import Program, resolve, ros_arguments
+from mddag_executor.executor.loading import Program, resolve, ros_arguments
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.outputs import Output

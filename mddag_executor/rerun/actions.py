@@ -17,7 +17,7 @@ from functools import partial
 import itertools
 from typing import Any
 
-from mddag_executor.live.compat import (
+from mddag_executor.executor.compat import (
     action_handle,
     attach_futures,
     CLIENT_HANDLE,
@@ -27,8 +27,8 @@ from mddag_executor.live.compat import (
     Replacements,
     SERVER_HANDLE,
 )
-from mddag_executor.live.entity import Entity
-from mddag_executor.live.work import Work
+from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.work import Work
 from mddag_executor.rerun.loop import Loop
 from mddag_executor.rerun.services import Header
 

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from typing import Any
 
 from mddag_executor.core import NEVER
-from mddag_executor.live.engine import Engine
-from mddag_executor.live.work import Work
+from mddag_executor.executor.engine import Engine
+from mddag_executor.executor.work import Work
 from mddag_executor.simulate.machine import begins, new_machine, NEXT_TIME, settle, share
 
 

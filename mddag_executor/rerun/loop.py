@@ -35,11 +35,11 @@ import math
 from typing import Any
 
 from mddag_executor.core import NEVER
-from mddag_executor.live.compat import UNKNOWN
-from mddag_executor.live.engine import Engine
-from mddag_executor.live.groups import Refused
-from mddag_executor.live.jobs import Origin
-from mddag_executor.live.work import Destroyed, QuickCallback, Work
+from mddag_executor.executor.compat import UNKNOWN
+from mddag_executor.executor.engine import Engine
+from mddag_executor.executor.groups import Refused
+from mddag_executor.executor.jobs import Origin
+from mddag_executor.executor.work import Destroyed, QuickCallback, Work
 from mddag_executor.rerun.computing import Computing
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.strands import Strands

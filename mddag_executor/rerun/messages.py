@@ -24,11 +24,11 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
-from mddag_executor.live.compat import callback_type, WITH_INFO
-from mddag_executor.live.entity import Entity
-from mddag_executor.live.jobs import header_stamp, Origin
-from mddag_executor.live.recorder import Recorder
-from mddag_executor.live.work import Work
+from mddag_executor.executor.compat import callback_type, WITH_INFO
+from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.jobs import header_stamp, Origin
+from mddag_executor.executor.recorder import Recorder
+from mddag_executor.executor.work import Work
 from mddag_executor.rerun.errors import RerunError
 from mddag_executor.rerun.loop import ARRIVED, Held, Loop
 from mddag_executor.rerun.outputs import Outputs

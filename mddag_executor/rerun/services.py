@@ -16,15 +16,15 @@ from functools import partial
 import itertools
 from typing import Any
 
-from mddag_executor.live.compat import (
+from mddag_executor.executor.compat import (
     complete_request,
     instead,
     new_request,
     Replacements,
     service_name,
 )
-from mddag_executor.live.entity import Entity, SERVICE
-from mddag_executor.live.work import Work
+from mddag_executor.executor.entity import Entity, SERVICE
+from mddag_executor.executor.work import Work
 from mddag_executor.rerun.loop import Loop
 from rclpy.client import Client
 from rclpy.exceptions import InvalidHandle

@@ -35,7 +35,7 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.live.thread_clock import is_runnable
+from mddag_executor.executor.thread_clock import is_runnable
 
 _LOOK_S = 0.05
 _END_S = 2.0

@@ -19,8 +19,8 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-from mddag_executor.live.bench import campaign, publisher
-from mddag_executor.live.bench.campaign import BenchError, CrashError, measure, run_all, Spec
+from mddag_executor.executor.bench import campaign, publisher
+from mddag_executor.executor.bench.campaign import BenchError, CrashError, measure, run_all, Spec
 from mddag_executor.resources import find
 from msg_graph import load
 import pytest

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from mddag_executor.live.bench.loads import judge
+from mddag_executor.executor.bench.loads import judge
 from msg_graph import loads
 
 GRAPH = """

@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from mddag_executor.errors import MddagError
-from mddag_executor.live.bench.campaign import combine, parse_executors, Spec
+from mddag_executor.executor.bench.campaign import combine, parse_executors, Spec
 import pytest
 
 

@@ -43,9 +43,9 @@ import time
 from typing import Any
 
 from mddag_executor.defaults import LIVE_SEED
-from mddag_executor.live import DeadlineMiss
-from mddag_executor.live.executor import MultiDeadlineExecutor
-from mddag_executor.live.measure import ExecutionPlan
+from mddag_executor.executor import DeadlineMiss
+from mddag_executor.executor.executor import MultiDeadlineExecutor
+from mddag_executor.executor.measure import ExecutionPlan
 from msg_graph import load, TaskSet
 import rclpy
 from rclpy.executors import ExternalShutdownException

@@ -11,7 +11,7 @@ from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.errors import MddagError
-from mddag_executor.live.settings import Thresholds
+from mddag_executor.executor.settings import Thresholds
 import msg_graph
 import pytest
 import rclpy

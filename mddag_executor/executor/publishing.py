@@ -1,0 +1,137 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Two places in rclpy at which the executor must know what a callback does.
+
+Theory of operation
+-------------------
+``Publisher.publish`` and ``Client.call`` are wrapped once for the process, when the first executor
+is made.
+
+1.  *A callback in* ``Client.call`` lends its worker to a spare thread (``workers``).
+2.  *A publication on a trigger topic* is noted, so that its messages find their job (``jobs``).
+3.  *Delivery within the process.*  A middleware that delivers within a process does so inside of
+    ``publish``: when that returns, the message can be taken.  The publishing thread has just made
+    it, so it takes the message itself instead of waking a worker: the descriptors of this
+    process's subscriptions on the topic are switched off while it publishes; then it takes what
+    was announced, and switches them on again.  Nothing depends on who else publishes: whatever
+    arrives otherwise, or later, wakes a worker.
+4.  A thread that publishes while it has the engine's lock (a signal handler can) leaves the
+    message to a worker.
+
+Outside of callbacks of this executor, on topics that nobody here subscribes to, both methods do
+what they always did.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, Protocol
+
+from mddag_executor.executor.jobs import NO_ORIGIN, Publication, PublisherState
+from mddag_executor.executor.work import current
+from rclpy.client import Client
+from rclpy.publisher import Publisher
+
+
+class DirectSubscription(Protocol):
+    """A subscription of this process that publishing threads take from."""
+
+    def hold(self) -> None:
+        """Announce nothing for now."""
+
+    def collect_published(self, publication: Publication | None) -> None:
+        """Take what was announced since ``hold``, and announce again."""
+
+
+_STATE = '_mddag_publisher_state'
+_subscriptions: dict[str, tuple[DirectSubscription, ...]] = {}
+_lock = threading.Lock()
+_installed = False
+
+
+def subscribe(topic: str, subscription: DirectSubscription) -> None:
+    """Have publishing threads take for a subscription."""
+    with _lock:
+        _subscriptions[topic] = (*_subscriptions.get(topic, ()), subscription)
+
+
+def unsubscribe(topic: str, subscription: DirectSubscription) -> None:
+    """Have publishing threads take no more for a subscription."""
+    with _lock:
+        rest = tuple(s for s in _subscriptions.get(topic, ()) if s is not subscription)
+        if rest:
+            _subscriptions[topic] = rest
+        else:
+            _subscriptions.pop(topic, None)
+
+
+def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Publication | None:
+    """Publish; return the publication if it is of a trigger topic, by a callback."""
+    running = current.running
+    if running is None:
+        if state.is_tracked:
+            with state.lock:
+                state.count += 1
+                original(publisher, msg)
+        else:
+            original(publisher, msg)
+        return None
+    work = running.work
+    running.publishes(publisher, msg, state.topic)
+    topic = running.engine.jobs.topics.get(state.topic)
+    if topic is None:
+        original(publisher, msg)
+        return None
+    with state.lock:
+        if not state.is_tracked:
+            state.is_tracked = True
+            state.numbers.offset = None
+        state.count += 1
+        origin = NO_ORIGIN if work is None or work.origin is None else work.origin
+        publication: Publication = running.engine.jobs.publish(
+            original, publisher, msg, state, topic, origin)
+    return publication
+
+
+def install() -> None:
+    """Wrap rclpy's two methods; further calls change nothing."""
+    global _installed
+    with _lock:
+        if _installed:
+            return
+        _installed = True
+    send = Publisher.publish
+    call = Client.call
+
+    def publish(self: Any, msg: Any) -> None:
+        state = self.__dict__.get(_STATE)
+        if state is None:
+            state = self.__dict__.setdefault(_STATE, PublisherState(self.topic_name))
+        subscriptions = _subscriptions.get(state.topic)
+        if subscriptions is None:
+            if current.running is None and not state.is_tracked:
+                send(self, msg)
+            else:
+                _send(send, self, msg, state)
+            return
+        publication = None
+        for subscription in subscriptions:
+            subscription.hold()
+        try:
+            publication = _send(send, self, msg, state)
+        finally:
+            for subscription in subscriptions:
+                subscription.collect_published(publication)
+
+    def call_and_wait(self: Any, request: Any, *args: Any, **kwargs: Any) -> Any:
+        running = current.running
+        if running is None:
+            return call(self, request, *args, **kwargs)
+        with running.lend():
+            return call(self, request, *args, **kwargs)
+
+    publish.__doc__ = send.__doc__
+    call_and_wait.__doc__ = call.__doc__
+    Publisher.publish = publish  # type: ignore[method-assign]
+    Client.call = call_and_wait  # type: ignore[method-assign]

@@ -1,0 +1,317 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Unmodified programs on our executor, each test a real `mddag run --node`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+import gc
+import json
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+import weakref
+
+from mddag_executor.executor.hosting import Guest, Host
+from mddag_executor.executor.loading import Program
+from mddag_executor.replay import replay, reschedule
+from mddag_executor.trace import read_events, TraceError, TraceReader
+import pytest
+import rclpy
+from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.node import Node
+
+from .conftest import wait_for
+from .workspace import GRAPH, GUESTS, make_workspace
+
+
+@pytest.fixture
+def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    return make_workspace(tmp_path, monkeypatch)
+
+
+Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+
+
+def run(
+    *specs: str, until: Callable[[], bool] | None = None, number: int = signal.SIGINT
+) -> tuple[dict[str, Any], str]:
+    """
+    Run programs until something is true, which a signal ends then, or until they end.
+
+    Return the result, and what they printed.
+    """
+    nodes = [argument for spec in specs for argument in ('--node', spec)]
+    with open('out.txt', 'w') as out, subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'run', 'graph.yaml', *nodes, '--json',
+         'result.json', '--trace', 'out.mcap'], stdout=out, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, 'PYTHONUNBUFFERED': '1'},
+    ) as process:
+        try:
+            if until is not None:
+                assert wait_for(until, 60.0), (process.poll(), Path('out.txt').read_text())
+                process.send_signal(number)
+            _, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 0, err
+    # A busy machine skips releases, and this is said.
+    assert [line for line in err.splitlines() if 'cannot keep its rate' not in line] == []
+    result: dict[str, Any] = json.loads(Path('result.json').read_text())
+    return result, Path('out.txt').read_text()
+
+
+def has_heard() -> bool:
+    """Tell whether the trace has the listener's callback, the second of the graph, ten times."""
+    with suppress(OSError, TraceError):
+        complete = TraceReader('out.mcap').events({'mddag:complete'})
+        return sum(event[6] == 1 for event in complete) > 10
+    return False
+
+
+def heard(result: dict[str, Any]) -> int:
+    sink = result['dags']['/talker']['sinks']['/listener:heard']
+    return int(sink['completed'])
+
+
+@pytest.mark.parametrize(('listener', 'said'), [
+    ('pip-nodes/listener', 'listener ended after its spin'),
+    ('chat:main', 'listener ended after its spin'),
+    ('chat:Listener', ''),
+    ('chat:two', ''),
+    ('chat:with_arguments', ''),
+    ('chat:own_executor', 'own executor ended'),
+    ('chat:events_executor', ''),
+    ('chat:spins_once_for_ever', 'no longer ok'),
+    ('chat:catches_signals', ''),
+])
+def test_unmodified_programs_run_on_our_executor(
+    world: Path, listener: str, said: str
+) -> None:
+    result, output = run('chat_nodes/talker', listener, until=has_heard)
+    assert heard(result) > 5
+    assert result['never_ran'] == []
+    assert result['callbacks']['/talker:tick']['ran'] >= heard(result)
+    # Every message was attributed to a job of the talker's timer.
+    assert result['undeclared'] <= 2
+    assert said in output
+
+
+@pytest.mark.parametrize(('spec', 'lines'), [
+    ('chat:spins_in_thread', ['heard five', 'thread joined']),
+    ('chat:spins_once', ['heard enough']),
+    ('chat:calls_a_service', ['answer: forty-two']),
+])
+def test_a_program_goes_on_while_its_callbacks_run(
+    world: Path, spec: str, lines: list[str]
+) -> None:
+    run('chat_nodes/talker', spec,
+        until=lambda: set(lines) <= set(Path('out.txt').read_text().splitlines()))
+
+
+def test_a_program_that_leaves_early_leaves_the_others_alone(world: Path) -> None:
+    result, output = run('chat_nodes/talker', 'chat:main', 'chat:leaves_early', until=has_heard)
+    assert 'left early' in output
+    assert heard(result) > 5
+
+
+def test_what_is_due_while_other_programs_start_is_no_miss(world: Path, mddag: Mddag) -> None:
+    process = mddag(
+        'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', 'chat:starts_slowly',
+        '--duration', '1s', '--json', '-', '--trace', 'out.mcap')
+    assert process.returncode == 0, process.stderr
+    talker = json.loads(process.stdout)['dags']['/talker']
+    started = int(re.findall(r'^started at (\d+)$', process.stderr, re.MULTILINE)[0])
+    events = list(read_events('out.mcap', {'mddag:job_release', 'mddag:deadline'}))
+    released = [e['release'] for e in events if e['_name'] == 'mddag:job_release']
+    missed = [e['deadline'] for e in events if e['_name'] == 'mddag:deadline']
+    assert sum(release < started for release in released) >= 20
+    assert all(deadline - 50_000_000 >= started for deadline in missed)
+    assert 0 < talker['jobs'] <= sum(release >= started for release in released)
+    assert talker['sinks']['/listener:heard']['completed'] > 0
+    for found in (replay('out.mcap').result(), reschedule('out.mcap').result()['recorded']):
+        assert found['dags']['/talker']['jobs'] == talker['jobs']
+        assert found['dags']['/talker']['ends'] == talker['ends']
+
+
+def test_the_run_ends_when_a_callback_shuts_rclpy_down(world: Path) -> None:
+    _, output = run('chat_nodes/talker', 'chat:shuts_down_in_a_callback')
+    assert 'shut down' in output
+
+
+def test_the_run_ends_when_all_programs_have_ended(world: Path) -> None:
+    _, output = run('chat:calls_a_service')
+    assert 'answer: forty-two' in output
+
+
+@pytest.mark.parametrize(('spec', 'message'), [
+    ('chat:fails', 'it failed while starting (RuntimeError: no camera found, '),
+    ('chat:exits', 'it failed while starting (SystemExit: 3'),
+    ('chat:own_context', 'node /alone has a context of its own: let it use the default context'),
+    ('chat:other_domain', 'it asks for ROS domain 7, and this process is in another: set '),
+    ('chat:returns_text', 'it returned a str, which is no rclpy node'),
+    ('chat:returns_nothing', 'it ended and neither returned a node nor let one spin'),
+    ('chat:needs_two', 'the function requires the arguments one, two'),
+])
+def test_a_program_that_cannot_start_ends_the_run_with_one_line(
+    world: Path, mddag: Mddag, spec: str, message: str
+) -> None:
+    process = mddag('run', 'graph.yaml', '--node', spec, '--trace', 'out.mcap')
+    assert process.returncode == 2
+    assert process.stderr.startswith(f'error: --node {spec}: {message}')
+    assert process.stderr.count('\n') == 1
+    assert not Path('out.mcap').exists()
+
+
+@pytest.mark.parametrize(('spec', 'message'), [
+    ('chat:fails_later', 'RuntimeError: later'),
+    ('chat:raises_in_a_callback', 'ZeroDivisionError'),
+])
+def test_an_exception_during_the_run_comes_out_behind_the_summary(
+    world: Path, mddag: Mddag, spec: str, message: str
+) -> None:
+    process = mddag(
+        'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', spec, '--duration', '2s')
+    assert process.returncode == 70
+    assert message in process.stderr.splitlines()[-1]
+    assert 'sink jobs due' in process.stdout
+
+
+@pytest.mark.parametrize(('spec', 'warning'), [
+    ('chat:leaves_a_thread', 'threads that nodes started still run and are left behind: stubborn'),
+    ('chat:never_ends', '--node chat:never_ends: its main() has not ended in time'),
+    ('chat:blocks_in_a_callback', 'a callback has not ended in time; it is left behind'),
+])
+def test_what_does_not_end_is_left_behind(
+    world: Path, mddag: Mddag, spec: str, warning: str
+) -> None:
+    begin = time.monotonic()
+    process = mddag(
+        'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', spec, '--duration', '1s')
+    assert time.monotonic() - begin < 15
+    assert process.returncode == 0
+    assert warning in process.stderr
+    assert 'sink jobs due' in process.stdout
+
+
+def test_what_nodes_print_stays_out_of_the_json(world: Path, mddag: Mddag) -> None:
+    process = mddag('run', 'graph.yaml', '--node', 'chat:prints', '--duration', '0.2s',
+                    '--json', '-')
+    assert json.loads(process.stdout)['nodes'] == ['chat:prints']
+    assert 'not JSON' in process.stderr
+
+
+def test_ros_arguments_reach_the_nodes(world: Path, mddag: Mddag) -> None:
+    (world / 'graph.yaml').write_text(GRAPH.replace('/chatter', '/talk'))
+    process = mddag(
+        'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', 'chat:Listener',
+        '--duration', '1s', '--json', '-', '--ros-args', '-r', 'chatter:=talk')
+    assert process.returncode == 0, process.stderr
+    assert heard(json.loads(process.stdout)) >= 3
+
+
+def test_a_sigterm_ends_the_run(world: Path) -> None:
+    result, output = run(
+        'chat_nodes/talker', 'chat:main', until=has_heard, number=signal.SIGTERM)
+    assert 'sink jobs due' in output
+    assert 'listener ended after its spin' in output
+    assert heard(result) > 5
+
+
+@pytest.fixture
+def host(ros_context: Any) -> Iterator[Host]:
+    """Give a host whose executor nobody spins."""
+    executor = SingleThreadedExecutor(context=ros_context)
+    with Host(executor, lambda: None) as host:
+        yield host
+    executor.shutdown()
+
+
+def test_rclpy_is_as_before_when_the_host_is_left(ros_context: Any) -> None:
+    def parts() -> list[Any]:
+        return [
+            rclpy.init, rclpy.shutdown, rclpy.spin, rclpy.spin_once, signal.signal,
+            *(vars(c).get(name) for c in (Executor, SingleThreadedExecutor, MultiThreadedExecutor)
+              for name in ('spin', 'spin_once', 'add_node', 'create_task', 'shutdown'))]
+
+    before = parts()
+    executor = SingleThreadedExecutor(context=ros_context)
+    with Host(executor, lambda: None):
+        assert parts() != before
+    assert parts() == before
+    executor.shutdown()
+
+
+def test_another_executor_gives_its_nodes_to_ours_when_it_spins(
+    host: Host, ros_context: Any
+) -> None:
+    other = MultiThreadedExecutor(2, context=ros_context)
+    first, second = Node('first', context=ros_context), Node('second', context=ros_context)
+    other.add_node(first)
+    assert host.executor.get_nodes() == []
+    other.spin_once(timeout_sec=0.01)
+    assert host.executor.get_nodes() == [first]
+    assert first.executor is host.executor
+    spinning = threading.Thread(target=other.spin)
+    spinning.start()
+    time.sleep(0.05)
+    other.add_node(second)
+    assert set(host.executor.get_nodes()) == {first, second}
+    other.remove_node(first)
+    assert host.executor.get_nodes() == [second]
+    assert spinning.is_alive()
+    other.shutdown()
+    spinning.join(2.0)
+    assert not spinning.is_alive()
+
+
+def test_another_executors_tasks_run_on_ours(host: Host, ros_context: Any) -> None:
+    other = SingleThreadedExecutor(context=ros_context)
+    task = other.create_task(lambda: 42)
+    other.spin_until_future_complete(task, timeout_sec=0.05)
+    assert not task.done()  # nobody spins ours
+    host.executor.spin_once(timeout_sec=1.0)
+    assert task.result() == 42
+    other.shutdown()
+
+
+def test_executors_of_programs_are_not_kept(host: Host, ros_context: Any) -> None:
+    def use() -> Any:
+        other = SingleThreadedExecutor(context=ros_context)
+        other.spin_once(timeout_sec=0.0)
+        other.shutdown()
+        return weakref.ref(other)
+
+    used = [use() for _ in range(5)]
+    gc.collect()
+    assert [executor() for executor in used] == [None] * 5
+
+
+def test_nodes_that_a_program_destroys_are_not_kept(host: Host, ros_context: Any) -> None:
+    guest = Guest(Program('chat:main', 'chat', lambda: None))
+
+    def use() -> Any:
+        node = Node('helper', context=ros_context, enable_rosout=False)
+        host.adopt(node, guest)
+        node.destroy_node()
+        return weakref.ref(node)
+
+    used = [use() for _ in range(5)]
+    stays = Node('stays', context=ros_context)
+    host.adopt(stays, guest)
+    gc.collect()
+    assert [node() for node in used] == [None] * 5
+    assert guest.nodes == host.executor.get_nodes() == [stays]
+    stays.destroy_node()
+
+
+def test_the_guests_know_nothing_of_us() -> None:
+    for path in GUESTS.glob('*.py'):
+        assert 'mddag_executor.' not in path.read_text()
