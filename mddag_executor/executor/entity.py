@@ -77,7 +77,9 @@ class Entity:
         self.publishes: set[str] = set()
         self.removed = False
         # whether it holds the interpreter while it runs
-        self.habit = GilHabit(None if callback is None else callback.holds_interpreter)
+        # (one entity stands for all tasks, whatever they do)
+        self.habit = GilHabit(
+            False if kind == TASK else None if callback is None else callback.holds_interpreter)
         # when the executor began to look after it, on the trace's clock: no job is due before
         self.since = 0
         # whether it runs where it is taken (see ``receiver``)

@@ -13,9 +13,9 @@ callback that holds the GIL only if nothing as urgent holds it (rule 11 of ``cor
     fifths of its time, it holds the GIL.  If it computed for less than half of the time in which
     no other thread computed, it waits for something else than the GIL, and does not hold it.
     Anything between says nothing.
-2.  *Unknown.*  The first execution of a callback is treated as one that holds the GIL: it then runs
-    alone, which shows what it does.  The same is done once after ``UNCLEAR_RUNS`` executions that
-    said nothing.
+2.  *Unknown.*  As long as nothing is known, and after ``UNCLEAR_RUNS`` executions that said nothing,
+    the next execution is treated as one that holds the GIL: no other one computes then, which
+    shows what it does.
 3.  *A callback that computes with the GIL released* (numpy, hashlib) looks as if it held it.
     Declare ``holds_interpreter: false`` to have several of these run in parallel.
 4.  *A callback that waits though it usually computes* would keep others from the GIL.  ``GilCheck``
@@ -72,7 +72,7 @@ class GilHabit:
 
     def __init__(self, declared: bool | None = None) -> None:
         self.is_declared = self.is_known = declared is not None
-        self.holds = 1 if declared is None else int(declared)
+        self.holds = int(declared or False)
         self.mean_ns = 0
         self.share: float | None = None if declared is None else float(declared)
         self._unclear = 0
@@ -96,7 +96,7 @@ class GilHabit:
             had = max(own, wall - others)
             if own >= WAITS * had and own >= SHORT_NS:
                 self._unclear += 1
-                if self._unclear >= UNCLEAR_RUNS:
+                if self.share is None or self._unclear >= UNCLEAR_RUNS:
                     self._unclear = 0
                     self.holds = 1
                 return

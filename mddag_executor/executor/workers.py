@@ -782,6 +782,9 @@ class Direct:
     def collect_published(self, publication: Publication | None) -> None:
         """Take what was announced since ``hold``, and announce again."""
         pool = self._pool
+        running = current.running
+        if running is None or running.pool is not pool:
+            publication = None  # of another executor, whose jobs are others
         if not pool._is_inside():
             with pool.lock:
                 pool.tick()
