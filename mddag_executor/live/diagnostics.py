@@ -14,7 +14,7 @@ workers nor intake ever wait for it.
 A DAG's status says what came of its results (jobs of its sinks) lately.  STALE: nothing has been
 released for a while.  ERROR, WARN: see ``Thresholds``.  The pool's status says WARN when something
 was lost: messages beyond a queue's depth, releases of timers, messages whose job was not found,
-events of the trace.
+events of the trace, misses that ``on_deadline_miss`` was too slow for.
 
 By the conventions of diagnostics names are ``NAME: DAG`` and ``NAME: workers``, the hardware_id is
 the host's name and the process, and values are texts whose units stand in their keys.
@@ -40,6 +40,7 @@ from rclpy.logging import get_logger
 
 if TYPE_CHECKING:
     from diagnostic_msgs.msg import DiagnosticArray
+    from mddag_executor.live.miss_notifier import MissNotifier
     from mddag_executor.live.pool import Pool
     from mddag_executor.live.recorder import Recorder
     from mddag_executor.live.registry import Registry
@@ -175,9 +176,10 @@ class PoolWatch:
 
     def __init__(
         self, pool: Pool, registry: Registry, recorder: Recorder | None,
-        thresholds: Thresholds,
+        thresholds: Thresholds, notifier: MissNotifier | None = None,
     ) -> None:
         self._engine = pool.engine
+        self._notifier = notifier
         self._pool = pool
         self._registry = registry
         self._recorder = recorder
@@ -189,7 +191,8 @@ class PoolWatch:
         jobs = self._engine.jobs
         return {
             **self._registry.totals(), 'doubtful': jobs.doubtful,
-            'trace_lost': 0 if self._recorder is None else self._recorder.writer.dropped}
+            'trace_lost': 0 if self._recorder is None else self._recorder.writer.dropped,
+            'unreported_misses': 0 if self._notifier is None else self._notifier.unreported}
 
     def status(self, now: int) -> Status:
         """Return the state of things; to be called once a period (``now``: monotonic ns)."""
@@ -202,6 +205,7 @@ class PoolWatch:
         lost = [f'{step[key]} {what}' for key, what in (
             ('dropped', 'dropped'), ('skipped', 'timer releases skipped'),
             ('unattributed', 'messages without a job'), ('trace_lost', 'trace events lost'),
+            ('unreported_misses', 'misses not reported to on_deadline_miss'),
         ) if step[key]]
         failed = self._recorder is not None and self._recorder.writer.error is not None
         if failed:
@@ -216,7 +220,8 @@ class PoolWatch:
             'cpu_ratio': f'{cpu_used / passed:.3f}',
             'cpu_us_per_callback': f'{cpu_used / 1e3 / step["ran"]:.1f}' if step['ran'] else '',
             **{key: str(counts[key]) for key in (
-                'ran', 'dropped', 'skipped', 'unattributed', 'doubtful', 'trace_lost')}}
+                'ran', 'dropped', 'skipped', 'unattributed', 'doubtful', 'trace_lost',
+                'unreported_misses')}}
         return Status(
             f'{self._thresholds.name}: {WORKERS}',
             ERROR if failed else WARN if lost else OK,
@@ -234,7 +239,7 @@ class Diagnostics:
     def __init__(
         self, context: Context, task_set: TaskSet | None, pool: Pool, registry: Registry,
         recorder: Recorder | None, period_ns: int, thresholds: Thresholds,
-        process: str | None = None,
+        process: str | None = None, notifier: MissNotifier | None = None,
     ) -> None:
         self._context = context
         self._registry = registry
@@ -249,7 +254,7 @@ class Diagnostics:
             self._dags.append((
                 {vertex.callback.key for vertex in reported_by},
                 DagWatch(verdicts.tally, dag, thresholds, period_ns, verdicts.causes[dag.index])))
-        self._pool = PoolWatch(pool, registry, recorder, thresholds)
+        self._pool = PoolWatch(pool, registry, recorder, thresholds, notifier)
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
 

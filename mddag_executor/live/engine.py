@@ -69,21 +69,19 @@ class Engine:
 
     :param record: where trace events go; None records nothing.
     :param on_miss: gets every miss (see ``Verdicts``).
-    :param fail: gets what ``on_miss`` raises.
     :param process: which of the declared processes this is.
     """
 
     def __init__(
         self, task_set: TaskSet | None, n_workers: int, policy: str, *, default_deadline: int,
         max_active_jobs: int, expire_after: int, record: Record | None = None,
-        on_miss: Callable[[DeadlineMiss], None] | None = None,
-        fail: Callable[[BaseException], None] = lambda error: None, process: str | None = None,
+        on_miss: Callable[[DeadlineMiss], None] | None = None, process: str | None = None,
     ) -> None:
         self.tables = Tables.build(
             task_set, legs=True, groups=False, default_deadline=default_deadline,
             max_active_jobs=max_active_jobs, expire_after=expire_after)
         self.scheduler = Scheduler(self.tables, n_workers, policy, propagate=False)
-        self.verdicts = Verdicts(task_set, self.tables, record, on_miss, fail)
+        self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
         self.jobs = Jobs(task_set)
         self.other_processes = OtherProcesses.of(
             task_set, self.tables, self.scheduler, self.jobs, process)

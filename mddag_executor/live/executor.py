@@ -46,6 +46,7 @@ from mddag_executor.live.groups import Groups
 from mddag_executor.live.intake.events import EventsIntake
 from mddag_executor.live.intake.waitset import ALL_KINDS, WaitSetIntake
 from mddag_executor.live.interpreter import short_switch_interval
+from mddag_executor.live.miss_notifier import MissNotifier
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.rates import RateWatch
 from mddag_executor.live.receiver import Receiver
@@ -103,7 +104,9 @@ class MultiDeadlineExecutor(BareExecutor):
     :param policy: ``rad`` or another of ``mddag_executor.core.POLICIES``.
     :param context: the context that the executor belongs to, or None for the default one.
     :param trace: path of an MCAP file to record to, or None.
-    :param on_deadline_miss: called with a ``DeadlineMiss``, in a worker thread.
+    :param on_deadline_miss: called with each ``DeadlineMiss``, in a thread of its own; what it
+        raises comes out of the spin.  If it takes too long, misses are counted and not reported
+        (``unreported_misses`` in ``statistics()``).
     :param default_deadline: relative deadline of undeclared callbacks: ns, or text as ``100ms``.
     :param intake: ``events``, ``waitset`` or ``auto`` (events where this rclpy has them).
     :param worker_policy: real-time policy of the workers, ``SCHED_FIFO`` or ``SCHED_RR``.
@@ -170,12 +173,16 @@ class MultiDeadlineExecutor(BareExecutor):
         self._attention = Bell()
         self._spinning = threading.Lock()
         self._finished = False
+        # reentrant: a signal's handler may end the run in the thread that ends it
+        self._ending = threading.RLock()
         self._freeze_gc = freeze_gc
+        self._notifier = None if on_deadline_miss is None else MissNotifier(
+            on_deadline_miss, self._fail)
         self._engine = Engine(
             task_set, num_workers, policy, default_deadline=deadline_ns,
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
-            record=self._recorder.record if self._recorder else None, on_miss=on_deadline_miss,
-            fail=self._fail, process=process)
+            record=self._recorder.record if self._recorder else None,
+            on_miss=None if self._notifier is None else self._notifier.post, process=process)
         self._pool = Pool(
             self._engine, self._trace_clock, self._fail, self._context_ended, prepare,
             bool(preempt))
@@ -211,7 +218,7 @@ class MultiDeadlineExecutor(BareExecutor):
         if every_ns is not None:
             self._diagnostics = Diagnostics(
                 self.context, task_set, self._pool, self._registry, self._recorder, every_ns,
-                thresholds, process)
+                thresholds, process, self._notifier)
         if process is not None and task_set is not None and (
                 self._engine.other_processes is not None
                 and self._engine.other_processes.announces):
@@ -407,6 +414,8 @@ class MultiDeadlineExecutor(BareExecutor):
             if is_over(self.context):
                 self._pool.close(0.5)
                 self._end_run()
+                if self._notifier is not None:
+                    self._notifier.stop()
             self._spinning.release()
 
     def _settle(self) -> None:
@@ -434,6 +443,8 @@ class MultiDeadlineExecutor(BareExecutor):
             self._announcements.look()
         if self._diagnostics is not None:
             self._diagnostics.start()
+        if self._notifier is not None:
+            self._notifier.start()
 
     def _check_context(self) -> None:
         if is_over(self.context):
@@ -592,14 +603,18 @@ class MultiDeadlineExecutor(BareExecutor):
         if not self._pool.close(timeout_sec):
             return False
         self._end_run()
+        reported = self._notifier is None or self._notifier.stop(timeout_sec)
         finished: bool = super().shutdown(timeout_sec)
-        return finished
+        return finished and reported
 
     def _end_run(self) -> None:
-        """Judge what is open and close the trace, once."""
-        if self._finished:
-            return
-        self._finished = True
+        """Judge what is open and close the trace, once; whoever comes second waits for that."""
+        with self._ending:
+            if not self._finished:
+                self._finished = True
+                self._judge_and_close()
+
+    def _judge_and_close(self) -> None:
         if self._diagnostics is not None:
             self._diagnostics.stop()
         self._groups.release()
@@ -609,7 +624,6 @@ class MultiDeadlineExecutor(BareExecutor):
             now = self._pool.tick()
             end = min(now, self._pool.stopped_at or now)
             self._engine.finish(now, end)
-        self._engine.verdicts.report_misses()
         if self._recorder is not None:
             self._recorder.close(now, end)
 
@@ -652,4 +666,5 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def statistics(self) -> dict[str, Any]:
         """Return a snapshot of what has happened so far (see the module ``statistics``)."""
-        return statistics(self._pool, self._registry, self._recorder, self._process)
+        return statistics(
+            self._pool, self._registry, self._recorder, self._process, self._notifier)

@@ -266,9 +266,13 @@ class Pool:
             except Exception as error:
                 self._fail(error)
         while not seat.ended:
-            seat.wake.acquire()
-            while seat.work is not None:
-                self._execute(seat)
+            seat.wake.acquire()  # once for each assignment by another thread
+            try:
+                goes_on = seat.work is not None  # else it was woken to end
+                while goes_on:
+                    goes_on = self._execute(seat)
+            except BaseException as error:  # the executor's own: a callback's were handled
+                self._fail(error)
         seat.cpu_clock.close()
 
     @contextmanager
@@ -323,8 +327,7 @@ class Pool:
 
     def run_one(self) -> bool:
         """Run one ready callback in the calling thread; False when none may run."""
-        ran = False
-        while not ran:
+        while True:
             with self.lock:
                 work = self.engine.dispatch(self.tick())
                 if work is None:
@@ -333,18 +336,21 @@ class Pool:
                 seat.work = work
             seat.vtid = threading.get_native_id()
             before = current.running    # a callback that steps the executor itself
-            ran = self._execute(seat)
+            self._execute(seat)
             current.running = before
-        return True
+            if not seat.refused:
+                return True
 
     def _execute(self, seat: Seat) -> bool:
         """
         Run the seat's execution until it ends or waits; leave a worker's next one in the seat.
 
-        :return: False when its callback group did not let it run.
+        :return: whether there is a next one. What another thread puts into the seat later is not
+            meant: that thread wakes the worker for it.
         """
         work, engine, offset = seat.work, self.engine, self.clock.offset_ns
         assert work is not None
+        goes_on = False
         entity = work.entity
         waits_for: Any = None
         raised: BaseException | None = None
@@ -399,21 +405,19 @@ class Pool:
                 self._leave(seat, now)
             else:
                 seat.work = engine.dispatch(now, seat.worker)
+                goes_on = seat.work is not None
                 if engine.has_more:
                     self._hand_out(now)
                 elif (engine.holders and any(engine.queues) or engine.is_shared
                         or self.interpreter.rings_at):
                     self.interpreter.look_after()
-        let_run = type(raised) is not Refused
         if waits_for is not None:
             self._resume_when_done(work, waits_for)
         elif raised is not None:  # now, when its job has failed for whoever catches it
             if not isinstance(raised, (Destroyed, Refused)):
                 self._fail(raised)
             raised = None   # it refers to this frame
-        if engine.verdicts.misses:
-            engine.verdicts.report_misses()
-        return let_run
+        return goes_on
 
     def _report_outcome(
         self, seat: Seat, work: Work, waits_for: Any, raised: BaseException | None, start: int,
@@ -422,6 +426,7 @@ class Pool:
         """Give the engine what became of an execution that has not simply ended."""
         engine = self.engine
         if isinstance(raised, Refused):
+            seat.refused = True
             engine.refused(work, now)
             return
         engine.report_alone(now)

@@ -47,12 +47,14 @@ class Seat:
     :ivar thread: its thread where that is one of the pool's own.
     :ivar waits: whether its callback waits for a service, and has lent its worker.
     :ivar published: when the callback that runs published first (monotonic ns); 0: not yet.
+    :ivar refused: whether a callback group has not let something run in it.
     :ivar relieved: whether another thread does what it, an intake's, would do otherwise.
     """
 
     __slots__ = (
         'worker', 'wake', 'work', 'ended', 'thread', 'vtid', 'cpu_clock', 'waits', 'relieved',
-        'reading', 'began_ns', 'others_before', 'engine', '_clock', '_lend', 'published')
+        'reading', 'began_ns', 'others_before', 'engine', '_clock', '_lend', 'published',
+        'refused')
 
     def __init__(
         self, engine: Engine, clock: TraceClock, worker: int,
@@ -77,6 +79,7 @@ class Seat:
         self._clock = clock
         self._lend = lend
         self.published = 0
+        self.refused = False
 
     def publish(
         self, send: Any, publisher: Any, msg: Any, state: PublisherState, begin: int

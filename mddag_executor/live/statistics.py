@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core.tally import counts, never_due
+from mddag_executor.live.miss_notifier import MissNotifier
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
 
 
 def statistics(
-    pool: Pool, registry: Registry, recorder: Recorder | None, process: str | None = None
+    pool: Pool, registry: Registry, recorder: Recorder | None, process: str | None = None,
+    notifier: MissNotifier | None = None,
 ) -> dict[str, Any]:
     """
     Return the counts of a run.
@@ -38,7 +40,8 @@ def statistics(
     while it spun, how many misses fell into these stops, and the times of the last ones (ns since
     the epoch).  ``causes`` has how many misses of which cause there are, as far as the executor
     knows it at once.  ``preemption`` (None unless asked for) has why it is off, or None, and how
-    often a callback was to pause.
+    often a callback was to pause.  ``unreported_misses`` counts those that ``on_deadline_miss``
+    was not called with, because it had not returned from earlier ones in time.
     """
     engine = pool.engine
     with pool.lock:
@@ -70,6 +73,7 @@ def statistics(
             'unknown': engine.jobs.unknown,
             'doubtful': engine.jobs.doubtful},
         'never_ran': never_ran,
+        'unreported_misses': 0 if notifier is None else notifier.unreported,
         'trace': None if recorder is None else {
             'path': recorder.path, 'lost': recorder.writer.dropped,
             'error': None if recorder.writer.error is None else str(recorder.writer.error)},

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 import threading
@@ -62,16 +61,13 @@ class Verdicts:
     """
     The run's counts, misses and mddag trace events.
 
-    ``report_misses`` calls the user, so it is not to be called under a lock.
-
     :param record: where trace events go; None records nothing.
-    :param on_miss: gets every miss, in the thread that calls ``report_misses``.
-    :param fail: gets what ``on_miss`` raises.
+    :param on_miss: gets every miss under the engine's lock, so it must not wait.
     """
 
     def __init__(
         self, task_set: TaskSet | None, tables: Tables, record: Record | None,
-        on_miss: Callable[[DeadlineMiss], None] | None, fail: Callable[[BaseException], None],
+        on_miss: Callable[[DeadlineMiss], None] | None,
     ) -> None:
         self.tally = Tally(task_set, tables, KEEP_RESPONSES)
         self.stops = Stops()
@@ -82,10 +78,8 @@ class Verdicts:
         self._dags = task_set.dags if task_set is not None else ()
         self._tables = tables
         self._on_miss = on_miss
-        self._fail = fail
         #: Called with DAG and release of each job that starts.
         self.on_release: Callable[[int, int], None] | None = None
-        self.misses: deque[DeadlineMiss] = deque()
         self._aborted: dict[tuple[int, int], None] = {}
 
     def add(self, decisions: list[Decision], now: int, state: State) -> list[int]:
@@ -130,19 +124,9 @@ class Verdicts:
             cause = MACHINE
         self.causes[dag][cause] += 1
         if self._on_miss is not None:
-            self.misses.append(DeadlineMiss(
+            self._on_miss(DeadlineMiss(
                 self._dags[dag].name, self.tally.vertex_name(vertex), job, release, deadline,
                 time if kind == SINK_LATE else None, VERDICTS[kind]))
-
-    def report_misses(self) -> None:
-        """Call ``on_miss`` for the misses since the last call."""
-        while self.misses and self._on_miss is not None:
-            try:
-                self._on_miss(self.misses.popleft())
-            except IndexError:
-                return  # another thread has reported it
-            except Exception as error:
-                self._fail(error)
 
     def released(self, dag: int, job: int, release: int, now: int, judged: bool) -> None:
         """Note that a job was released."""

@@ -28,7 +28,7 @@ class Driven:
         task_set = loads(GRAPH)
         tables = Tables.build(task_set, legs=True)
         self.core = Scheduler(tables, 1, propagate=False)
-        self.verdicts = Verdicts(task_set, tables, None, None, pytest.fail)
+        self.verdicts = Verdicts(task_set, tables, None, None)
         self.slot = self.core.release(0, 0, 0, 0)
 
     def run(self, vertex: int, ready: int, start: int, end: int) -> None:
