@@ -267,12 +267,13 @@ class Pool:
                 self._fail(error)
         while not seat.ended:
             seat.wake.acquire()  # once for each assignment by another thread
-            try:
-                goes_on = seat.work is not None  # else it was woken to end
-                while goes_on:
+            goes_on = seat.work is not None  # else it was woken to end
+            while goes_on:
+                goes_on = False
+                try:
                     goes_on = self._execute(seat)
-            except BaseException as error:  # the executor's own: a callback's were handled
-                self._fail(error)
+                except BaseException as error:  # the executor's own: a callback's were handled
+                    self._fail(error)
         seat.cpu_clock.close()
 
     @contextmanager
@@ -456,8 +457,11 @@ class Pool:
         if waits_for is UNKNOWN or not hasattr(waits_for, 'add_done_callback'):
             with self.lock:
                 self._polled.append(work)
-        else:
+            return
+        try:
             waits_for.add_done_callback(QuickCallback(partial(self.resume, work)))
+        except BaseException as error:  # it may be of a class of the user's
+            self._fail(error)
 
     def is_idle(self) -> bool:
         """Return whether nothing runs and nothing is ready."""
