@@ -7,6 +7,10 @@ Two places in rclpy where the executor must know what a callback does.
 holds publications.  ``Client.call``: a callback that waits for a service lends its worker's place
 to a spare thread.  Both are wrapped once for the process, when the first executor is made; outside
 of this executor's callbacks they do what they always did.
+
+A signal's handler may publish, in the main thread, which may hold any lock just then: of a
+publisher, of a subscription, of the engine.  So a publisher's lock is reentrant, and publications
+of the main thread are delivered by another one (see ``inline``).
 """
 
 from __future__ import annotations
@@ -49,10 +53,14 @@ def install() -> None:
             state.count += 1
             begin = time_ns()
             running = current.running
-            if running is None:
-                send(self, msg)
-            else:
-                running.publish(send, self, msg, state, begin)
+            try:
+                if running is None:
+                    send(self, msg)
+                else:
+                    running.publish(send, self, msg, state, begin)
+            except BaseException:
+                state.count -= 1  # the middleware has not counted it
+                raise
         for deliver in state.deliver:  # looked up after it is sent: see ``inline``
             deliver(begin)
 

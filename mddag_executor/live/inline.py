@@ -20,11 +20,13 @@ Nothing may get lost or wait by that:
     its own, or filters) shows that the assumption is wrong here: the intake takes over for good.
 3.  Whoever starts to look after a subscription, the intake or this one, first takes what is there
     already.
-4.  Each publication takes at least once, after its message has arrived, so as often as messages
+4.  The main thread takes nothing: a signal's handler may publish in it, while it holds the lock of
+    a subscription or of the engine.  The thread that counts publishers takes for it, at once.
+5.  Each publication takes at least once, after its message has arrived, so as often as messages
     arrive, whichever of several threads gets which.  One lock for each subscription keeps the
     messages in order.
 
-5.  Whatever happened, every ``TAKE_EVERY`` looks all that has arrived is taken.  So a publisher
+6.  Whatever happened, every ``TAKE_EVERY`` looks all that has arrived is taken.  So a publisher
     from elsewhere that has just come is served ``LOOK_S`` later at the most, one that has come and
     gone within that time a second later; sooner where one of these nodes publishes on its topic.
     (More often would cost too much: a look at a hundred subscriptions takes half a millisecond.)
@@ -41,11 +43,14 @@ to run what waits for it.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 import threading
+import time
 from typing import Any
 
+from mddag_executor.live.alarm import Bell
 from mddag_executor.live.compat import keeps_time, RCL_ERRORS
 from mddag_executor.live.hooks import install, publisher_state
 from mddag_executor.live.intake.arrivals import Receiver
@@ -120,16 +125,26 @@ class Delivery:
     Takes from some subscriptions what was published for them.
 
     :param on_miss: called when a message is not there that was published.
+    :param leave: has another thread call ``deliver`` with a begin; it waits for no lock.
     """
 
-    __slots__ = ('_directs', '_receiver', '_on_miss')
+    __slots__ = ('_directs', '_receiver', '_on_miss', '_leave')
 
     def __init__(
         self, directs: Iterable[Direct], receiver: Receiver, on_miss: Callable[[], None],
+        leave: Callable[[Delivery, int], None],
     ) -> None:
         self._directs = sorted(directs, key=id)  # so no two threads wait for each other's locks
         self._receiver = receiver
         self._on_miss = on_miss
+        self._leave = leave
+
+    def published(self, begin: int) -> None:
+        """Deliver what was just published, in the calling thread unless it is the main one."""
+        if threading.get_ident() == threading.main_thread().ident:
+            self._leave(self, begin)
+        else:
+            self.deliver(begin)
 
     def deliver(self, begin: int) -> None:
         """Take what is there (see ``Direct.take``), and hand it over in one piece."""
@@ -178,6 +193,9 @@ class InlineDelivery:
         self._left: EntitySet | None = None
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
+        self._bell = Bell()
+        # what the main thread has published
+        self._left_to_thread: deque[tuple[Delivery, int]] = deque()
 
     def choose(self, entities: EntitySet) -> EntitySet:
         """
@@ -220,12 +238,25 @@ class InlineDelivery:
             self._thread.start()
         return self._rest(entities, chosen)
 
+    def _leave(self, delivery: Delivery, begin: int) -> None:
+        self._left_to_thread.append((delivery, begin))
+        self._bell.ring()
+
     def _look_after(self, stopping: threading.Event) -> None:
-        looks = 0
-        while not stopping.wait(LOOK_S) and not self._over():
-            looks += 1
-            if self._look(looks % TAKE_EVERY == 0):
-                self._on_change()
+        looks, next_look = 0, time.monotonic() + LOOK_S
+        while True:
+            self._bell.wait(max(0.0, next_look - time.monotonic()))
+            if stopping.is_set() or self._over():
+                self._bell.ring()  # for the next thread
+                return
+            while self._left_to_thread:
+                delivery, begin = self._left_to_thread.popleft()
+                delivery.deliver(begin)
+            if time.monotonic() >= next_look:
+                next_look = time.monotonic() + LOOK_S
+                looks += 1
+                if self._look(looks % TAKE_EVERY == 0):
+                    self._on_change()
 
     def _look(self, take: bool) -> bool:
         """Return whether publishers have come or gone; take what has arrived, too, if asked to."""
@@ -244,7 +275,7 @@ class InlineDelivery:
                 self._delivery([direct]).deliver(0)
 
     def _delivery(self, directs: list[Direct]) -> Delivery:
-        return Delivery(directs, self._receiver, self._on_change)
+        return Delivery(directs, self._receiver, self._on_change, self._leave)
 
     def stop(self) -> threading.Thread | None:
         """
@@ -254,6 +285,8 @@ class InlineDelivery:
         """
         self._set_takes({}, {})
         self._stopping.set()
+        self._bell.ring()
+        self._left_to_thread.clear()
         thread, self._thread = self._thread, None
         self._stopping = threading.Event()
         self._known = {}
@@ -281,7 +314,7 @@ class InlineDelivery:
     ) -> None:
         for key, state in (*self._states.items(), *states.items()):
             mine = takes.get(key, []) if states.get(key) is state else []
-            state.set_delivery(self, self._delivery(mine).deliver if mine else None)
+            state.set_delivery(self, self._delivery(mine).published if mine else None)
         self._states = states
 
     def _forget(self, entities: EntitySet) -> None:

@@ -9,16 +9,19 @@ A message says when it was published: its source timestamp, which the middleware
 system clock inside ``publish``.  Every ``publish`` of a trigger topic by a callback of this
 executor is noted as a *publication*: the window of system time that it took, the publisher's
 running number, and the execution that published it (the one whose callback runs in that thread).
-A message belongs to the publication of its topic whose window holds its source timestamp.
 
-Where several windows hold it (two threads published on one topic at the same microsecond), the
-publication sequence number decides.  Publications of one publisher never overlap: they are
-serialised, as the middleware does anyway.  So a doubt can only remain between two publishers with
-the same number; then, and when no window fits (a publisher in another process or thread), the
-answer is None and the message runs as an undeclared callback: never dropped, never guessed.
-
-A publisher may have published before anybody counted; the difference to the middleware's number
-is learnt from messages that only one window holds.
+1.  A message belongs to the publication of its topic whose window holds its source timestamp and
+    which has its publication sequence number.  A message of a publisher in another process or
+    thread may lie in a window, too: its number is another one.
+2.  Publications of one publisher never overlap: they are serialised, as the middleware does
+    anyway.  So a doubt can only remain between two publishers with the same number.  Then, and
+    when nothing fits, the answer is None and the message runs as an undeclared callback: never
+    dropped, never guessed.  Only where the middleware gives no numbers, the window decides alone.
+3.  A publisher is expected to have sent nothing before it was counted.  Messages of two of its
+    publications in a row that lie in no other window and differ from the count by the same number
+    show that it had.
+4.  A signal's handler may publish with the publisher whose ``publish`` it interrupts.  Which of
+    the two gets which number is not known, so neither has one.
 
 Publications of other processes that these announce (``announcements``) are found in the same way.
 """
@@ -39,10 +42,8 @@ KEEP = 256
 ROUNDING_NS = 2
 """DDS stamps are multiples of 2**-32 s: they may lie this far outside of the window."""
 
-OUT_OF_ORDER_NS = 1_000_000
-"""Publications are kept in order of their begin, but for threads that overtake each other."""
-
 _STILL_PUBLISHING = 2 ** 63 - 1
+_NO_NUMBER = -(2 ** 62)
 
 
 class Origin(NamedTuple):
@@ -75,18 +76,33 @@ class Announced(NamedTuple):
 
 class RemotePublisher:
     """
-    A publisher in another process.
+    A publisher in another process, which is counted there.
 
-    :ivar offset: from its own count to the middleware's number; None: not known yet.
+    :ivar offset: from this count to the middleware's number.
+    :ivar unlike: that of the last message if it was another one, and the publication in whose
+        window that message was; None: it was this one.
     """
 
-    __slots__ = ('offset',)
+    __slots__ = ('offset', 'unlike')
 
     def __init__(self) -> None:
-        self.offset: int | None = None
+        self.offset = 0
+        self.unlike: tuple[int, int] | None = None
+
+    def learn(self, count: int, number: int) -> bool:
+        """
+        Return whether the publication of a count is known to have another number than expected.
+
+        To be asked only for messages that lie in no other publication's window.
+        """
+        before, self.unlike = self.unlike, (number - count, count)
+        if before is None or before[0] != number - count or before[1] == count:
+            return False
+        self.offset, self.unlike = number - count, None
+        return True
 
 
-class PublisherState:
+class PublisherState(RemotePublisher):
     """
     What is kept for each publisher: its topic, and how many messages it has published.
 
@@ -95,13 +111,14 @@ class PublisherState:
     :ivar noted_by: the ``Jobs`` that ``notes`` is of: what is kept there of the topic.
     """
 
-    __slots__ = ('lock', 'topic', 'count', 'offset', 'deliver', 'noted_by', 'notes', '_delivery')
+    __slots__ = ('lock', 'topic', 'count', 'deliver', 'noted_by', 'notes', '_delivery')
 
     def __init__(self, topic: str) -> None:
-        self.lock = threading.Lock()
+        super().__init__()
+        # reentrant: a signal's handler may publish while it is held
+        self.lock = threading.RLock()
         self.topic = topic
         self.count = 0
-        self.offset = 0
         self.deliver: tuple[Callable[[int], None], ...] = ()
         self.noted_by: Jobs | None = None
         self.notes: _Topic | None = None
@@ -122,7 +139,7 @@ class Publication:
     __slots__ = ('begin', 'end', 'publisher', 'sequence', 'origin')
 
     def __init__(
-        self, begin: int, publisher: PublisherState | RemotePublisher,
+        self, begin: int, publisher: RemotePublisher,
         origin: Origin | Announced, sequence: int, end: int = _STILL_PUBLISHING,
     ) -> None:
         self.begin = begin
@@ -145,7 +162,7 @@ class _Topic:
         self.is_announced = False
         # what is announced once no publication of the topic is open
         self.to_announce: list[Publication] = []
-        self.lock = threading.Lock()
+        self.lock = threading.RLock()
         # The longest window of those kept; a maximum of two generations, so that it is forgotten.
         self.longest = 0
         self._longest_lately = 0
@@ -155,15 +172,16 @@ class _Topic:
 
     def ended(self, publication: Publication, end: int) -> None:
         length = end - publication.begin
-        if length > self._longest_lately:
-            self._longest_lately = length
-            self.longest = max(self.longest, length)
+        with self.lock:
+            if length > self._longest_lately:
+                self._longest_lately = length
+                self.longest = max(self.longest, length)
+            self._count += 1
+            if self._count >= KEEP:
+                self._count = 0
+                self.longest, self._longest_lately = self._longest_lately, 0
         publication.end = end
         self.open.remove(publication)
-        self._count += 1
-        if self._count >= KEEP:
-            self._count = 0
-            self.longest, self._longest_lately = self._longest_lately, 0
 
 
 class Jobs:
@@ -200,8 +218,13 @@ class Jobs:
         if topic.on_header is not None:
             topic.on_header(header_stamp(msg), origin)
         publication = Publication(begin, state, origin, state.count)
+        for interrupted in topic.open.copy():
+            if interrupted.publisher is state:
+                interrupted.sequence = publication.sequence = _NO_NUMBER
         topic.open.append(publication)
         topic.publications.append(publication)
+        # Again: the thread may have waited for the interpreter meanwhile, and others published.
+        publication.begin = time_ns()
         try:
             send(publisher, msg)
         finally:
@@ -245,13 +268,13 @@ class Jobs:
         fits: list[Publication] = []
         if known.open:
             fits.extend(p for p in known.open.copy() if p.begin - ROUNDING_NS <= stamp)
-        # What began this long ago has ended before the stamp, like all before it.
-        first = stamp - known.longest - OUT_OF_ORDER_NS
+        # All that was noted before one that ended this long ago has ended before the stamp.
+        first = stamp - known.longest - ROUNDING_NS
         publications = known.publications
         for i in range(len(publications) - 1, -1, -1):
             # By index: other threads append meanwhile, which may only show an entry twice.
             publication = publications[i]
-            if publication.begin < first:
+            if publication.end < first:
                 break
             if (publication.begin - ROUNDING_NS <= stamp <= publication.end + ROUNDING_NS
                     and publication not in fits):
@@ -260,17 +283,23 @@ class Jobs:
             fits.extend(p for p in known.announced.copy()
                         if p.begin - ROUNDING_NS <= stamp <= p.end + ROUNDING_NS)
         if len(fits) == 1:
-            if sequence is not None:
-                fits[0].publisher.offset = sequence - fits[0].sequence
-            return fits[0].origin
-        if not fits:
+            publication = fits[0]
+            publisher, count = publication.publisher, publication.sequence
+            if sequence is None:
+                return publication.origin
+            if sequence - count == publisher.offset:
+                publisher.unlike = None
+                return publication.origin
+            if count != _NO_NUMBER and publisher.learn(count, sequence):
+                return publication.origin
+        elif sequence is not None:
+            matches = [p for p in fits if p.sequence + p.publisher.offset == sequence]
+            if len(matches) == 1:
+                return matches[0].origin
+        if len(fits) > 1:
+            self.doubtful += counted
+        else:
             self.unknown += counted
-            return None
-        matches = [p for p in fits if p.publisher.offset is None
-                   or p.sequence + p.publisher.offset == sequence]
-        if len(matches) == 1 and matches[0].publisher.offset is not None:
-            return matches[0].origin
-        self.doubtful += counted
         return None
 
     def release(
