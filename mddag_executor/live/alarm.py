@@ -11,6 +11,7 @@ import time
 
 _CLOEXEC = os.O_CLOEXEC  # TFD_CLOEXEC of timerfd_create(2)
 _ENDING_NS = 1
+_TIMES = ctypes.c_long * 4
 
 
 class Bell:
@@ -43,7 +44,6 @@ class Alarm:
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
         self._file = -1
-        self._times: dict[int, ctypes.Array[ctypes.c_long]] = {}
         try:
             library = ctypes.PyDLL(None, use_errno=True)
             self._set = library.timerfd_settime
@@ -56,11 +56,8 @@ class Alarm:
         """Have it ring so much later, and not when it was to ring before; 0: never."""
         if self._file < 0:
             return
-        value = self._times.get(ns)
-        if value is None:  # period and time: seconds, nanoseconds
-            value = (ctypes.c_long * 4)(0, 0, *divmod(ns, 1_000_000_000))
-            self._times[ns] = value
-        self._set(self._file, 0, value, None)
+        # period and time: seconds, nanoseconds
+        self._set(self._file, 0, _TIMES(0, 0, *divmod(ns, 1_000_000_000)), None)
 
     def wait(self) -> None:
         """Wait until it rings."""

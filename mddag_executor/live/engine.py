@@ -34,6 +34,7 @@ from threading import get_native_id
 from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.queues import overtaking_pays
 from mddag_executor.core.rules import progress
@@ -81,6 +82,7 @@ class Engine:
             task_set, legs=True, groups=False, default_deadline=default_deadline,
             max_active_jobs=max_active_jobs, expire_after=expire_after)
         self.scheduler = Scheduler(self.tables, n_workers, policy, propagate=False)
+        self.deadlines = Deadlines(self.tables, self.scheduler.state)
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
         self.jobs = Jobs(task_set)
         self.other_processes = OtherProcesses.of(
@@ -99,6 +101,8 @@ class Engine:
         self._work: dict[int, Work] = {}
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
+        # when it was judged last which sinks are overdue
+        self._judged_at = 0
         # those that hold the interpreter, in the order in which they began; likewise
         self.holders: list[Work] = []
         # whether who holds the interpreter may have overtaken another
@@ -279,6 +283,7 @@ class Engine:
         slot = self.scheduler.release(dag, job, release, now)
         if self._state.decisions:
             self._decided(now)
+        self.deadlines.watch(slot)
         self.verdicts.released(dag, job, release, now, is_judged(self._state, slot))
         return slot
 
@@ -513,6 +518,8 @@ class Engine:
         x, work.x = work.x, -1
         if work in self.holders:
             self.holders.remove(work)
+        if end < self._judged_at:  # that it was overdue was reported before this was known
+            end = self._judged_at
         end_it = self.scheduler.fail if failed else self.scheduler.complete
         if self.record is None:
             end_it(x, end)
@@ -603,7 +610,7 @@ class Engine:
         decisions = self.scheduler.decisions()
         if self._finished:  # it was judged already, and the trace is closed
             return
-        for x in self.verdicts.add(decisions, now, self._state):
+        for x in self.verdicts.add(decisions, now):
             work = self._work.pop(x, None)
             if work is not None:  # the core dropped it: what is left of an aborted job
                 work.entity.waiting.pop(x, None)
@@ -616,6 +623,15 @@ class Engine:
         judge_from(self._state, release)
         if self.record is not None:
             self.record('judge_from', now, get_native_id(), release)
+
+    def judge_overdue(self, now: int) -> None:
+        """Report the sinks whose deadlines are over and which have not completed."""
+        if self._finished:
+            return
+        self.deadlines.judge(now)
+        if self._state.decisions:
+            self._judged_at = now
+            self._decided(now)
 
     # --- the end ---------------------------------------------------------------------------------
 

@@ -39,6 +39,7 @@ from mddag_executor.live.compat import (
     TASKS_NEWEST_FIRST,
 )
 from mddag_executor.live.cpu_order import CpuOrder, why_not
+from mddag_executor.live.deadline_watch import MissLog
 from mddag_executor.live.diagnostics import Diagnostics
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import Entity, TASK
@@ -196,6 +197,8 @@ class MultiDeadlineExecutor(BareExecutor):
             get_logger('mddag_executor').warning(
                 f'preempt: it is off: {self._pool.preemption.reason}')
         self._pool.pump = self._pump
+        self._miss_log = MissLog(self._engine.verdicts)
+        self._pool.after_judging = self._miss_log.write
         self._pool.relieve_intake = self._relieve_intake
         self._stop_watch = StopWatch(
             self._attention, self._stopped, look=self._look_at_late)
@@ -383,6 +386,8 @@ class MultiDeadlineExecutor(BareExecutor):
             self._submit_tasks()  # as in rclpy, before what else is ready
             self._start_intake()
             self._pool.interpreter.looks_late = True
+            if self._engine.dag_names:
+                self._pool.watch.start()
             self._pool.start()
             self._stop_watch.start()
             while not self.is_ending():
@@ -445,6 +450,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._diagnostics.start()
         if self._notifier is not None:
             self._notifier.start()
+        self._miss_log.write()
 
     def _check_context(self) -> None:
         if is_over(self.context):
@@ -570,6 +576,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._upkeep.add_intake(self._stepping)
         self._upkeep.refresh()
         self._pool.look_around()
+        self._pool.judge_overdue()
         self._stepping.poll(0.0)
         self._submit_tasks()
         if self._pool.run_one():

@@ -85,7 +85,7 @@ class Interpreter:
         self._hand_out = hand_out
         # with one CPU nothing computes beside anything
         self._may_overlap = len(os.sched_getaffinity(0)) > 1
-        self._alarm = Alarm(LOOK_NS)
+        self._alarm: Alarm | None = None  # with the thread, which closes it
         self.rings_at = 0
         self.looks_late = False
         self._thread: threading.Thread | None = None
@@ -130,7 +130,7 @@ class Interpreter:
         holder = engine.interpreter_holder() if any(engine.queues) or pauses else None
         if holder is None:
             self._seen = None, 0, 0
-            if self.rings_at:
+            if self.rings_at and self._alarm is not None:
                 self.rings_at = 0
                 self._alarm.start(0)
             return
@@ -168,25 +168,26 @@ class Interpreter:
 
     def _watch(self, ns: int) -> None:
         """Set the alarm for the next look."""
+        if self._alarm is None:
+            self._alarm = Alarm(LOOK_NS)
+            self._thread = threading.Thread(
+                target=self._look_on, args=(self._alarm,), daemon=True, name='mddag-interpreter')
+            self._thread.start()
         self.rings_at = monotonic_ns() + ns
         self._alarm.start(ns)
-        if self._thread is None and not self._closed:
-            self._thread = threading.Thread(
-                target=self._look_on, daemon=True, name='mddag-interpreter')
-            self._thread.start()
 
     def close(self) -> None:
         """End the thread."""
         with self._lock:
             self._closed = True
-            thread = self._thread
-        if thread is not None and thread is not threading.current_thread():
-            self._alarm.ring()
+            thread, alarm = self._thread, self._alarm
+        if thread is not None and alarm is not None and thread is not threading.current_thread():
+            alarm.ring()
             thread.join()
 
-    def _look_on(self) -> None:
+    def _look_on(self, alarm: Alarm) -> None:
         while True:
-            self._alarm.wait()
+            alarm.wait()
             with self._lock:
                 if self._closed:
                     break
@@ -195,7 +196,7 @@ class Interpreter:
                     self.rings_at = 0
                     self._look(free)
                     self._hand_out()
-        self._alarm.close()
+        alarm.close()
 
     def _look(self, free: bool) -> None:
         """

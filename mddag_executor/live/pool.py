@@ -40,6 +40,7 @@ from mddag_executor.clocks import TraceClock
 from mddag_executor.core import NEVER
 from mddag_executor.live.compat import UNKNOWN
 from mddag_executor.live.cpu_order import CpuOrder
+from mddag_executor.live.deadline_watch import DeadlineWatch
 from mddag_executor.live.engine import Engine
 from mddag_executor.live.entity import BRIEF_NS, MOST_DEBT, SOON_NS
 from mddag_executor.live.groups import Refused
@@ -99,6 +100,9 @@ class Pool:
         self._refusals = 0
         self.cpu_order: CpuOrder | None = None
         self.preemption = Preemption() if preempt else None
+        self.watch = DeadlineWatch(self.lock, self.judge_overdue, clock.now, fail)
+        # called, without the lock, after it was judged what is overdue
+        self.after_judging: Callable[[], None] = lambda: None
         self.interpreter = Interpreter(
             engine, self.lock, self._seats, self._hand_out_now, self.preemption)
 
@@ -117,6 +121,8 @@ class Pool:
                 now = self._last
             self._last = now
             event(*args, now)
+            if self.engine.deadlines.next < self.watch.at:
+                self.watch.wait_for(self.engine.deadlines.next)
             running = current.running
             if running is None:
                 own = self._hand_out(now, current.intake)
@@ -167,6 +173,15 @@ class Pool:
         self._last = max(self._last, self.clock.now())
         return self._last
 
+    def judge_overdue(self) -> None:
+        """Report the sinks whose deadlines are over; of a run that has ended, as of its end."""
+        with self.lock:
+            now = self.tick()
+            self.engine.judge_overdue(min(now, self.stopped_at or now))
+            if self.running:
+                self.watch.wait_for(self.engine.deadlines.next)
+        self.after_judging()
+
     def resume(self, work: Work) -> None:
         """Make a suspended execution ready to go on."""
         with self.lock:
@@ -190,6 +205,7 @@ class Pool:
                 self._new_thread(worker)
             self.running = True
             self.stopped_at = 0
+            self.watch.wait_for(self.engine.deadlines.next)
             self._hand_out(self.tick())
 
     def pause(self) -> None:
@@ -223,6 +239,7 @@ class Pool:
                 self.preemption.close()
             seats += self._intakes
         self.interpreter.close()
+        self.watch.close()
         deadline = None if timeout is None else monotonic_ns() + int(timeout * 1e9)
         done = True
         for seat in seats:

@@ -16,7 +16,6 @@ from mddag_executor.live.miss_notifier import MissNotifier
 from mddag_executor.live.pool import Pool
 from mddag_executor.live.recorder import Recorder
 from mddag_executor.live.registry import Registry
-from mddag_executor.live.why import CAUSES
 from msg_graph import TaskSet
 from msg_graph.drift import Drift, drift, Observed, Releases
 
@@ -37,9 +36,8 @@ def statistics(
     while it runs, and for which part of its time it needs that (None: not known yet).
     ``unattributed`` counts messages of declared callbacks whose publication was not found; they
     ran as undeclared ones.  ``stops`` has how often and for how long no thread of the process ran
-    while it spun, how many misses fell into these stops, and the times of the last ones (ns since
-    the epoch).  ``causes`` has how many misses of which cause there are, as far as the executor
-    knows it at once.  ``preemption`` (None unless asked for) has why it is off, or None, and how
+    while it spun, how many misses these stops explain, and the times of the last ones (ns since
+    the epoch).  ``preemption`` (None unless asked for) has why it is off, or None, and how
     often a callback was to pause.  ``unreported_misses`` counts those that ``on_deadline_miss``
     was not called with, because it had not returned from earlier ones in time.
     """
@@ -47,7 +45,6 @@ def statistics(
     with pool.lock:
         result = engine.verdicts.tally.result()
         stops = engine.verdicts.stops.result()
-        causes = {cause: sum(of[cause] for of in engine.verdicts.causes) for cause in CAUSES}
         waiting = engine.scheduler.queue_length
         idle = engine.scheduler.idle_workers
         undeclared = engine.undeclared
@@ -63,7 +60,7 @@ def statistics(
     result['never_due'] = never_due(result['dags'])
     return {
         'policy': engine.scheduler.policy.name, 'workers': engine.n_workers,
-        **result, 'stops': stops, 'causes': causes, 'callbacks': callbacks,
+        **result, 'stops': stops, 'callbacks': callbacks,
         'undeclared': undeclared,
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
         'preemption': None if pool.preemption is None else {

@@ -149,14 +149,13 @@ def test_unequal_deadlines_are_judged_apart_and_misses_are_told(make_executor, m
         assert wait_for(lambda: len(chain.jobs['last']) == len(chain.jobs['tick'])
                         and is_idle(executor))
     found = sinks(executor)
-    late = [miss for miss in misses if miss.kind == 'late']  # not periods that were missed
-    assert found['/middle:early']['late'] >= found['/middle:early']['completed'] == len(late)
+    late = [miss for miss in misses if miss.kind in ('late', 'overdue')]  # not skipped periods
+    assert found['/middle:early']['late'] == found['/middle:early']['completed'] == len(late)
     assert found['/sink:last']['late'] == 0
-    assert executor.statistics()['dags']['chain']['ends']['late'] >= len(late)
+    assert executor.statistics()['dags']['chain']['ends']['late'] == len(late)
     miss = late[0]
     assert (miss.dag, miss.vertex, miss.job) == ('chain', '/middle:early', 0)
     assert miss.deadline_ns == miss.release_ns + 10_000_000
-    assert miss.completed_ns is not None and miss.completed_ns > miss.deadline_ns
 
 
 def test_messages_of_others_run_as_undeclared_ones(make_executor, make_node):

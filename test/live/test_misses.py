@@ -1,22 +1,26 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What `on_deadline_miss` does, however long it takes, never disturbs the executor.
+Misses are known when they happen, and what `on_deadline_miss` does never disturbs the executor.
 
-`make stress` runs the same for MISS_STRESS_SECONDS (20) each.
+`make stress` runs the latter for MISS_STRESS_SECONDS (20) each.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 import os
+import random
 import sys
 import threading
 import time
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from mddag_executor import DeadlineMiss, MultiDeadlineExecutor
 from mddag_executor.core.tally import total
+from mddag_executor.replay import replay
+from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -163,3 +167,156 @@ def test_the_handler_may_end_the_executor(ros_context, make_node) -> None:
     executor.spin()
     assert wait_for(lambda: ended)
     assert all(ended)
+
+
+# --- when a miss is known ------------------------------------------------------------------------
+
+#: Nothing but `/start` starts a job, so nothing else makes a miss known.
+ONCE = """
+mddag: 1
+nodes:
+  - node: /source
+    callbacks: [{name: begin, subscription: /start, period: 60s, publishes: [/a], dag: once}]
+  - node: /sink
+    callbacks:
+      - {name: end, subscription: /a, deadline: 20ms}
+"""
+
+
+class Once:
+    """The nodes of ONCE; ``go`` starts a job, whose callbacks do what they are given."""
+
+    def __init__(self, make_node: Any, begin: Any, end: Any) -> None:
+        self.nodes = [make_node('source'), make_node('sink')]
+        self.group = ReentrantCallbackGroup()
+        self._go = make_node('go').create_publisher(Header, '/start', 10)
+        self.publisher = self.nodes[0].create_publisher(Header, '/a', 10)
+        for node, topic, body in zip(self.nodes, ('/start', '/a'), (begin, end)):
+            node.create_subscription(
+                Header, topic, lambda _, body=body: body(), 10, callback_group=self.group)
+
+    def go(self) -> None:
+        assert wait_for(lambda: self._go.get_subscription_count() == 1
+                        and self.publisher.get_subscription_count() == 1)
+        self._go.publish(Header())
+
+
+def judged(dags: dict[str, Any]) -> dict[str, Any]:
+    """Return the verdicts of a result, with the longest response times."""
+    keys = ('completed', 'late', 'overdue', 'expired', 'failed', 'aborted')
+    return {name: (dag['jobs'], dag['ends'], {
+        sink: ([counts[key] for key in keys], (counts['response_ns'] or {}).get('max'))
+        for sink, counts in dag['sinks'].items()}) for name, dag in dags.items()}
+
+
+def test_a_result_that_never_comes_is_a_miss_at_its_deadline(
+        ros_context, make_node, capfd) -> None:
+    misses: list[DeadlineMiss] = []
+    once = Once(make_node, lambda: None, lambda: None)
+    executor = MultiDeadlineExecutor(
+        loads(ONCE), on_deadline_miss=misses.append, context=ros_context)
+    for node in once.nodes:
+        executor.add_node(node)
+    with Spinning(executor):
+        once.go()
+        assert wait_for(lambda: misses)
+        assert wait_for(lambda: '1 deadline missed: /sink:end, 20 ms, job 0 of once'
+                        in capfd.readouterr().err)
+        statistics = executor.statistics()
+    miss, = misses
+    assert (miss.kind, miss.vertex, miss.job, miss.completed_ns) == (
+        'overdue', '/sink:end', 0, None)
+    assert miss.deadline_ns - miss.release_ns == 20_000_000
+    sink = statistics['dags']['once']['sinks']['/sink:end']
+    assert (sink['late'], sink['overdue'], sink['completed']) == (1, 1, 0)
+    assert statistics['first_miss'] == {
+        'dag': 'once', 'vertex': '/sink:end', 'job': 0, 'deadline_ns': miss.deadline_ns,
+        'completed_ns': None}
+
+
+def test_a_callback_that_hangs_is_a_miss_once(ros_context, make_node, tmp_path) -> None:
+    """Known while it hangs, to all who ask; what comes of it later is its verdict."""
+    misses: list[DeadlineMiss] = []
+    go_on = threading.Event()
+    once = Once(make_node, lambda: once.publisher.publish(Header()), lambda: go_on.wait(60.0))
+    reported: list[dict[str, str]] = []
+
+    def diagnosed(message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == 'mddag: once':
+                reported.append({each.key: each.value for each in status.values})
+
+    once.nodes[0].create_subscription(
+        DiagnosticArray, '/diagnostics', diagnosed, 10, callback_group=once.group)
+    trace = str(tmp_path / 'run.mcap')
+    executor = MultiDeadlineExecutor(
+        loads(ONCE), on_deadline_miss=misses.append, context=ros_context, trace=trace,
+        diagnostics_period='50ms')
+    for node in once.nodes:
+        executor.add_node(node)
+    with Spinning(executor):
+        once.go()
+        assert wait_for(lambda: misses)
+        assert wait_for(lambda: reported and (reported[-1]['missed'], reported[-1]['late']) == (
+            '1', '1')), reported[-1:]
+        go_on.set()
+        assert wait_for(lambda: executor.statistics()['dags']['once']['ends']['late'] == 1)
+    assert [miss.kind for miss in misses] == ['overdue']
+    dags = executor.statistics()['dags']
+    sink = dags['once']['sinks']['/sink:end']
+    assert (sink['late'], sink['overdue'], sink['completed']) == (1, 0, 1)
+    assert judged(replay(trace).result()['dags']) == judged(dags)
+
+
+def test_what_is_stepped_knows_of_a_miss_with_the_next_step(ros_context, make_node) -> None:
+    misses: list[DeadlineMiss] = []
+    once = Once(make_node, lambda: None, lambda: None)
+    executor = MultiDeadlineExecutor(
+        loads(ONCE), on_deadline_miss=misses.append, context=ros_context)
+    for node in once.nodes:
+        executor.add_node(node)
+    once.go()
+
+    def step() -> bool:
+        executor.spin_once(0.001)
+        return bool(misses)
+
+    assert wait_for(step)
+    executor.shutdown()
+    assert [miss.kind for miss in misses] == ['overdue']
+
+
+def test_what_was_reported_is_what_a_replay_judges(ros_context, make_node, tmp_path) -> None:
+    """Callbacks end just before and after their deadlines."""
+    generator, group = random.Random(1), ReentrantCallbackGroup()
+    misses: list[DeadlineMiss] = []
+    node = make_node('many')
+    publisher = node.create_publisher(Header, '/many', 10)
+    node.create_timer(0.005, lambda: publisher.publish(Header()), group)
+    for _ in range(2):
+        node.create_subscription(
+            Header, '/many', lambda _: time.sleep(generator.uniform(0.0, 0.008)), 10,
+            callback_group=group)
+    trace = str(tmp_path / 'run.mcap')
+    executor = MultiDeadlineExecutor(loads("""
+mddag: 1
+nodes:
+  - node: /many
+    callbacks:
+      - {name: tick, timer: 5ms, publishes: [/many], dag: many}
+      - {name: soon, subscription: /many, deadline: 4ms}
+      - {name: later, subscription: /many, deadline: 6ms}
+"""), on_deadline_miss=misses.append, context=ros_context, trace=trace)
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: executor.statistics()['dags']['many']['jobs'] >= 200)
+    statistics = executor.statistics()
+    reported = [(miss.vertex, miss.job) for miss in misses]
+    assert len(set(reported)) == len(reported) == total(statistics['dags']).missed > 20
+    names = ['/many:tick', '/many:soon', '/many:later']
+    assert sorted(reported) == sorted(
+        (names[event['vertex']], event['job']) for event in read_events(trace)
+        if event['_name'] == 'mddag:deadline')
+    replayed = replay(trace)
+    assert replayed.warnings == []
+    assert judged(replayed.result()['dags']) == judged(statistics['dags'])
