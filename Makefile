@@ -15,7 +15,7 @@ ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: help env demo test test-kilted check-fresh soak fuzz lint docs clean distclean
+.PHONY: help env demo test test-kilted check-fresh soak stress fuzz lint docs clean distclean
 .NOTPARALLEL:
 
 help:
@@ -24,6 +24,7 @@ help:
 	@echo 'make test-kilted  the tests of what runs ROS, with ROS 2 Kilted, in $(KILTED)/'
 	@echo 'make check-fresh  make demo and make test in new installations of Debian (CHECK_FRESH=...)'
 	@echo 'make soak       the Autoware workload with random faults for SOAK_SECONDS (600)'
+	@echo 'make stress     deadline misses reported to all kinds of handlers, STRESS_SECONDS (20) each'
 	@echo 'make fuzz       read damaged traces and bags for FUZZ_SECONDS (600) each'
 	@echo 'make lint       run the linters and mypy only'
 	@echo 'make docs       build the documentation, build/docs/index.html'
@@ -66,6 +67,11 @@ SOAK_SECONDS ?= 600
 soak: env
 	@ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python test/endurance/soak.py config/autoware.yaml \
 		--seconds $(SOAK_SECONDS) $(SOAK_ARGS)
+
+STRESS_SECONDS ?= 20
+
+stress: env
+	@MISS_STRESS_SECONDS=$(STRESS_SECONDS) $(BIN)/python -m pytest -q test/live/test_misses.py
 
 lint: env
 	@$(BIN)/python -m pytest -q -m linter test/test_linters.py test/test_layers.py

@@ -51,7 +51,7 @@ def run(depth: int) -> None:
     """Run for two seconds, with so many images waiting at most."""
     told: Counter[str] = Counter()
 
-    def missed(miss: DeadlineMiss) -> None:  # in a worker, so it has to be short
+    def missed(miss: DeadlineMiss) -> None:
         told[f'{miss.dag} {miss.kind}'] += 1
 
     executor = MultiDeadlineExecutor(

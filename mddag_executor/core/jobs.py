@@ -27,6 +27,7 @@ from mddag_executor.core.state import (
     SINK_FAILED,
     SINK_IN_TIME,
     SINK_MISSED,
+    SINK_OVERDUE,
     SKIP,
     State,
 )
@@ -238,6 +239,34 @@ def overdue(t: Tables, s: State, slot: int, now: int) -> bool:
                 and s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0):
             return True
     return False
+
+
+def next_deadline(t: Tables, s: State, slot: int, after: int) -> int:
+    """Return the first deadline after a time of a job's sinks that have not completed; NEVER."""
+    dag = s.job_dag[slot]
+    first = NEVER
+    for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
+        vertex = t.sinks[i]
+        deadline = s.job_release[slot] + t.sink_deadline[vertex]
+        if after < deadline < first and (
+                s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0):
+            first = deadline
+    return first
+
+
+def announce_overdue(t: Tables, s: State, slot: int, after: int, until: int) -> None:
+    """
+    Say which sinks of an open job have not completed by their deadlines (rule 6).
+
+    :param after: only of deadlines after that; ``until``: and not after that.
+    """
+    dag = s.job_dag[slot]
+    for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
+        vertex = t.sinks[i]
+        deadline = s.job_release[slot] + t.sink_deadline[vertex]
+        if after < deadline <= until and (
+                s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0):
+            judge(s, slot, SINK_OVERDUE, vertex, deadline, -1)
 
 
 def finish(t: Tables, s: State, now: int) -> None:

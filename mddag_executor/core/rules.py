@@ -37,7 +37,9 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
     waiting one.  Migration is free; overheads are added to what is left to execute.
 6.  **Verdicts.**  A sink that completes after its absolute deadline (release plus its relative
     deadline) is late; at the deadline is in time.  ``finish`` judges what is open when the run
-    ends: an absolute deadline at or before the end has been missed.  Jobs that are released less
+    ends: an absolute deadline at or before the end has been missed.  Each sink of a job gets one
+    verdict.  A driver with a clock also learns when a deadline passes (``deadlines``): the sink is
+    *overdue* until its verdict, which is not in time.  Jobs that are released less
     than ``SKIP`` after the first one, or before ``JUDGE_FROM``, get no verdicts: a warm-up.
     ``judge_from`` says that the run begins in earnest later: live, when all programs have started.
 7.  **Misses.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops what is left of it, as soon

@@ -31,11 +31,12 @@ ELSEWHERE, HERE, ENDS_HERE = range(3)
 
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  Each sink of a job is in time,
 # or late: it completed; or missed: it had not completed when the run ended past its deadline; or
-# its job was aborted, expired or failed.  The deadline is that of the sink; the time that of the
+# its job was aborted, expired or failed.  Before one of these, except in time, it may be announced
+# that its deadline is over (overdue).  The deadline is that of the sink; the time that of the
 # decision, for a sink that completed the completion, else -1.  Instead of a vertex the end of a
 # job has -1, or NOT_JUDGED.
-(SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, JOB_END,
- DROP) = range(8)
+(SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, JOB_END, DROP,
+ SINK_OVERDUE) = range(9)
 SINK_COMPLETED = (SINK_IN_TIME, SINK_LATE)
 NOT_JUDGED = -2
 

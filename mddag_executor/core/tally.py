@@ -30,13 +30,14 @@ from mddag_executor.core.state import (
     SINK_IN_TIME,
     SINK_LATE,
     SINK_MISSED,
+    SINK_OVERDUE,
 )
 from mddag_executor.core.tables import Tables
 from msg_graph import Dag, TaskSet
 
 VERDICTS = {
     SINK_IN_TIME: 'in_time', SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
-    SINK_ABORTED: 'aborted', SINK_FAILED: 'failed'}
+    SINK_ABORTED: 'aborted', SINK_FAILED: 'failed', SINK_OVERDUE: 'overdue'}
 """What a verdict of the core is called."""
 _OUTCOMES = {COMPLETED: 'completed', LATE: 'late', ABORTED: 'aborted', EXPIRED: 'expired',
              FAILED: 'failed'}
@@ -58,7 +59,7 @@ def quantiles_us(values: list[int]) -> dict[str, float] | None:
 
 
 class Counts(NamedTuple):
-    """Verdicts about the jobs of a sink, or of several; ``late`` with the overdue at the end."""
+    """Verdicts about the jobs of a sink, or of several; ``late`` with the overdue."""
 
     due: int
     in_time: int
@@ -211,7 +212,7 @@ class SinkTally:
             self.longest = response
 
     def result(self) -> dict[str, Any]:
-        """Return the sink's part of the result; ``late`` includes the overdue at the end."""
+        """Return the sink's part of the result; ``late`` includes the overdue."""
         response = None
         if self.responses:
             ordered = sorted(self.responses)
@@ -238,6 +239,8 @@ class Tally:
         self.ends = [dict.fromkeys(_OUTCOMES, 0) for _ in range(tables.n_dags)]
         self.sinks = {v: SinkTally(tables.sink_deadline[v], keep) for v in tables.sinks}
         self.dropped = 0
+        #: By vertex and job: the deadlines of sinks that are overdue and have no verdict yet.
+        self.overdue: dict[tuple[int, int], int] = {}
         #: The miss that was known first; of those judged at the run's end, the first deadline's.
         self.first_miss: dict[str, Any] | None = None
         self._first_kind = -1
@@ -251,16 +254,31 @@ class Tally:
         """Count decisions of the core."""
         for kind, dag, vertex, job, deadline, time in decisions:
             if kind == JOB_END:
+                if self.overdue:  # of a job that is no longer judged
+                    for sink_vertex in self._sinks_of(dag):
+                        self._end_overdue(sink_vertex, job)
                 if vertex != NOT_JUDGED:
                     self.ends[dag][deadline] += 1
             elif kind == DROP:
                 self.dropped += 1
+            elif kind == SINK_OVERDUE:
+                self.overdue[vertex, job] = deadline
+                self.sinks[vertex].late += 1
+                self.sinks[vertex].overdue += 1
             else:
+                if self.overdue:
+                    self._end_overdue(vertex, job)
                 if kind in SINK_COMPLETED:
                     sink = self.sinks[vertex]
                     sink.done(time - deadline + sink.relative_deadline_ns, kind == SINK_LATE)
                 if kind != SINK_IN_TIME:
                     self._add_miss(kind, dag, vertex, job, deadline, time)
+
+    def _end_overdue(self, vertex: int, job: int) -> None:
+        """Let the verdict of a sink take the place of its being overdue."""
+        if self.overdue.pop((vertex, job), None) is not None:
+            self.sinks[vertex].late -= 1
+            self.sinks[vertex].overdue -= 1
 
     def _add_miss(
         self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
@@ -279,15 +297,30 @@ class Tally:
                 kind == self._first_kind == SINK_MISSED
                 and deadline < self.first_miss['deadline_ns']):
             self._first_kind = kind
-            self.first_miss = {
-                'dag': self._dags[dag].name, 'vertex': self.vertex_name(vertex), 'job': job,
-                'deadline_ns': deadline, 'completed_ns': time if kind == SINK_LATE else None}
+            self.first_miss = self._miss(
+                vertex, job, deadline, time if kind == SINK_LATE else None)
+
+    def _miss(
+        self, vertex: int, job: int, deadline: int, completed: int | None
+    ) -> dict[str, Any]:
+        dag = self._dags[self._tables.dag_of[vertex]]
+        return {'dag': dag.name, 'vertex': self.vertex_name(vertex), 'job': job,
+                'deadline_ns': deadline, 'completed_ns': completed}
+
+    def _first_of_all(self) -> dict[str, Any] | None:
+        """Return the first miss, of a sink that is overdue if there is no verdict yet."""
+        if self.first_miss is not None or not self.overdue:
+            return self.first_miss
+        (vertex, job), deadline = min(self.overdue.items(), key=lambda item: item[1])
+        return self._miss(vertex, job, deadline, None)
 
     def sinks_of(self, dag: Dag) -> dict[int, SinkTally]:
         """Return what came of the sinks of a DAG, by global vertex."""
+        return {v: self.sinks[v] for v in self._sinks_of(dag.index)}
+
+    def _sinks_of(self, dag: int) -> list[int]:
         first = self._tables.first_sink
-        return {v: self.sinks[v]
-                for v in self._tables.sinks[first[dag.index]:first[dag.index + 1]]}
+        return self._tables.sinks[first[dag]:first[dag + 1]]
 
     def vertex_name(self, vertex: int) -> str:
         """Return the name of a global vertex."""
@@ -297,7 +330,7 @@ class Tally:
     @property
     def missed(self) -> bool:
         """Return whether any deadline was missed."""
-        return self.first_miss is not None
+        return self.first_miss is not None or bool(self.overdue)
 
     def result(self) -> dict[str, Any]:
         """Return the result format's verdicts: ``deadline_missed`` to ``dags``."""
@@ -308,5 +341,5 @@ class Tally:
                 'ends': {_OUTCOMES[e]: n for e, n in self.ends[dag.index].items()},
                 'sinks': {self.vertex_name(v): sink.result()
                           for v, sink in self.sinks_of(dag).items()}}
-        return {'deadline_missed': self.missed, 'first_miss': self.first_miss,
+        return {'deadline_missed': self.missed, 'first_miss': self._first_of_all(),
                 'never_due': never_due(dags), 'dags': dags}

@@ -23,8 +23,7 @@ window, sequence number, and the job, on a topic of its own.  Both have the same
     that, as the process may just have been stopped.  Then it runs as undeclared, and is counted.
     Publications of one publisher are announced in their order, so its messages stay in order.
 4.  Announced publications are looked up with those of this process, by one rule (``Jobs.find``):
-    a doubt between two is decided by the sequence number, where both publishers' are known to be
-    counted from one, or not at all.
+    window and sequence number.
 5.  Only executors with the same declaration understand each other: its digest is in the name of
     the topic.  Each process has a topic of its own, so that nobody hears itself.
 """

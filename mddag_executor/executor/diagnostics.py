@@ -23,6 +23,7 @@ the host's name and the process, and values are texts whose units stand in their
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from contextlib import suppress
 import os
 import socket
@@ -68,6 +69,7 @@ class _Seen(NamedTuple):
     results: Counts
     jobs: int
     completed: list[int]
+    in_stops: int
 
 
 class DagWatch:
@@ -75,14 +77,17 @@ class DagWatch:
     Judges the state of one DAG, period by period.
 
     :param every_ns: the period of the diagnostics.
+    :param in_stops: by DAG, how many misses stops of the machine explain.
     """
 
     def __init__(
         self, tally: Tally, dag: Dag, thresholds: Thresholds, every_ns: int,
+        in_stops: Sequence[int],
     ) -> None:
         self._tally = tally
         self._dag = dag
         self._thresholds = thresholds
+        self._in_stops = in_stops
         self._sinks = {tally.vertex_name(v): sink for v, sink in tally.sinks_of(dag).items()}
         self._stale_after = max(thresholds.stale_periods * dag.period_ns, every_ns)
         # what was seen in each period of the window, and before it
@@ -93,7 +98,7 @@ class DagWatch:
         sinks = self._sinks.values()
         return _Seen(
             Counts.total(counts(vars(sink)) for sink in sinks), self._tally.jobs[self._dag.index],
-            [sink.completed for sink in sinks])
+            [sink.completed for sink in sinks], self._in_stops[self._dag.index])
 
     def status(self, now: int) -> Status:
         """Return the state of things; to be called once a period (``now``: monotonic ns)."""
@@ -103,7 +108,8 @@ class DagWatch:
             self._released_at = now
         before, results = self._seen[0], seen.results
         window = results.minus(before.results)
-        level, message = self._level(results.minus(last.results), window, now)
+        in_stops = seen.in_stops - before.in_stops
+        level, message = self._level(results.minus(last.results), window, now, in_stops)
         ratio = window.missed / window.due if window.due else 0.0
         values = {
             'period_ms': _ms(self._dag.period_ns), 'jobs': str(seen.jobs),
@@ -111,12 +117,12 @@ class DagWatch:
             'late': str(results.late), 'expired': str(results.expired),
             'aborted': str(results.aborted), 'failed': str(results.failed),
             'window_results': str(window.due), 'window_missed': str(window.missed),
-            'window_missed_ratio': f'{ratio:.4f}',
+            'window_missed_ratio': f'{ratio:.4f}', 'window_in_stops': str(in_stops),
             **self._response_times(last, seen)}
         return Status(f'{self._thresholds.name}: {self._dag.name}', level, message, values)
 
     def _level(
-        self, step: Counts, window: Counts, now: int
+        self, step: Counts, window: Counts, now: int, in_stops: int
     ) -> tuple[int, str]:
         limits = self._thresholds
         if self._released_at is None:
@@ -127,6 +133,8 @@ class DagWatch:
         if not window.missed:
             return OK, f'{counted(window.due, "result")} in time'
         message = f'{window.missed} of {window.due} results missed their deadlines'
+        if in_stops:
+            message += f', {in_stops} as the machine stood still'
         if window.missed >= max(
                 limits.warn_burst, limits.error_ratio * window.due):
             return ERROR, message
@@ -243,7 +251,7 @@ class Diagnostics:
                 dag.vertices[i] for i in (dag.source, *dag.sinks)]
             self._dags.append((
                 {vertex.callback.key for vertex in reported_by},
-                DagWatch(verdicts.tally, dag, thresholds, period_ns)))
+                DagWatch(verdicts.tally, dag, thresholds, period_ns, verdicts.in_stops)))
         self._pool = PoolWatch(pool, registry, recorder, thresholds, notifier)
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None

@@ -31,6 +31,7 @@ from threading import get_native_id
 from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE
 from mddag_executor.core.rules import progress
@@ -79,6 +80,7 @@ class Engine:
             task_set, legs=True, groups=False, default_deadline=default_deadline,
             max_active_jobs=max_active_jobs, expire_after=expire_after)
         self.scheduler = Scheduler(self.tables, n_workers, policy, propagate=False)
+        self.deadlines = Deadlines(self.tables, self.scheduler.state)
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
         self.jobs = Jobs(task_set)
         self.other_processes = OtherProcesses.of(
@@ -96,6 +98,8 @@ class Engine:
         self._work: dict[int, Work] = {}
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
+        # when it was judged last which sinks are overdue
+        self._judged_at = 0
         # those that hold the GIL, in the order in which they began; not to be changed from outside
         self.holders: list[Work] = []
         self._holds_since = 0
@@ -244,6 +248,7 @@ class Engine:
         slot = self.scheduler.release(dag, job, release, now)
         if self._state.decisions:
             self._decided(now)
+        self.deadlines.watch(slot)
         self.verdicts.released(dag, job, release, now, is_judged(self._state, slot))
         return slot
 
@@ -492,6 +497,8 @@ class Engine:
         x, work.x = work.x, -1
         if self.holders:
             self._let_go(work)
+        if end < self._judged_at:  # that it was overdue was reported before this was known
+            end = self._judged_at
         end_it = self.scheduler.fail if failed else self.scheduler.complete
         if self.record is None:
             end_it(x, end)
@@ -596,12 +603,14 @@ class Engine:
         if self.record is not None:
             self.record('judge_from', now, get_native_id(), release)
 
-    def next_deadline(self) -> int:
-        """Return the next deadline of an open job, 0 for none."""
-        return 0
-
-    def check_deadlines(self, now: int) -> None:
-        """Report the sinks whose deadlines have passed."""
+    def judge_overdue(self, now: int) -> None:
+        """Report the sinks whose deadlines are over and which have not completed."""
+        if self._finished:
+            return
+        self.deadlines.judge(now)
+        if self._state.decisions:
+            self._judged_at = now
+            self._decided(now)
 
     # --- the end ---------------------------------------------------------------------------------
 

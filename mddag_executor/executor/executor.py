@@ -43,6 +43,7 @@ from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.gil import short_switch_interval
 from mddag_executor.executor.inbox import Inbox
+from mddag_executor.executor.miss_log import MissLog
 from mddag_executor.executor.miss_notifier import MissNotifier
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
@@ -100,7 +101,9 @@ class MultiDeadlineExecutor(BareExecutor):
     :param policy: ``rad`` or another of ``mddag_executor.core.POLICIES``.
     :param context: the context that the executor belongs to, or None for the default one.
     :param trace: path of an MCAP file to record to, or None.
-    :param on_deadline_miss: called with a ``DeadlineMiss``, in a thread of its own.
+    :param on_deadline_miss: called with each ``DeadlineMiss``, in a thread of its own; what it
+        raises comes out of the spin.  If it takes too long, misses are counted and not reported
+        (``unreported_misses`` in ``statistics()``).
     :param default_deadline: relative deadline of undeclared callbacks: ns, or text as ``100ms``.
     :param worker_policy: real-time policy of the workers, ``SCHED_FIFO`` or ``SCHED_RR``.
     :param worker_priority: their priority under it.
@@ -158,6 +161,8 @@ class MultiDeadlineExecutor(BareExecutor):
         self._unclaimed = Unclaimed(self._fail, lambda: self._at_once.ring())
         self._spinning = threading.Lock()
         self._finished = False
+        # reentrant: a signal's handler may end the run in the thread that ends it
+        self._ending = threading.RLock()
         self._freeze_gc = freeze_gc
         self._notifier = None if on_deadline_miss is None else MissNotifier(
             on_deadline_miss, self._fail)
@@ -165,7 +170,7 @@ class MultiDeadlineExecutor(BareExecutor):
             task_set, num_workers, policy, default_deadline=deadline_ns,
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
             record=self._recorder.record if self._recorder else None,
-            on_miss=self._notifier.post if self._notifier else None, process=process)
+            on_miss=None if self._notifier is None else self._notifier.post, process=process)
         inbox = Inbox(self._engine, self._trace_clock, self._recorder, self._fail)
         self._pool = WorkerPool(
             self._engine, self._trace_clock, inbox, self._fail, self._context_ended, prepare)
@@ -173,6 +178,8 @@ class MultiDeadlineExecutor(BareExecutor):
         self._pool.serve_meanwhile = self._serve_meanwhile
         self._pool.stopped = self._stopped
         self._pool.context_ended = self._at_once.ring
+        self._miss_log = MissLog(self._engine.verdicts)
+        self._pool.missed = self._miss_log.write
         self._registry = Registry(task_set, self._engine, self._pool.leave_group)
         self._new_tasks: deque[Work] = deque()
         self._task_entity = Entity(TASK, None, '', None, -1, 0, '')
@@ -190,8 +197,8 @@ class MultiDeadlineExecutor(BareExecutor):
         self._diagnostics: Diagnostics | None = None
         if every_ns is not None:
             self._diagnostics = Diagnostics(
-                self.context, task_set, self._pool, self._registry, self._recorder,
-                every_ns, thresholds, process, self._notifier)
+                self.context, task_set, self._pool, self._registry, self._recorder, every_ns,
+                thresholds, process, self._notifier)
         if process is not None and task_set is not None and (
                 self._engine.other_processes is not None
                 and self._engine.other_processes.announces):
@@ -349,6 +356,8 @@ class MultiDeadlineExecutor(BareExecutor):
             if is_over(self.context):
                 self._pool.close(0.5)
                 self._end_run()
+                if self._notifier is not None:
+                    self._notifier.stop()
             self._spinning.release()
 
     def _patience_s(self, deadline: float | None, rest: float | None) -> float | None:
@@ -512,14 +521,18 @@ class MultiDeadlineExecutor(BareExecutor):
         if not self._pool.close(timeout_sec):
             return False
         self._end_run()
+        reported = self._notifier is None or self._notifier.stop(timeout_sec)
         finished: bool = super().shutdown(timeout_sec)
-        return finished
+        return finished and reported
 
     def _end_run(self) -> None:
-        """Judge what is open and close the trace, once."""
-        if self._finished:
-            return
-        self._finished = True
+        """Judge what is open and close the trace, once; whoever comes second waits for that."""
+        with self._ending:
+            if not self._finished:
+                self._finished = True
+                self._judge_and_close()
+
+    def _judge_and_close(self) -> None:
         if self._diagnostics is not None:
             self._diagnostics.stop()
         self._wait_sets.stop()

@@ -368,8 +368,6 @@ def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) ->
     every = {process.name for process in task_set.processes}
     return {
         **of_processes(task_set, results),
-        'causes': {cause: sum(part['causes'][cause] for part in parts)
-                   for cause in parts[0]['causes']},
         'stops': {key: sum(part['stops'][key] for part in parts)
                   for key in ('count', 'total_ns', 'misses')},
         'callbacks': callbacks,

@@ -36,8 +36,9 @@ def statistics(
     while it runs, and for which part of its time it needs that (None: not known yet).
     ``unattributed`` counts messages of declared callbacks whose publication was not found; they
     ran as undeclared ones.  ``stops`` has how often and for how long no thread of the process ran
-    while it spun, how many misses fell into these stops, and the times of the last ones (ns since
-    the epoch).
+    while it spun, how many misses these stops explain, and the times of the last ones (ns since
+    the epoch).  ``unreported_misses`` counts those that ``on_deadline_miss``
+    was not called with, because it had not returned from earlier ones in time.
     """
     engine = pool.engine
     with pool.lock:

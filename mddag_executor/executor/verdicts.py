@@ -19,6 +19,7 @@ from mddag_executor.core.state import (
     SINK_FAILED,
     SINK_IN_TIME,
     SINK_LATE,
+    SINK_OVERDUE,
 )
 from mddag_executor.core.stops import LEAST_NS, Stops
 from mddag_executor.core.tally import VERDICTS
@@ -35,8 +36,10 @@ class DeadlineMiss:
     """
     A sink that missed its deadline; times in ns since the epoch.
 
-    ``completed_ns`` is None where it never completed: ``kind`` says why (``late``, ``overdue``
-    at the run's end, ``expired``, ``aborted``, or ``failed``: a callback of the job raised).
+    ``kind`` is ``overdue`` if it had not completed at its deadline: that is reported then,
+    whatever comes of it later.  It is ``late`` if the executor learnt of the completion first, at
+    the time ``completed_ns`` (else None).  Before the deadline it is ``expired``, ``aborted``, or
+    ``failed`` (a callback of the job raised) if the job can no longer complete.
     """
 
     dag: str
@@ -69,6 +72,11 @@ class Verdicts:
     ) -> None:
         self.tally = Tally(task_set, tables, KEEP_RESPONSES)
         self.stops = Stops()
+        #: By DAG: how many misses are explained by stops of the machine.
+        self.in_stops = [0] * tables.n_dags
+        #: How many misses were reported, each of them once.
+        self.missed = 0
+        self._last_missed = -1, -1
         self.record = record
         self._dags = task_set.dags if task_set is not None else ()
         self._tables = tables
@@ -79,15 +87,17 @@ class Verdicts:
 
     def add(self, decisions: list[Decision], now: int) -> list[int]:
         """Count decisions of a core; return the executions that it dropped."""
-        self.tally.add(decisions)
         dropped = []
         for kind, dag, vertex, job, deadline, time in decisions:
             if kind == DROP:
                 dropped.append(deadline)
             elif kind == JOB_END:
                 self._ended(dag, job, deadline, now)
+            elif kind == SINK_OVERDUE:
+                self._report(kind, dag, vertex, job, deadline, None)
             elif kind != SINK_IN_TIME:
                 self._missed(kind, dag, vertex, job, deadline, time, now)
+        self.tally.add(decisions)  # last: it knows what was overdue before
         return dropped
 
     def _ended(self, dag: int, job: int, end: int, now: int) -> None:
@@ -110,13 +120,30 @@ class Verdicts:
             self.record(
                 'deadline', now, threading.get_native_id(), dag,
                 self._tables.index_in_dag[vertex], job, deadline, time)
-        release = deadline - self._tables.sink_deadline[vertex]
-        if kind != SINK_FAILED:  # else it is its callback's doing
-            self.stops.missed(release, deadline)
+        completed = time if kind == SINK_LATE else None
+        # what failed is its callback's doing
+        if kind != SINK_FAILED:
+            release = deadline - self._tables.sink_deadline[vertex]
+            self.in_stops[dag] += self.stops.missed(release, deadline, time, dag)
+        if (vertex, job) not in self.tally.overdue:
+            self._report(kind, dag, vertex, job, deadline, completed)
+
+    def _report(
+        self, kind: int, dag: int, vertex: int, job: int, deadline: int, completed: int | None
+    ) -> None:
+        self.missed += 1
+        self._last_missed = vertex, job
         if self._on_miss is not None:
             self._on_miss(DeadlineMiss(
-                self._dags[dag].name, self.tally.vertex_name(vertex), job, release, deadline,
-                time if kind == SINK_LATE else None, VERDICTS[kind]))
+                self._dags[dag].name, self.tally.vertex_name(vertex), job,
+                deadline - self._tables.sink_deadline[vertex], deadline, completed,
+                VERDICTS[kind]))
+
+    def last_missed(self) -> tuple[str, str, int, int]:
+        """Return DAG, sink, job and relative deadline of the last miss; there has been one."""
+        vertex, job = self._last_missed
+        return (self._dags[self._tables.dag_of[vertex]].name, self.tally.vertex_name(vertex), job,
+                self._tables.sink_deadline[vertex])
 
     def released(self, dag: int, job: int, release: int, now: int, judged: bool) -> None:
         """Note that a job was released."""
@@ -129,8 +156,8 @@ class Verdicts:
 
     def stopped(self, begin: int, end: int) -> None:
         """Note that no thread of the process ran for a while, which has just ended."""
-        if end - begin >= LEAST_NS:
-            self.stops.stopped(begin, end)
+        for dag in self.stops.stopped(begin, end) if end - begin >= LEAST_NS else ():
+            self.in_stops[dag] += 1
         if self.record is not None:
             self.record('stop', end, threading.get_native_id(), begin, end)
 

@@ -39,6 +39,7 @@ from time import monotonic_ns, process_time_ns, thread_time_ns
 from typing import Any, NamedTuple
 
 from mddag_executor.clocks import TraceClock
+from mddag_executor.core import NEVER
 from mddag_executor.executor.compat import UNKNOWN
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
@@ -169,6 +170,8 @@ class WorkerPool:
         self.lent = 0
         #: called with something to run while a callback of ``spin_once`` waits in ``Client.call``
         self.serve_meanwhile: Callable[[], Any] | None = None
+        #: called when deadlines were missed
+        self.missed: Callable[[], None] = lambda: None
         #: called when it is noticed that the context has ended
         self.context_ended: Callable[[], None] = lambda: None
         #: called with begin and end of a time in which no thread of the process ran (monotonic)
@@ -187,6 +190,7 @@ class WorkerPool:
         self._all_left = threading.Event()
         self._is_stepping = False
         self._last = 0
+        self._misses = 0
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._agenda_entries = 0
         self._gil_check = GilCheck()
@@ -461,6 +465,10 @@ class WorkerPool:
             if not calls and not is_last:
                 work = self._choose(me, now)
             self._arm(now - self.clock.offset_ns)
+            misses = self.engine.verdicts.missed
+        if misses != self._misses:
+            self._misses = misses
+            self.missed()
         if ended is not None and (ended.waits_for is not None or ended.raised is not None):
             self._settle_end(ended)
         if calls:
@@ -504,7 +512,8 @@ class WorkerPool:
         self.loop.timer.at = 0
         for fired in self.timers.fire():
             self.inbox.timer(fired)
-        self.engine.check_deadlines(now)
+        if now > self.engine.deadlines.next:
+            self.engine.judge_overdue(now)
         check = self._gil_check
         if 0 < check.at <= monotonic:
             self._check_gil(monotonic)
@@ -526,9 +535,9 @@ class WorkerPool:
             return
         first = self._next_timer() if self._muted_until else self.timers.next_due()
         offset = self.clock.offset_ns
-        deadline = self.engine.next_deadline()
-        if deadline and (deadline - offset < first or not first):
-            first = deadline - offset
+        deadline = self.engine.deadlines.next
+        if deadline < NEVER and (deadline - offset < first or not first):
+            first = deadline - offset + 1
         if self._agenda and (self._agenda[0][0] < first or not first):
             first = self._agenda[0][0]
         if self._muted_until and (self._muted_until - offset < first or not first):

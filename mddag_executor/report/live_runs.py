@@ -20,13 +20,8 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
     stops = result['stops']
     if stops['misses']:
         yield (f'{stops["misses"]} of {counted(total(result["dags"]).missed, "miss", "misses")} '
-               f'fell into {counted(stops["count"], "stop")} ({stops["total_ns"] / 1e9:.2f} s), '
+               f'are due to {counted(stops["count"], "stop")} ({stops["total_ns"] / 1e9:.2f} s), '
                'in which no thread of this process ran')
-    others = {cause: n for cause, n in result['causes'].items() if n and cause != 'machine'}
-    if others:
-        yield (f'{"other " if stops["misses"] else ""}misses, as far as the executor knows: '
-               + ', '.join(f'{n} {cause}' for cause, n in sorted(
-                   others.items(), key=lambda item: -item[1])))
     yield from never_due_lines(result['dags'])
     if 'processes' in result:
         yield from _absent(result['dags'])

@@ -234,7 +234,7 @@ def test_a_stop_of_the_machine_is_told_from_the_executors_own_misses(graph: Path
         out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     line = re.search(
-        r'^(\d+) of (\d+) misses fell into (\d+) stops? \((\d+\.\d\d) s\), in which no '
+        r'^(\d+) of (\d+) misses are due to (\d+) stops? \((\d+\.\d\d) s\), in which no '
         r'thread of this process ran$', out, re.MULTILINE)
     assert line is not None, out
     result = json.loads(Path('result.json').read_text())

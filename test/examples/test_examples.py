@@ -92,7 +92,8 @@ def test_overload() -> None:
             assert 0 <= dag['jobs'] - sum(v for k, v in dag.items() if k != 'jobs') <= 6
         told = {what: int(count) for count, what in re.findall(
             r'(\d+) (perception \w+)', block.split('misses:')[1])}
-        assert told.get('perception aborted', 0) == counts['perception']['aborted']
+        # Each is overdue, before it is aborted.
+        assert sum(told.values()) >= counts['perception']['aborted']
         assert counts['control']['aborted'] == 0
         ends.append(counts)
     long, short = ends

@@ -33,10 +33,10 @@ class Watched:
         self.tally = Tally(task_set, tables)
         self.sink = next(v for v in tables.sinks if tables.sink_deadline[v] == 50_000_000)
         self.job = 0
-        self.causes: dict[str, int] = {}
+        self.in_stops = [0]
         self.now = SECOND
         self.watch = DagWatch(
-            self.tally, task_set.dags[0], Thresholds(**thresholds), SECOND, self.causes)
+            self.tally, task_set.dags[0], Thresholds(**thresholds), SECOND, self.in_stops)
 
     def after(self, in_time: int = 0, late: int = 0, expired: int = 0) -> Any:
         for kind, count, response in (
@@ -56,10 +56,10 @@ def test_levels_follow_the_share_of_misses_in_the_window():
     watched = Watched(window=3)
     assert watched.after().level == STALE
     assert watched.after(in_time=50).level == OK
-    watched.causes['waited'] = 1
+    watched.in_stops[0] = 1
     status = watched.after(in_time=49, late=1)
     assert (status.level, status.message) == (
-        WARN, '1 of 100 results missed their deadlines: 1 waited')
+        WARN, '1 of 100 results missed their deadlines, 1 as the machine stood still')
     assert status.values['margin_min_ms'] == '-10.000'
     assert status.values[f'margin_ms {watched.tally.vertex_name(watched.sink)}'] == '-10.000'
     assert status.values['window_missed_ratio'] == '0.0100'

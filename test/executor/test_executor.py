@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+import gc
+import os
 import threading
 import time
 from typing import Any
@@ -466,3 +468,24 @@ def test_a_node_that_is_destroyed_before_the_executor_looks_at_it_harms_nobody(
                 executor.add_node(gone)
                 gone.destroy_node()
             assert not spins or wait_for(lambda: len(ran) > 10)
+
+
+def test_executors_that_are_shut_down_leave_no_files(ros_context):
+    """Neither those that have spun nor those that were only stepped."""
+    def files() -> int:
+        return len(os.listdir('/proc/self/fd'))
+
+    def use(spin: bool) -> None:
+        executor = MultiDeadlineExecutor(num_workers=1, context=ros_context)
+        if spin:
+            executor.spin_until_future_complete(executor.create_task(lambda: None))
+        else:
+            executor.spin_once(0.0)
+        executor.shutdown()
+
+    use(True)  # what the process keeps
+    before = files()
+    for spin in (False, True) * 5:
+        use(spin)
+    gc.collect()
+    assert files() <= before

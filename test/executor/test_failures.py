@@ -213,6 +213,34 @@ nodes:
     assert ends['completed'] == ends['late'] == 0
 
 
+class Awaitable:
+    """Something to wait for of a user's own, which takes no callbacks."""
+
+    def __await__(self) -> Any:
+        yield self
+
+    def add_done_callback(self, callback: Any) -> None:
+        raise Wrong('no callbacks')
+
+
+def test_an_exception_outside_of_callbacks_ends_spin_and_no_worker(
+        make_executor, make_node) -> None:
+    node = make_node('source')
+    ran: list[int] = []
+
+    async def tick() -> None:
+        ran.append(len(ran))
+        await Awaitable()
+
+    node.create_timer(0.01, tick, ReentrantCallbackGroup())
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    for runs in (1, 2, 3):
+        with pytest.raises(Wrong):
+            executor.spin()
+        assert len(ran) >= runs
+
+
 def test_what_cannot_work_because_its_context_has_ended_has_not_failed(
         make_executor, make_node, ros_context: Any) -> None:
     """Such a callback is one that had not ended when the run ended."""

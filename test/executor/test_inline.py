@@ -64,8 +64,10 @@ def test_the_publishing_thread_takes(ros_context, make_node, monkeypatch):
         assert wait_for(lambda: got == ['before'])
         assert takes_of(publisher) is not None
         threads.clear()
-        publisher.publish(Header(frame_id='then'))
-        assert threads == [threading.get_ident()]
+        thread = threading.Thread(target=publisher.publish, args=(Header(frame_id='then'),))
+        thread.start()
+        thread.join()
+        assert threads == [thread.ident]
         assert wait_for(lambda: got == ['before', 'then'])
     assert takes_of(publisher) is None
     publisher.publish(Header(frame_id='after'))
@@ -165,9 +167,13 @@ thread.start()
 state = hooks.publisher_state(publisher)
 while not state.deliver:
     time.sleep(0.01)
-for number in range(50):
-    publisher.publish(Header(frame_id=str(number)))
-    time.sleep(0.001)
+def publish():
+    for number in range(50):
+        publisher.publish(Header(frame_id=str(number)))
+        time.sleep(0.001)
+publishing = threading.Thread(target=publish)
+publishing.start()
+publishing.join()
 end = time.monotonic() + 10
 while len(got) < 50 and time.monotonic() < end:
     time.sleep(0.01)

@@ -1,0 +1,60 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The deadlines of open jobs, for drivers with a clock: a miss is known when it happens (rule 6).
+
+A driver asks for the next deadline, and calls ``judge`` when that is over.  Each slot has one
+entry in a heap, for the next deadline of its job.  A job that ends leaves its entry behind, so an
+entry may be too early for the slot's next job: it is then replaced when its time has come.
+"""
+
+from __future__ import annotations
+
+from heapq import heappop, heappush
+
+from mddag_executor.core.jobs import announce_overdue, next_deadline
+from mddag_executor.core.state import OPEN, State
+from mddag_executor.core.tables import NEVER, Tables
+
+
+class Deadlines:
+    """
+    Finds the sinks that have not completed by their deadlines, each of them once.
+
+    :ivar next: a time at or before the next deadline; ``NEVER`` if there is none.
+    """
+
+    def __init__(self, t: Tables, s: State) -> None:
+        self._rule = t, s
+        self._state = s
+        self._heap: list[tuple[int, int]] = []
+        # by slot: the time of its entry, and up to when its job was judged
+        self._entry: dict[int, int] = {}
+        self._judged: dict[int, int] = {}
+        self.next = NEVER
+
+    def watch(self, slot: int) -> None:
+        """Watch the job that was just released in a slot."""
+        self._judged[slot] = -NEVER
+        self._add(slot, -NEVER)
+
+    def judge(self, now: int) -> None:
+        """Decide ``SINK_OVERDUE`` for each sink whose deadline was before now."""
+        heap = self._heap
+        while heap and heap[0][0] < now:
+            time, slot = heappop(heap)
+            if self._entry.get(slot) != time:
+                continue  # an earlier one was added
+            del self._entry[slot]
+            if self._state.job_state[slot] == OPEN:
+                announce_overdue(*self._rule, slot, self._judged[slot], now - 1)
+                self._judged[slot] = now - 1
+                self._add(slot, now - 1)
+        self.next = heap[0][0] if heap else NEVER
+
+    def _add(self, slot: int, after: int) -> None:
+        time = next_deadline(*self._rule, slot, after)
+        if time < self._entry.get(slot, NEVER):
+            self._entry[slot] = time
+            heappush(self._heap, (time, slot))
+            self.next = self._heap[0][0]
