@@ -358,6 +358,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._end_run()
                 if self._notifier is not None:
                     self._notifier.stop()
+            self._close()
             self._spinning.release()
 
     def _patience_s(self, deadline: float | None, rest: float | None) -> float | None:
@@ -523,7 +524,18 @@ class MultiDeadlineExecutor(BareExecutor):
         self._end_run()
         reported = self._notifier is None or self._notifier.stop(timeout_sec)
         finished: bool = super().shutdown(timeout_sec)
+        if self._spinning.acquire(blocking=False):  # else the spin does that when it ends
+            self._close()
+            self._spinning.release()
         return finished and reported
+
+    def _close(self) -> None:
+        """Close what an executor waits in, once it has ended."""
+        if self._finished and self.is_ending():
+            if self._stepping is not None:
+                self._stepping.close()
+            self._pool.loop.close()
+            self._at_once.loop.close()
 
     def _end_run(self) -> None:
         """Judge what is open and close the trace, once; whoever comes second waits for that."""

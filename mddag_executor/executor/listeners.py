@@ -137,7 +137,3 @@ class TimerFd:
         self.at = at
         self._time[2], self._time[3] = divmod(at, 1_000_000_000)
         _timer_settime(self.fd, 1, self._time, None)  # 1: TFD_TIMER_ABSTIME
-
-    def close(self) -> None:
-        """Close the descriptor."""
-        os.close(self.fd)

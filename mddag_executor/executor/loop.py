@@ -175,7 +175,7 @@ class EventLoop:
 
     def wait(self, timeout_s: float = -1) -> Events:
         """Return events, waiting for one until the time is over; -1: for ever."""
-        return self._epoll.poll(timeout_s)
+        return [] if self._epoll.closed else self._epoll.poll(timeout_s)
 
     def sources(self, events: Events) -> tuple[list[ChannelSource], bool]:
         """Return the sources at which something has arrived, and whether the timer has expired."""
@@ -193,8 +193,11 @@ class EventLoop:
         return found, expired
 
     def wake(self) -> None:
-        """Wake one of those that wait."""
-        os.eventfd_write(self._bell, 1)
+        """Wake one of those that wait; from any thread, also after ``close``."""
+        try:
+            os.eventfd_write(self._bell, 1)
+        except (OSError, ValueError):
+            pass
 
     def wake_all(self) -> None:
         """Wake all that wait, and let nobody wait until ``let_wait``."""
@@ -230,10 +233,20 @@ class EventLoop:
         return found
 
     def close(self) -> None:
-        """Close all descriptors; no source has a listener any more."""
-        for fd in (*self._free, *self._channels, self._bell, self._leave):
-            os.close(fd)
-        self.timer.close()
-        for nested in self._nested:
-            nested.close()
-        self._epoll.close()
+        """
+        Close all descriptors, once; nobody waits any more.
+
+        Those of sources that still have a listener stay open: it may write to them.
+        """
+        fds = [*self._free, self._bell, self._leave, self.timer.fd]
+        self._bell = self._leave = self.timer.fd = -1
+        self._free.clear()
+        for fd in fds:
+            if fd >= 0:
+                os.close(fd)
+        for epoll in (self._epoll, *self._nested):
+            epoll.close()
+
+    def __del__(self) -> None:
+        """Close what an executor that was never shut down has left open."""
+        self.close()

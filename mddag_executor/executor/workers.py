@@ -462,20 +462,22 @@ class WorkerPool:
             if self.running and (expired or self.timers.has_jumped):
                 calls = self._on_time(now)
             work = None
-            if not calls and not is_last:
+            timed = bool(calls)
+            if not timed and not is_last:
                 work = self._choose(me, now)
             self._arm(now - self.clock.offset_ns)
             misses = self.engine.verdicts.missed
+        if ended is not None and (ended.waits_for is not None or ended.raised is not None):
+            calls.append(partial(self._settle_end, ended))
         if misses != self._misses:
             self._misses = misses
-            self.missed()
-        if ended is not None and (ended.waits_for is not None or ended.raised is not None):
-            self._settle_end(ended)
-        if calls:
-            for call in calls:
+            calls.append(self.missed)
+        for call in calls:  # of these, none may end the thread
+            try:
                 call()
-            return self._turn(me, None, [])
-        return work
+            except BaseException as error:
+                self._fail(error)
+        return self._turn(me, None, []) if timed else work
 
     def _choose(self, me: WorkerThread, now: int) -> Work | None:
         """Return what to run; the caller has the lock."""
