@@ -531,11 +531,12 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _close(self) -> None:
         """Close what an executor waits in, once it has ended."""
-        if self._finished and self.is_ending():
-            if self._stepping is not None:
-                self._stepping.close()
-            self._pool.loop.close()
-            self._at_once.loop.close()
+        with self._ending:
+            if self._finished and self.is_ending():
+                if self._stepping is not None:
+                    self._stepping.close()
+                self._pool.loop.close()
+                self._at_once.loop.close()
 
     def _end_run(self) -> None:
         """Judge what is open and close the trace, once; whoever comes second waits for that."""
