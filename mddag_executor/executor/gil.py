@@ -64,7 +64,7 @@ class GilHabit:
 
     :param declared: what the declaration says; None: it is measured.
     :ivar holds: 1 or 0, for its next execution.
-    :ivar mean_ns: how long its executions take, lately.
+    :ivar mean_ns: for how long its executions compute, lately.
     :ivar is_known: whether ``holds`` is declared, or has been measured.
     """
 
@@ -87,7 +87,7 @@ class GilHabit:
         :param others: for how long all other threads of the process computed meanwhile, ns.
         """
         runs = self._runs = min(self._runs + 1, LATELY)
-        self.mean_ns += (wall - self.mean_ns) // runs
+        self.mean_ns += (own - self.mean_ns) // runs
         if self.is_declared:
             return
         if own >= COMPUTES * wall:
@@ -151,12 +151,14 @@ class GilCheck:
         :param began: when the execution began, monotonic ns.
         :param computed: what the thread's CPU clock read then, ns.
         """
-        if not self._checked_at:
+        is_first = not self._checked_at
+        if is_first:
             self._checked_at, self._computed = began, computed
         passed, before = now - self._checked_at, self._computed
         self._checked_at = now
         self._computed = clock_gettime_ns(pthread_getcpuclockid(thread))
-        self._step = min(max(FIRST_CHECK_NS, 2 * self._step), LAST_CHECK_NS)
+        # what it has computed before it began to wait shows in the first check only
+        self._step = FIRST_CHECK_NS if is_first else min(2 * self._step, LAST_CHECK_NS)
         self.at = now + self._step
         return self._computed - before < IDLE_SHARE * passed
 

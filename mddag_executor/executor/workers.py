@@ -275,7 +275,14 @@ class WorkerPool:
 
     def _wake_for_more(self) -> None:
         """Wake a thread if an idle worker may start something; the caller has the lock."""
-        if not self.running or not self.engine.may_start_more(self._last):
+        if not self.running:
+            return
+        if not self.engine.may_start_more(self._last):
+            if self.engine.holders and self.engine.has_waiting:
+                self._watch_holder(monotonic_ns())
+                at = self._gil_check.at
+                if at and not 0 < self.loop.timer.at <= at:
+                    self.loop.timer.arm(at)
             return
         running = current.running
         if (running is not None and running.pool is self and running.published
@@ -546,9 +553,7 @@ class WorkerPool:
             first = self._muted_until - offset
         check = self._gil_check
         if self.engine.holders and self.engine.has_waiting:
-            holder = self.engine.interpreter_holder()
-            if holder is not None:
-                check.begin(holder, now, 2 * holder.entity.habit.mean_ns)
+            self._watch_holder(now)
             if 0 < check.at < first or not first:
                 first = check.at
         elif check.at:
@@ -600,6 +605,12 @@ class WorkerPool:
 
     def _thread_of(self, work: Work) -> WorkerThread | None:
         return next((each for each in (*self._threads, *self._visitors) if each.work is work), None)
+
+    def _watch_holder(self, now: int) -> None:
+        """Check whether what holds the GIL computes, as something waits for that."""
+        holder = self.engine.interpreter_holder()
+        if holder is not None:
+            self._gil_check.begin(holder, now, 2 * holder.entity.habit.mean_ns)
 
     def _check_gil(self, now: int) -> None:
         """Take the GIL from an execution that waits for something else."""
