@@ -97,12 +97,16 @@ class WaitableSource:
         self._fail = fail
         self._set = FilledSet(context, [entity.rclpy for entity in entities])
         self._timers: list[NextCall] = []
+        self._has_parts = False
         self._set.parts(self._add_part)
+        if not self._has_parts:
+            raise ListenerError('nothing has no listener')  # it is ready when something else is
         self._lock = threading.Lock()
         self._has_more = False
         self._ignored = False
 
     def _add_part(self, kind: str, address: int) -> None:
+        self._has_parts = True
         if kind == 'guard_condition':
             raise ListenerError('a guard condition has no listener')
         if kind == 'timer':

@@ -4,24 +4,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 import gc
+import os
+import threading
 import time
 from typing import Any
 import weakref
 
-from mddag_executor import MultiDeadlineExecutor
-from mddag_executor.executor import compat
-from mddag_executor.executor.compat.events_executor import events_executor_modules, is_available
-from mddag_executor.executor.intake.entities import alive
+from mddag_executor.executor import compat, listeners, waitsets
+from mddag_executor.executor.snapshot import alive, is_qos_event
 import pytest
 import rclpy
+from rclpy.action import ActionClient, ActionServer
+from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 from rclpy.task import Future
+from rclpy.wait_for_message import wait_for_message
 from rclpy.waitable import NumberOfEntities, Waitable
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
+from test_msgs.action import Fibonacci
 
 from .conftest import Spinning, wait_for
 
@@ -247,16 +251,14 @@ def test_what_a_coroutine_waits_for_is_found():
 
 # --- executors and nodes -------------------------------------------------------------------------
 
-def test_the_bare_executor_has_guards_until_its_end(ros_context):
+def test_the_bare_executor_knows_of_signals_and_of_its_end(ros_context):
     executor = compat.BareExecutor(context=ros_context)
-    assert len([guard.handle for guard in executor.guards()]) == 2
+    assert alive(executor.signal_guard())
     assert not executor.is_ending() and not executor.is_gone()
-    executor.ring()
     executor.begin_end()
     assert executor.is_ending()
     executor.shutdown()
     assert executor.is_gone()
-    executor.ring()
 
 
 def test_the_end_of_a_context_is_told_before_its_nodes_are_gone():
@@ -290,18 +292,6 @@ def test_who_is_called_by_spin_knows(ros_context, make_node):
     assert found == [False, True]
 
 
-def test_changes_of_a_node_are_told(make_node, monkeypatch):
-    monkeypatch.setattr(rclpy.node.Node, '_wake_executor', rclpy.node.Node._wake_executor)
-    calls = []
-    compat.on_changes(calls.append)
-    node = make_node()
-    calls.clear()
-    timer = node.create_timer(1.0, print)
-    assert calls == [node]
-    node.destroy_timer(timer)
-    assert set(calls) == {node} and len(calls) >= 1
-
-
 def test_the_subscription_that_keeps_time_is_known(make_node):
     node = make_node(parameter_overrides=[rclpy.parameter.Parameter('use_sim_time', value=True)])
     other = node.create_subscription(String, 'said', lambda message: None, 1)
@@ -309,14 +299,39 @@ def test_the_subscription_that_keeps_time_is_known(make_node):
     assert [s.topic_name for s in kept] == ['/clock'] and other not in kept
 
 
-def test_which_qos_events_only_write_to_the_log_is_known(make_node):
+def test_which_waitables_are_qos_events_is_known(make_node):
     node = make_node()
     callbacks = SubscriptionEventCallbacks(deadline=print)
     node.create_subscription(
         String, 'said', lambda message: None, 1, event_callbacks=callbacks)
-    logs = {w.event_type.name.rpartition('_')[2]: compat.only_logs(w) for w in node.waitables}
-    assert logs.pop('MISSED') is False
-    assert logs and all(logs.values())
+    events = list(node.waitables)
+    assert events and all(map(is_qos_event, events))
+    assert not is_qos_event(Always(node))
+
+
+def test_services_of_rclpys_own_are_known(make_node):
+    node = make_node(start_parameter_services=True)
+    mine = node.create_service(SetBool, 'asked', lambda request, response: response)
+    others = [service for service in node.services if service is not mine]
+    assert others and all(map(compat.is_builtin, others)) and not compat.is_builtin(mine)
+
+
+def test_a_subscription_that_waits_for_one_message_is_known(make_node):
+    node, found = make_node(), []
+    plain = node.create_subscription(String, 'said', lambda message: None, 10)
+    publisher = node.create_publisher(String, 'said', 10)
+
+    def look() -> None:
+        if wait_for(lambda: len(list(node.subscriptions)) == 2):
+            found.extend(map(compat.is_of_wait_for_message, node.subscriptions))
+        publisher.publish(String())
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    got, _ = wait_for_message(String, node, 'said', time_to_wait=15.0)
+    thread.join()
+    assert got and found == [False, True]
+    node.destroy_subscription(plain)
 
 
 def test_names_of_services(pair):
@@ -325,17 +340,98 @@ def test_names_of_services(pair):
 
 
 def test_the_native_executor_is_there():
-    assert is_available()
-    assert all(hasattr(module, 'EventsExecutor') for module in events_executor_modules())
+    modules = compat.events_executor_modules()
+    assert modules and all(hasattr(module, 'EventsExecutor') for module in modules)
 
 
-def test_without_a_native_executor_there_is_the_wait_set(monkeypatch, ros_context, make_node):
-    monkeypatch.delattr(implementation, 'EventsExecutor')
-    assert not is_available() and not events_executor_modules()
-    node, ran = make_node(), []
-    node.create_timer(0.01, lambda: ran.append(1))
-    executor = MultiDeadlineExecutor(context=ros_context)
-    executor.add_node(node)
-    with Spinning(executor) as spinning:
-        assert wait_for(lambda: ran)
-    assert spinning.error is None
+# --- what is behind a handle ---------------------------------------------------------------------
+
+def is_written(fd: int) -> bool:
+    try:
+        return os.eventfd_read(fd) > 0
+    except BlockingIOError:
+        return False
+
+
+@pytest.fixture
+def eventfd() -> Iterator[int]:
+    """Give an eventfd that nothing has been written to."""
+    fd = listeners.new_eventfd()
+    yield fd
+    os.close(fd)
+
+
+def listened(kind: str, entity: Any, fd: int, cause: Callable[[], Any]) -> None:
+    """Try a listener: what it writes at once, when something happens, and when it is cleared."""
+    with entity.handle:
+        listeners.set_listener(kind, entity.handle.pointer, fd)
+    assert is_written(fd)  # it is not known what was there before
+    assert not is_written(fd)
+    cause()
+    assert wait_for(lambda: is_written(fd))
+    with entity.handle:
+        listeners.clear_listener(kind, entity.handle.pointer)
+    cause()
+    time.sleep(0.05)
+    assert not is_written(fd)
+
+
+def test_a_message_is_announced(make_node, eventfd):
+    node = make_node()
+    subscription = node.create_subscription(String, 'said', lambda message: None, 10)
+    publisher = node.create_publisher(String, 'said', 10)
+    assert wait_for(lambda: publisher.get_subscription_count() == 1)
+    listened('subscription', subscription, eventfd, lambda: publisher.publish(String()))
+
+
+def test_a_request_is_announced(pair, eventfd):
+    client, service = pair
+    listened('service', service, eventfd, lambda: client.call_async(SetBool.Request()))
+
+
+def test_a_response_is_announced(pair, eventfd):
+    client, service = pair
+    take = compat.request_taker(service)
+
+    def answer() -> None:
+        client.call_async(SetBool.Request())
+        service.send_response(SetBool.Response(), until_there(take)[1])
+
+    listened('client', client, eventfd, answer)
+
+
+def test_a_reset_of_a_timer_is_announced(make_node, eventfd):
+    timer = make_node().create_timer(3600.0, print)
+    listened('timer', timer, eventfd, timer.reset)
+
+
+def test_when_rcl_calls_a_timer_next_is_known(make_node):
+    timer = make_node().create_timer(
+        3600.0, print, clock=rclpy.clock.Clock(clock_type=ClockType.STEADY_TIME))
+    with timer.handle:
+        next_call = listeners.NextCall(timer.handle.pointer)
+        at = next_call.read()
+        assert 3590 * 10**9 < at - time.monotonic_ns() <= 3600 * 10**9
+        assert 3590 * 10**9 < next_call.until() <= 3600 * 10**9
+        timer.cancel()
+        assert next_call.read() is next_call.until() is None
+
+
+def test_the_parts_of_a_waitable_are_known(make_node):
+    node = make_node()
+    callbacks = SubscriptionEventCallbacks(deadline=print)
+    subscription = node.create_subscription(
+        String, 'said', lambda message: None, 1, event_callbacks=callbacks)
+    client = ActionClient(node, Fibonacci, 'count')
+    server = ActionServer(node, Fibonacci, 'count', lambda goal: Fibonacci.Result())
+    for waitables, kinds in (
+        (subscription.event_handlers, ['event'] * len(subscription.event_handlers)),
+        ([client], ['subscription', 'subscription', 'client', 'client', 'client']),
+        ([server], ['timer', 'service', 'service', 'service']),
+    ):
+        found: list[str] = []
+        waitsets.FilledSet(node.context, waitables).parts(
+            lambda kind, address, found=found: found.append(kind))
+        assert found == kinds
+    client.destroy()
+    server.destroy()

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from mddag_executor.core import NEVER, POLICIES
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.habits import Habit
+from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.jobs import Origin
 from mddag_executor.executor.work import Work
 from msg_graph import TaskSet
-import pytest
 
 from ..core.task_sets import Case, cases, Event, examples, TICK
 
@@ -67,8 +66,8 @@ class Driver:
                 return
             while releases and releases[0][0] == now:
                 source = self.entities[self.tables.source[releases.pop(0)[1]]]
-                self.engine.timer_due(Work(None, print, entity=source), now, now)
-            while (work := self.engine.dispatch(now)) is not None:
+                self.engine.timer_due(Work(source, print), now, now)
+            while (work := self.engine.next(0, now)) is not None:
                 self.note(now, 'start', work)
                 assert work.origin is not None
                 _, dag, _, vertex = work.origin
@@ -84,7 +83,7 @@ class Driver:
         for i in range(tables.first_successor[vertex], tables.first_successor[vertex + 1]):
             after = self.entities[tables.successors[i]]
             self.engine.arrived(
-                Work(None, print, entity=after), Origin(slot, dag, job, vertex), -1, -1, now)
+                Work(after, print), Origin(slot, dag, job, vertex), -1, -1, now)
 
 
 @examples(150)
@@ -110,18 +109,18 @@ def test_nothing_waits_that_may_run_beside_who_computes(steps: list[bool | int])
         None, 3, 'rad', default_deadline=10 ** 9, max_active_jobs=NEVER, expire_after=NEVER)
     entities = [Entity('waitable', None, '/n', None, -1, 0, '') for _ in range(2)]
     for holds, entity in enumerate(entities):
-        entity.habit = Habit(bool(holds))
+        entity.habit = GilHabit(bool(holds))
     running: dict[int, Work] = {}
     for now, step in enumerate(steps):
         begun: list[Work | None] = []
         if isinstance(step, bool):
-            engine.ready(Work(None, print, entity=entities[step]), now)
-            begun.append(engine.dispatch(now))
+            engine.ready(Work(entities[step], print), now)
+            begun.append(engine.next(0, now))
         elif step in running:
             engine.finished(running.pop(step), now, now, now, 0, step)
-            begun.append(engine.dispatch(now, step))
-        while begun and engine.has_more and (len(begun) == 1 or begun[-1] is not None):
-            begun.append(engine.dispatch(now))
+            begun.append(engine.next(step, now))
+        while begun and engine.may_start_more(now) and (len(begun) == 1 or begun[-1] is not None):
+            begun.append(engine.next(0, now))
         running |= {work.worker: work for work in begun if work is not None}
         if len(running) < engine.n_workers:
             assert not entities[0].waiting
@@ -132,11 +131,11 @@ def test_nothing_waits_that_may_run_beside_who_computes(steps: list[bool | int])
 def test_a_full_queue_drops_the_oldest_and_counts_it() -> None:
     engine = Engine(None, 1, 'rad', default_deadline=100, max_active_jobs=64, expire_after=NEVER)
     entity = Entity('waitable', None, '/n', None, -1, 2, '/t')
-    works = [Work(None, print, (number,), entity=entity) for number in range(5)]
+    works = [Work(entity, print, (number,)) for number in range(5)]
     for now, work in enumerate(works):
         engine.arrived(work, None, -1, -1, now)
     ran = []
-    while (ready := engine.dispatch(10)) is not None:
+    while (ready := engine.next(0, 10)) is not None:
         ran.append(ready.args[0])
         engine.finished(ready, 10, 11, 11, 0, ready.worker)
     assert (ran, entity.dropped, entity.ran) == ([3, 4], 3, 2)
@@ -150,64 +149,72 @@ def test_it_needs_no_rclpy_and_no_thread() -> None:
     assert subprocess.run([sys.executable, '-c', program], check=False).returncode == 0
 
 
-def entity_without_job(engine: Engine, group: int = -1) -> Entity:
-    return Entity('waitable', None, '/n', None, group, 10, '/t')
+def without_job(group: int = -1, most_waiting: int = 0) -> Entity:
+    entity = Entity('waitable', None, '/n', None, group, 0, '/t')
+    entity.most_waiting = most_waiting
+    return entity
 
 
-def test_what_runs_past_the_core_keeps_its_worker_and_its_group() -> None:
-    engine = Engine(None, 2, 'rad', default_deadline=100, max_active_jobs=64, expire_after=NEVER)
-    entity = entity_without_job(engine, engine.scheduler.new_group())
-    other = entity_without_job(engine)
-    alone = Work(None, print, entity=entity)
-    assert engine.begins_alone(alone)
-    works = [Work(None, print, entity=each) for each in (entity, other, other)]
+def new_engine(workers: int = 2, policy: str = 'rad') -> Engine:
+    return Engine(None, workers, policy, default_deadline=100, max_active_jobs=64,
+                  expire_after=NEVER)
+
+
+def test_of_a_group_one_runs_and_the_next_one_when_it_has_ended() -> None:
+    engine = new_engine()
+    entity, other = without_job(engine.scheduler.new_group()), without_job()
+    works = [Work(each, print) for each in (entity, entity, other)]
     for now, work in enumerate(works):
-        engine.arrived(work, None, -1, -1, now)
-    assert engine.dispatch(5) is works[1]   # there is one worker more, and the group is busy
-    assert engine.dispatch(5) is None
-    engine.finished(alone, 0, 6, 6, 0, alone.worker)
-    assert engine.dispatch(6) is works[0]
-    assert engine.dispatch(6) is None
-    engine.finished(works[1], 5, 7, 7, 0, works[1].worker)
-    assert engine.dispatch(7) is works[2]
-    assert (entity.ran, entity.ready, other.ready, engine.undeclared) == (1, 2, 2, 4)
+        engine.ready(work, now)
+    assert engine.next(0, 5) is works[0]
+    assert engine.may_start_more(5)
+    assert engine.next(1, 5) is works[2]
+    assert not engine.may_start_more(5) and engine.next(1, 5) is None
+    engine.finished(works[2], 5, 6, 6, 0, works[2].worker)
+    assert engine.next(1, 6) is None
+    engine.finished(works[0], 5, 7, 7, 0, works[0].worker)
+    assert engine.next(1, 7) is works[1]
 
 
-def test_nothing_runs_past_the_core_that_this_would_not_dispatch() -> None:
-    engine = Engine(None, 1, 'rad', default_deadline=100, max_active_jobs=64, expire_after=NEVER)
-    entity = entity_without_job(engine, engine.scheduler.new_group())
-    works = [Work(None, print, entity=entity) for _ in range(3)]
-    engine.arrived(works[0], None, -1, -1, 0)
-    assert not engine.begins_alone(works[1])    # one waits
-    assert engine.dispatch(0) is works[0]
-    assert not engine.begins_alone(works[1])    # it runs, on the only worker
-    engine.suspended(works[0], 0, 1, 0, works[0].worker)
-    assert not engine.begins_alone(works[1])    # its group is busy
-    engine.resume(works[0])
-    assert engine.dispatch(2) is works[0]
-    engine.finished(works[0], 2, 3, 3, 0, works[0].worker)
-    assert engine.begins_alone(works[1])
-    assert not engine.begins_alone(works[2])    # one at a time
-    engine.finished(works[1], 3, 4, 4, 0, works[1].worker)
-    assert engine.dispatch(4) is None and engine.idle_workers == 1
-
-
-@pytest.mark.parametrize('policy', POLICIES)
-def test_what_runs_past_the_core_is_in_nobodys_place(policy: str) -> None:
-    engine = Engine(None, 2, policy, default_deadline=1, max_active_jobs=NEVER, expire_after=NEVER)
-    alone, *works = (Work(None, print, entity=entity_without_job(engine)) for _ in range(3))
-    if not engine.begins_alone(alone):
-        assert policy not in PLAIN
-        engine.ready(alone, 0)
-        assert engine.dispatch(0) is alone
+def test_a_suspended_execution_keeps_its_group_and_no_worker() -> None:
+    engine = new_engine(1)
+    entity, other = without_job(engine.scheduler.new_group()), without_job()
+    works = [Work(each, print) for each in (entity, entity, other)]
     for work in works:
-        engine.ready(work, 1)
-    first = engine.dispatch(2)
-    assert first in works and first.worker != alone.worker
-    assert engine.dispatch(2) is None
-    engine.finished(alone, 0, 3, 3, 0, alone.worker)
-    second = engine.dispatch(3)
-    assert second in works and second is not first
-    for work in (first, second):
-        engine.finished(work, 2, 4, 4, 0, work.worker)
-    assert engine.idle_workers == 2 and not engine.has_waiting
+        engine.ready(work, 0)
+    assert engine.next(0, 0) is works[0]
+    engine.suspended(works[0], 0, 1, 0, works[0].worker)
+    assert engine.next(0, 1) is works[2]
+    engine.finished(works[2], 1, 2, 2, 0, works[2].worker)
+    assert engine.next(0, 2) is None and engine.idle_workers == 1
+    engine.resume(works[0])
+    assert engine.next(0, 3) is works[0]
+    engine.finished(works[0], 3, 4, 4, 0, works[0].worker)
+    assert engine.next(0, 4) is works[1]
+
+
+def test_more_is_collected_when_one_that_waits_starts() -> None:
+    engine, collected = new_engine(), []
+    entity = without_job(most_waiting=1)
+    engine.ready(Work(entity, print), 0)
+    entity.collect_more = lambda: collected.append(1)
+    first = engine.next(0, 0)
+    assert first is not None and collected == [1] and entity.collect_more is None
+
+
+def test_who_holds_the_gil_is_given_back_when_it_ends_waits_or_lends() -> None:
+    engine = new_engine(4)
+    entities = [without_job() for _ in range(3)]
+    for entity in entities:
+        entity.habit = GilHabit(True)
+    for end in (
+        lambda work: engine.finished(work, 0, 1, 1, 0, work.worker),
+        lambda work: engine.suspended(work, 0, 1, 0, work.worker),
+        engine.lend, engine.stop_holding,
+        lambda work: engine.left_open(work, 0, 1, 0, work.worker, True),
+    ):
+        work = Work(entities[0], print)
+        engine.ready(work, 0)
+        assert engine.next(0, 0) is work and engine.interpreter_holder() is work
+        end(work)
+        assert engine.holders == [] and engine.interpreter_holder() is None
