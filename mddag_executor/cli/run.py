@@ -81,13 +81,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='end after this time, for instance 20s, with --synthetic after a warm-up of 1 s '
         '(default: run until Ctrl-C)')
     options.add_policy(parser)
-    add('--cpu-order', action='store_true',
-        help='give the CPUs to the workers with the most urgent callbacks, by nice levels: for '
-        'more processes than CPUs, where the user has the permission')
-    add('--preempt', action='store_true',
-        help='pause callbacks that compute in Python for more urgent ones (Python 3.12 and newer)')
-    add('--intake', choices=('auto', 'events', 'waitset'), default='auto',
-        help='how the executor learns what is ready (default: auto)')
     add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
         help="how often to publish the executor's state on /diagnostics, for mddag top and other "
         "tools; 'off': never (default: 1s)")
@@ -100,9 +93,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--process', metavar='NAME',
         help='run only the nodes of this declared process, for a launch file that starts each '
         'process; give the --node options of these nodes only')
-    add('--on-exit', choices=('end', 'continue', 'restart'), default='end',
-        help='if one of several processes ends by itself: end the run, continue without it, or '
-        'start it again (default: end)')
+    add('--on-exit', choices=('end', 'continue'), default='end',
+        help='if one of several processes ends by itself: end the run, or continue without it '
+        '(default: end)')
     add('--part', help=argparse.SUPPRESS)  # the folder of a run of several processes
     options.add(parser, 'graph', '--workers', '--json', '--ros-args')
 
@@ -174,8 +167,7 @@ def run_here(
         from mddag_executor.executor.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
-            intake=args.intake, freeze_gc=True, preempt=args.preempt, cpu_order=args.cpu_order,
-            diagnostics_period=args.diagnostics, process=args.process)
+            freeze_gc=True, diagnostics_period=args.diagnostics, process=args.process)
         # With `--json -` what nodes print must not get into the JSON.
         output = sys.stdout if common.wants_tables(args) else sys.stderr
         try:

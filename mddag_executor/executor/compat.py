@@ -14,8 +14,8 @@ Two adapters have modules of their own: ``listeners`` (``handle.pointer``) and `
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 import importlib
 import inspect
@@ -361,62 +361,3 @@ def service_name(entity: Any) -> str:
     """Return the name of a service or client. 7.1.5 has no ``service_name``."""
     name: str = entity.service_name if hasattr(entity, 'service_name') else entity.srv_name
     return name
-
-
-# --- requests without a middleware: what a rerun uses --------------------------------------------
-
-CLIENT_HANDLE: Any = _rclpy.ActionClient
-"""The class of an action client's handle: its methods send requests."""
-SERVER_HANDLE: Any = _rclpy.ActionServer
-"""That of an action server's: its methods send responses, feedback and status."""
-
-
-def new_request(client: Any, number: int) -> Future:
-    """Return the future of a request with a number, as ``Client.call_async`` makes it."""
-    future = Future()
-    with client._lock:
-        client._pending_requests[number] = future
-    future.add_done_callback(client.remove_pending_request)
-    return future
-
-
-def action_handle(waitable: Any) -> Any:
-    """Return the handle of an action client or server."""
-    return waitable._client_handle if hasattr(waitable, '_client_handle') else waitable._handle
-
-
-def feedback_callback(client: Any, message: Any) -> Any:
-    """Return what an action client calls for a feedback message; None for nothing."""
-    return client._feedback_callbacks.get(bytes(message.goal_id.uuid))
-
-
-def goal_states(server: Any) -> Iterator[tuple[Any, int]]:
-    """Yield the goals (``GoalInfo``) that an action server knows, with their status."""
-    for goal in list(server._goal_handles.values()):
-        handle = goal._goal_handle
-        if handle is not None:  # not by its property: that takes a lock that may be held here
-            yield goal._goal_info, handle.get_status()
-
-
-# --- what does something else for as long as a run lasts -----------------------------------------
-
-def instead(function: Callable[..., Any]) -> Callable[[Any], Any]:
-    """Return what puts a function, or a bound method, in the place of a method."""
-    return lambda original: lambda *args, **more: function(*args, **more)
-
-
-class Replacements(ExitStack):
-    """What has been replaced; ``close`` puts it back."""
-
-    def replace(self, owner: Any, name: str, make: Callable[[Any], Any]) -> None:
-        """
-        Replace a function of a module, or a method or property of a class.
-
-        :param make: returns what stands there from now on, given what stood there.
-        """
-        original = vars(owner)[name]
-        replacement = make(original)
-        if callable(original) and replacement.__doc__ is None:
-            replacement.__doc__ = original.__doc__
-        self.callback(setattr, owner, name, original)
-        setattr(owner, name, replacement)

@@ -34,9 +34,7 @@ from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE
-from mddag_executor.core.rules import progress
 from mddag_executor.core.state import (
-    DONE,
     IDLE,
     N_IDLE,
     OPEN,
@@ -437,25 +435,6 @@ class Engine:
         """Give the interpreter back for an execution that does not need it now."""
         self._let_go(work)
         self.scheduler.stop_holding(work.x)
-
-    def makes_whole(self, work: Work) -> bool:
-        """Return whether the end of a running execution completes its vertex: the last leg's."""
-        if work.origin is None:
-            return True
-        state, vertex = self._state, work.origin.vertex
-        first = state.job_base[work.origin.slot] + self.tables.region_offset[vertex]
-        return all(state.x_state[x] == DONE
-                   for x in range(first, first + self.tables.n_legs[vertex]) if x != work.x)
-
-    def takes(self, work: Work, ns: int) -> None:
-        """Set how long a running execution takes, for those that need to know how far it is."""
-        state, x = self._state, work.x
-        state.x_left[x] += ns - state.x_cost[x]
-        state.x_cost[x] = ns
-
-    def progress(self, x: int, now: int) -> int:
-        """Return how far a running execution is, ns; see ``takes``."""
-        return progress(self._state, x, now)
 
     def lend(self, work: Work) -> None:
         """Free the worker of an execution that goes on without one."""

@@ -36,8 +36,9 @@ import threading
 from typing import Any, TYPE_CHECKING
 import weakref
 
-from mddag_executor.executor.compat import events_executor_modules, instead, Replacements
+from mddag_executor.executor.compat import events_executor_modules
 from mddag_executor.executor.loading import LoadingError
+from mddag_executor.replacements import instead, Replacements
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node

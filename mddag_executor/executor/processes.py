@@ -12,9 +12,8 @@ which passes it on, and they end when the supervisor does, even if that was kill
 What they print is passed on line by line, each line with the name of its process before it.  An
 error line of one that then ends with status 2 is the supervisor's error.
 
-A process that ends ahead of the run's end has *died*, unless its status is 0.  What follows is
-said by ``on_exit``: ``end`` ends all, ``continue`` lets the others go on, ``restart`` starts it
-again after ``REST_S``, for what is left of the run then.  The run ends when nothing runs any more.
+A process that ends ahead of the run's end has *died*, unless its status is 0.  Then all end, or
+the others go on (``goes_on``).  The run ends when nothing runs any more.
 
 It does end: what does not end ``END_TIMEOUT_S`` after another one has ended in order, because the
 run was over, is asked to end (SIGTERM); what has not ended as long after it was asked is killed.
@@ -57,7 +56,6 @@ from msg_graph import TaskSet
 from msg_graph.binding import Entity
 from msg_graph.drift import drift, Observed, Releases
 
-REST_S = 1.0
 END_TIMEOUT_S = 20.0
 _LOOK_S = 0.02
 _PR_SET_PDEATHSIG = 1
@@ -89,13 +87,11 @@ class Run:
     One process, from its start to its end.
 
     :ivar name: of the process in the declaration.
-    :ivar nth: how many of this name there have been, with this one.
     :ivar status: its exit status, negative for a signal; None while it runs.
     :ivar asked: it was asked to end; ``killed``: it did not, and was killed.
     """
 
     name: str
-    nth: int
     process: subprocess.Popen[bytes]
     status: int | None = None
     asked: bool = False
@@ -132,27 +128,25 @@ class Supervisor:
     """
     Runs processes.
 
-    :param command: returns the command line of a process, by its name and number, and the seconds
-        since the run's begin.
-    :param on_exit: ``end``, ``continue`` or ``restart``.
+    :param command: returns the command line of a process, by its name.
+    :param goes_on: whether the others go on when one ends by itself.
     :param out: where standard output goes; ``err``: standard error.
     :param on_end: called with each that has ended.
     """
 
     def __init__(
-        self, command: Callable[[str, int, float], Sequence[str]], on_exit: str, out: TextIO,
-        err: TextIO, on_end: Callable[[Run], None],
+        self, command: Callable[[str], Sequence[str]], goes_on: bool, out: TextIO, err: TextIO,
+        on_end: Callable[[Run], None],
     ) -> None:
         self.runs: list[Run] = []
         self._command = command
-        self._on_exit = on_exit
+        self._goes_on = goes_on
         self._out, self._err = out, err
         self._on_end = on_end
         self._lock = threading.Lock()
         self._stop = False
         self._asked_at: float | None = None
         self._over_at: float | None = None
-        self._to_start: list[tuple[float, str]] = []
 
     def stop(self, hurried: bool = False) -> None:
         """Let the run end; from any thread, also from a signal's handler."""
@@ -169,17 +163,14 @@ class Supervisor:
         begin = time.monotonic()
         try:
             for name in names:
-                self._start(name, 0.0)
-            while any(run.status is None for run in self.runs) or self._to_start:
+                self._start(name)
+            while any(run.status is None for run in self.runs):
                 time.sleep(_LOOK_S)
                 now = time.monotonic()
                 for run in self.runs:
                     if run.status is None and run.process.poll() is not None:
                         is_over = seconds is not None and now - begin >= seconds
                         self._ended(run, now, is_over)
-                if seconds is not None and now - begin >= seconds:
-                    self._to_start.clear()
-                self._start_again(now, now - begin)
                 self._end_if_asked(now)
         finally:
             for run in self.runs:
@@ -187,12 +178,11 @@ class Supervisor:
                     run.process.kill()
                     self._reap(run)
 
-    def _start(self, name: str, since: float) -> None:
-        nth = 1 + sum(run.name == name for run in self.runs)
+    def _start(self, name: str) -> None:
         process = subprocess.Popen(
-            self._command(name, nth, since), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            self._command(name), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, env={**os.environ, 'PYTHONUNBUFFERED': '1'})
-        run = Run(name, nth, process)
+        run = Run(name, process)
         self.runs.append(run)
         for source, target in ((process.stdout, self._out), (process.stderr, self._err)):
             assert source is not None
@@ -236,19 +226,8 @@ class Supervisor:
         self._on_end(run)
         if is_over and not run.died and self._over_at is None:
             self._over_at = now
-        if self._stop or (is_over and not run.died):
-            return
-        if self._on_exit == 'restart':
-            self._to_start.append((now + REST_S, run.name))
-        elif self._on_exit == 'end':
+        if not self._goes_on and (run.died or not is_over):
             self._stop = True
-
-    def _start_again(self, now: float, since: float) -> None:
-        if self._stop:
-            self._to_start.clear()
-        for at, name in [each for each in self._to_start if each[0] <= now]:
-            self._to_start.remove((at, name))
-            self._start(name, since)
 
     def _end_if_asked(self, now: float) -> None:
         """Ask all to end, once, also those that should have ended; kill what then does not."""
@@ -301,11 +280,6 @@ class Part:
         part = path.with_suffix('.part')
         part.write_text(json.dumps(result, default=list))
         part.replace(path)
-
-    @staticmethod
-    def starts(folder: str, name: str) -> None:
-        """Note, in the run, that a process is going to be started, perhaps again."""
-        Path(folder, f'{name}.ended').unlink(missing_ok=True)
 
     @staticmethod
     def ended(folder: str, name: str) -> None:

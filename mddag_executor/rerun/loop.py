@@ -35,6 +35,7 @@ import math
 from typing import Any
 
 from mddag_executor.core import NEVER
+from mddag_executor.core.state import DONE
 from mddag_executor.executor.compat import UNKNOWN
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.groups import Refused
@@ -185,7 +186,7 @@ class Loop:
             self.strands.expire(now)
             return True
         engine = self.engine
-        work = engine.dispatch(now) if engine.has_waiting else None
+        work = engine.next(0, now)
         if work is not None:
             self._execute(work)
             return True
@@ -305,9 +306,16 @@ class Loop:
         if work in self._resumed:
             self._resumed.discard(work)
             return 0
-        if not self.engine.makes_whole(work):
+        if not self._is_last_leg(work, origin):
             return 0
         return self._times.execution(origin.dag, origin.vertex, release)
+
+    def _is_last_leg(self, work: Work, origin: Origin) -> bool:
+        """Return whether the end of a running execution completes its vertex."""
+        state, tables = self.engine.scheduler.state, self.engine.tables
+        first = state.job_base[origin.slot] + tables.region_offset[origin.vertex]
+        return all(state.x_state[x] == DONE
+                   for x in range(first, first + tables.n_legs[origin.vertex]) if x != work.x)
 
     def ended(self, execution: Execution, now: int) -> None:
         """End an execution in virtual time, or suspend it."""

@@ -35,8 +35,6 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.executor.thread_clock import is_runnable
-
 _LOOK_S = 0.05
 _END_S = 2.0
 """Strands have this much real time to end when the run is over."""
@@ -302,6 +300,14 @@ class _Watch:
             self._since = now
         elif now - self._since > self._patience_s:
             raise Stuck(owner, place_of(owner.ident))
+
+
+def is_runnable(folder: Path) -> bool:
+    """Return whether a thread runs or waits for a CPU, by its folder in /proc (proc(5))."""
+    try:
+        return (folder / 'stat').read_bytes().rpartition(b')')[2].split()[0] == b'R'
+    except (OSError, IndexError):
+        return False
 
 
 def place_of(ident: int) -> str:

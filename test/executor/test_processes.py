@@ -167,7 +167,6 @@ def test_processes_start_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_who_has_ended_is_not_waited_for(tmp_path: Path) -> None:
-    """As a process that is started again in the last second, when the others end."""
     processes.Part.make(str(tmp_path), CHAIN)
     for step in ('made', 'ready'):
         (tmp_path / f'second.{step}').write_text('1')
@@ -175,10 +174,6 @@ def test_who_has_ended_is_not_waited_for(tmp_path: Path) -> None:
     part = processes.Part.read(str(tmp_path))
     part.start_together('first', ['first', 'second', 'third'], session, lambda: ['/half'])
     assert not session.happens and session.waited <= processes.LEAD_NS / 1e9
-    processes.Part.starts(str(tmp_path), 'second')  # again: from now on it is
-    session = Beside(lambda: (tmp_path / 'third.made').write_text('1'), lambda: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        part.start_together('first', ['first', 'second', 'third'], session, lambda: ['/half'])
 
 
 def test_what_is_lost_until_processes_have_met_is_of_no_job(world: Path) -> None:

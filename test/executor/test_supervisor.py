@@ -28,23 +28,20 @@ print('ends')
 
 
 class Case:
-    """A supervisor of programs by name; of those started again, the last program goes on."""
+    """A supervisor of programs by name."""
 
-    def __init__(self, on_exit: str = 'end', **programs: str | list[str]) -> None:
+    def __init__(self, goes_on: bool = False, **programs: str) -> None:
         self.out, self.err = io.StringIO(), io.StringIO()
         self.died: list[Run] = []
-        self.since: list[tuple[str, float]] = []
-        self.programs = {n: p if isinstance(p, list) else [p] for n, p in programs.items()}
-        self.supervisor = Supervisor(self.command, on_exit, self.out, self.err, self.ended)
+        self.programs = programs
+        self.supervisor = Supervisor(self.command, goes_on, self.out, self.err, self.ended)
 
     def ended(self, run: Run) -> None:
         if run.died:
             self.died.append(run)
 
-    def command(self, name: str, nth: int, since: float) -> list[str]:
-        self.since.append((name, since))
-        programs = self.programs[name]
-        return [sys.executable, '-c', programs[min(nth, len(programs)) - 1]]
+    def command(self, name: str) -> list[str]:
+        return [sys.executable, '-c', self.programs[name]]
 
     def run(self, seconds: float | None = None) -> list[tuple[str, int | None]]:
         self.supervisor.run(list(self.programs), seconds)
@@ -62,7 +59,7 @@ class Case:
 
 
 def test_output_has_the_name_of_the_process_before_each_line() -> None:
-    case = Case('continue', a='print("one"); print("two", end="")',
+    case = Case(True, a='print("one"); print("two", end="")',
                 b='import sys; print("three", file=sys.stderr)')
     assert case.run() == [('a', 0), ('b', 0)]
     assert case.out.getvalue() == '[a] one\n[a] two\n'
@@ -80,7 +77,7 @@ def test_the_end_of_one_ends_all(tmp_path: Path) -> None:
 
 
 def test_one_that_dies_is_named_with_what_it_said() -> None:
-    case = Case('continue', a='raise ValueError("boom")',
+    case = Case(True, a='raise ValueError("boom")',
                 b='import os, signal; os.kill(os.getpid(), signal.SIGKILL)', c='pass')
     assert dict(case.run()) == {'a': 1, 'b': -signal.SIGKILL, 'c': 0}
     by_name = {run.name: run for run in case.died}
@@ -89,27 +86,9 @@ def test_one_that_dies_is_named_with_what_it_said() -> None:
     assert by_name['b'].how == 'was ended by SIGKILL'
 
 
-def test_one_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, 'REST_S', 0.01)
-    case = Case('restart', a=['raise SystemExit(3)', WAITS], b=WAITS)
-    case.stop_when('[a] waits')
-    statuses = case.run()
-    assert [name for name, _ in statuses] == ['a', 'b', 'a']
-    assert statuses[0] == ('a', 3) and [run.nth for run in case.died] == [1]
-    assert '[a] ends' in case.out.getvalue()
-    *first, (name, since) = case.since
-    assert first == [('a', 0), ('b', 0)] and (name, since > 0) == ('a', True)
-
-
-def test_nothing_is_started_again_once_the_run_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, 'REST_S', 3600)
-    case = Case('restart', a='raise SystemExit(3)')
-    assert case.run(seconds=0.01) == [('a', 3)]
-
-
 def test_bad_input_of_one_is_the_error_of_all() -> None:
     error = 'import sys; print("error: x.yaml:1: wrong: mend it", file=sys.stderr); sys.exit(2)'
-    case = Case('continue', a=WAITS, b=error)
+    case = Case(True, a=WAITS, b=error)
     with pytest.raises(ProcessError, match='^process b: x.yaml:1: wrong: mend it$'):
         case.run()
     assert all(run.status is not None for run in case.supervisor.runs)
@@ -117,7 +96,7 @@ def test_bad_input_of_one_is_the_error_of_all() -> None:
 
 
 def test_an_error_line_of_one_that_ends_otherwise_is_printed() -> None:
-    case = Case('continue', a='import sys; print("error: no", file=sys.stderr)')
+    case = Case(True, a='import sys; print("error: no", file=sys.stderr)')
     case.run()
     assert case.err.getvalue() == '[a] error: no\n'
 
