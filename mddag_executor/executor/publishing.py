@@ -34,8 +34,8 @@ from rclpy.client import Client
 from rclpy.publisher import Publisher
 
 
-class DirectSubscription(Protocol):
-    """A subscription of this process that publishing threads take from."""
+class Delivery(Protocol):
+    """The subscriptions of one executor on a topic, that publishing threads take from."""
 
     def hold(self) -> None:
         """Announce nothing for now."""
@@ -45,25 +45,21 @@ class DirectSubscription(Protocol):
 
 
 _STATE = '_mddag_publisher_state'
-_subscriptions: dict[str, tuple[DirectSubscription, ...]] = {}
+_deliveries: dict[str, tuple[Delivery, ...]] = {}
 _lock = threading.Lock()
 _installed = False
 
 
-def subscribe(topic: str, subscription: DirectSubscription) -> None:
-    """Have publishing threads take for a subscription."""
+def replace_delivery(topic: str, old: Delivery | None, new: Delivery | None) -> None:
+    """Have publishing threads take by ``new`` what they have taken by ``old``; None: nothing."""
     with _lock:
-        _subscriptions[topic] = (*_subscriptions.get(topic, ()), subscription)
-
-
-def unsubscribe(topic: str, subscription: DirectSubscription) -> None:
-    """Have publishing threads take no more for a subscription."""
-    with _lock:
-        rest = tuple(s for s in _subscriptions.get(topic, ()) if s is not subscription)
-        if rest:
-            _subscriptions[topic] = rest
+        several = [each for each in _deliveries.get(topic, ()) if each is not old]
+        if new is not None:
+            several.append(new)
+        if several:
+            _deliveries[topic] = tuple(several)
         else:
-            _subscriptions.pop(topic, None)
+            _deliveries.pop(topic, None)
 
 
 def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Publication | None:
@@ -108,21 +104,21 @@ def install() -> None:
         state = self.__dict__.get(_STATE)
         if state is None:
             state = self.__dict__.setdefault(_STATE, PublisherState(self.topic_name))
-        subscriptions = _subscriptions.get(state.topic)
-        if subscriptions is None:
+        deliveries = _deliveries.get(state.topic)
+        if deliveries is None:
             if current.running is None and not state.is_tracked:
                 send(self, msg)
             else:
                 _send(send, self, msg, state)
             return
         publication = None
-        for subscription in subscriptions:
-            subscription.hold()
+        for delivery in deliveries:
+            delivery.hold()
         try:
             publication = _send(send, self, msg, state)
         finally:
-            for subscription in subscriptions:
-                subscription.collect_published(publication)
+            for delivery in deliveries:
+                delivery.collect_published(publication)
 
     def call_and_wait(self: Any, request: Any, *args: Any, **kwargs: Any) -> Any:
         running = current.running

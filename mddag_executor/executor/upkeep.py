@@ -38,7 +38,7 @@ from mddag_executor.executor.snapshot import is_qos_event, snapshot
 from mddag_executor.executor.sources import ClientSource, ServiceSource, SubscriptionSource
 from mddag_executor.executor.timers import TimerSource
 from mddag_executor.executor.waitables import EventsSource, WaitableSource, WaitSetThread
-from mddag_executor.executor.workers import Direct, WorkerPool
+from mddag_executor.executor.workers import LocalDelivery, WorkerPool
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 
@@ -76,7 +76,7 @@ class Upkeep:
         self._lock = threading.RLock()
         self._refresh_at = 0.0
         self._sources: dict[Entity, AnySource | WaitableSource] = {}
-        self._direct: dict[Entity, Direct] = {}
+        self._deliveries: dict[str, LocalDelivery] = {}
         self._events: WaitableSource | None = None
         self._unlistened: list[Entity] = []
 
@@ -171,16 +171,24 @@ class Upkeep:
         if loop is not pool.loop:
             return
         if isinstance(source, SubscriptionSource) and not loop.is_shared(source):
-            direct = self._direct[entity] = Direct(source, pool)
-            publishing.subscribe(entity.label, direct)
+            before = self._deliveries.get(entity.label)
+            self._deliver(entity.label, (*(before.sources if before else ()), source))
             entity.classify = lambda: pool.classify(source)
+
+    def _deliver(self, topic: str, sources: tuple[SubscriptionSource, ...]) -> None:
+        """Have publishing threads of this process take for these subscriptions of a topic."""
+        new = LocalDelivery(sources, self._pool) if sources else None
+        publishing.replace_delivery(topic, self._deliveries.pop(topic, None), new)
+        if new is not None:
+            self._deliveries[topic] = new
 
     def _forget(self, entity: Entity) -> None:
         """Let go of the source of an entity; the caller has the engine's lock."""
-        direct = self._direct.pop(entity, None)
-        if direct is not None:
-            publishing.unsubscribe(entity.label, direct)
         source = self._sources.pop(entity, None)
+        delivery = self._deliveries.get(entity.label)
+        if delivery is not None and source in delivery.sources:
+            self._deliver(
+                entity.label, tuple(each for each in delivery.sources if each is not source))
         if source is None or isinstance(source, WaitableSource):
             if source is not None:
                 self._sources[entity] = source  # later, without the lock

@@ -64,6 +64,8 @@ POLL_NS = 2_000_000
 """A coroutine that awaits something unknown is resumed after this."""
 ASK_AGAIN_NS = 10_000_000
 """A callback group that has refused an execution is asked again after this."""
+CONTEXT_CHECK_NS = 100_000_000
+"""How often it is checked, when a timer is due, whether the context has been destroyed."""
 LEAVE_S = 1.0
 """How long a pause waits for the threads in the epoll to leave it; it takes less than 1 ms."""
 MOST_LENT = 64
@@ -191,6 +193,7 @@ class WorkerPool:
         self._is_stepping = False
         self._last = 0
         self._misses = 0
+        self._check_context_at = 0
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._agenda_entries = 0
         self._gil_check = GilCheck()
@@ -277,21 +280,19 @@ class WorkerPool:
         """Wake a thread if an idle worker may start something; the caller has the lock."""
         if not self.running:
             return
-        if not self.engine.may_start_more(self._last):
-            if self.engine.holders and self.engine.has_waiting:
-                self._watch_holder(monotonic_ns())
-                at = self._gil_check.at
-                if at and not 0 < self.loop.timer.at <= at:
-                    self.loop.timer.arm(at)
-            return
         running = current.running
         if (running is not None and running.pool is self and running.published
                 and running.work is not None and running.work.entity.tail_ns <= TAIL_NS):
             guard = monotonic_ns() + WAKE_GUARD_NS
             if not 0 < self.loop.timer.at <= guard:
                 self.loop.timer.arm(guard)
-            return
-        self._wake_one()
+        elif self.engine.may_start_more(self._last):
+            self._wake_one()
+        elif self.engine.holders and self.engine.has_waiting:
+            self._watch_holder(monotonic_ns())
+            at = self._gil_check.at
+            if at and not 0 < self.loop.timer.at <= at:
+                self.loop.timer.arm(at)
 
     def _wake_one(self) -> None:
         if self._polling or self._is_stepping:
@@ -516,8 +517,10 @@ class WorkerPool:
         """Handle what is due by now; return what is to be called without the lock."""
         monotonic = now - self.clock.offset_ns
         self._notice_stop(monotonic)
-        if self._context_ended():  # nobody says so if it was only destroyed
-            self.context_ended()
+        if monotonic > self._check_context_at:  # nobody says so if it was only destroyed
+            self._check_context_at = monotonic + CONTEXT_CHECK_NS
+            if self._context_ended():
+                self.context_ended()
         self.loop.timer.at = 0
         for fired in self.timers.fire():
             self.inbox.timer(fired)
@@ -783,23 +786,24 @@ class WorkerPool:
             self.engine.idle_workers >= self.engine.n_workers)
 
 
-class Direct:
+class LocalDelivery:
     """
-    A subscription that publishing threads of this process take from (see ``publishing``).
+    The subscriptions on one topic that publishing threads of this process take from.
 
-    :param source: the subscription's.
+    :param sources: theirs.
     """
 
-    __slots__ = ('_source', '_pool', '_loop')
+    __slots__ = ('sources', '_pool')
 
-    def __init__(self, source: SubscriptionSource, pool: WorkerPool) -> None:
-        self._source = source
+    def __init__(self, sources: tuple[SubscriptionSource, ...], pool: WorkerPool) -> None:
+        self.sources = sources
         self._pool = pool
-        self._loop = pool.loop
 
     def hold(self) -> None:
         """Announce nothing for now."""
-        self._loop.hold(self._source)
+        hold = self._pool.loop.hold
+        for source in self.sources:
+            hold(source)
 
     def collect_published(self, publication: Publication | None) -> None:
         """Take what was announced since ``hold``, and announce again."""
@@ -810,6 +814,11 @@ class Direct:
         if not pool._is_inside():
             with pool.lock:
                 pool.tick()
-                if self._source.collect_published(publication):
+                posted = False
+                for source in self.sources:
+                    posted |= source.collect_published(publication)
+                if posted:
                     pool._wake_for_more()
-        self._loop.release(self._source)
+        release = pool.loop.release
+        for source in self.sources:
+            release(source)
