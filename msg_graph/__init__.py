@@ -12,10 +12,20 @@ from __future__ import annotations
 from msg_graph.derive import load, loads
 from msg_graph.duration import DurationError, format_duration, parse_duration
 from msg_graph.errors import GraphError, GraphErrors
-from msg_graph.model import Callback, Dag, ExecutionTime, Path, Process, QueueEdge, TaskSet, Vertex
+from msg_graph.model import (
+    Callback,
+    Dag,
+    ExecutionTime,
+    NO_GRAPH,
+    Path,
+    Process,
+    QueueEdge,
+    TaskSet,
+    Vertex,
+)
 
 __all__ = [
-    'Callback', 'Dag', 'DurationError', 'ExecutionTime', 'GraphError', 'GraphErrors',
+    'Callback', 'Dag', 'DurationError', 'ExecutionTime', 'GraphError', 'GraphErrors', 'NO_GRAPH',
     'Path', 'Process', 'QueueEdge', 'TaskSet', 'Vertex', 'format_duration', 'load', 'loads',
     'parse_duration',
 ]

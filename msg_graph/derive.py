@@ -31,7 +31,8 @@ Rules 1, 2, 3 and 6 concern callbacks (``Links``), the others make vertices.
 7. DAGs are numbered by their sources' places in the file. The vertices of a DAG are numbered by
    their callbacks' places in the file, several of one callback in the order of the vertices that
    start them, that is of the publishers. The edges of a vertex are listed in the order of the
-   topics that it publishes, those of one topic by index.
+   topics that it publishes, those of one topic by index.  A DAG is called by ``dag:``, else after
+   its source's node, or, if several sources of the node have no ``dag:``, ``/node/callback``.
 8. Errors are collected in stages, as far as none is a consequence of another: who starts whom and
    who reads what; then cycles, deadlines and paths; then what the vertices show.
 9. The number of vertices and edges is bounded before they are made, as rule 4 multiplies.
@@ -434,11 +435,16 @@ def _dags(links: Links, expansion: _Expansion) -> tuple[Dag, ...]:
 
 
 def _dag_names(links: Links, sources: list[int]) -> dict[int, str]:
+    """Return by source the name that it declares, else that of its node; of several its own."""
     names: dict[int, str] = {}
     taken: dict[str, int] = {}
+    unnamed = Counter(callback.node for callback in map(links.callbacks.__getitem__, sources)
+                      if callback.dag is None)
     for source in sources:
         callback = links.callbacks[source]
         name = callback.dag or callback.node
+        if callback.dag is None and unnamed[callback.node] > 1:
+            name = f'{callback.node}/{callback.name}'
         if name in taken:
             other = links.callbacks[taken[name]].key
             raise links.entries[callback.key].error(

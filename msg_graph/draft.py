@@ -20,14 +20,17 @@ open (``open_blanks``), all of it at once, instead of the errors that come of it
    may.
 4. *timers* that are only supposed, as nothing else seems to start what their node publishes.
 
+``accept`` decides instead of asking, by what was recorded: measured periods and proposed deadlines
+become entries, nothing is published that was not seen to be, and a source whose rate is not known
+is left out (``leave_out_sources``).
+
 A named path becomes an entry where each of its nodes has just one callback that fits.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, field
 import re
 
@@ -40,6 +43,7 @@ from msg_graph.yamltext import plain_scalar
 UNDEFINED = 'UNDEFINED'
 """Stands for a topic at the end of a path (CARET's word)."""
 MARK = 'FILL IN'
+LEFT_OUT = '# Left out:'
 _OPEN = re.compile(rf'\s*#\s+(?:(\w+:).*\s#\s+)?{MARK}: (.*)')
 _ENTRY = re.compile(r'\s*- (?:name|node):|\s*-\s*\{')
 _LITTLE = 1e-4      # of a period
@@ -56,6 +60,7 @@ class DraftCallback:
     :ivar publishes: topics that it publishes for sure.
     :ivar maybe: topics of its node that it may publish.
     :ivar reads: topics and callbacks of its node that it reads by queue edges.
+    :ivar runs: how many executions of it were recorded; None: nothing was.
     :ivar interval_ns: measured mean time between two of its executions.
     :ivar times: its measured execution time, and the number of executions that were measured.
     :ivar guessed: whether it is only supposed that there is this timer.
@@ -74,6 +79,7 @@ class DraftCallback:
     dag: str | None = None
     deadline_ns: int | None = None
     release_from: ReleaseFrom = 'arrival'
+    runs: int | None = None
     interval_ns: int | None = None
     times: tuple[ExecutionTime, int] | None = None
     guessed: bool = False
@@ -114,12 +120,14 @@ class Draft:
     A system.
 
     :ivar origin: what it was made from, for the first line of the declaration.
+    :ivar left_out: callbacks that the declaration does not have, with the reason.
     """
 
     origin: str
     nodes: list[DraftNode]
     paths: list[DraftPath] = field(default_factory=list)
     workers: int | None = None
+    left_out: list[str] = field(default_factory=list)
 
     def callbacks(self) -> Iterator[DraftCallback]:
         """Yield the callbacks of all nodes."""
@@ -127,9 +135,61 @@ class Draft:
             yield from node.callbacks.values()
 
 
-def declaration_of(draft: Draft) -> str:
-    """Return the text of a declaration with marked blanks."""
-    return '\n'.join(_Writer(draft).lines()) + '\n'
+def leave_out_sources(draft: Draft, reason: Callable[[DraftCallback], str]) -> None:
+    """
+    Leave out sources, and sources that come of it as nobody publishes their topics any more.
+
+    :param reason: says why a source is left out; an empty text keeps it.
+    """
+    while True:
+        published = {topic for callback in draft.callbacks()
+                     for topic in callback.publishes + callback.maybe}
+        found = {callback.key: why for callback in draft.callbacks()
+                 if _is_source(callback, published) and (why := reason(callback))}
+        if not found:
+            return
+        for node in draft.nodes:
+            for callback in list(node.callbacks.values()):
+                if callback.key in found:
+                    del node.callbacks[callback.name]
+                    what = ' '.join((callback.kind, *callback.starts))
+                    draft.left_out.append(f'{callback.key} ({what}): {found[callback.key]}')
+        draft.nodes = [node for node in draft.nodes if node.callbacks]
+
+
+def _is_source(callback: DraftCallback, published: Container[str]) -> bool:
+    return callback.kind != 'sync' and (
+        callback.kind != 'subscription' or callback.starts[0] not in published)
+
+
+def accept(draft: Draft) -> None:
+    """Decide what is not known by what was recorded, so that the periods of all sources are."""
+    for callback in draft.callbacks():
+        callback.maybe.clear()
+    leave_out_sources(draft, _without_rate)
+
+
+def _without_rate(callback: DraftCallback) -> str:
+    if callback.guessed:
+        return 'nothing is recorded that starts it'
+    if callback.kind == 'timer' and not _is_timer_period(callback.period_ns or 0):
+        return f'its period is said to be {format_duration(callback.period_ns or 0)}'
+    if callback.source_period_ns is not None:
+        return ''
+    return 'it ran once, which gives no rate' if callback.runs == 1 else 'it never ran'
+
+
+def _is_timer_period(period_ns: int) -> bool:
+    return MICROSECOND <= period_ns <= DAY
+
+
+def declaration_of(draft: Draft, accepted: bool = False) -> str:
+    """
+    Return the text of a declaration.
+
+    :param accepted: proposals for periods and deadlines become entries, else marked blanks.
+    """
+    return '\n'.join(_Writer(draft, accepted).lines()) + '\n'
 
 
 def open_blanks(text: str, file: str) -> list[GraphError]:
@@ -157,8 +217,9 @@ def with_blanks(error: GraphError, text: str, file: str) -> GraphError:
 
 class _Writer:
 
-    def __init__(self, draft: Draft) -> None:
+    def __init__(self, draft: Draft, accepted: bool) -> None:
         self._draft = draft
+        self._accepted = accepted
         self._callbacks = list(draft.callbacks())
         self._publishers: dict[str, list[DraftCallback]] = {}
         self._started: dict[str, list[DraftCallback]] = {}
@@ -168,15 +229,12 @@ class _Writer:
             if callback.kind in ('subscription', 'sync'):
                 for topic in callback.starts:
                     self._started.setdefault(topic, []).append(callback)
-        self._maybe = {topic for callback in self._callbacks for topic in callback.maybe}
-        self._sources = Counter(c.node for c in self._callbacks if self._is_source(c))
+        self._published = {*self._publishers, *(
+            topic for callback in self._callbacks for topic in callback.maybe)}
         self._period = self._shortest_periods()
 
     def _is_source(self, callback: DraftCallback) -> bool:
-        if callback.kind == 'sync':
-            return False
-        return callback.kind != 'subscription' or not (
-            callback.starts[0] in self._publishers or callback.starts[0] in self._maybe)
+        return _is_source(callback, self._published)
 
     def _shortest_periods(self) -> dict[str, DraftCallback]:
         """Return by callback the source with the shortest period that leads to it, perhaps."""
@@ -194,8 +252,12 @@ class _Writer:
 
     def lines(self) -> Iterator[str]:
         yield f'# From {printable(self._draft.origin)}.'
-        yield f"# Lines with '{MARK}' are blanks: correct the value, then take the '# ' away."
-        yield "# 'mddag graph check' lists what is still open."
+        if self._accepted:
+            yield "# Values marked 'proposed' come from the recording, not from requirements."
+        else:
+            yield f"# Lines with '{MARK}' are blanks: correct the value, then take the '# ' away."
+            yield "# 'mddag graph check' lists what is still open."
+        yield from (f'{LEFT_OUT} {printable(text)}' for text in self._draft.left_out)
         yield 'mddag: 1'
         if self._draft.workers is not None:
             yield f'workers: {self._draft.workers}'
@@ -234,7 +296,7 @@ class _Writer:
                 return (f'        timer: {_rounded(callback.interval_ns or 0)}  # {MARK}: is this '
                         f'a timer? Proposed: the measured {_measured(callback)}')
             period_ns = callback.period_ns or 0
-            if not MICROSECOND <= period_ns <= DAY:
+            if not _is_timer_period(period_ns):
                 return (f'        # timer: 100ms  # {MARK}: its period is said to be '
                         f'{exact_duration(period_ns)}')
             return f'        timer: {_whole(period_ns)}'
@@ -245,29 +307,33 @@ class _Writer:
     def _source(self, callback: DraftCallback) -> Iterator[str]:
         """Yield what concerns a source: the name of its DAG, and its period if it is no timer."""
         source = self._is_source(callback)
-        known = callback.kind == 'timer' or callback.period_ns is not None
-        if source and (callback.dag or self._sources[callback.node] > 1):
-            dag = f'dag: {plain_scalar(callback.dag or callback.node + "/" + callback.name)}'
-            blank = callback.kind == 'subscription' and not known
-            yield f'        # {dag}  # {MARK}: with the period' if blank else f'        {dag}'
+        if source and callback.dag:
+            yield f'        dag: {plain_scalar(callback.dag)}'
         if callback.kind in ('timer', 'sync'):
             return
-        if source and known:
-            yield f'        period: {exact_duration(callback.period_ns or 0)}'
+        if source and callback.period_ns is not None:
+            yield f'        period: {exact_duration(callback.period_ns)}'
             if callback.release_from != 'arrival':
                 yield f'        release_from: {callback.release_from}'
         elif source:
-            yield f'        # period: {self._period_blank(callback)}'
+            yield self._period_line(callback)
         elif callback.starts[0] not in self._publishers:
             yield f'        # {callback.starts[0]} has no known publisher yet: see its blanks'
 
-    def _period_blank(self, callback: DraftCallback) -> str:
+    def _proposal(self, entry: str, what: str, why: str) -> str:
+        """Return the line of a proposed entry: a blank, or the entry if proposals are accepted."""
+        if self._accepted:
+            return f'        {entry}  # proposed: {why}'
+        return f'        # {entry}  # {MARK}: {what}; proposed: {why}'
+
+    def _period_line(self, callback: DraftCallback) -> str:
         what = ('the time between two requests' if callback.kind == 'service' else
                 'nobody here publishes the topic; the time between two messages')
         if callback.interval_ns is not None:
-            return (f'{_rounded(callback.interval_ns)}  # {MARK}: {what}; proposed: the measured '
-                    f'{_measured(callback)}')
-        return f'{"1s" if callback.kind == "service" else "100ms"}  # {MARK}: {what}'
+            return self._proposal(f'period: {_rounded(callback.interval_ns)}', what,
+                                  f'the measured {_measured(callback)}')
+        default = '1s' if callback.kind == 'service' else '100ms'
+        return f'        # period: {default}  # {MARK}: {what}'
 
     def _publishes(self, callback: DraftCallback) -> Iterator[str]:
         every = ', '.join(callback.publishes + callback.maybe)
@@ -288,8 +354,8 @@ class _Writer:
                     'leads here')
         source = self._period[callback.key]
         leads = 'timer' if source.kind == 'timer' else 'source'
-        return (f'        # deadline: {_period(source)}  # {MARK}: {what}; proposed: the period '
-                f'of the {leads} that leads here')
+        return self._proposal(f'deadline: {_period(source)}', what,
+                              f'the period of the {leads} that leads here')
 
     def _paths(self) -> Iterator[str]:
         found = [(path, self._path_keys(path)) for path in self._draft.paths]

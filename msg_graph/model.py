@@ -334,3 +334,7 @@ def load_of(dag: Dag) -> float | None:
     """
     means = mean_execution_times(dag)
     return None if means is None else sum(means) / dag.period_ns
+
+
+NO_GRAPH = TaskSet((), (), (), (), None, '', '')
+"""Stands for a declaration where there is none."""

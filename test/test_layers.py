@@ -3,8 +3,8 @@
 """
 The parts of the program know one another in one direction only.
 
-    cli -> report, rerun -> (live | replay | assign | simulate | analysis) -> trace, core, generate
-        -> msg_graph
+    cli -> report, rerun -> hosting -> (live | replay | assign | simulate | analysis)
+        -> trace, core, generate -> msg_graph
 
 Imports are read from the sources, those inside functions and for type checkers included. So are
 the names that only ``live.compat`` may use of rclpy.
@@ -39,9 +39,10 @@ LEVELS = {
     'mddag_executor.executor': 6,
     'mddag_executor.replay': 6,
     'mddag_executor.report': 7,
-    'mddag_executor.rerun': 7,
-    'mddag_executor.cli': 8,
-    'mddag_executor.__main__': 9,
+    'mddag_executor.hosting': 7,
+    'mddag_executor.rerun': 8,
+    'mddag_executor.cli': 9,
+    'mddag_executor.__main__': 10,
 }
 # What mddag_executor/__init__.py passes on belongs to the part that it comes from.
 PASSED_ON = {'mddag_executor.DeadlineMiss', 'mddag_executor.MultiDeadlineExecutor'}
@@ -54,7 +55,8 @@ NOT_IN_CORE = {
 # Offline parts work on a machine without ROS.
 ROS = {'rclpy', 'rcl_interfaces', 'std_msgs', 'diagnostic_msgs', 'builtin_interfaces', 'launch',
        'launch_ros', 'ament_index_python', 'rosidl_parser'}
-MAY_USE_ROS = {'mddag_executor.executor', 'mddag_executor.rerun', 'mddag_executor.cli'}
+MAY_USE_ROS = {'mddag_executor.executor', 'mddag_executor.hosting', 'mddag_executor.rerun',
+               'mddag_executor.cli'}
 
 
 def part_of(module: str) -> str | None:

@@ -15,7 +15,7 @@ HELP = 'import a session that LTTng recorded'
 DESCRIPTION = """\
 Turn a session that LTTng recorded (CARET, ros2_tracing), all its processes and events, into a
 trace. It is read with the Python bindings of babeltrace2 (apt install python3-bt2), in whichever
-Python of this machine has them."""
+Python of this machine has them. Several sessions, one of each computer, become one trace."""
 EXAMPLE = """\
 mddag import ctf ~/.ros/tracing/session-20261121101500 -o drive.mcap
 mddag replay drive.mcap graph.yaml"""
@@ -23,7 +23,9 @@ mddag replay drive.mcap graph.yaml"""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('session', metavar='SESSION', help='the folder that was recorded to')
+    parser.add_argument(
+        'session', metavar='SESSION', nargs='+',
+        help='the folder that was recorded to; of a run on several computers the folder of each')
     parser.add_argument('-o', '--output', metavar='OUT.mcap', required=True, type=NamedFile,
                         help='the trace to write')
 

@@ -32,7 +32,8 @@ mddag rerun drive.mcap graph.yaml --node my_package.tracker:main --times run.mca
 
 exit status: 0 done; 1 the outputs are not those of --expect; 2 bad input, or a callback raised"""
 
-_PROGRAMS = ('bin/mddag', 'mddag_executor/__main__.py')
+_PROGRAMS = ('mddag', 'ros2')  # wherever pip, colcon or a user has put them
+_MODULE = 'mddag_executor/__main__.py'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,14 +88,21 @@ def main(args: argparse.Namespace) -> int:
 
 def _fix_hashes() -> None:
     """
-    Begin anew with fixed hashes of strings, where they are drawn anew by each process.
+    Start the program again with fixed hashes of strings, on which the order of a set depends.
 
-    The order of a set depends on them. (Not where something else calls this.)
+    Another program that calls this verb, and a Python that ignores its environment, only get a
+    warning.
     """
-    if sys.flags.hash_randomization and sys.argv[0].endswith(_PROGRAMS):
+    if not sys.flags.hash_randomization:
+        return
+    if sys.flags.ignore_environment:
+        warn('hashes of strings are not the same in each run: leave out -E and -I of Python')
+    elif os.path.basename(sys.argv[0]) in _PROGRAMS or sys.argv[0].endswith(_MODULE):
         os.execve(
             sys.executable, [sys.executable, *sys.orig_argv[1:]],
             {**os.environ, 'PYTHONHASHSEED': '0'})
+    else:
+        warn('hashes of strings are not the same in each run: set PYTHONHASHSEED=0')
 
 
 def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, ExitStack, redirect_stdout
 from dataclasses import asdict, replace
 from functools import partial
 import os
@@ -37,11 +37,12 @@ from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.report.live_runs import summary
 from mddag_executor.report.tables import sink_table
 from mddag_executor.report.text import listed
-from msg_graph import loads
+from msg_graph import loads, NO_GRAPH
 
 if TYPE_CHECKING:
+    from mddag_executor.hosting.host import Host
+    from mddag_executor.hosting.loading import Program
     from mddag_executor.executor.executor import MultiDeadlineExecutor
-    from mddag_executor.executor.loading import Program
     from mddag_executor.executor.measure import ExecutionPlan, Ledger
     from mddag_executor.executor.processes import Supervisor
     from mddag_executor.executor.session import Session
@@ -49,7 +50,8 @@ if TYPE_CHECKING:
 
 EXAMPLE = """\
 mddag run graph.yaml --node my_package/driver --node my_package.filter:main --trace run.mcap
-mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20s"""
+mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20s
+mddag run --node my_package/driver --node my_package/filter --trace run.mcap"""
 
 # SIGINTs within this time are one: who ends a process group sends it to all processes of it, and
 # `ros2 launch`, where it reads from no terminal, then once more to those that it started.
@@ -97,7 +99,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='if one of several processes ends by itself: end the run, or continue without it '
         '(default: end)')
     add('--part', help=argparse.SUPPRESS)  # the folder of a run of several processes
-    options.add(parser, 'graph', '--workers', '--json', '--ros-args')
+    parser.add_argument(
+        'graph', metavar='GRAPH', nargs='?', type=options.Input,
+        help="the declaration, a YAML file ('-': standard input); with --node it may be left out: "
+        'then nothing is judged, and a trace shows what there is to declare')
+    options.add(parser, '--workers', '--json', '--ros-args')
 
 
 def _or_off(text: str) -> int:
@@ -110,7 +116,7 @@ def main(args: argparse.Namespace) -> int:
     _check_arguments(args)
     if args.part is not None:
         return part(args)
-    task_set = common.load_graph(args.graph)
+    task_set = NO_GRAPH if args.graph is None else common.load_graph(args.graph)
     if args.processes not in (None, '1') or (task_set.processes and args.processes is None):
         from mddag_executor.cli.run_processes import run_processes, with_declared
         if args.process is None:
@@ -130,11 +136,10 @@ def part(args: argparse.Namespace) -> int:
     belong_to_parent(the_part.parent)
     task_set = loads(the_part.text, name=args.graph)
     if args.process is None:
-        from mddag_executor.executor.hosting import nodes_of
-        from mddag_executor.executor.loading import resolve, ros_arguments
+        from mddag_executor.hosting.host import nodes_of
+        from mddag_executor.hosting.loading import ros_arguments
         with _rclpy(args.ros_args or []):
-            ros = ros_arguments(args.ros_args)
-            names = nodes_of([resolve(spec, ros) for spec in args.node], ros)
+            names = nodes_of(args.node, ros_arguments(args.ros_args))
         the_part.leave(names)
         sys.stdout.flush()
         os._exit(0)  # without the ends of programs that were only looked at
@@ -155,15 +160,19 @@ def run_here(
     common.check_output(args.trace)
     workers = defaults.workers(args.workers, task_set)
     plan = None
+    host: Host | None = None
     programs: list[Program] = []
     if args.synthetic is not None:
         from mddag_executor.executor.measure import ExecutionPlan
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
-    else:
-        from mddag_executor.executor.loading import resolve, ros_arguments
-        programs = [resolve(spec, ros_arguments(args.ros_args)) for spec in args.node]
     with dump_when_stuck() as ends, Signals(
-            _PART_ENDS_S if args.part else 0) as signals, _rclpy(args.ros_args or []):
+            _PART_ENDS_S if args.part else 0) as signals, _rclpy(
+            args.ros_args or []), ExitStack() as stack:
+        if args.synthetic is None:
+            from mddag_executor.hosting.host import Host
+            from mddag_executor.hosting.loading import ros_arguments
+            host = stack.enter_context(Host())
+            programs = host.load(args.node, ros_arguments(args.ros_args))
         from mddag_executor.executor.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
@@ -172,7 +181,7 @@ def run_here(
         output = sys.stdout if common.wants_tables(args) else sys.stderr
         try:
             with redirect_stdout(output):
-                return _run(args, task_set, executor, programs, plan, signals, ends)
+                return _run(args, task_set, executor, host, programs, plan, signals, ends)
         except MddagError:
             if args.trace is not None:  # nothing ran: leave no empty trace behind
                 Path(args.trace).unlink(missing_ok=True)
@@ -204,6 +213,10 @@ def _check_arguments(args: argparse.Namespace) -> None:
         raise UsageError('--trace -: a trace is not written to standard output: name a file')
     if args.processes is not None and args.processes.isdecimal() and not int(args.processes):
         raise UsageError('--processes 0: give 1 or more, or a file')
+    needs_graph = next((name for name in ('synthetic', 'processes', 'process')
+                        if getattr(args, name) not in (None, '1')), None)
+    if args.graph is None and needs_graph is not None:
+        raise UsageError(f'--{needs_graph}: it is about the nodes of a declaration: give a GRAPH')
     if args.synthetic is None and args.utilisation is not None:
         raise UsageError(
             '--utilisation: it scales synthetic nodes only: add --synthetic or leave it out')
@@ -267,7 +280,7 @@ def _init(arguments: list[str]) -> None:
 
 def _run(
     args: argparse.Namespace, task_set: TaskSet, executor: MultiDeadlineExecutor,
-    programs: list[Program], plan: ExecutionPlan | None, signals: Signals,
+    host: Host | None, programs: list[Program], plan: ExecutionPlan | None, signals: Signals,
     ends: Callable[[], None],
 ) -> tuple[dict[str, Any], BaseException | None]:
     """Run until the end; see ``run_here``."""
@@ -285,15 +298,15 @@ def _run(
     seconds = None if args.duration is None else args.duration / 1e9
     ledger: Ledger | None = None
     signals.end_of(session)
-    with Progress('running', seconds) as progress:
-        if plan is not None:
+    if host is not None:  # without progress: programs use the terminal, too
+        _run_programs(args, task_set, session, host, programs, seconds)
+    elif plan is not None:
+        with Progress('running', seconds) as progress:
             if args.part is None:
                 warn_of(plan, args.ros_args)
             ledger = _run_synthetic(args, session, task_set, plan, seconds, progress)
-        else:
-            _run_programs(args, task_set, session, executor, programs, seconds, progress)
     result = {
-        'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
+        'file': task_set.file or None, 'nodes': args.node, 'synthetic': args.synthetic,
         **executor.statistics(),
         'measured': None if ledger is None or plan is None else measure(ledger, plan)}
     result['drift'] = [each.result() for each in watch.drift(result)]
@@ -334,39 +347,37 @@ def _begin(args: argparse.Namespace, task_set: TaskSet) -> Callable[..., int | N
 
 
 def _run_programs(
-    args: argparse.Namespace, task_set: TaskSet, session: Session,
-    executor: MultiDeadlineExecutor, programs: list[Program], seconds: float | None,
-    progress: Progress,
+    args: argparse.Namespace, task_set: TaskSet, session: Session, host: Host,
+    programs: list[Program], seconds: float | None,
 ) -> None:
-    from mddag_executor.executor.hosting import Host
-    from mddag_executor.executor.loading import ros_arguments
+    from mddag_executor.hosting.loading import ros_arguments
     from mddag_executor.executor.session import SessionError
-    with Host(executor, session.stop) as host:
-        executor.set_judging(False)
-        try:
-            with session:
-                host.start(programs, ros_arguments(args.ros_args))
-                begins: int | None = None
-                if args.process is not None:  # what is lost until then is no job's fault
-                    try:
-                        begins = _begin(args, task_set)(
-                            session, executor.unmatched, _MEET_S if args.part else _ALONE_S)
-                    except SessionError as error:
-                        warn(f'{error}; what is lost meanwhile counts as missed')
-                executor.set_judging(True, begins)
-                session.wait(seconds, progress.update)
-                host.close()
-        except MddagError:
-            # What a callback raised says more than that its program failed to start.
-            if session.error is None:
-                raise
-        left = host.end()
-        for guest in host.guests:
-            if guest.error is not None and session.error is None:
-                session.error = guest.error
-        for guest in left:
-            warn(f'--node {guest.program.spec}: its main() has not ended in time; it is left '
-                 'behind')
+    executor: Any = session.executor
+    executor.set_judging(False)
+    try:
+        with session:
+            host.start(
+                executor, programs, ros_arguments(args.ros_args), session.stop,
+                lambda: session.stopped)
+            begins: int | None = None
+            if args.process is not None:  # what is lost until then is no job's fault
+                try:
+                    begins = _begin(args, task_set)(
+                        session, executor.unmatched, _MEET_S if args.part else _ALONE_S)
+                except SessionError as error:
+                    warn(f'{error}; what is lost meanwhile counts as missed')
+            executor.set_judging(True, begins)
+            session.wait(seconds)
+    except MddagError:
+        # What a callback raised says more than that its program failed to start.
+        if session.error is None:
+            raise
+    left = host.end()
+    for guest in host.guests:
+        if guest.error is not None and session.error is None:
+            session.error = guest.error
+    for guest in left:
+        warn(f'--node {guest.program.spec}: its main() has not ended in time; it is left behind')
 
 
 class Signals:
@@ -416,8 +427,9 @@ class Signals:
 def report(args: argparse.Namespace, result: dict[str, Any]) -> bool:
     """Write the result; return whether tables were printed."""
     shown = common.write_result(args, result)
-    if shown:
+    if shown and result['dags']:
         print(sink_table(result['dags']))
+    if shown:
         for line in summary(result):
             print(line)
     return shown

@@ -56,7 +56,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     :raises msg_graph.GraphError: when the declaration is wrong
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
-    from mddag_executor.executor.loading import ros_arguments
+    from mddag_executor.hosting.loading import ros_arguments
     from mddag_executor.executor.measure import ExecutionPlan
     from mddag_executor.executor.processes import left, Part, Run, Supervisor, together
     plan = None
@@ -177,7 +177,7 @@ def _probe(
     args: argparse.Namespace, folder: str, specs: Sequence[str]
 ) -> Mapping[str, Sequence[str]]:
     """Return the names of the nodes that each SPEC brings."""
-    from mddag_executor.executor.loading import ros_arguments
+    from mddag_executor.hosting.loading import ros_arguments
     from mddag_executor.executor.processes import left, ProcessError
     # Nobody is to hear of these nodes.
     environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}

@@ -71,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
     common.show(args, result, lines(result))
     if args.fail_under is None:
         return 0
-    return int(bool(result['left_out']) or any(
+    return int(bool(result['missed']) or any(
         one['factor'] is not None and one['factor'] < args.fail_under
         for one in result['callbacks'].values()))
 

@@ -44,13 +44,16 @@ def recorded_system(given: str) -> System:
 
 
 def write_declaration(output: str, text: str) -> None:
-    """Write a declaration with blanks, and say how many there are."""
-    from msg_graph.draft import MARK
+    """Write a declaration, and print how many blanks it has and how many callbacks it lacks."""
+    from msg_graph.draft import LEFT_OUT, MARK
     common.write_text(output, text)
     if output == '-':
         return
-    count = sum(MARK in line for line in text.splitlines()[2:])
+    lines = text.splitlines()
+    count = sum(MARK in line for line in lines[2:])
     if count:
         print(f"{counted(count, 'blank')} to fill in, marked '{MARK}'")
     else:
         print('no blanks to fill in')
+    if count := sum(line.startswith(LEFT_OUT) for line in lines):
+        print(f"{counted(count, 'callback')} left out: see '{LEFT_OUT}' in it")

@@ -14,10 +14,9 @@ Two adapters have modules of their own: ``listeners`` (``handle.pointer``) and `
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
-import importlib
 import inspect
 from operator import attrgetter
 import sys
@@ -329,12 +328,14 @@ def is_called_by_spin() -> bool:
     return sys._getframe(2).f_code is rclpy.spin.__code__
 
 
-def events_executor_modules() -> list[Any]:
-    """Return the modules that offer rclpy's ``EventsExecutor``; the first ones of 7.1 had none."""
-    names = ('rclpy.experimental', 'rclpy.experimental.events_executor')
-    if not hasattr(_rclpy, 'EventsExecutor'):
-        return []
-    return [importlib.import_module(name) for name in names]
+@contextmanager
+def executor_kept(node: Any) -> Iterator[None]:
+    """Have another executor run a node, as it is added to that; ``node.executor`` stays."""
+    before, node._Node__executor_weakref = node._Node__executor_weakref, None
+    try:
+        yield
+    finally:
+        node._Node__executor_weakref = before
 
 
 def keeps_time(subscription: Any) -> bool:

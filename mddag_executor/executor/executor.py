@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 import gc
 import os
 import select
@@ -59,7 +59,7 @@ from mddag_executor.executor.tasks import make_task, Unclaimed
 from mddag_executor.executor.upkeep import Upkeep
 from mddag_executor.executor.verdicts import DeadlineMiss
 from mddag_executor.executor.waitables import WaitSetThread
-from mddag_executor.executor.work import QuickCallback, Work
+from mddag_executor.executor.work import current, QuickCallback, Work
 from mddag_executor.executor.workers import WorkerPool
 from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
@@ -280,6 +280,24 @@ class MultiDeadlineExecutor(BareExecutor):
         take = self._new_tasks.pop if TASKS_NEWEST_FIRST else self._new_tasks.popleft
         while self._new_tasks:
             self._pool.report(self._engine.ready, take())
+
+    # --- what a host of programs needs -----------------------------------------------------------
+
+    def on_callback_ended(
+        self, listener: Callable[[Any, BaseException | None], bool]
+    ) -> None:
+        """
+        Have a function called after each callback, in its thread.
+
+        :param listener: gets rclpy's entity (None: a task), and what its callback raised, or None;
+            returns whether it takes care of that, so that it does not end ``spin``.
+        """
+        self._pool.callback_ended = listener
+
+    def lend(self) -> AbstractContextManager[None]:
+        """Return what lends the worker of the calling callback, if it is one, while entered."""
+        running = current.running
+        return nullcontext() if running is None else running.lend()
 
     # --- spinning --------------------------------------------------------------------------------
 

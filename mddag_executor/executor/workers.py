@@ -172,6 +172,8 @@ class WorkerPool:
         self.lent = 0
         #: called with something to run while a callback of ``spin_once`` waits in ``Client.call``
         self.serve_meanwhile: Callable[[], Any] | None = None
+        #: called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
+        self.callback_ended: Callable[[Any, BaseException | None], bool] | None = None
         #: called when deadlines were missed
         self.missed: Callable[[], None] = lambda: None
         #: called when it is noticed that the context has ended
@@ -475,7 +477,9 @@ class WorkerPool:
                 work = self._choose(me, now)
             self._arm(now - self.clock.offset_ns)
             misses = self.engine.verdicts.missed
-        if ended is not None and (ended.waits_for is not None or ended.raised is not None):
+        if ended is not None and (
+                ended.waits_for is not None or ended.raised is not None
+                or self.callback_ended is not None):
             calls.append(partial(self._settle_end, ended))
         if misses != self._misses:
             self._misses = misses
@@ -703,7 +707,11 @@ class WorkerPool:
                 waits_for.add_done_callback(QuickCallback(partial(self.resume, work)))
         elif isinstance(raised, Refused):
             self.call_at(monotonic_ns() + ASK_AGAIN_NS, self._ask_again)
-        elif raised is not None and not isinstance(raised, Destroyed):
+        elif isinstance(raised, Destroyed):
+            pass
+        elif self.callback_ended is not None and self.callback_ended(work.entity.rclpy, raised):
+            pass
+        elif raised is not None:
             self._fail(raised)
 
     def _ask_again(self) -> None:

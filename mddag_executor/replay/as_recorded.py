@@ -48,7 +48,7 @@ class Replay:
         self.judge = Judge(run.task_set, run.same, waits, skip)
         self.usage = Usage(run.task_set, waits)
         self.tally = self.judge.tally
-        self._seen = None if run.declared else Communications(run.who)
+        self._seen = Communications(run.who) if run.imported else None
         self._paths = Paths(run) if paths else None
         self._drift = DriftObserver(run) if paths else None
         self.explainer = Explainer(run, self.judge, jobs) if paths else None
@@ -79,9 +79,14 @@ class Replay:
 
     @property
     def duration_ns(self) -> int:
-        """Return the time from the first release (or execution) to the end of the run."""
-        start = self.run.start
-        return 0 if start is None else max(0, self.run.end - start)
+        """
+        Return the time from the first release (or execution) to the end of the run.
+
+        Of a run without jobs it is that of the recording.
+        """
+        run = self.run
+        start = run.head.time if run.start is None else run.start
+        return max(0, run.end - (start if run.jobs else min(start, run.head.time)))
 
     def result(self) -> dict[str, Any]:
         """Return the result format of ``replay --json``."""

@@ -8,7 +8,7 @@ Theory of operation
 * A bag is a folder with `metadata.yaml` and the files that it names, or one such file.  What kind
   a file is of its first bytes say, not its name: MCAP (read with ``trace.TraceReader``), SQLite
   (read with rosbags) or zstd around one of them (a file-compressed bag; it is unpacked to a
-  temporary file).
+  temporary file).  A write-ahead log beside an SQLite file belongs to it.
 * Of each message there are its arrival (log time), its publication where the recorder kept that
   apart, and the stamp at the beginning of its content, where its type begins with a
   `std_msgs/Header` or a time.  Nothing else is decoded.
@@ -349,32 +349,58 @@ def _named_files(metadata: Path) -> tuple[list[str], int | None]:
 
 @contextmanager
 def _unpacked(file: Path) -> Iterator[tuple[Path, bytes]]:
-    """Give a file and the first bytes of its kind; one in zstd is unpacked first."""
-    kind = _kind(file)
-    if kind != _ZSTD:
+    """
+    Give a file as it can be read and the first bytes of its kind.
+
+    A file in zstd is unpacked.  An SQLite file with a write-ahead log, which a killed recorder
+    leaves, is copied, because reading the log changes the file.
+    """
+    kind, log = _kind(file), Path(f'{file}-wal')
+    has_log = kind == _SQLITE and log.is_file() and log.stat().st_size > 0
+    if kind != _ZSTD and not has_log:
         yield file, kind
         return
     with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
         target = Path(folder, 'bag')
         try:
-            with open(file, 'rb') as packed, open(target, 'wb') as out:
-                reader = zstandard.ZstdDecompressor(max_window_size=_WINDOW).stream_reader(packed)
-                while piece := reader.read(_PIECE):
-                    if out.tell() > _SPARE and out.tell() > _MOST_TIMES * packed.tell():
-                        raise BagError(
-                            str(file), f'it unpacks to more than {_MOST_TIMES} times its size',
-                            'unpack it yourself if you trust it')
-                    if shutil.disk_usage(folder).free < _SPARE + len(piece):
-                        raise BagError(
-                            str(file), f'unpacked it does not fit into {tempfile.gettempdir()}',
-                            'free space, or name another folder in TMPDIR')
-                    out.write(piece)
-        except zstandard.ZstdError as error:
+            if has_log:
+                _copy_with_log(file, log, target)
+            else:
+                _unpack(file, target)
+        except (zstandard.ZstdError, sqlite3.Error) as error:
             raise BagError(str(file), f'cannot be unpacked ({error})', _REMEDY) from None
         except OSError as error:
             raise BagError(
                 str(file), f'cannot be unpacked ({error.strerror})', 'free space') from None
         yield target, _kind(target)
+
+
+def _unpack(file: Path, target: Path) -> None:
+    with open(file, 'rb') as packed, open(target, 'wb') as out:
+        reader = zstandard.ZstdDecompressor(max_window_size=_WINDOW).stream_reader(packed)
+        while piece := reader.read(_PIECE):
+            if out.tell() > _SPARE and out.tell() > _MOST_TIMES * packed.tell():
+                raise BagError(
+                    str(file), f'it unpacks to more than {_MOST_TIMES} times its size',
+                    'unpack it yourself if you trust it')
+            _check_space(file, target, len(piece))
+            out.write(piece)
+
+
+def _copy_with_log(file: Path, log: Path, target: Path) -> None:
+    """Copy a database, and write what its write-ahead log holds into the copy."""
+    _check_space(file, target, file.stat().st_size + 2 * log.stat().st_size)
+    shutil.copyfile(file, target)
+    shutil.copyfile(log, f'{target}-wal')
+    with closing(sqlite3.connect(target)) as storage:
+        storage.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+
+
+def _check_space(file: Path, target: Path, size: int) -> None:
+    if shutil.disk_usage(target.parent).free < _SPARE + size:
+        raise BagError(
+            str(file), f'unpacked it does not fit into {tempfile.gettempdir()}',
+            'free space, or name another folder in TMPDIR')
 
 
 def _kind(file: Path) -> bytes:

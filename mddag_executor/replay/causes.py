@@ -25,8 +25,8 @@ The cause of a miss is that of which there is most, beyond what is usual.  Two r
 
 * What waited while, or soon after, the machine stood still had to wait for the backlog: up to the
   length of the stalls it counts as the machine's.
-* Where all of that together does not make up for the lateness, the usual times are too long for
-  the deadline, and they count, too.
+* If all of that together is less than the lateness, the usual times are too long for the deadline,
+  and they count, too: what callbacks usually take as *ran long*.
 
 A job whose callback raised has *failed*; one that expired for want of a message has *lost* it.
 Where a timer's release was skipped because the callback still waited for the one before, that
@@ -89,7 +89,7 @@ class Pool(NamedTuple):
     What ran and stood still in the time that is looked at.
 
     :ivar full: when all workers were busy; ``some``: when anything ran that may have held the
-        interpreter; ``shared``: when several did hold it.
+        interpreter (a callback that lent its worker waits); ``shared``: when several did hold it.
     :ivar stalls: begin and end of each.
     :ivar knows_workers: whether the number of workers is known, and an idle one takes what is
         ready.
@@ -99,7 +99,6 @@ class Pool(NamedTuple):
     some: Spans
     shared: Spans
     stalls: list[tuple[int, int]]
-    origin: int
     knows_workers: bool
 
 
@@ -144,11 +143,16 @@ class Never(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Misses (rows as in ``Misses``), their causes, and the parts of their times in order."""
+    """
+    Misses (rows as in ``Misses``), their causes, and the parts of their times in order.
+
+    :ivar too_short: of which misses the deadline is too short for what is usual.
+    """
 
     misses: Ints
     causes: Ints
     parts: Ints
+    too_short: Any
 
 
 def find(
@@ -165,7 +169,7 @@ def find(
     spans = _spans(rows, chain, is_source)
     kinds, of = spans[:, _S_KIND], spans[:, _S_MISS]
     begins, ends = np.array(pool.stalls, dtype=np.int64).reshape(-1, 2).T
-    stalls = Spans(begins, ends, pool.origin)
+    stalls = Spans(begins, ends)
     stood = stalls.within(spans[:, _S_BEGIN], spans[:, _S_END])
     left = spans[:, _S_END] - spans[:, _S_BEGIN] - stood
     times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
@@ -183,13 +187,17 @@ def find(
         times[waits] += _waits(spans[waits], left[waits], pool)
     total = np.zeros((len(rows), len(PARTS)), dtype=np.int64)
     np.add.at(total, of, times)
-    causes = _causes(rows, total, usual.lags[dag_of[rows[:, M_SINK]]], pool,
-                     deadline[rows[:, M_SINK]], never, is_source)
+    sinks = rows[:, M_SINK]
+    unusual = _unusual(total, usual.lags[dag_of[sinks]])
+    short = _too_short(rows, unusual.sum(axis=1), deadline[sinks])
+    amounts = np.where(short[:, np.newaxis], total[:, :len(CAUSES)], unusual)
+    amounts[short, RAN_LONG] += total[short, RAN_USUALLY]
+    causes = _causes(rows, total, amounts, pool, never, is_source)
     which, cause = np.nonzero(times)
     parts = np.column_stack((
         spans[which][:, [_S_MISS, _S_VERTEX]], cause, spans[which][:, [_S_BEGIN, _S_END]],
         times[which, cause]))
-    return Found(rows, causes, parts)
+    return Found(rows, causes, parts, short)
 
 
 # A span of time of a miss, at a vertex; of a wait how much of it was for the group, of a run its
@@ -286,21 +294,32 @@ def _pending(
             times[i, LOST] = left[i]
 
 
-def _causes(
-    rows: Ints, total: Ints, lags: Ints, pool: Pool, deadline: Ints, never: Never, is_source: Any
-) -> Ints:
-    """Return the cause of each miss."""
-    amounts = total[:, :len(CAUSES)].copy()
-    usual = np.minimum(amounts[:, RELEASED_LATE], lags)
-    amounts[:, RELEASED_LATE] -= usual
+def _unusual(total: Ints, lags: Ints) -> Ints:
+    """Return of each miss the times by cause, beyond what is usual."""
+    amounts: Ints = total[:, :len(CAUSES)].copy()
+    amounts[:, RELEASED_LATE] -= np.minimum(amounts[:, RELEASED_LATE], lags)
+    return amounts
+
+
+def _too_short(rows: Ints, unusual: Ints, deadline: Ints) -> Any:
+    """Return of which misses the deadline is too short for what is usual."""
     lateness = rows[:, M_UNTIL] - rows[:, M_RELEASE] - deadline
-    unusual = amounts.sum(axis=1)
-    short = (unusual == 0) | ((rows[:, M_KIND] == SINK_LATE) & (unusual < lateness))
-    amounts[short, RAN_LONG] += total[short, RAN_USUALLY]
-    amounts[short, RELEASED_LATE] += usual[short]
+    return (unusual == 0) | ((rows[:, M_KIND] == SINK_LATE) & (unusual < lateness))
+
+
+def delayed_by(rows: Ints, stall: tuple[int, int]) -> Any:
+    """Return which misses a stall, or the backlog after it, may have delayed."""
+    begin, end = stall
+    return (rows[:, M_RELEASE] < 2 * end - begin) & (rows[:, M_UNTIL] > begin)
+
+
+def _causes(
+    rows: Ints, total: Ints, amounts: Ints, pool: Pool, never: Never, is_source: Any
+) -> Ints:
+    """Return the cause of each miss; ``amounts`` are the times that count for it."""
     credit = np.zeros(len(rows), dtype=np.int64)    # what the machine may have delayed
-    for begin, end in pool.stalls:
-        credit[(rows[:, M_RELEASE] < 2 * end - begin) & (rows[:, M_UNTIL] > begin)] += end - begin
+    for stall in pool.stalls:
+        credit[delayed_by(rows, stall)] += stall[1] - stall[0]
     after_stall = credit > 0
     for cause in (WAITED, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT):
         moved = np.minimum(credit, amounts[:, cause])
@@ -343,13 +362,14 @@ def _given_up(
 
 
 def behind(
-    parts: Ints, chosen: Ints, runs: dict[int, Spans], same_group: Any
+    parts: Ints, chosen: Ints, runs: dict[int, Spans], on_workers: dict[int, Spans],
+    same_group: Any,
 ) -> dict[int, list[tuple[int, int]]]:
     """
     Return by part the callbacks behind which it waited, and how long each ran, longest first.
 
     :param chosen: the numbers of the parts.
-    :param runs: by callback when it ran.
+    :param runs: by callback when it ran; ``on_workers``: when it kept a worker busy by that.
     :param same_group: returns of a vertex and a callback whether they share a group.
     """
     found: dict[int, list[tuple[int, int]]] = {}
@@ -358,6 +378,9 @@ def behind(
     names = list(runs)
     begins, ends = parts[chosen, P_BEGIN], parts[chosen, P_END]
     times = np.array([each.within(begins, ends) for each in runs.values()])
+    waited = parts[chosen, P_CAUSE] == WAITED
+    times[:, waited] = [
+        each.within(begins[waited], ends[waited]) for each in on_workers.values()]
     grouped = np.flatnonzero(parts[chosen, P_CAUSE] == GROUP)
     for vertex in np.unique(parts[chosen[grouped], P_VERTEX]).tolist():
         others = [i for i, callback in enumerate(names) if not same_group(vertex, callback)]

@@ -5,65 +5,97 @@ Drafts of systems from traces: nodes, callbacks, what each publishes, rates, exe
 
 Theory of operation
 -------------------
-1. ``Entities`` knows what there is. What every node has anyway (parameter services and their like)
-   is left out, and with it nodes that have nothing else.
-2. A callback that the recorded declaration names keeps its name, and what was declared of it that
+1. ``Entities`` knows what there is: a first pass reads the initialisation.  What every node has
+   anyway (parameter services and their like) is left out, and with it nodes that have nothing
+   else.
+2. A second pass reads executions and publications.  Both addresses that rclcpp gives the callback
+   of a subscription are one callback.  A coroutine is one execution, however often it was resumed:
+   the pieces of an execution have the same ``ready`` time in their ``mddag:dispatch`` events.
+3. A callback that the recorded declaration names keeps its name, and what was declared of it that
    a trace does not show: deadline, queue edges, period, sync, group, name of the DAG.  Others have
    the name of their function where the trace has it, else ``callback_0``, ``callback_1``, … by
    node, in the order in which they were made.
-3. A topic of a node is published by the callbacks that were seen to publish it. Where none was,
+4. A topic of a node is published by the callbacks that were seen to publish it. Where none was,
    each callback of the node may; where the node has no callback, there is supposed to be a timer.
-4. Execution times are the quantiles of ``PERCENT``. Those of a sync callback are of the executions
+5. A service that was never called, and a subscription that never got a message and whose topic no
+   callback publishes, have no rate, so they start no DAG.  They are left out and named.
+6. Execution times are the quantiles of ``PERCENT``. Those of a sync callback are of the executions
    that made it whole: the others only keep a message.
 """
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 import os
+from typing import Any
 
 from mddag_executor.core import quantile
 from mddag_executor.errors import InputError
-from mddag_executor.replay.entities import (
-    Address,
-    as_table,
-    Callback,
-    Entities,
-    Event,
-    INIT_EVENTS,
-    KINDS,
-)
+from mddag_executor.replay.entities import Callback, Entities, Event, INIT_EVENTS, KINDS, Publisher
 from mddag_executor.trace import TraceReader
 from msg_graph import Callback as Declared
 from msg_graph import ExecutionTime, GraphError, loads, TaskSet
 from msg_graph.binding import function_of, is_background
-from msg_graph.draft import Draft, DraftCallback, DraftNode
+from msg_graph.draft import Draft, DraftCallback, DraftNode, leave_out_sources
 from msg_graph.language import CALLBACK, NODE, SERVICE, TOPIC
 
 PERCENT = (0.0, 50.0, 90.0, 99.0, 100.0)
 _STEP = 4096
 _KEEP_TIMES = 100_000
-_START, _END = 'ros2:callback_start', 'ros2:callback_end'
-_PUBLISH = ('ros2:rclcpp_publish', 'ros2:rcl_publish')
-_TASK_SET, _DISPATCH, _COMPLETE = 'mddag:task_set', 'mddag:dispatch', 'mddag:complete'
+_KEEP_PIECES = 1_024
+
+Fields = dict[str, Any]
+Thread = tuple[int, int]
+"""Process and thread."""
+Piece = tuple[int, ...]
+"""What the pieces of an execution have in common: DAG, vertex, job and ready time."""
 
 
 @dataclass
 class Runs:
-    """What a callback did; of the times that runs took, the first ``_KEEP_TIMES`` are kept, ns."""
+    """
+    The executions of a callback.
+
+    :ivar count: how many there are; ``first``, ``last``: when the first and the last began, ns.
+    :ivar times: how long each of the first ``_KEEP_TIMES`` took, its pieces together, ns; -1 where
+        the end is not recorded.
+    :ivar publishers: what they published with, by number.
+    """
 
     count: int = 0
     first: int = 0
     last: int = 0
     times: array[int] = field(default_factory=lambda: array('q'))
-    publishers: dict[Address, None] = field(default_factory=dict)
+    publishers: dict[int, Publisher] = field(default_factory=dict)
+    _recent: dict[Piece, int] = field(default_factory=dict)
 
     @property
     def interval_ns(self) -> int | None:
-        """Return the mean time between two of its starts; None with fewer than two."""
+        """Return the mean time between two of its executions; None with fewer than two."""
         return (self.last - self.first) // (self.count - 1) if self.count > 1 else None
+
+    def begin(self, now: int, piece: Piece | None) -> int:
+        """Note that an execution began or was resumed; return the number of the execution."""
+        if piece is not None and piece in self._recent:
+            return self._recent[piece]
+        number = self.count
+        self.first = self.first if number else now
+        self.last = now
+        self.count += 1
+        if number < _KEEP_TIMES:
+            self.times.append(-1)
+        if piece is not None:
+            self._recent[piece] = number
+            if len(self._recent) > _KEEP_PIECES:
+                del self._recent[next(iter(self._recent))]
+        return number
+
+    def end(self, number: int, took: int) -> None:
+        """Note how long an execution, or a piece of it, took."""
+        if number < len(self.times):
+            self.times[number] = max(0, self.times[number]) + took
 
 
 class System:
@@ -81,105 +113,122 @@ class System:
         self.name = name or os.fspath(path)
         self.task_set: TaskSet | None = None
         self.workers: int | None = None
-        self._declared: dict[Address | None, Declared] = {}
+        # by callback's number
+        self._declared: dict[int, Declared] = {}
+        self._runs: dict[int, Runs] = {}
         self._whole: dict[str, array[int]] = {}     # by sync callback: how long these took
-        self._runs: dict[Address | None, Runs] = {}
-        # by process and thread what runs, and since when; what ended last, and how long it took
-        self._running: dict[tuple[int, int], list[tuple[Address, int]]] = {}
-        self._took: dict[tuple[int, int], tuple[Address, int]] = {}
+        # by thread: the piece that comes next; what runs, and since when; what ended last
+        self._next: dict[Thread, tuple[int, Piece]] = {}
+        self._running: dict[Thread, list[tuple[int, int, int]]] = {}
+        self._ended: dict[Thread, tuple[int, int]] = {}
         reader = TraceReader(path)
-        who = Entities()
-        who.read(self._others(reader, progress))
-        self.warnings = list(reader.warnings)
+        self._who = Entities()
+        self._who.read(reader.layout_events(INIT_EVENTS))
         self._entities = [entity for entity in sorted(
-            who.made, key=lambda e: (e.made, KINDS.index(e.kind))) if _is_shown(entity)]
+            self._who.made, key=lambda e: (e.made, KINDS.index(e.kind))) if _is_shown(entity)]
         if not self._entities:
             raise InputError(
                 self.name, 'no timer, subscription or service of a node is recorded in it',
                 'record the start of the nodes, too')
+        self._read(reader, progress)
+        self.warnings = list(reader.warnings)
         #: By node the topics that it publishes, and whether a callback was seen to do so.
         self._publishers: dict[str, dict[str, bool]] = {
-            name: {} for name in who.names_of_nodes}
-        for publisher in who.every_publisher.values():
+            name: {} for name in self._who.names_of_nodes}
+        for publisher in self._who.every_publisher.values():
             if publisher.node is not None:
                 self._publishers[publisher.node.name][publisher.topic] = False
-        #: By callback's address the topics that it was seen to publish.
-        self._publishes: dict[Address | None, list[str]] = {}
-        for callback, runs in self._runs.items():
-            for address in runs.publishers:
-                found = who.publishers.latest(*address, runs.last)
-                if found is not None and found.node is not None:
-                    self._publishes.setdefault(callback, []).append(found.topic)
-                    self._publishers[found.node.name][found.topic] = True
+        for runs in self._runs.values():
+            for publisher in runs.publishers.values():
+                if publisher.node is not None:
+                    self._publishers[publisher.node.name][publisher.topic] = True
 
-    def _others(
-        self, reader: TraceReader, progress: Callable[[int], None] | None
-    ) -> Iterator[Event]:
-        """Yield the events that say who is who; note what the others say."""
+    def _read(self, reader: TraceReader, progress: Callable[[int], None] | None) -> None:
+        """Note what ran, and what was published."""
         handlers = {
-            _DISPATCH: self._dispatch, _COMPLETE: self._complete, _TASK_SET: self._recorded,
-            _START: self._start, _END: self._end, **dict.fromkeys(_PUBLISH, self._publish)}
-        for count, event in enumerate(reader.layout_events({*INIT_EVENTS, *handlers})):
-            handler = handlers.get(event[0].name)
-            if handler is None:
-                yield event
-            else:
-                handler(as_table(event))
+            'mddag:task_set': self._recorded,
+            'mddag:dispatch': self._dispatch,
+            'mddag:complete': self._complete,
+            'ros2:callback_start': self._start,
+            'ros2:callback_end': self._end,
+            'ros2:rclcpp_publish': self._publish,
+            'ros2:rclcpp_intra_publish': self._publish,
+            'ros2:rcl_publish': self._publish}
+        for count, event in enumerate(reader.layout_events(frozenset(handlers))):
+            fields = dict(zip(event[0].fields, event[4:]))
+            handlers[event[0].name](event, fields)
             if progress is not None and count % _STEP == 0:
                 progress(count)
 
-    def _start(self, event: Event) -> None:
-        callback = event[2], event[4]
-        if event[4] is None:
+    def _number(self, event: Event, fields: Fields) -> int:
+        """Return the number of the callback that an event is of."""
+        return self._who.callback(event[2], fields['callback'], event[1]).number
+
+    def _start(self, event: Event, fields: Fields) -> None:
+        if not isinstance(fields.get('callback'), int):
             return
-        self._running.setdefault(event[2:4], []).append((callback, event[1]))
-        runs = self._runs.setdefault(callback, Runs(first=event[1]))
-        runs.count += 1
-        runs.last = event[1]
+        thread, now, callback = event[2:4], event[1], self._number(event, fields)
+        expected, piece = self._next.pop(thread, (0, ()))
+        number = self._runs.setdefault(callback, Runs()).begin(
+            now, piece if expected == callback else None)
+        self._running.setdefault(thread, []).append((callback, number, now))
 
-    def _end(self, event: Event) -> None:
-        stack = self._running.get(event[2:4], [])
-        while stack and event[4] is not None:
-            callback, start = stack.pop()
-            if callback == (event[2], event[4]):
-                self._took[event[2:4]] = callback, event[1] - start
-                times = self._runs[callback].times
-                if len(times) < _KEEP_TIMES:
-                    times.append(event[1] - start)
-                return
+    def _end(self, event: Event, fields: Fields) -> None:
+        if not isinstance(fields.get('callback'), int):
+            return
+        thread, callback = event[2:4], self._number(event, fields)
+        stack = self._running.get(thread, [])
+        if all(each[0] != callback for each in stack):
+            return      # it began before the recording did
+        while True:     # what began inside it and has no end was lost
+            running, number, since = stack.pop()
+            if running == callback:
+                break
+        self._runs[callback].end(number, event[1] - since)
+        self._ended[thread] = callback, number
 
-    def _publish(self, event: Event) -> None:
+    def _publish(self, event: Event, fields: Fields) -> None:
         """Note what publishes: runs nest in a thread, as a callback may spin."""
-        stack = self._running.get(event[2:4])
-        if stack and event[4] is not None:
-            self._runs[stack[-1][0]].publishers[event[2], event[4]] = None
+        stack, handle = self._running.get(event[2:4]), fields.get('publisher_handle')
+        if not stack or not handle:
+            return
+        publisher = self._who.publishers.latest(event[2], handle, event[1])
+        if publisher is not None:
+            self._runs[stack[-1][0]].publishers[publisher.number] = publisher
 
-    def _recorded(self, event: Event) -> None:
-        if None in event or self.task_set is not None or not event[4].strip():
+    def _recorded(self, event: Event, fields: Fields) -> None:
+        text = fields.get('yaml')
+        if self.task_set is not None or not text or not text.strip():
             return
         try:
-            self.task_set = loads(event[4], event[5] or self.name)
+            self.task_set = loads(text, fields.get('file') or self.name)
         except GraphError:
             return  # what it declares is of no use, but who is who still is
-        self.workers = event[7]
+        self.workers = fields.get('workers')
 
-    def _dispatch(self, event: Event) -> None:
-        if self.task_set is None or None in event:
+    def _dispatch(self, event: Event, fields: Fields) -> None:
+        piece = tuple(value for name in ('dag', 'vertex', 'job', 'ready')
+                      if isinstance(value := fields.get(name), int))
+        if len(piece) < 4 or fields.get('callback') is None:
             return
-        dag, vertex = event[5], event[6]
-        if (0 <= dag < len(self.task_set.dags)
+        callback = self._number(event, fields)
+        self._next[event[2:4]] = callback, piece
+        dag, vertex = piece[:2]
+        if (self.task_set is not None and 0 <= dag < len(self.task_set.dags)
                 and 0 <= vertex < len(self.task_set.dags[dag].vertices)):
-            callback = self.task_set.dags[dag].vertices[vertex].callback
-            self._declared[event[2], event[4]] = callback
+            self._declared[callback] = self.task_set.dags[dag].vertices[vertex].callback
 
-    def _complete(self, event: Event) -> None:
-        declared = self._declared.get((event[2], event[4]))
-        took = self._took.get(event[2:4])
-        if declared is None or declared.kind != 'sync' or not event[8] or took is None:
+    def _complete(self, event: Event, fields: Fields) -> None:
+        if fields.get('callback') is None or not fields.get('last_leg'):
             return
-        times = self._whole.setdefault(declared.key, array('q'))
-        if took[0] == (event[2], event[4]) and len(times) < _KEEP_TIMES:
-            times.append(took[1])
+        callback = self._number(event, fields)
+        declared = self._declared.get(callback)
+        ended, number = self._ended.get(event[2:4], (0, 0))
+        if declared is None or declared.kind != 'sync' or ended != callback:
+            return
+        times = self._runs[callback].times
+        if number < len(times):
+            self._whole.setdefault(declared.key, array('q')).append(times[number])
 
     def draft(self) -> Draft:
         """Return the whole system."""
@@ -197,7 +246,12 @@ class System:
             if unseen:
                 for callback in nodes[name].callbacks.values() if name in nodes else ():
                     callback.maybe.extend(t for t in unseen if t not in callback.publishes)
-        return Draft(f'the trace {self.name}', self._ordered(nodes), workers=self.workers)
+        draft = Draft(f'the trace {self.name}', self._ordered(nodes), workers=self.workers)
+        declared = {callback.key for callback in self._declared.values()}
+        leave_out_sources(draft, lambda callback: (
+            'it never ran' if callback.runs == 0 and callback.kind != 'timer'
+            and callback.key not in declared else ''))
+        return draft
 
     def _ordered(self, nodes: dict[str, DraftNode]) -> list[DraftNode]:
         """Return the nodes in the order of the recorded declaration, which counts for ties."""
@@ -213,7 +267,7 @@ class System:
         return found
 
     def _callback(self, entity: Callback, node: DraftNode) -> DraftCallback:
-        declared = self._declared.get(entity.address)
+        declared = self._declared.get(entity.number)
         if declared is not None and declared.node == entity.node_name:
             known = node.callbacks.get(declared.name)
             callback = known or _from_declared(declared)
@@ -246,12 +300,14 @@ class System:
 
     def _measure(self, callback: DraftCallback, entity: Callback) -> bool:
         """Fill in what was measured of a callback; return whether anything was."""
-        runs = self._runs.get(entity.address)
-        if runs is None:
+        runs = self._runs.get(entity.number) or Runs()
+        callback.runs = (callback.runs or 0) + runs.count
+        if not runs.count:
             return False
         callback.publishes.extend(
-            t for t in self._publishes.get(entity.address, ()) if t not in callback.publishes
-            and not is_background(t, callback.node) and TOPIC.check(t) is None)
+            t for t in dict.fromkeys(each.topic for each in runs.publishers.values())
+            if t not in callback.publishes and not is_background(t, callback.node)
+            and TOPIC.check(t) is None)
         callback.maybe = [t for t in callback.maybe if t not in callback.publishes]
         if callback.kind == 'sync':
             callback.times = execution_time(self._whole.get(callback.key, ()))
@@ -282,7 +338,7 @@ class System:
 
 def execution_time(took: Iterable[int]) -> tuple[ExecutionTime, int] | None:
     """Return the execution time of a callback and of how many executions it is; None of none."""
-    times = sorted(max(1, time) for time in took)
+    times = sorted(max(1, time) for time in took if time >= 0)
     if not times:
         return None
     quantiles = tuple(quantile(times, share / 100) for share in PERCENT)

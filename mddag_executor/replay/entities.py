@@ -89,7 +89,7 @@ class Callback:
     :ivar grid: from when on its timer's periods count, ns; None where that is not recorded.
     :ivar group: number of its mutually exclusive group; -1 for another one, None: not known.
     :ivar symbol: of its function; empty where that is not recorded.
-    :ivar address: process and address of its callback.
+    :ivar address: process and address of its callback, of several the last one.
     """
 
     __slots__ = ('number', 'node', 'kind', 'start', 'period', 'made', 'grid', 'group', 'symbol',
@@ -385,10 +385,3 @@ def _complete(name: str, fields: Fields) -> bool:
 def _as_dict(fields: Iterable[str], event: Event) -> Fields:
     return {'_timestamp': event[1], '_vpid': event[2], '_vtid': event[3],
             **dict(zip(fields, event[4:]))}
-
-
-def as_table(event: Event) -> Event:
-    """Return an event of ``layout_events`` with the table's fields; None is one that it lacks."""
-    kind = EVENTS[event[0].name]
-    values = {**kind.defaults, **dict(zip(event[0].fields, event[4:]))}
-    return (event[0].name, *event[1:4], *(values.get(field) for field, _ in kind.fields))

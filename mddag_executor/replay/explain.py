@@ -23,6 +23,7 @@ from mddag_executor.core.tally import VERDICTS
 from mddag_executor.replay.causes import (
     behind,
     CAUSES,
+    delayed_by,
     find,
     Found,
     MACHINE,
@@ -71,7 +72,7 @@ _MOST_DROPS = 1_000_000
 _PIECES, _TOOK, _RELEASED, _STARTED, _TIMES, _STOPS, _HELD = range(7)
 _WIDTHS = (5, 3, 3, 4, 1, 2, 2)
 # Columns of pieces.
-_CALLBACK, _VERTEX, _SHARE, _START, _END = range(5)
+_CALLBACK, _VERTEX, _WORKER, _START, _END = range(5)     # worker -1: it lent its worker
 
 
 class Typical:
@@ -151,7 +152,7 @@ class Explainer(Observer):
         pieces, done, started = (batch.columns(kind) for kind in (RAN, COMPLETED, STARTED))
         done = done[done[:, 10] >= 0]
         released = batch.columns(RELEASED)
-        self._keep(_PIECES, pieces[:, [0, 2, 8, 6, 7]])
+        self._keep(_PIECES, pieces[:, [0, 2, 4, 6, 7]])
         # of a sync the last message makes it run; the others are only kept
         last = done[done[:, 4] != 0]
         self._keep(_TOOK, np.column_stack((last[:, 1], last[:, 8] - last[:, 7], last[:, 11])))
@@ -224,15 +225,14 @@ class Explainer(Observer):
 
     def _one(self, misses: Misses, pieces: Ints, usual: Usual) -> None:
         """Explain some misses, and count their causes."""
-        origin = int(misses.rows[:, M_RELEASE].min())
-        start, end = pieces[:, _START], pieces[:, _END]
-        first = int(start.min()) if len(pieces) else origin
+        start, end = pieces[pieces[:, _WORKER] >= 0][:, [_START, _END]].T
+        first = min(pieces[:, _START].min(initial=_NO_END), misses.rows[:, M_RELEASE].min())
         since, held = self._table(_HELD).T
         pool = Pool(
-            Spans(*crowded(start, end, max(1, self._workers)), origin),
-            Spans(*(crowded(since, held, 1) if len(held) else crowded(start, end, 1)), origin),
-            Spans(*crowded(since, held, 2), origin),
-            [stall for stall in self.stalls if stall[1] >= min(first, origin)], origin,
+            Spans(*crowded(start, end, max(1, self._workers))),
+            Spans(*(crowded(since, held, 1) if len(held) else crowded(start, end, 1))),
+            Spans(*crowded(since, held, 2)),
+            [stall for stall in self.stalls if stall[1] >= first],
             self._workers > 0)
         found = find(
             misses, pool, usual, Never(self._dropped, self._table(_STARTED)),
@@ -241,17 +241,14 @@ class Explainer(Observer):
         rows = found.misses
         np.add.at(self._counts, (rows[:, M_SINK], found.causes), 1)
         machine = found.causes == MACHINE
-        for stall in pool.stalls:
-            begin, end_of = stall
-            n = int((machine & (rows[:, M_RELEASE] < 2 * end_of - begin)
-                     & (rows[:, M_UNTIL] > begin)).sum())
-            self._in_stalls[stall] = self._in_stalls.get(stall, 0) + n
+        for stall in sorted(pool.stalls, key=lambda stall: stall[0] - stall[1]):    # longest first
+            mine = machine & delayed_by(rows, stall)
+            machine &= ~mine    # each miss counts once
+            self._in_stalls[stall] = self._in_stalls.get(stall, 0) + int(mine.sum())
         if self._keeps:
-            self._found.append((found, self._behind(found, pieces, origin)))
+            self._found.append((found, self._behind(found, pieces)))
 
-    def _behind(
-        self, found: Found, pieces: Ints, origin: int
-    ) -> dict[int, list[tuple[int, int]]]:
+    def _behind(self, found: Found, pieces: Ints) -> dict[int, list[tuple[int, int]]]:
         chosen = to_explain(found)
         if not len(chosen):
             return {}
@@ -267,11 +264,14 @@ class Explainer(Observer):
         callbacks, which = np.unique(pieces[:, _CALLBACK], return_inverse=True)
         order = np.argsort(which, kind='stable')
         borders = np.searchsorted(which[order], np.arange(len(callbacks) + 1)).tolist()
-        runs = {}
+        runs, on_workers = {}, {}
         for callback, first, last in zip(callbacks.tolist(), borders, borders[1:]):
             mine = pieces[order[first:last]]
-            runs[callback] = Spans(mine[:, _START], mine[:, _END], origin)
-        return behind(found.parts, chosen, runs, same_group)
+            runs[callback] = on_workers[callback] = Spans(mine[:, _START], mine[:, _END])
+            if (mine[:, _WORKER] < 0).any():
+                mine = mine[mine[:, _WORKER] >= 0]
+                on_workers[callback] = Spans(mine[:, _START], mine[:, _END])
+        return behind(found.parts, chosen, runs, on_workers, same_group)
 
     def _forget(self, until: int) -> None:
         """Forget what is older than the block before."""
@@ -374,8 +374,10 @@ class Explainer(Observer):
             sinks = found.misses[:, M_SINK].tolist()
             causes = found.causes.tolist()
             counts.update(zip(sinks, causes))
-            cause, kind = found.causes[found.parts[:, P_MISS]], found.parts[:, P_CAUSE]
-            mine = np.flatnonzero((kind == cause) | ((kind == RAN_USUALLY) & (cause == RAN_LONG)))
+            of, kind = found.parts[:, P_MISS], found.parts[:, P_CAUSE]
+            cause = found.causes[of]
+            mine = np.flatnonzero((kind == cause) | (
+                (kind == RAN_USUALLY) & (cause == RAN_LONG) & found.too_short[of]))
             for i, part in zip(mine.tolist(), found.parts[mine].tolist()):
                 key = sinks[part[P_MISS]], causes[part[P_MISS]]
                 at.setdefault(key, Counter())[part[P_VERTEX]] += part[P_NS]

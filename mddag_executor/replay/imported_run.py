@@ -33,6 +33,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable as Function
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, legs_of, NEVER
 from mddag_executor.replay.doubts import Doubts
@@ -74,21 +75,41 @@ _START = 'ros2:callback_start'
 _OWN = ('mddag:job_release', 'mddag:dispatch')
 
 
+class Ended(NamedTuple):
+    """
+    What has ended with a run of a callback in a thread.
+
+    :ivar first: whether it was the first piece of an execution, ``last``: whether the last.
+    :ivar start: of the execution; ``busy``: how long it ran.
+    """
+
+    first: bool
+    last: bool
+    start: int
+    busy: int
+
+
 class ImportedRun(LinkObserver):
     """
     A recorded run of another executor.
 
     :param reader: of the trace, which no declaration is in.
     :param task_set: the declaration that judges; None: there is none.
+    :param head: of a trace of this executor; None: another one recorded it.
+    :param linker: links its events.
     """
 
     declared = False
     same = False
+    imported = True
 
-    def __init__(self, reader: TraceReader, name: str, task_set: TaskSet | None) -> None:
+    def __init__(
+        self, reader: TraceReader, name: str, task_set: TaskSet | None, head: Head | None = None,
+        linker: type[Linker] = Linker,
+    ) -> None:
         self._reader = reader
         self.name = name
-        first: int | None = None
+        first: int | None = None if head is None else head.time
         threads: set[tuple[int, int]] = set()
         own = False
         init: list[Event] = []
@@ -101,13 +122,14 @@ class ImportedRun(LinkObserver):
                 own = True      # of this executor, but what it ran is lost
             else:
                 init.append(event)
-        if first is None or own:
+        if first is None or own and head is None:
             raise no_run(reader)
         #: Who is who in it.
         self.who = Entities()
         self.who.read(init)
         # What another executor goes by is not recorded; it takes the place of the pool.
-        self.head = Head(first, '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
+        self.head = head or Head(
+            first, '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
         self._matching = Matching(name, self.who, threads, task_set)
         #: The declaration that judges; none is recorded.
         self.task_set = self.recorded_set = self._matching.task_set
@@ -120,7 +142,7 @@ class ImportedRun(LinkObserver):
         self.jobs = 0
         self.dropped: Counter[str] = Counter()
         self._doubts = Doubts(self.task_set.dags)
-        self._linker = Linker(self.who, self)
+        self._linker = linker(self.who, self)
         self._workers: dict[tuple[int, int], int] = {}
         self._timers = _Timers()
         self._fallbacks: Counter[str] = Counter()
@@ -190,7 +212,11 @@ class ImportedRun(LinkObserver):
         for dag, jobs in enumerate(self._open):
             for release, job in jobs:
                 self._close(dag, job, release)
-        self._batches.finish(self.end)
+        self._batches.finish(self._judged_until())
+
+    def _judged_until(self) -> int:
+        """Return up to when what is open is judged."""
+        return self.end
 
     # --- executions ------------------------------------------------------------------------------
 
@@ -270,16 +296,23 @@ class ImportedRun(LinkObserver):
         self._add(OVER, callback, self._vertex.get(callback, -1), run.number, run.end)
         dag, vertex, job = run.of if run.of is not None else (-1, -1, -1)
         worker = self._workers.setdefault(run.thread, len(self._workers))
+        ended = self._ended(run)
         self._add(RAN, callback, dag, vertex, job, worker, run.ready, run.start,
-                  run.end, 1)
+                  run.end, int(ended.first))
         if dag < 0:
             return
         self._active[(dag, job)] -= 1
+        if not ended.last:
+            return
         whole = self._is_whole(vertex, job, run.leg)
         if whole:
             self._doubts.done(dag, vertex, job)
         self._add(COMPLETED, dag, vertex, job, run.leg, int(whole), run.end, run.ready,
-                  run.start, run.end, run.end - run.start, run.number, -1, 0)
+                  ended.start, run.end, ended.busy, run.number, -1, 0)
+
+    def _ended(self, run: Execution) -> Ended:
+        """Return what has ended with a run of a callback: one piece is all of an execution."""
+        return Ended(True, True, run.start, run.end - run.start)
 
     def _is_whole(self, vertex: int, job: int, leg: int) -> bool:
         """Return whether an execution completes its vertex: of a sync's legs the last one does."""

@@ -12,7 +12,8 @@ The joined trace has the events of all in the order of time, and is replayed lik
    trace's clock exactly; those of others by an offset that is given, or that messages show
    (``clocks``), else they are taken as they are.
 2. *Who is who.*  Addresses, which are those of one process, get the number of the trace above
-   their 48 bits; workers are counted through.
+   their 48 bits; workers are counted through.  A process or thread with a number that another
+   trace has already, as in containers or on another machine, gets a number of its own.
 3. *Jobs* are numbered anew, in the order of their first release.  A release is that of a job that
    another process has released already if it is the same, to ``SAME_RELEASE``; of a DAG whose jobs
    header stamps join, also if it follows that within the DAG's period: the stamp is taken later
@@ -39,6 +40,7 @@ from mddag_executor.replay import clocks
 from mddag_executor.replay.recording import (
     declared,
     Head,
+    is_declared,
     named_errors,
     read_head,
     ReplayError,
@@ -47,6 +49,7 @@ from mddag_executor.replay.recording import (
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceFile, TraceReader
 from mddag_executor.trace.errors import renamed
+from mddag_executor.trace.numbers import Numbers
 from mddag_executor.trace.schema import EVENTS
 from msg_graph import Dag, Process
 
@@ -56,8 +59,8 @@ _BITS = 48
 _INIT, _SHUTDOWN = 'ros2_caret:caret_init', 'mddag:shutdown'
 _JUDGE_FROM, _HOSTED, _RELEASE = 'mddag:judge_from', 'mddag:hosted', 'mddag:job_release'
 _COMPLETE, _DISPATCH = 'mddag:complete', 'mddag:dispatch'
-_ENDS = ('mddag:expire', 'mddag:abort')
-_OF_DAG = ('mddag:deadline', 'mddag:drop', 'mddag:fail', _DISPATCH, _COMPLETE, *_ENDS)
+_ENDS = ('mddag:expire', 'mddag:abort', 'mddag:fail')
+_OF_DAG = ('mddag:deadline', 'mddag:drop', _DISPATCH, _COMPLETE, *_ENDS)
 _TIMES = {'release', 'ready', 'reference_deadline', 'completed', 'deadline', 'begin', 'end'}
 _NO_ADDRESSES = {'queue_depth', 'message_timestamp'}
 
@@ -86,6 +89,10 @@ class _Part:
             if head is None:
                 raise ReplayError(
                     name, 'it was not recorded by this executor', 'replay it by itself')
+            if not is_declared(head):
+                raise ReplayError(
+                    name, 'it was recorded without a declaration, so its jobs have no names that '
+                    'other traces know', 'replay it by itself, with a GRAPH')
             self.head: Head = head
             self.clock = self.judges_from = 0
             self.end: int | None = None
@@ -150,7 +157,9 @@ class _Part:
         return address | self.place << _BITS if 0 < address < 1 << _BITS else address
 
     def _worker(self, worker: int) -> int:
-        if 0 <= worker < self.head.workers:
+        if worker < 0:      # it was lent
+            return worker
+        if worker < self.head.workers:
             return self.first_worker + worker
         return self.first_spare + worker
 
@@ -253,6 +262,7 @@ class Joined:
         begin = min(part.first for part in self._parts)
         judges_from = max(self._judging(), default=0)
         end = judged = 0
+        processes, threads = Numbers(), Numbers()
         with TraceFile(path) as file:
             file.add(TASK_SET, begin, 0, 0, head.yaml, head.file, head.policy, self._workers,
                      head.default_deadline, head.max_active_jobs, head.preemptive, head.cpus)
@@ -267,7 +277,9 @@ class Joined:
                     joined = self._of_whole_run(part, event)
                     if joined is not None:
                         end = max(end, event[1])
-                        file.add(*joined)
+                        name, time, process, thread, *fields = joined
+                        file.add(name, time, processes.of(part.place, process),
+                                 threads.of(part.place, thread), *fields)
             if any(part.end is not None for part in self._parts):
                 file.add(_SHUTDOWN, max(end, judged), 0, 0, judged)
         self._check_run()

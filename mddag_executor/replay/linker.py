@@ -30,10 +30,13 @@ subscriber may run before the tracer has recorded the stamp of the message that 
    Until September 2021 CARET's events were called `ros2_hook`, some of their fields otherwise.
 3. *Messages between processes*: `dispatch_subscription_callback` (Galactic, Humble) names the
    callback and the source timestamp; later formats have `rmw_take` in the same thread before the
-   `callback_start`.  The publication is the one on the same topic with that source timestamp.
+   `callback_start`.  In August 2021 `dispatch` named the callback and the message's address, and
+   `take_type_erased`, before it in the same thread, that address and the source timestamp.  The
+   publication is the one on the same topic with that source timestamp.
 4. *Messages within a process*: in Humble by the message's address, followed through the copies
-   (`message_construct`) to `dispatch_intra_process_subscription_callback`; from Iron on by buffer
-   and index of the ring buffer that it went through (`rclcpp_ring_buffer_enqueue`, `_dequeue`).
+   (`message_construct`) to `dispatch_intra_process_subscription_callback` (in August 2021
+   `dispatch_intra_process`); from Iron on by buffer and index of the ring buffer that it went
+   through (`rclcpp_ring_buffer_enqueue`, `_dequeue`).
 5. `rmw_take` inside an execution is a message that the callback took itself (a queue edge).
 6. What does not fit (an end without a start, a start without an end, a message whose publication
    is not in the recording, a publisher's that lacks a tracepoint) is counted by callback or topic,
@@ -163,8 +166,8 @@ _SAID = {
                  'path'),
     'unlinked': ('execution', 'for a message whose publication is not known (not all of its topic '
                  'have a source timestamp in it): of no job and no path'),
-    'without_message': ('execution', 'of a subscription without a message in it (its taking is '
-                        'not recorded): of no job and no path'),
+    'without_message': ('execution', 'of a subscription with no event in it that says which '
+                        'message was taken: of no job and no path'),
     'partial': ('publication', 'without the tracepoint rclcpp_publish that others of the '
                 'publisher have: counted from rcl_publish on'),
     'ambiguous': ('execution', 'for a message with the topic and source timestamp of another one: '
@@ -200,7 +203,7 @@ class Losses:
 class _Thread:
     """What a thread does."""
 
-    __slots__ = ('stack', 'last', 'take', 'fresh')
+    __slots__ = ('stack', 'last', 'take', 'erased', 'fresh')
 
     def __init__(self) -> None:
         self.stack: list[Execution] = []
@@ -209,6 +212,8 @@ class _Thread:
         # time)
         self.take: tuple[Callback | None, list[Callback] | None, int, int, Publication | None,
                          int] | None = None
+        # by `take_type_erased`: the message's address, its stamp and the time; zeros: none
+        self.erased = 0, 0, 0
         self.fresh = True       # nothing has started in it so far
 
 
@@ -249,8 +254,11 @@ class Linker:
             'dds:write_pre': self._write_begins,
             'dds:write': self._written,
             'ros2:dispatch_subscription_callback': self._dispatch,
+            'ros2_hook:take_type_erased': self._take_erased,
+            'ros2:dispatch': self._dispatch_erased,
             'ros2:rmw_take': self._take,
             'ros2:dispatch_intra_process_subscription_callback': self._dispatch_within,
+            'ros2:dispatch_intra_process': self._dispatch_within,
             'ros2:message_construct': self._copy,
             'ros2:rclcpp_ring_buffer_enqueue': self._enqueue,
             'ros2:rclcpp_ring_buffer_dequeue': self._dequeue,
@@ -463,8 +471,12 @@ class Linker:
                 last.rcl and address not in (0, last.message, last.written)):
             return
         last.stamp = stamp
-        known = self._by_stamp.setdefault(last.topic, {})
-        known[stamp] = None if stamp in known else last
+        self._know(last.topic, stamp, last)
+
+    def _know(self, topic: str, stamp: int, message: Publication | None) -> None:
+        """Note of which publication a source timestamp is; None: of one of several."""
+        known = self._by_stamp.setdefault(topic, {})
+        known[stamp] = None if stamp in known else message
         if len(known) > KEEP:
             del known[next(iter(known))]
 
@@ -474,6 +486,15 @@ class Linker:
         callback = self._entities.callback(thread[0], self._get(event, 'callback'), event[1])
         stamp, stated = self._get(event, 'source_stamp'), self._get(event, 'message_timestamp')
         state.take = callback, None, stamp, stated, None, event[1]
+
+    def _take_erased(self, event: Event, thread: Thread, state: _Thread) -> None:
+        state.erased = self._get(event, 'message'), self._get(event, 'source_stamp'), event[1]
+
+    def _dispatch_erased(self, event: Event, thread: Thread, state: _Thread) -> None:
+        callback = self._entities.callback(thread[0], self._get(event, 'callback'), event[1])
+        (address, stamp, time), state.erased = state.erased, (0, 0, 0)
+        if address == self._get(event, 'message'):      # else the event of its taking was lost
+            state.take = callback, None, stamp, 0, None, time
 
     def _take(self, event: Event, thread: Thread, state: _Thread) -> None:
         stamp = self._get(event, 'source_timestamp')

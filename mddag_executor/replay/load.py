@@ -30,6 +30,9 @@ Theory of operation
   ``simulate.intakes`` says: it takes what it took in the recording (see ``noticed``).  A job whose
   timer was noticed too late is not skipped then.
 * Where there is no such time in a job, the median of the edge, or of all executions, stands in.
+* What was not published is not published again: if an execution completed without publishing on a
+  topic on which its callback published in other jobs, and no execution followed in that job, the
+  edge never comes true.  What could only run after that has no execution time.
 
 Without overheads (``overheads=False``) transport and dispatch take no time and a timer's source is
 ready at its release: what an ideal executor on the same machine would do.
@@ -57,6 +60,7 @@ from mddag_executor.simulate.deliveries import DELAY_NS
 from mddag_executor.simulate.intakes import Costs
 from mddag_executor.simulate.load import edge_numbers, edges_of, FAILS, RUNS, SKIPPED
 from msg_graph import Dag, TaskSet
+from msg_graph.model import topological_order
 import numpy as np
 
 _UNKNOWN = -1
@@ -91,8 +95,8 @@ _COLUMNS = {
     'release': (_JOB, 'q'), 'noticed': (_JOB, 'q'), 'round': (_JOB, 'q'),
     'took': (_VERTEX, 'q'), 'start': (_VERTEX, 'q'), 'end': (_VERTEX, 'q'),
     'cpu': (_VERTEX, 'q'), 'dispatch': (_VERTEX, 'i'), 'held': (_VERTEX, 'h'),
-    'arrived': (_EDGE, 'q')}
-"""What is known by job, by job and vertex, or by job and edge; ns, or unknown."""
+    'arrived': (_EDGE, 'q'), 'sent': (_EDGE, 'b')}
+"""What is known by job, by job and vertex, or by job and edge; ns, or unknown (``sent``: 1)."""
 
 
 class _Jobs:
@@ -169,6 +173,14 @@ class LoadBuilder(Observer):
             [numbers[first + before, first + vertex.index]
              for _, before in legs_of(vertex, dag.vertices)]
             for dag, first in zip(task_set.dags, tables.first_vertex) for vertex in dag.vertices]
+        # by global vertex and topic: the edges that a publication makes true
+        self._edges_from: dict[tuple[int, str], list[int]] = {}
+        for dag, first in zip(task_set.dags, tables.first_vertex):
+            for vertex in dag.vertices:
+                for place, before in legs_of(vertex, dag.vertices):
+                    self._edges_from.setdefault(
+                        (first + before, vertex.callback.topics[place]), []).append(
+                            numbers[first + before, first + vertex.index])
         # (time when ready, what it took, its dispatch or -1): undeclared callbacks, and legs that
         # completed nothing
         self._others: list[tuple[int, int, int]] = []
@@ -258,6 +270,19 @@ class LoadBuilder(Observer):
             if end < max(ends):
                 jobs.arrived[row * jobs.n_edges + edge] = end
 
+    def published(
+        self, publisher: int, callback: int, dag: int, vertex: int, job: int, ready: int, now: int
+    ) -> None:
+        """Note which edges a job's publication made true."""
+        known = self._who.every_publisher.get(publisher)
+        if vertex < 0 or known is None:
+            return
+        jobs = self._jobs[dag]
+        row = jobs.row.get(job)
+        if row is not None:
+            for edge in self._edges_from.get((vertex, known.topic), ()):
+                jobs.sent[row * jobs.n_edges + edge] = 1
+
     def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
         """Keep what was skipped."""
         jobs = self._jobs[dag]
@@ -298,9 +323,12 @@ class LoadBuilder(Observer):
         every, usual, warmth, late, intakes = self._alone(workers, anew)
         if anew:
             self._skipped.clear()
+        unsent = self._unsent()
         delays, transport = self._transports(overheads, process, intakes)
-        self._drop('start', 'end', 'arrived')
-        estimated, unknown = self._estimate(process)
+        if unsent:
+            delays[np.concatenate([each.ravel() for each in unsent])] = NEVER
+        self._drop('start', 'end', 'arrived', 'sent')
+        estimated, unknown = self._estimate(process, unsent)
         took, cpu, held = (self._whole.pop(name) for name in ('took', 'cpu', 'held'))
         demand, executions = int(took.sum()), len(took)
         if overheads:
@@ -348,18 +376,40 @@ class LoadBuilder(Observer):
             for jobs in self._jobs:
                 delattr(jobs, name)
 
-    def _estimate(self, process: Sequence[int]) -> tuple[int, list[str]]:
+    def _unsent(self) -> list[Any]:
+        """Return by DAG, job and edge whether it was not published, as far as that is known."""
+        found = []
+        for jobs in self._jobs:
+            sent, arrived, end = map(jobs.rows, ('sent', 'arrived', 'end'))
+            completed = end[:, jobs.publishers] >= 0
+            found.append((sent < 0) & (arrived < 0) & completed & (sent >= 0).any(axis=0))
+        return found
+
+    def _never_ready(self, dag: Dag, unsent: Any) -> Any:
+        """Return by job and vertex what cannot run, because an edge before it is unsent."""
+        first = self._first[dag.index]
+        found = np.zeros((len(unsent), len(dag.vertices)), dtype=np.bool_)
+        if unsent.any():
+            for v in topological_order(dag):
+                edges = self._edges_into[first + v]
+                found[:, v] = unsent[:, edges].any(axis=1) | found[
+                    :, list(dag.vertices[v].predecessors)].any(axis=1)
+        return found
+
+    def _estimate(self, process: Sequence[int], unsent: list[Any]) -> tuple[int, list[str]]:
         """
         Fill in what was not recorded of executions: what they took and computed.
 
+        :param unsent: by DAG, job and edge whether it never comes true.
         :return: how many there are, and the callbacks of which no time is known at all.
         """
         typical = self._typical()
         unknown: dict[str, None] = {}
         estimated = 0
-        for dag, jobs in zip(self._task_set.dags, self._jobs):
+        for dag, jobs, edges in zip(self._task_set.dags, self._jobs, unsent):
             took, cpu, held = map(jobs.rows, ('took', 'cpu', 'held'))
             took[[row for of, row in self._skipped if of == dag.index]] = 0
+            took[(took < 0) & self._never_ready(dag, edges)] = 0
             missing = took < 0
             estimated += int(missing.sum())
             held[held < 0] = 0

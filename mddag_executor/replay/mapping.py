@@ -37,7 +37,7 @@ from mddag_executor.replay.entities import Callback, Entities, Node
 from mddag_executor.replay.recording import ReplayError
 from mddag_executor.text import counted, listed
 from msg_graph import Callback as Declared
-from msg_graph import Dag, format_duration, TaskSet, Vertex
+from msg_graph import Dag, format_duration, NO_GRAPH, TaskSet, Vertex
 from msg_graph.binding import Binder, entities_of, Entity, meant
 
 
@@ -209,7 +209,7 @@ class Matching:
     def __init__(
         self, name: str, who: Entities, threads: Set[tuple[int, int]], judge: TaskSet | None
     ) -> None:
-        self.task_set = judge or TaskSet((), (), (), (), None, '', '')
+        self.task_set = judge or NO_GRAPH
         self.warnings: list[str] = []
         #: By number of a recorded callback.
         self.target: dict[int, Target] = {}

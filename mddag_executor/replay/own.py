@@ -48,7 +48,7 @@ from mddag_executor.replay.happenings import (
     THREAD,
 )
 from mddag_executor.replay.mapping import Mapping
-from mddag_executor.replay.recording import declared, Head, named_errors, TASK_SET
+from mddag_executor.replay.recording import declared, Head, named_errors, no_end, TASK_SET
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.errors import renamed
@@ -88,6 +88,7 @@ class OwnRun:
     """
 
     declared = True
+    imported = False
 
     def __init__(
         self, reader: TraceReader, name: str, head: Head, task_set: TaskSet | None
@@ -160,9 +161,7 @@ class OwnRun:
         lines = [renamed(text, path, name) for text in self._reader.warnings]
         lines += self._mapping.warnings + self.notes
         if not self.shut_down:
-            lines.append(
-                f'{name}: the end of the run is not recorded (the process was killed, or the '
-                'trace is cut): what was open is judged at the last recorded instant')
+            lines.append(no_end(name))
         if self.lost:
             lines.append(
                 f'{name}: {counted(self.lost, "event")} lost while recording: jobs may be '

@@ -55,17 +55,29 @@ def read_head(reader: TraceReader) -> Head | None:
     return None
 
 
+def is_declared(head: Head) -> bool:
+    """Return whether a run was recorded with a declaration."""
+    return bool(head.yaml.strip())
+
+
 def declared(head: Head, name: str) -> TaskSet:
     """Return the declaration that a run was recorded with."""
-    if not head.yaml.strip():
+    if not is_declared(head):
         raise ReplayError(
-            name, 'it was recorded without a declaration, so there are no jobs', _RECORD)
+            name, 'it was recorded without a declaration, so there are no jobs',
+            'give the GRAPH that judges it (mddag graph from-trace drafts one)')
     try:
         return loads(head.yaml, head.file or name)
     except GraphError as error:
         raise ReplayError(
             name, f'the declaration that it was recorded with is wrong ({error})',
             'record the run anew') from None
+
+
+def no_end(name: str) -> str:
+    """Return the line about a run whose end is not recorded."""
+    return (f'{name}: the end of the run is not recorded (the process was killed, or the trace is '
+            'cut): what was open is judged at the last recorded instant')
 
 
 def no_run(reader: TraceReader) -> ReplayError:

@@ -15,7 +15,7 @@ from dataclasses import asdict, replace
 from functools import cached_property, partial
 from typing import Any
 
-from mddag_executor.core import NEVER, POLICIES, processes_of, Tables
+from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, POLICIES, processes_of, Tables
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
 from mddag_executor.memory import give_back
@@ -192,7 +192,8 @@ def reschedule(
         preemptive = head.preemptive and not find_policy(policy).polling
     bound = head.max_active_jobs if head.max_active_jobs > 0 else NEVER
     tables = Tables.build(
-        run.task_set, default_deadline=head.default_deadline, max_active_jobs=bound)
+        run.task_set, default_deadline=head.default_deadline, max_active_jobs=bound,
+        expire_after=EXPIRE_AFTER_NS)
     builder = LoadBuilder(
         run.task_set, tables, run.who, each, max(0, head.cpus), _processes(run, ran))
     builders = [builder]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Union
 import weakref
 
 from mddag_executor.replay.own import OwnRun
-from mddag_executor.replay.recording import named_errors, read_head, ReplayError
+from mddag_executor.replay.recording import is_declared, named_errors, read_head, ReplayError
 from mddag_executor.trace import TraceReader
 from msg_graph import TaskSet
 
@@ -25,8 +25,8 @@ Run = Union[OwnRun, 'ImportedRun']
 What all have: ``play``, and
 
 * ``name`` of the recording, its ``head`` (policy, workers, …), the ``task_set`` that judges,
-  ``declared``: whether the recording itself says which deadlines there are, and ``same``: whether
-  these judge;
+  ``declared``: whether the recording itself says which deadlines there are, ``same``: whether
+  these judge, and ``imported``: whether another executor ran it;
 * once it has been played: ``start`` and ``end`` (ns), ``shut_down``: whether the end is recorded,
   ``lost`` events, ``dropped`` messages by reason, and ``warnings``.
 """
@@ -72,8 +72,11 @@ def open_run(
     with named_errors(path, name or path):
         reader = reader or TraceReader(path)
         head = read_head(reader)
-        if head is not None:
+        if head is not None and (task_set is None or is_declared(head)):
             return OwnRun(reader, name or path, head, task_set)
+        if head is not None and task_set is not None:
+            from mddag_executor.replay.undeclared_run import UndeclaredRun
+            return UndeclaredRun(reader, name or path, head, task_set)
         from mddag_executor.replay.imported_run import ImportedRun
         run = ImportedRun(reader, name or path, task_set)
     if needs_declaration and task_set is None:
@@ -107,7 +110,8 @@ def _joined(traces: Traces, task_set: TaskSet | None) -> OwnRun:
     return run
 
 
-def is_own(path: str | os.PathLike[str], name: str | None = None) -> bool:
-    """Return whether a trace was recorded by this executor."""
+def has_declaration(path: str | os.PathLike[str], name: str | None = None) -> bool:
+    """Return whether a trace says which deadlines there are."""
     with named_errors(os.fspath(path), name or os.fspath(path)):
-        return read_head(TraceReader(path)) is not None
+        head = read_head(TraceReader(path))
+        return head is not None and is_declared(head)

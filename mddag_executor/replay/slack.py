@@ -1,13 +1,14 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-How much longer callbacks may take before a deadline is missed.
+How much longer callbacks may take before a deadline is missed that is met as things are.
 
 Theory of operation
 -------------------
 The load, recorded or periodic, is scheduled again and again, each time with the execution times of
-one callback (or of all) a factor longer.  The greatest factor with every deadline met is found by
-bisection, to 1 %.  What dispatch takes does not grow with it.
+one callback (or of all) a factor longer.  The greatest factor is found by bisection, to 1 %, with
+which no deadline is missed but those that are missed with the times as they are.  What dispatch
+takes does not grow with it.
 
 A run that meets all deadlines takes long, one that misses ends early.  So a miss, once it is
 found, is looked at by itself: the releases of a *window* before it, ``WINDOW`` times its deadline
@@ -18,13 +19,14 @@ finds is tried on the whole load, which confirms it or finds another window.
 Schedules have anomalies: a longer callback may let a deadline be met that a shorter one misses.
 The factor is one below which nothing broke where it was looked.
 
-Sinks that miss with the times as they are, are left out; so their factor says nothing of them.
+A sink that misses every deadline with the times as they are is left out: it cannot get worse.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
@@ -37,6 +39,7 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core.jobs import is_miss
+from mddag_executor.core.state import Decision, SINK_IN_TIME
 from mddag_executor.replay.as_recorded import slack as margin
 from mddag_executor.replay.load import RecordedLoad
 from mddag_executor.simulate import Load, schedule, Settings
@@ -144,9 +147,12 @@ class Search:
         self._stops = True
         #: Windows in which something broke, the last one first.
         self._windows: list[tuple[int, int]] = []
-        #: Sinks that miss without any factor.
+        #: By sink how many deadlines it misses without any factor.
+        self.missed: Counter[int] = Counter()
+        #: Sinks that miss all of them.
         self.left_out: list[int] = []
-        self._leave_out()
+        self._missed: set[tuple[int, int]] = set()      # sink and job, without any factor
+        self._find_missed()
 
     def _callback_of_cost(self, load: Load, tables: Tables) -> Any:
         """Return by place of a cost whose it is; -1 of what no DAG declares."""
@@ -160,31 +166,35 @@ class Search:
             of[base:base + rows * len(row)] = np.tile(row, rows)
         return of
 
-    def _leave_out(self) -> None:
-        """Leave out the sinks that miss anyway."""
+    def _find_missed(self) -> None:
+        """Find out what is missed anyway, and leave out the sinks that miss everything."""
         problem = self._problem
         with no_garbage():
-            missed = {miss.sink for miss in self._misses(self._scaled(ALL, 1), False)}
-        self.left_out = sorted(missed)
-        if missed:
-            deadlines = list(problem.tables.sink_deadline)
-            for sink in missed:
-                deadlines[sink] = _NO_DEADLINE
-            self._problem = problem._replace(
-                tables=problem.tables._replace(sink_deadline=deadlines))
-            # jobs may still expire, which is no reason to stop
-            self._stops = next(self._misses(self._scaled(ALL, 1), False, True), None) is None
+            decisions = self._decisions(self._scaled(ALL, 1), False)
+            self.missed.update(
+                vertex for kind, _, vertex, *_ in decisions if is_miss(kind))
+            met = {vertex for kind, _, vertex, *_ in decisions if kind == SINK_IN_TIME}
+            self.left_out = sorted(set(self.missed) - met)
+            if self.left_out:
+                deadlines = list(problem.tables.sink_deadline)
+                for sink in self.left_out:
+                    deadlines[sink] = _NO_DEADLINE
+                self._problem = problem._replace(
+                    tables=problem.tables._replace(sink_deadline=deadlines))
+                decisions = self._decisions(self._scaled(ALL, 1), False)
+        self._missed = {(vertex, job) for kind, _, vertex, job, *_ in decisions if is_miss(kind)}
+        self._stops = not self._missed
 
-    def _misses(
-        self, scaled: tuple[Load, int], stop: bool, of_any: bool = False
-    ) -> Iterator[Miss]:
+    def _decisions(self, scaled: tuple[Load, int], stop: bool) -> Sequence[Decision]:
         problem, (load, end) = self._problem, scaled
         settings = replace(problem.settings, duration_ns=end, stop_at_first_miss=stop)
-        decisions = schedule(
-            problem.tables, load, settings, compiled=self._compiled).decisions
-        for kind, _, vertex, _, deadline, until in decisions:
-            if is_miss(kind) and (of_any or vertex not in self.left_out):
-                release = deadline - problem.tables.sink_deadline[vertex]
+        return schedule(problem.tables, load, settings, compiled=self._compiled).decisions
+
+    def _misses(self, scaled: tuple[Load, int], stop: bool) -> Iterator[Miss]:
+        """Yield what is missed, but not anyway."""
+        for kind, _, vertex, job, deadline, until in self._decisions(scaled, stop):
+            if is_miss(kind) and (vertex, job) not in self._missed:
+                release = deadline - self._problem.tables.sink_deadline[vertex]
                 yield Miss(vertex, deadline, release, until)
 
     def _scaled(self, callback: int, factor: float) -> tuple[Load, int]:
@@ -205,7 +215,7 @@ class Search:
         worst: bool = False,
     ) -> Miss | None:
         """
-        Return a deadline that is missed with a factor, in a window or anywhere, if any is.
+        Return a deadline that a factor makes be missed, in a window or anywhere, if any is.
 
         :param worst: the one that is missed by most; else the first.
         """
@@ -218,7 +228,7 @@ class Search:
                 jobs=load.jobs[first:last], releases=load.releases[first:last])
         with no_garbage():
             stops = self._stops and not worst
-            missed = list(self._misses((load, end), stops, True))
+            missed = list(self._misses((load, end), stops))
             if stops and missed and all(miss.sink in self.left_out for miss in missed):
                 # it stopped where a job of what is left out expired
                 missed = list(self._misses((load, end), False))
@@ -290,11 +300,13 @@ class Slack(NamedTuple):
     What was found.
 
     :ivar factors: by callback, and of all together (``ALL``).
-    :ivar left_out: sinks that miss as things are.
+    :ivar missed: by sink how many deadlines it misses as things are.
+    :ivar left_out: sinks that miss all of them.
     :ivar fewer: of ``workers`` and ``cpus``; None: it was not said how many there are.
     """
 
     factors: dict[int, Found]
+    missed: dict[int, int]
     left_out: list[int]
     fewer: dict[str, Fewer | None]
 
@@ -326,7 +338,8 @@ def find_slack(
             for callback, one in zip(rest, pool.map(partial(_factor, search), rest)):
                 found[callback] = one
                 progress(len(found) - 1)
-    return Slack(found, search.left_out, {of: search.fewer(of) for of in ('workers', 'cpus')})
+    return Slack(found, search.missed, search.left_out,
+                 {of: search.fewer(of) for of in ('workers', 'cpus')})
 
 
 def slack_result(
@@ -355,6 +368,7 @@ def slack_result(
         'load': shown(slack.factors[ALL]),
         **{of: None if fewer is None else {**fewer._asdict(), 'breaks': named(fewer.breaks)}
            for of, fewer in slack.fewer.items()},
+        'missed': {names[sink]: slack.missed[sink] for sink in sorted(slack.missed)},
         'left_out': [names[sink] for sink in slack.left_out],
         'sinks': {name: {'relative_deadline_ns': sink['relative_deadline_ns'],
                          'margin_ns': margin(sink)}

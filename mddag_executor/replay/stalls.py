@@ -28,24 +28,19 @@ import numpy as np
 
 _UNNOTICED_NS = 10_000_000
 _MOST, _ABOUT = 0.75, 1.25
-_FAR_NS = 1 << 40
 
 
 class Spans:
     """
     Spans from starts to ends, ns.
 
-    :param origin: a time near all of them; what is further away than 18 minutes is cut there.
+    Sums of times may exceed 64 bits.  They wrap around, as numpy's integers do; the difference of
+    two of them, a length of time, is exact all the same.
     """
 
-    def __init__(self, starts: Ints, ends: Ints, origin: int) -> None:
-        self._origin = origin
-        self._starts, self._ends = (np.sort(self._near(each)) for each in (starts, ends))
+    def __init__(self, starts: Ints, ends: Ints) -> None:
+        self._starts, self._ends = np.sort(starts), np.sort(ends)
         self._sums = [np.r_[0, np.cumsum(each)] for each in (self._starts, self._ends)]
-
-    def _near(self, times: Ints) -> Ints:
-        near: Ints = np.clip(times - self._origin, -_FAR_NS, _FAR_NS)
-        return near
 
     def within(self, begins: Ints, ends: Ints) -> Ints:
         """Return how long they lasted within each span of time, added up, ns."""
@@ -53,11 +48,10 @@ class Spans:
         return found
 
     def _before(self, times: Ints) -> Ints:
-        near = self._near(times)
-        total = np.zeros(len(near), dtype=np.int64)
+        total = np.zeros(len(times), dtype=np.int64)
         for sign, each, sums in zip((1, -1), (self._starts, self._ends), self._sums):
-            number = np.searchsorted(each, near, 'right')
-            total += sign * (near * number - sums[number])
+            number = np.searchsorted(each, times, 'right')
+            total += sign * (times * number - sums[number])
         return total
 
 
@@ -98,7 +92,7 @@ class Stretch:
         long = self.ran[self.ran[:, 2] >= _MOST * LEAST_NS]
         starts, ends = np.concatenate(
             [self.timers, self.started, long[:, :2]]).reshape(-1, 2).T
-        return Spans(starts, ends, int(self.times[0]))
+        return Spans(starts, ends)
 
 
 def find(stretch: Stretch, since: int, until: int) -> list[tuple[int, int]]:

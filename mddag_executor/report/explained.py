@@ -20,14 +20,16 @@ def causes_line(misses: Mapping[str, Any]) -> Iterator[str]:
     causes = {cause: n for cause, n in misses['causes'].items() if n}
     if not causes:
         return
-    stalls = misses['stalls']
+    stalls = [stall for stall in misses['stalls'] if stall['misses']]
     parts = []
-    stood = sum(stall['misses'] > 0 for stall in stalls)
-    if stood and 'machine' in causes:
-        length = sum(stall['length_ns'] for stall in stalls if stall['misses'])
-        parts.append(f'{causes.pop("machine")} in {counted(stood, "stop")} of the machine '
+    if stalls:
+        inside = sum(stall['misses'] for stall in stalls)
+        length = sum(stall['length_ns'] for stall in stalls)
+        parts.append(f'{inside} in {counted(len(stalls), "stop")} of the machine '
                      f'({length / 1e9:.2f} s)')
-    parts += [f'{n} {cause}' for cause, n in sorted(causes.items(), key=lambda item: -item[1])]
+        causes['machine'] -= inside
+    parts += [f'{n} {cause}' for cause, n in sorted(causes.items(), key=lambda item: -item[1])
+              if n]
     yield f'{counted(misses["missed"], "miss", "misses")}: {", ".join(parts)}'
 
 

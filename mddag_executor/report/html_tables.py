@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Sequence
 from html import escape
 
+from mddag_executor.core.tally import total
 from mddag_executor.replay.chains import Breakdown
 from mddag_executor.report.html_data import KINDS, Prepared, ReportData
 from mddag_executor.report.replays import (
@@ -73,7 +74,9 @@ def sinks_html(data: ReportData) -> str:
 def misses_html(data: ReportData, prepared: Prepared) -> str:
     """Return the table of the worst misses, by time."""
     if not data.timeline.n_missed:
-        return '<p class="note">No deadline was missed.</p>\n'
+        due = total(data.tally.result()['dags']).due
+        return ('<p class="note">No deadline was missed.</p>\n' if due else
+                '<p class="note">No job was due at any sink: nothing is proven.</p>\n')
     short = short_names(vertex.name for vertex in data.task_set.vertices)
     rows = []
     for miss in (prepared.misses[i] for i in prepared.worst):

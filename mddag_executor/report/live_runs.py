@@ -15,8 +15,9 @@ from mddag_executor.text import counted
 
 
 def summary(result: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines that stand below the table of a run."""
-    yield verdicts_line(result['dags'])
+    """Yield the lines below the table of a run; without a declaration there is no table."""
+    yield verdicts_line(result['dags']) if result['dags'] else (
+        'no declaration was given, so no deadline was judged')
     stops = result['stops']
     if stops['misses']:
         yield (f'{stops["misses"]} of {counted(total(result["dags"]).missed, "miss", "misses")} '
@@ -55,6 +56,10 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
             lost = trace['lost']
             yield (f'trace: {printable(str(Path(trace["path"]).absolute()))}'
                    + (f' ({counted(lost, "event")} lost: the disk was too slow)' if lost else ''))
+    if not result['dags'] and result['trace'] is not None:
+        path = printable(result['trace']['path'])
+        yield (f'to judge it: mddag graph from-trace {path} --accept -o graph.yaml, then '
+               f'mddag replay {path} graph.yaml')
 
 
 def _absent(dags: dict[str, Any]) -> Iterator[str]:

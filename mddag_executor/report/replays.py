@@ -155,7 +155,7 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
         pool += f' in {counted(len(result["processes"]), "process", "processes")}'
     yield (pool + (', preemptive' if result['preemptive'] else '')
            + f', {format_ns(result["duration_ns"])}, utilisation {_share(result["utilisation"])}'
-           + f' (all callbacks: {_share(result["worker_use"]["use"])})')
+           + _use(result))
     miss = result['first_miss']
     if miss is not None:
         late = 'never completed' if miss['completed_ns'] is None else \
@@ -176,6 +176,14 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
     if dropped:
         yield f'{sum(dropped.values())} dropped: ' + ', '.join(
             f'{printable(reason)} {n}' for reason, n in dropped.items())
+
+
+def _use(result: Mapping[str, Any]) -> str:
+    """Return how busy the workers were, or are with what is asked of them when rescheduled."""
+    use = result['worker_use']['use']
+    if result['rescheduled']:
+        return '' if use is None else f', workers busy {100 * use:.1f} %'
+    return f' (all callbacks: {_share(use)})'
 
 
 def _share(value: float | None) -> str:

@@ -46,15 +46,20 @@ def _margins(sink: Mapping[str, Any]) -> list[Cell]:
 def _summary(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the tables."""
     if len(result['left_out']) == len(result['sinks']):
-        yield 'every sink misses deadlines as things are: nothing is left that could break'
+        yield 'every sink misses every deadline as things are: nothing is left that could break'
         return
     free = sum(one['factor'] is None for one in result['callbacks'].values())
     most = result['most']
     if free:
         yield f'{counted(free, "callback")} may take {most:g} times as long and more'
     if result['left_out']:
-        yield (f'left out, because they miss deadlines as things are: '
+        yield (f'left out, because they miss every deadline as things are: '
                f'{listed(result["left_out"])}')
+    some = {name: n for name, n in result['missed'].items() if name not in result['left_out']}
+    if some:
+        yield (f'{counted(sum(some.values()), "deadline")} missed as things are: '
+               + listed([f'{name} ({n})' for name, n in some.items()])
+               + '; the factors say when another one is missed')
     load = result['load']
     yield 'the load as a whole: ' + (
         f'{most:g} times and more' if load['factor'] is None else

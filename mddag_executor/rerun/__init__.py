@@ -21,7 +21,7 @@ from typing import Any
 
 from mddag_executor import defaults
 from mddag_executor.core import policy as find_policy
-from mddag_executor.executor.loading import Program, resolve, ros_arguments
+from mddag_executor.hosting.loading import Program, resolve, ros_arguments
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.outputs import Output
@@ -62,7 +62,8 @@ def rerun(
     :param nodes: as for ``mddag run --node``; or classes of nodes, or functions that return nodes.
     :param times: ``recorded``, ``declared``, or a file (see ``sources.open_source``).
     :param output: a file that gets the outputs as a bag; ``trace``: one that gets the run.
-    :param patience_s: a callback that uses no CPU for this long is blocked for ever.
+    :param patience_s: a callback or thread that waits for this long, and not in virtual time, ends
+        the run.
     :raises mddag_executor.errors.MddagError: on whatever keeps the run from going on; a
         ``CallbackFailed`` for what a callback raised, which is its cause.
     :raises msg_graph.GraphError: when the declaration is wrong.

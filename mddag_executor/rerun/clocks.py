@@ -16,6 +16,7 @@ steady and system clocks, ``time``    virtual if asked for; else what they alway
 ``Thread.start``, ``Thread.join``     threads that strands start are strands; to wait for their end
                                       is to wait in virtual time
 ``uuid.uuid4``                        is drawn with the seed: goals of actions are called so
+``random``, ``numpy.random``          generators that nodes make without a seed get one
 ====================================  =============================================================
 
 Threads that are no strands get what they always do, except from a node's clock.
@@ -24,6 +25,7 @@ Threads that are no strands get what they always do, except from a node's clock.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 import queue
 import random
 import sys
@@ -95,6 +97,15 @@ class VirtualTime:
         # The one in C waits without asking anybody; pools of threads are built on it.
         replace(queue, 'SimpleQueue', lambda original: vars(queue)['_PySimpleQueue'])
         replace(uuid, 'uuid4', _asking)
+        replace(random.Random, 'seed', self._seed)
+        # that of the module is a method of a generator, bound before
+        replace(random, 'seed', lambda original: partial(random.Random.seed, original.__self__))
+        try:
+            from numpy.random import bit_generator
+        except ImportError:
+            pass
+        else:  # what all of numpy's generators begin with that get no seed
+            replace(bit_generator, 'randbits', self._randbits)
         for name in (*_READS, 'sleep'):
             replace(time, name, _asking)
         _Asked.run = self
@@ -173,6 +184,31 @@ class VirtualTime:
         effect = 'takes real time' if 'sleep' in what else 'is not the same in each run'
         self._warn(f'{name}:{caller.f_lineno}: {what} {effect}: give --all-clocks')
 
+    # --- random numbers --------------------------------------------------------------------------
+
+    def _seed(self, original: Callable[..., None]) -> Callable[..., None]:
+        def seed(generator: random.Random, a: Any = None, version: int = 2) -> None:
+            if a is None and self._is_asked_by_node():
+                a = self._random.getrandbits(128)
+            original(generator, a, version)
+
+        return seed
+
+    def _randbits(self, original: Callable[[int], int]) -> Callable[[int], int]:
+        def randbits(bits: int) -> int:
+            draw = self._random.getrandbits if self._is_asked_by_node() else original
+            return draw(bits)
+
+        return randbits
+
+    def _is_asked_by_node(self) -> bool:
+        """Return whether code of a node calls what calls this; libraries keep what they draw."""
+        caller = sys._getframe(2)
+        while caller.f_back is not None and caller.f_globals.get('__name__') == 'random':
+            caller = caller.f_back
+        return self._loop.strands.mine() is not None and not is_library(
+            caller.f_globals.get('__name__', ''))
+
     # --- waiting and threads ---------------------------------------------------------------------
 
     def _condition_wait(self, original: Callable[..., bool]) -> Callable[..., bool]:
@@ -193,6 +229,7 @@ class VirtualTime:
                 original(thread)
                 return
             strand = self._threads[thread] = strands.make(f'thread {thread.name}')
+            thread.daemon = True  # one that does not end keeps no process from ending
             run = thread.run
             thread.run = lambda: strands.run_as(strand, run)  # type: ignore[method-assign]
             with strands.set_aside():  # it waits until the thread is there

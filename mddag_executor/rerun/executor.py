@@ -8,9 +8,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from mddag_executor.hosting.host import Guest, Host
 from mddag_executor.executor.compat import BareExecutor
 from mddag_executor.executor.entity import Entity, TASK
-from mddag_executor.executor.hosting import Guest, Host
 from mddag_executor.executor.tasks import make_task, Unclaimed
 from mddag_executor.executor.work import QuickCallback, Work
 from mddag_executor.rerun.loop import Loop, POLL_NS
@@ -66,6 +66,11 @@ class NodeHolder(BareExecutor):
         self.loop.soon(partial(self._ready, work))
         return task
 
+    def on_callback_ended(self, listener: Callable[[Any, BaseException | None], bool]) -> None:
+        """Have a function called after each callback; what one raises ends the run."""
+        assert self.loop is not None
+        self.loop.on_ended = lambda entity: listener(entity, None)
+
     def _ready(self, work: Work) -> None:
         assert self.loop is not None
         self.loop.engine.ready(work, self.loop.now)
@@ -78,36 +83,29 @@ class NodeHolder(BareExecutor):
 class RerunHost(Host):
     """Runs programs as strands: their waiting takes virtual time."""
 
-    def __init__(self, executor: NodeHolder, end_run: Callable[[], None], loop: Loop) -> None:
-        super().__init__(executor, end_run)
+    def __init__(self, loop: Loop) -> None:
+        super().__init__()
         self._loop = loop
 
-    def program_ended(self, guest: Guest) -> None:
-        """Take a program's nodes away; end the run where it has failed, or after the last."""
-        super().program_ended(guest)
-        if guest.error is not None:
-            self.end_run()
+    def program_failed(self, guest: Guest, error: BaseException) -> None:
+        """End the run."""
+        self.end_run()
+
+    def _wait_settled(self, guest: Guest) -> None:
+        loop = self._loop
+        loop.wait(lambda: guest.settled or loop.strands.has_waiting(guest.thread), None,
+                  'for a program to start')
 
     def wait(
-        self, timeout_s: float | None, event: Any = None, guest: Guest | None = None,
+        self, changed: Any, until: Callable[[], bool], timeout_s: float | None,
+        guest: Guest | None,
     ) -> None:
-        """Wait in virtual time for an event, the end of the run or of a program, or for a time."""
+        """Wait in virtual time for something, the end of the run or the program, or a time."""
         loop = self._loop
         if loop.strands.mine() is None:
-            super().wait(timeout_s, event, guest)
-            return
-        if self.current_guest() is None and event is not None and event is self.guests[-1].settled:
-            thread = self.guests[-1].thread
-            loop.wait(lambda: event.is_set() or loop.strands.has_waiting(thread), None,
-                      'for a program to start')
+            super().wait(changed, until, timeout_s, guest)
             return
         deadline = None
         if timeout_s is not None and timeout_s >= 0:  # callbacks are to run meanwhile
             deadline = loop.deadline_after(max(POLL_NS / 1e9, timeout_s))
-
-        def over() -> bool:
-            return (guest is not None and guest.ended.is_set()
-                    or event is not None and event.is_set())
-
-        nothing = event is None and guest is None
-        loop.wait(None if nothing else over, deadline, 'for the end of the run')
+        loop.wait(lambda: until() or self.is_over(guest), deadline, 'for the end of the run', True)

@@ -19,14 +19,19 @@ whose recorded transport time is negative left before the end, and does so here,
 What threads of others send has no virtual time: it is taken as of when it comes, and a warning
 says so.
 
-The run is over when nothing is left to happen, or at ``end``.  Then no timer fires any more, but
-what has begun is completed, for ``DRAIN_NS`` at most.
+A recording may have pauses: the recorder was stopped, or the machine's clock set forward.  No
+timer fires in a pause, and what has begun is completed, for ``DRAIN_NS`` at most.  What else would
+happen in it happens at its end, a timer once.
+
+The run is over when nothing is left to happen, or at ``end``.  Then, too, no timer fires any more,
+and what has begun is completed.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from heapq import heappop, heappush
@@ -47,7 +52,7 @@ from mddag_executor.rerun.strands import Strands
 from mddag_executor.rerun.times import Times
 
 DRAIN_NS = 10_000_000_000
-"""What has begun may go on this long after the end of the recording."""
+"""What has begun may go on this long after the end of the recording, and in a pause of it."""
 POLL_NS = 1_000_000
 """How often a waiting callback looks again, or asks again for the interpreter."""
 MOST_LOOKS = 1000
@@ -100,6 +105,7 @@ class Loop:
 
     :param start: the virtual time at which it begins, ns since the epoch.
     :param end: when the recording ends.
+    :param pauses: from when to when it has no messages.
     :param refresh: brings up to date which entities there are.
     :param begin: is called once, in the first strand: it starts the programs; ``over``: at the
         end, before the strands end that still wait.
@@ -107,18 +113,22 @@ class Loop:
     :ivar callbacks: how many callbacks have run.
     :ivar computing: shares CPUs and the interpreter, where these are few.
     :ivar changed: whether there may be new entities, or some are gone.
+    :ivar on_ended: called with rclpy's entity when its callback has ended.
     """
 
     def __init__(
-        self, engine: Engine, times: Times, start: int, end: int, refresh: Callable[[], None],
+        self, engine: Engine, times: Times, start: int, end: int,
+        pauses: Sequence[tuple[int, int]], refresh: Callable[[], None],
         begin: Callable[[], None], over: Callable[[], None],
     ) -> None:
         self.engine = engine
         self.now = self.start = start
         self.end = end
+        self._pauses = pauses
         self.callbacks = 0
         self.changed = True
         self.computing: Computing | None = None
+        self.on_ended: Callable[[Any], object] = lambda entity: None
         self.strands = Strands(self._step, over)
         self._times = times
         self._refresh = refresh
@@ -136,7 +146,13 @@ class Loop:
 
     def at(self, time: int, kind: int, function: Callable[..., None], *args: Any) -> None:
         """Have something happen; at one instant, in the order of kinds, then of these calls."""
+        time = self.after_pause(time, DRAIN_NS)
         heappush(self._events, (time, kind, next(self._order), function, args))
+
+    def after_pause(self, time: int, drain_ns: int = 0) -> int:
+        """Return the end of the pause that a time lies in, or else that time."""
+        place = bisect_left(self._pauses, (time - drain_ns,)) - 1
+        return time if place < 0 else max(time, self._pauses[place][1])
 
     def soon(self, function: Callable[[], None]) -> None:
         """Do something at once, or, where a thread of others calls, as soon as possible."""
@@ -327,6 +343,7 @@ class Loop:
             each.record(execution.thread)  # before its callback's end
         if waits_for is None:
             engine.finished(work, start, now, now, execution.thread, worker)
+            self.on_ended(work.entity.rclpy)
         else:
             engine.suspended(work, start, now, execution.thread, worker)
             self._resumed.add(work)
@@ -375,9 +392,11 @@ class Loop:
         """
         if until is not None and until():
             return True
-        if deadline is not None and deadline <= self.now:
-            self.looked()
-            return until is not None and until()
+        if deadline is not None:
+            if deadline <= self.now:
+                self.looked()
+                return until is not None and until()
+            deadline = self.after_pause(deadline, DRAIN_NS)
         execution = self._current
         if execution is not None:
             held, execution.held = execution.held, []

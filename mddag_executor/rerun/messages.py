@@ -28,6 +28,7 @@ from mddag_executor.executor.compat import callback_type, WITH_INFO
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import header_stamp, Origin
 from mddag_executor.executor.recorder import Recorder
+from mddag_executor.executor.snapshot import alive
 from mddag_executor.executor.work import Work
 from mddag_executor.rerun.errors import RerunError
 from mddag_executor.rerun.loop import ARRIVED, Held, Loop
@@ -126,6 +127,8 @@ class Messages:
                 new.append(inlet)
             self._known[id(entity)] = inlet
             self._inlets.setdefault(inlet.topic, []).append(inlet)
+        # a destroyed publisher serves no late subscription
+        self._outlets = {p: outlet for p, outlet in self._outlets.items() if alive(p)}
         for outlet in self._outlets.values():
             outlet.inlets = None
         self.offered, self._publishers = {}, {}

@@ -27,14 +27,14 @@ from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE
 from mddag_executor.executor import publishing
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import WAITABLE
-from mddag_executor.executor.hosting import Guest
-from mddag_executor.executor.loading import describe, Program, ros_arguments
 from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.snapshot import is_qos_event, snapshot
 from mddag_executor.executor.work import Work
+from mddag_executor.hosting.host import Guest
+from mddag_executor.hosting.loading import describe, Program, ros_arguments
 from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.actions import Actions
 from mddag_executor.rerun.clocks import VirtualTime
@@ -52,6 +52,7 @@ from mddag_executor.rerun.sources import Source
 from mddag_executor.rerun.strands import Stuck
 from mddag_executor.rerun.timers import Timers
 from mddag_executor.rerun.times import AsRecorded
+from mddag_executor.text import counted
 from msg_graph import TaskSet
 import rclpy
 from rclpy.exceptions import ROSInterruptException
@@ -76,7 +77,8 @@ class Settings:
     :ivar cpus: that callbacks which compute share; None: as many as are needed.
     :ivar seed: of Python's ``random``, of numpy's legacy generator and of what is drawn.
     :ivar all_clocks: whether steady and system clocks and Python's ``time`` are virtual, too.
-    :ivar patience_s: a callback that uses no CPU for this long is blocked for ever.
+    :ivar patience_s: a callback or thread that waits for this long, and not in virtual time, ends
+        the run.
     """
 
     workers: int = defaults.WORKERS
@@ -171,8 +173,8 @@ class Rerun:
             task_set, self._engine.tables, self._engine.scheduler, self._engine.jobs,
             task_set.dags)
         self._loop = loop = Loop(
-            self._engine, source.times, source.start, source.end, self._refresh, self._begin,
-            self._over)
+            self._engine, source.times, source.start, source.end, source.pauses, self._refresh,
+            self._begin, self._over)
         clock.loop = self._holder.loop = loop
         self._holders = self._held()
         if settings.cpus is not None or self._holders:
@@ -191,7 +193,7 @@ class Rerun:
             loop, self._holder, self._messages, source.topics,
             lambda: {} if recording is None else recording.kinds, self._warn)
         self._timers = Timers(loop, source.first_release)
-        self._host = RerunHost(self._holder, loop.stop, loop)
+        self._host = RerunHost(loop)
         if self._recorder is not None:
             self._recorder.entities((), [self._holder.task_entity])
 
@@ -233,6 +235,7 @@ class Rerun:
                     self._seed()
                     loop.strands.run(
                         self._settings.patience_s,
+                        lambda: (loop.now, loop.callbacks, len(self._host.guests)),
                         lambda: tick(loop.now - loop.start) if tick is not None else None)
             except Stuck as stuck:
                 raise self._blocked(stuck) from None
@@ -286,16 +289,22 @@ class Rerun:
 
     def _begin(self) -> None:
         """Start the programs, one after the other; each runs until it waits for something."""
-        self._host.start(self._programs(), ros_arguments(self._settings.ros_args))
+        self._host.start(
+            self._holder, self._programs(), ros_arguments(self._settings.ros_args),
+            self._loop.stop)
         self._loop.at(self._loop.start, ENDED, self._started)
 
     def _started(self) -> None:
         """Begin to deliver, when each program has come to where it waits for something."""
         self._started_s = time.monotonic() - self._begun
         gc.freeze()  # else each full collection looks at all that the nodes are made of
-        if all(guest.settled.is_set() for guest in self._host.guests) and not self._hosted:
+        if all(guest.settled for guest in self._host.guests) and not self._hosted:
             raise RerunError(self._none_hosted())
         self._check_topics()
+        if self._source.pauses:
+            self._warn(f'{self._source.name}: timers do not fire in '
+                       f'{counted(len(self._source.pauses), "pause")} of over a minute without '
+                       'any message')
         self._playing.begin()
 
     def _none_hosted(self) -> str:
@@ -345,15 +354,13 @@ class Rerun:
         self._failed = [guest for guest in self._host.guests if guest.error is not None]
         self.warnings += self._loop.blocked()
         self._engine.finish(self._loop.now)
-        self._host.close()
-        self._holder.context.try_shutdown()
+        self._host.shut_down()
 
     def _blocked(self, stuck: Stuck) -> RerunError:
         at = (self._loop.now - self._loop.start) / 1e9
         return RerunError(
-            f'{self._loop.here()}: it has been blocking at {stuck.place} for '
-            f'{self._settings.patience_s:g} s, at {at:.6f} s of the run: let it wait with '
-            'rclpy or threading, or correct it')
+            f'{self._loop.here()}: {stuck}, at {at:.6f} s of the run: let it wait with rclpy or '
+            'threading, give --all-clocks where it sleeps, or correct it')
 
     def _check_programs(self) -> None:
         for guest in self._failed:

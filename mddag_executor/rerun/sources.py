@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Collection, Iterator
+from itertools import pairwise
 import os
 import tempfile
 from typing import NamedTuple
@@ -52,6 +53,7 @@ class Recording:
     A bag.
 
     :ivar start: when its first message came, ns; ``end``: the last.
+    :ivar pauses: from when to when none came (see ``trace.times``).
     :ivar topics: every topic in it.
     :ivar kinds: the type of each topic, as far as it has been loaded.
     :raises mddag_executor.replay.bags.BagError: where there is no bag.
@@ -62,6 +64,8 @@ class Recording:
         self.name = name or path
         bag = Bag(path, (), name)
         self.start, self.end = bag.start, bag.end
+        self.pauses = [(before[1], after[0])
+                       for before, after in pairwise(bag.stretches)]
         self.topics = frozenset(bag.topics)
         self.warnings = list(bag.warnings)
         self.kinds: dict[str, str] = {}
@@ -132,6 +136,11 @@ class Source(NamedTuple):
     def first_release(self, dag: int) -> int | None:
         """Return when the first job of a DAG was released in the recorded run; None: unknown."""
         return self.times.first_release(dag) if isinstance(self.times, AsRecorded) else None
+
+    @property
+    def pauses(self) -> list[tuple[int, int]]:
+        """Return from when to when no messages came."""
+        return [] if self.messages is None else self.messages.pauses
 
     @property
     def topics(self) -> frozenset[str]:

@@ -20,8 +20,9 @@ Threads that do not belong to the run (the middleware's) are no strands: what th
 it always does.
 
 A strand that waits for something else than this (a socket, a lock that another strand has) keeps
-its turn, and the run stands still.  Whoever has started the run watches for that: a strand that
-has used no CPU for as long as ``patience_s`` is *stuck*.
+its turn, and virtual time stands still.  The thread that has started the run watches for that:
+where no virtual time passes and no callback ends, a strand that waits for ``patience_s`` is
+*stuck*, and so is one that computes for ``_COMPUTES`` times as long.
 """
 
 from __future__ import annotations
@@ -36,6 +37,9 @@ import time
 from typing import Any
 
 _LOOK_S = 0.05
+_LONGEST_LOOK_S = 1.0
+"""More time between two looks is that of a process that was stopped."""
+_COMPUTES = 10
 _END_S = 2.0
 """Strands have this much real time to end when the run is over."""
 
@@ -70,12 +74,11 @@ class Strand:
 
 
 class Stuck(Exception):
-    """A strand that neither goes on nor waits in virtual time: its name, and where it is."""
+    """A strand in which no virtual time passes."""
 
-    def __init__(self, strand: Strand, place: str) -> None:
-        super().__init__(strand.name, place)
-        self.strand = strand
-        self.place = place
+    def __init__(self, strand: Strand, what: str, seconds: float) -> None:
+        super().__init__(
+            f'it has been {what} at {place_of(strand.ident)} for {seconds:g} s')
 
 
 class Strands:
@@ -84,7 +87,7 @@ class Strands:
 
     :param step: does the next thing in virtual time; False: the run is over.
     :param at_end: called then, before the strands end that still wait.
-    :ivar owner: the strand that has the turn; ``turns``: grows while the run goes on.
+    :ivar owner: the strand that has the turn.
     """
 
     def __init__(self, step: Callable[[], bool], at_end: Callable[[], None]) -> None:
@@ -97,7 +100,6 @@ class Strands:
         self._here = threading.local()
         self._done = threading.Lock()
         self._done.acquire()
-        self.turns = 0
         self.over = False
         self.error: BaseException | None = None
 
@@ -118,7 +120,6 @@ class Strands:
             self._here.strand = strand
 
     def _give(self, strand: Strand) -> None:
-        self.turns += 1
         self.owner = strand
         strand.lock.release()
 
@@ -128,7 +129,6 @@ class Strands:
             self._give(self._idle.pop())
             return
         driver = Strand('driver')
-        self.turns += 1
         self.owner = driver
         driver.lock.release()
         threading.Thread(
@@ -171,7 +171,6 @@ class Strands:
                 self._finish(me)
             elif not self._step():
                 self._end()
-            self.turns += 1
 
     def _next(self) -> Strand | None:
         """Return a strand that goes on now."""
@@ -250,17 +249,20 @@ class Strands:
 
     # --- from outside ----------------------------------------------------------------------------
 
-    def run(self, patience_s: float, tick: Callable[[], None]) -> None:
+    def run(
+        self, patience_s: float, progress: Callable[[], object], tick: Callable[[], None]
+    ) -> None:
         """
         Run all until the run is over, watched by the calling thread, which is no strand.
 
-        :param patience_s: a strand that uses no CPU for this long is stuck.
+        :param patience_s: a strand that waits for this long is stuck.
+        :param progress: what it returns changes as long as the run goes on.
         :param tick: called now and then.
         :raises Stuck: where one is; its thread is left behind.
         :raises BaseException: what ended the run.
         """
         self._pass_on()
-        watch = _Watch(self, patience_s)
+        watch = _Watch(self, progress, patience_s)
         ending_at = 0.0
         try:
             while not self._done.acquire(timeout=_LOOK_S):
@@ -278,28 +280,46 @@ class Strands:
 
 
 class _Watch:
-    """Finds out whether a run stands still."""
+    """
+    Finds out whether virtual time stands still since a strand waits, or computes, for too long.
 
-    def __init__(self, strands: Strands, patience_s: float) -> None:
+    Only the time in which the strand waits counts, or that of its CPU: the machine may be busy.
+    """
+
+    def __init__(
+        self, strands: Strands, progress: Callable[[], object], patience_s: float
+    ) -> None:
         self._strands = strands
+        self._progress = progress
         self._patience_s = patience_s
-        self._seen: tuple[int, int] | None = None
-        self._since = time.monotonic()
+        self._seen: object = None
+        self._owner: Strand | None = None
+        self._looked_at = time.monotonic()
+        self._cpu_s = self._waited_s = self._computed_s = 0.0
 
     def look(self) -> None:
-        owner = self._strands.owner
+        before, owner = self._owner, self._strands.owner
         now = time.monotonic()
+        passed_s, self._looked_at = min(now - self._looked_at, _LONGEST_LOOK_S), now
+        self._owner = None
         if owner is None or owner.clock == -1:
-            self._since = now
             return
-        # in ms: a thread that waits in small steps computes a little
-        seen = self._strands.turns, time.clock_gettime_ns(owner.clock) // 1_000_000
+        try:
+            cpu_s = time.clock_gettime(owner.clock)
+        except OSError:
+            return  # its thread has just ended
+        computed_s, self._owner, self._cpu_s = cpu_s - self._cpu_s, owner, cpu_s
+        seen = self._progress()
         if seen != self._seen:
-            self._seen, self._since = seen, now
-        elif is_runnable(owner.folder):
-            self._since = now
-        elif now - self._since > self._patience_s:
-            raise Stuck(owner, place_of(owner.ident))
+            self._seen, self._waited_s, self._computed_s = seen, 0.0, 0.0
+        elif owner is before:
+            self._computed_s += computed_s
+            if not is_runnable(owner.folder):
+                self._waited_s += max(0.0, passed_s - computed_s)
+            if self._waited_s > self._patience_s:
+                raise Stuck(owner, 'blocking', self._patience_s)
+            if self._computed_s > _COMPUTES * self._patience_s:
+                raise Stuck(owner, 'computing', _COMPUTES * self._patience_s)
 
 
 def is_runnable(folder: Path) -> bool:

@@ -9,7 +9,8 @@ What rcl knows of a timer's time is not asked for; only whether it is cancelled.
 period after it was made or reset, and each period after that.  Where a recorded run has jobs of
 the timer's DAG, it is due first when the first of these was released, so that it keeps their
 phase.
-No timer is due any more when the recording ends.
+After a pause of the recording (see ``loop``) it keeps its phase.  No timer is due any more when
+the recording ends.
 """
 
 from __future__ import annotations
@@ -97,28 +98,29 @@ class Timers:
         except InvalidHandle:
             known.due = -1
         if 0 <= known.due < self._loop.end:
-            self._loop.at(due, TIMER, self._fire, known, due)
+            self._loop.at(self._loop.after_pause(due), TIMER, self._fire, known, due)
 
     def _fire(self, known: _Known, due: int) -> None:
-        timer, engine = known.entity.rclpy, self._loop.engine
+        timer, engine, now = known.entity.rclpy, self._loop.engine, self._loop.now
         if known.due != due or self._known.get(id(timer)) is not known:
             return  # it was reset or cancelled meanwhile, or is gone
         try:
-            self._aim(known, due + _period(timer))
+            period = _period(timer)
+            self._aim(known, due + ((now - due) // period + 1) * period)
         except InvalidHandle:
             return
         if known.due < 0:
             return
-        info = {'expected_call_time': due, 'actual_call_time': due}
+        info = {'expected_call_time': due, 'actual_call_time': now}
         callback = timer.callback
-        known.last = due
+        known.last = now
         if callback is None:
             return
         if ends_sleep(callback):
             callback()
             return
         work = Work(known.entity, with_timer_info(timer, callback, info))
-        engine.timer_due(work, due, due)
+        engine.timer_due(work, now, now)
 
     # --- what nodes do with them -----------------------------------------------------------------
 

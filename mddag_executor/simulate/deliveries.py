@@ -9,6 +9,7 @@ Where messages take time, what a vertex publishes makes its edge to a successor 
 after the vertex completes; the core gets each by ``rules.edge``.  A delay may be negative:
 the callback published before its end.  Then the edge comes true that long before the end, as far
 as the execution had begun.  Where executions may be preempted, their edges come true at the end.
+A delay of NEVER stands for what is not published: its edge never comes true.
 Where they may stand still (see ``machine``), the end is not known in advance; but how far the
 execution is when it publishes, its *place*, is.
 
@@ -146,8 +147,9 @@ def _publish_next(
 
 def _post(s: State, d: Deliveries, time: int, x: int, vertex: int) -> None:
     slot = s.x_slot[x]
-    d.sent[0] += 1
-    heappush(d.messages, (time, d.sent[0], slot, s.job_index[slot], vertex))
+    if time < NEVER:
+        d.sent[0] += 1
+        heappush(d.messages, (time, d.sent[0], slot, s.job_index[slot], vertex))
 
 
 def _arrive(

@@ -8,16 +8,19 @@ Theory of operation:
 1. babeltrace2 reads the session, through its Python bindings in a process of their own
    (`ctf_helper`): they usually belong to the system's Python, and they abort on some damage. The
    Pythons are tried one after the other, this one first, until one has the bindings.
-2. All traces below the folder (processes, hosts, kernel) come as one stream in the order of time.
-   What CARET's analysis leaves beside them, its cache `caret_converted`, is a Python pickle of the
-   same events and is not read: a pickle runs whatever code is in it.
+2. All traces of a session (processes, kernel, rotated chunks) come as one stream in the order of
+   time.  LTTng writes into the metadata of each trace which session it is of.  A folder that holds
+   several sessions is refused, because they may be of different runs.  Sessions of one run on
+   several computers are named one by one.  CARET's cache beside them, `caret_converted`, is a
+   Python pickle of the same events and is not read: a pickle runs whatever code is in it.
 3. Every event becomes one event of the trace, with all fields of its payload. An event of the
    table (`schema.EVENTS`) has the table's types for the table's fields: flags that C has as
    integers become bool, unsigned times int64 of the same bits. Any other event, and any other
    fields, come with the types that they have in the session. A name that ROS does not allow is
    changed; one that the preamble or the table has for something else gets `_` at its end.
-4. Contexts `vpid` and `vtid` are the preamble. Before the first event of a thread, and where its
-   name changes, stands an event `mddag:process` with its `procname`.
+4. Contexts `vpid` and `vtid` are the preamble.  If sessions of several computers or containers
+   have the same numbers, those of later ones are changed (`numbers`).  Before the first event of a
+   thread, and where its name changes, stands an event `mddag:process` with its `procname`.
 5. What the tracer discarded is an event `mddag:lost` at the end of the gap; a packet that was
    lost counts as one event at least, and a warning says so.
 """
@@ -25,7 +28,7 @@ Theory of operation:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 import json
 import os
@@ -38,10 +41,11 @@ import subprocess
 import sys
 from typing import Any, IO, NamedTuple
 
-from mddag_executor.text import counted
+from mddag_executor.text import counted, listed
 from mddag_executor.trace.cdr import FieldType
-from mddag_executor.trace.ctf_helper import PATIENCE_S
+from mddag_executor.trace.ctf_helper import PATIENCE_S, SESSION
 from mddag_executor.trace.errors import TraceError
+from mddag_executor.trace.numbers import Numbers
 from mddag_executor.trace.schema import EVENTS, EventType, PREAMBLE, PROVIDERS
 from mddag_executor.trace.trace_file import TraceFile
 
@@ -69,33 +73,45 @@ class Imported:
 
 
 def import_ctf(
-    session: str | os.PathLike[str], output: str | os.PathLike[str], *,
-    progress: Callable[[int], None] | None = None,
+    session: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    output: str | os.PathLike[str], *, progress: Callable[[int], None] | None = None,
 ) -> Imported:
     """
     Write the events of a CTF session into a trace file.
 
-    :param session: the folder of the session; traces are looked for in all folders below it
+    :param session: the folder of the session; traces are looked for in all folders below it.
+        Several sessions are one run that was recorded on several computers.
     :param output: the trace; it is not complete when an exception comes up
     :param progress: called now and then with the number of events so far
     :raises TraceError: where the session or the file cannot be used, or babeltrace2 is missing
     """
-    path = os.fspath(session)
-    _check_session(path)
+    paths = [os.fspath(path) for path in (
+        [session] if isinstance(session, (str, os.PathLike)) else session)]
+    found = [_metadata_of(path) for path in paths]
+    real = [os.path.realpath(metadata) for each in found for metadata in each]
+    name = ', '.join(paths)
+    if len(set(real)) < len(real):
+        raise TraceError(name, 'a session is named twice', 'name each once')
+    sessions = [_check_sessions(path, each) for path, each in zip(paths, found)]
+    places = {each: place for place, (_, several) in enumerate(sessions) for each in several}
     with TraceFile(output) as file:
-        importer = _Importer(path, file)
-        for row in _rows(path):
+        importer = _Importer(name, file, places)
+        for row in _rows(name, paths, any(is_ctf_2 for is_ctf_2, _ in sessions)):
             importer.take(row)
             if progress is not None and row[0] == 'event' and importer.result.events % 5000 == 0:
                 progress(importer.result.events)
         if importer.result.events == 0:
-            raise TraceError(path, 'no event is recorded in it', _RECORD)
+            raise TraceError(name, 'no event is recorded in it', _RECORD)
         importer.finish()
     return importer.result
 
 
-def _check_session(path: str) -> None:
-    """Raise TraceError where there is no session, before babeltrace2 says so in its own words."""
+def _metadata_of(path: str) -> list[str]:
+    """
+    Return the metadata files of the traces below a folder.
+
+    :raises TraceError: where there is none, before babeltrace2 says so in its own words.
+    """
     remedy = 'name the folder that LTTng recorded to, such as ~/.ros/tracing/SESSION'
     if '\0' in path or not os.path.exists(path):
         raise TraceError(path, 'there is no such folder', remedy)
@@ -108,9 +124,53 @@ def _check_session(path: str) -> None:
         if os.path.exists(os.path.join(path, _CACHE)):
             what = f'holds only what CARET converted ({_CACHE}), not the recording itself'
         raise TraceError(path, what, remedy)
-    for metadata in found:
-        _check_metadata(metadata)
+    return sorted(found)
 
+
+def _check_sessions(path: str, found: Sequence[str]) -> tuple[bool, set[tuple[str, ...]]]:
+    """
+    Return whether one of the traces of a session is CTF 2, and what they say of the session.
+
+    :param found: the metadata files below the folder.
+    :raises TraceError: where the folder holds several sessions, or metadata is damaged.
+    """
+    # What the metadata says may differ between the traces of a session's folder: the first counts.
+    sessions: dict[str, tuple[str, ...]] = {}
+    every: set[tuple[str, ...]] = set()
+    is_ctf_2 = False
+    for metadata in found:
+        text = _metadata_text(metadata)
+        is_ctf_2 = is_ctf_2 or text.startswith(_CTF_2)
+        known = dict(_ENVIRONMENT.findall(text))
+        if 'trace_name' in known:
+            said = tuple(known.get(name, '') for name in SESSION)
+            sessions.setdefault(_session_folder(os.path.relpath(metadata, path)), said)
+            every.add(said)
+    folders = {identity: folder for folder, identity in sessions.items()}
+    if len(folders) > 1:
+        raise TraceError(
+            path, f'it holds {len(folders)} sessions: {listed(sorted(folders.values()))}',
+            'name the folder of one, or, if they are of one run on several computers, each of '
+            'their folders')
+    return is_ctf_2, every
+
+
+def _session_folder(metadata: str) -> str:
+    """Return the folder of the session that a trace is of: LTTng's parts of it lie below."""
+    folder = os.path.dirname(metadata)
+    parts = folder.split(os.sep)
+    below = next((place for place, part in enumerate(parts) if part in _PARTS), len(parts))
+    return os.sep.join(parts[:below])
+
+
+# What LTTng says of a session in the environment of the metadata, in CTF 1.8 and CTF 2, and how
+# the folders in that of a session are called.
+_ENVIRONMENT = re.compile(
+    r'"?\b(trace_name|trace_creation_datetime|hostname)\b"?\s*[=:]\s*"((?:[^"\\]|\\.)*)"')
+_PARTS = {'ust', 'kernel', 'archives'}
+# A sequence of JSON texts (RFC 7464) begins with this character.
+_CTF_2 = '\x1e'
+_READS_CTF_2 = (2, 1)
 
 # The head of a metadata packet: magic, UUID, checksum, sizes of content and packet in bits, and
 # compression, encryption, checksum scheme, major, minor (CTF 1.8.3, 7.1).
@@ -118,29 +178,35 @@ _PACKET = '16sIII5B'
 _MAGIC = 0x75D11D57
 
 
-def _check_metadata(path: str) -> None:
-    """Raise TraceError where a packet of the metadata is cut: babeltrace2 2.0 never ends on it."""
+def _metadata_text(path: str) -> str:
+    """
+    Return the text of metadata, which comes in packets or as it is.
+
+    :raises TraceError: where a packet is cut: babeltrace2 2.0 never ends on it.
+    """
     try:
         with open(path, 'rb') as stream:
             data = stream.read()
     except OSError as error:
         raise TraceError(path, f'cannot be read ({error.strerror})', _RECORD) from None
+    if not data:
+        raise TraceError(path, 'the metadata is empty', _RECORD)
     order = next((order for order in '<>' if data[:4] == struct.pack(f'{order}I', _MAGIC)), None)
     if order is None:
-        if not data:
-            raise TraceError(path, 'the metadata is empty', _RECORD)
-        return      # plain text
+        return data.decode(errors='replace')
     head = struct.Struct(f'{order}I{_PACKET}')
-    position = 0
+    position, text = 0, b''
     while position < len(data):
         if position + head.size > len(data):
             raise TraceError(path, f'the metadata is cut at byte {len(data)}', _RECORD)
         magic, _, _, content, size, *_ = head.unpack_from(data, position)
         if magic != _MAGIC or not head.size * 8 <= content <= size or size % 8:
             raise TraceError(path, f'the metadata is damaged at byte {position}', _RECORD)
+        text += data[position + head.size:position + content // 8]
         position += size // 8
         if position > len(data):
             raise TraceError(path, f'the metadata is cut at byte {len(data)}', _RECORD)
+    return text.decode(errors='replace')
 
 
 # --- the helper process --------------------------------------------------------------------------
@@ -154,27 +220,40 @@ def interpreters() -> list[str]:
     return list(dict.fromkeys(name for name in found if name and os.access(name, os.X_OK)))
 
 
-def _rows(path: str) -> Iterator[Row]:
-    """Yield the rows of the first Python that has the bindings."""
+def _rows(name: str, paths: Sequence[str], is_ctf_2: bool) -> Iterator[Row]:
+    """Yield the rows of the first Python that has bindings which read the format."""
+    too_old = None
     for interpreter in interpreters():
-        rows = _rows_of(interpreter, path)
+        rows = _rows_of(interpreter, name, paths)
         first = next(rows, None)
         if first is not None and first[0] == 'ready':
-            yield from rows
-            return
+            if not is_ctf_2 or _version(first[1]) >= _READS_CTF_2:
+                yield from rows
+                return
+            too_old = first[1]
         rows.close()
+    if too_old is not None:
+        raise TraceError(
+            name, f'it is CTF 2, which babeltrace2 {too_old} does not read',
+            'install babeltrace2 2.1 or newer, or record with lttng create --trace-format=ctf-1.8')
     raise TraceError(
-        path, "babeltrace2's Python bindings, which read it, are not installed", INSTALL)
+        name, "babeltrace2's Python bindings, which read it, are not installed", INSTALL)
 
 
-def _rows_of(interpreter: str, path: str) -> Generator[Row, None, None]:
+def _version(text: str) -> tuple[int, ...]:
+    return tuple(map(int, re.findall(r'\d+', text)[:2]))
+
+
+def _rows_of(
+    interpreter: str, name: str, paths: Sequence[str]
+) -> Generator[Row, None, None]:
     """Yield the rows of a helper process."""
     # A home that is set for one Python breaks another. Bytecode would be the only thing written.
     environment = {name: value for name, value in os.environ.items() if name != 'PYTHONHOME'}
     environment['PYTHONDONTWRITEBYTECODE'] = '1'
     try:
         process = subprocess.Popen(
-            [interpreter, str(_HELPER), os.path.abspath(path)], env=environment,
+            [interpreter, str(_HELPER), *map(os.path.abspath, paths)], env=environment,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     except OSError:
         return      # the next one, then
@@ -183,13 +262,13 @@ def _rows_of(interpreter: str, path: str) -> Generator[Row, None, None]:
     try:
         for row in _read(process.stdout):
             if row[0] == 'error':
-                raise TraceError(path, f'cannot be read ({row[1]})', _RECORD)
+                raise TraceError(name, f'cannot be read ({row[1]})', _RECORD)
             if row[0] == 'end':
                 return
             ready = ready or row[0] == 'ready'
             yield row
         if ready:
-            raise TraceError(path, f'babeltrace2 gave up ({_end_of(process)})', _RECORD)
+            raise TraceError(name, f'babeltrace2 gave up ({_end_of(process)})', _RECORD)
     finally:
         process.kill()
         process.stdout.close()
@@ -227,20 +306,34 @@ def _end_of(process: subprocess.Popen[bytes]) -> str:
 
 
 class _Kind(NamedTuple):
-    """How the events of a class are written; `unread` is a provider that replay does not know."""
+    """
+    How the events of a class are written.
+
+    :ivar unread: a provider that replay does not know.
+    :ivar place: of the session that they are of.
+    """
 
     key: str
     converts: Sequence[Callable[[Any], Any] | None]
     unread: str | None
+    place: int
 
 
 class _Importer:
-    """Writes the rows of a session as events."""
+    """
+    Writes the rows of the sessions of a run as events.
 
-    def __init__(self, path: str, file: TraceFile) -> None:
+    :param places: by what a trace says of its session, which one of them that is.
+    """
+
+    def __init__(
+        self, path: str, file: TraceFile, places: Mapping[tuple[str, ...], int]
+    ) -> None:
         self.result = Imported()
         self._path = path
         self._file = file
+        self._places = places
+        self._processes, self._threads = Numbers(), Numbers()
         self._kinds: dict[int, _Kind] = {}
         self._originals: dict[str, str] = {}        # full name in the trace: that in the session
         self._changed: dict[str, str] = {}
@@ -263,10 +356,12 @@ class _Importer:
         if vpid is None or vtid is None:
             self._nameless += 1
             vpid, vtid = vpid or 0, vtid or 0
+        kind = self._kinds[number]
+        vpid = self._processes.of(kind.place, vpid)
+        vtid = self._threads.of(kind.place, vtid)
         if procname and self._procnames.get((vpid, vtid)) != procname:
             self._procnames[vpid, vtid] = procname
             self._file.extend((('mddag:process', time, vtid, procname),), vpid)
-        kind = self._kinds[number]
         if kind.converts:
             values = [value if convert is None else convert(value)
                       for convert, value in zip(kind.converts, values)]
@@ -283,14 +378,18 @@ class _Importer:
         self.result.discarded += max(count, 1)
         self._file.extend((('mddag:lost', max(time, self._time), 0, max(count, 1)),), 0)
 
-    def _class(self, number: int, original: str, fields: list[tuple[str, str]]) -> None:
+    def _class(
+        self, number: int, original: str, fields: list[tuple[str, str]],
+        session: Sequence[str] = (),
+    ) -> None:
         event, converts = event_type(self._name(original), fields)
         for (given, _), (name, _) in zip(fields, event.fields):
             if given != name and given not in dict(PREAMBLE):
                 self._changed[f'{original}.{given}'] = name
         unread = None if event.provider in PROVIDERS else event.provider
         self._kinds[number] = _Kind(
-            self._file.define(event), converts if any(converts) else (), unread)
+            self._file.define(event), converts if any(converts) else (), unread,
+            self._places.get(tuple(session), 0))
 
     def _name(self, original: str) -> str:
         """Return the full name of an event; different ones stay different."""

@@ -133,11 +133,11 @@ class Session:
         # By the address of the event's class, which is kept so that none gets its address.
         self._known: dict[int, tuple[int, Any, list[Callable[[Any], Any]]]] = {}
 
-    def read(self, path: str) -> None:
-        """Write a row for each event below a folder, in the order of time."""
+    def read(self, paths: list[str]) -> None:
+        """Write a row for each event below some folders, in the order of time."""
         bt2 = self._bt2
         discarded = (bt2._DiscardedEventsMessageConst, bt2._DiscardedPacketsMessageConst)
-        for message in bt2.TraceCollectionMessageIterator(path):
+        for message in bt2.TraceCollectionMessageIterator(paths):
             if type(message) is bt2._EventMessageConst:
                 self._event(message)
             elif isinstance(message, discarded):
@@ -147,7 +147,7 @@ class Session:
         event = message.event
         known = self._known.get(event.cls.addr)
         if known is None:
-            known = self._define(event.cls)
+            known = self._define(event)
         number, _, getters = known
         payload = event.payload_field
         context = event.common_context_field
@@ -155,12 +155,15 @@ class Session:
             'event', number, message.default_clock_snapshot.ns_from_origin,
             *[_pick(context, names) for names in _IDENTITY], [get(payload) for get in getters])
 
-    def _define(self, cls: Any) -> tuple[int, Any, list[Callable[[Any], Any]]]:
+    def _define(self, event: Any) -> tuple[int, Any, list[Callable[[Any], Any]]]:
+        cls = event.cls         # which belongs to one trace
+        environment = event.stream.trace.environment
+        session = [str(environment[name]) if name in environment else '' for name in SESSION]
         fields = members(cls.payload_field_class)
         number = len(self._known)
         known = number, cls, [get for _, _, get in fields]
         self._known[cls.addr] = known
-        self._add('class', number, cls.name or '', [field[:2] for field in fields])
+        self._add('class', number, cls.name or '', [field[:2] for field in fields], session)
         return known
 
     def _discarded(self, message: Any) -> None:
@@ -173,6 +176,9 @@ class Session:
             time = -1       # the stream has no times for it
         self._add('discarded', time, -1 if count is None else count)
 
+
+# What tells sessions apart in the environment of their traces.
+SESSION = ('hostname', 'trace_name', 'trace_creation_datetime')
 
 # Process, thread and name: of user space first, then of the kernel.
 _IDENTITY = (('vpid', 'pid'), ('vtid', 'tid'), ('procname',))
@@ -193,8 +199,8 @@ def reason(error: BaseException) -> str:
     return ' '.join(str(text or error or type(error).__name__).split())
 
 
-def main(session: str) -> int:
-    """Read a session; the outcome is the last row."""
+def main(sessions: list[str]) -> int:
+    """Read the sessions of a run; the outcome is the last row."""
     # What a library prints must not come between the rows.
     with os.fdopen(os.dup(1), 'wb') as stream:
         os.dup2(2, 1)
@@ -207,7 +213,7 @@ def main(session: str) -> int:
         add('ready', str(getattr(bt2, '__version__', '')))
         stream.flush()
         try:
-            Session(bt2, add).read(session)
+            Session(bt2, add).read(sessions)
             add('end')
         except BrokenPipeError:
             os._exit(1)     # the importer has gone
@@ -220,4 +226,4 @@ if __name__ == '__main__':
     # The folder of this file is no place to import from: its modules are the project's.
     _here = os.path.dirname(os.path.abspath(__file__))
     sys.path[:] = [_path for _path in sys.path if os.path.abspath(_path or '.') != _here]
-    sys.exit(main(sys.argv[1]))
+    sys.exit(main(sys.argv[1:]))

@@ -17,7 +17,7 @@ Theory of operation:
    order: that is damage. Events of equal time come in the order of the file.
 4. In both orders a block is used only when everything before it in the file is sound, so what
    damage leaves is always the beginning of the recording. It is kept in `damage`, not raised.
-5. In the order of time an event at a time that cannot be (`times`) is left out and counted.
+5. In the order of time an event before 1970 or after 2116 (`times`) is left out and counted.
 6. A message in a sound chunk that does not decode is left out and counted.
 7. The messages of other topics are given out as they are, in the order of the file.
 """
@@ -38,7 +38,7 @@ from mddag_executor.trace.cdr import ENCAPSULATION
 from mddag_executor.trace.channels import Channels, Topic
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.events import Event, Events, Ints, OTHER, rows_at
-from mddag_executor.trace.times import plain, Times
+from mddag_executor.trace.times import Times
 import numpy as np
 
 _BATCH = 16                     # blocks that are loaded at a time in the order of time
@@ -200,10 +200,9 @@ class Reading:
         times = found.times
         if not len(times):
             return found
-        if not plain(int(times.min()), int(times.max())):
-            kept = np.ones(len(times), dtype=np.bool_)
-            kept[self._times.impossible(times.tolist())] = False
-            found = found.some(kept)
+        wrong = self._times.out_of_range(times)
+        if wrong.any():
+            found = found.some(~wrong)
             times = found.times
         if (times[1:] < times[:-1]).any():
             found = found.some(np.argsort(times, kind='stable'))

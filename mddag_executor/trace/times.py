@@ -8,6 +8,11 @@ Theory of operation
 One flipped bit makes a time that is years away; a program that believes it waits for years.
 
 1. A time before 1970 or at or after `NEVER` (2116) is impossible.
+
+The other rules are for bags, whose messages are in the order in which they were recorded.  In a
+trace an execution is recorded when it ends: its start may lie any time before the events around
+it.  Chunks of a trace have checksums.
+
 2. The other times, in the order of the file, are put into groups: times that are `GAP_NS` or less
    from the next are of one group.  Most recordings have one; a recorder that was paused, or one
    of rare messages, makes several, one after the other.
@@ -47,18 +52,27 @@ class Times:
         self.furthest = 0
         self._example = 0
 
+    def out_of_range(self, times: Any) -> Any:
+        """Return which times of an array are impossible by themselves (rule 1)."""
+        wrong = (times < 0) | (times >= NEVER)
+        self._leave_out(times[wrong])
+        return wrong
+
+    def _leave_out(self, times: Any) -> None:
+        if len(times) and not self.left_out:
+            self._example = int(times[0])
+        self.left_out += len(times)
+
     def impossible(self, times: Sequence[int]) -> list[int]:
-        """Return the places, in ascending order, of what cannot be among times of one file."""
-        if not len(times) or plain(min(times), max(times)):
+        """Return the places, in ascending order, of what cannot be among times of one bag."""
+        if not len(times) or _plain(min(times), max(times)):
             return []
         array = np.array([min(max(int(time), -1), NEVER) for time in times], dtype=np.int64)
         wrong = (array < 0) | (array >= NEVER)
         for group in self._stray(array, np.flatnonzero(~wrong)):
             wrong[group] = True
         found: list[int] = np.flatnonzero(wrong).tolist()
-        if found and not self.left_out:
-            self._example = int(times[found[0]])
-        self.left_out += len(found)
+        self._leave_out([times[place] for place in found])
         back = -np.diff(array[~wrong])
         back = back[back > GAP_NS]
         self.jumps += len(back)
@@ -106,7 +120,7 @@ def credible(stamp: int, arrival: int) -> bool:
     return 0 < stamp and arrival - stamp < FAR_NS
 
 
-def plain(least: int, greatest: int) -> bool:
+def _plain(least: int, greatest: int) -> bool:
     """Return whether times between these two are all possible, and of one group."""
     return 0 <= least and greatest < NEVER and greatest - least <= GAP_NS
 

@@ -9,10 +9,13 @@ import json
 from pathlib import Path
 import re
 import subprocess
+import sys
 
 from mddag_executor.report.tables import drift_lines, MOST_LINES
 import msg_graph
 import pytest
+
+from ..replay.recorded import MS, Recorded
 
 Mddag = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -26,6 +29,56 @@ nodes:
 - node_name: /nobody
   callbacks:
   - {callback_name: /nobody/callback_0, callback_type: timer_callback, period_ns: 5000000}
+"""
+
+ASKING = """\
+from mddag_executor import MultiDeadlineExecutor
+import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+
+class Asking(Node):
+    def __init__(self):
+        super().__init__('asking')
+        group = ReentrantCallbackGroup()
+        for name in ('inner', 'outer'):
+            self.create_service(Trigger, name, getattr(self, name), callback_group=group)
+        self.inner_client, self.outer_client = (
+            self.create_client(Trigger, name, callback_group=group) for name in ('inner', 'outer'))
+        self.timer = self.create_timer(0.05, self.ask)
+        self.asked = self.answered = 0
+
+    def inner(self, request, response):
+        return response
+
+    async def outer(self, request, response):
+        await self.inner_client.call_async(Trigger.Request())
+        await self.inner_client.call_async(Trigger.Request())
+        return response
+
+    def ask(self):
+        if self.asked == 5:
+            self.timer.cancel()
+            return
+        self.asked += 1
+        self.outer_client.call_async(Trigger.Request()).add_done_callback(self.count)
+
+    def count(self, future):
+        self.answered += 1
+
+
+rclpy.init()
+node = Asking()
+executor = MultiDeadlineExecutor(None, trace='ask.mcap')
+executor.add_node(node)
+node.inner_client.wait_for_service()
+node.outer_client.wait_for_service()
+while node.answered < 5 or not node.timer.is_canceled():
+    executor.spin_once(timeout_sec=1)
+executor.shutdown()
+print(node.asked)
 """
 
 
@@ -53,6 +106,152 @@ def test_from_trace_keeps_what_was_declared(
     callback, = msg_graph.load(tmp_path / 'again.yaml').callbacks
     assert (callback.on_miss, callback.max_active_jobs, callback.holds_interpreter) == (
         'abort', 900, False)
+
+
+def composed(path: Path) -> Path:
+    """Write five messages within a process: rclcpp runs the subscription's second callback."""
+    r = Recorded(path)
+    r.node(1, '/camera')
+    r.node(2, '/detect')
+    r.timer(11, 1, 100 * MS)
+    r.publisher(100, 1, '/image')
+    r.subscription(12, 2, '/image', within=13)
+    for k in range(1, 6):
+        at = k * 100 * MS
+        r.run(11, 1, at, at + 2 * MS)
+        r.add('ros2:rclcpp_intra_publish', at + MS, 1, 100, 0x500)
+        r.add('ros2:rclcpp_ring_buffer_enqueue', at + MS + 1, 1, 0xB, 0, 1, 0)
+        r.add('ros2:rclcpp_ring_buffer_dequeue', at + 3 * MS, 2, 0xB, 0, 0)
+        r.run(13, 2, at + 3 * MS + 1, at + 7 * MS + 1, within=True)
+    return r.write()
+
+
+def test_messages_within_a_process_count(call: Mddag, tmp_path: Path) -> None:
+    """From the recording alone, and with an architecture file."""
+    composed(tmp_path / 'c.mcap')
+    done = call('graph', 'from-trace', 'c.mcap', '--accept', '-o', 'g.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, 'no blanks to fill in\n', '')
+    grab, detect = msg_graph.load(tmp_path / 'g.yaml').callbacks
+    assert (grab.publishes, detect.topics, detect.deadline_ns) == (
+        ('/image',), ('/image',), 100 * MS)
+    assert detect.execution_time is not None
+    assert set(detect.execution_time.quantiles_ns) == {4 * MS}
+    done = call('replay', 'c.mcap', 'g.yaml', '--json', '-', cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    sink, = json.loads(done.stdout)['dags']['/camera']['sinks'].values()
+    assert (sink['completed'], sink['late'], sink['response_ns']['max']) == (5, 0, 7 * MS + 1)
+    (tmp_path / 'a.yaml').write_text("""\
+nodes:
+- node_name: /camera
+  callbacks:
+  - {callback_name: /camera/callback_0, callback_type: timer_callback, period_ns: 100000000}
+  publishes:
+  - {topic_name: /image, callback_names: [UNDEFINED]}
+- node_name: /detect
+  callbacks:
+  - {callback_name: /detect/callback_0, callback_type: subscription_callback, topic_name: /image}
+""")
+    done = call('graph', 'from-caret', 'a.yaml', '--trace', 'c.mcap', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout.count('# measured in 5 executions') == 2
+
+
+def test_from_trace_accepts_the_proposals(call: Mddag, tmp_path: Path) -> None:
+    """Two sources in a node, and what has no rate; the declaration then judges the recording."""
+    r = Recorded(tmp_path / 'r.mcap')
+    r.node(1, '/n')
+    r.node(2, '/quiet')
+    r.timer(11, 1, 10 * MS)
+    r.timer(16, 1, 100_000_000 * MS)                # longer than a declaration allows
+    r.publisher(100, 1, '/out')
+    r.publisher(101, 1, '/status')                  # which no callback was seen to publish
+    r.publisher(102, 2, '/alone')
+    for callback, topic in ((12, '/in'), (13, '/never'), (14, '/once'), (15, '/status')):
+        r.subscription(callback, 1, topic)
+    r.subscription(17, 1, '/out')
+    for k in range(1, 11):
+        at = k * 10 * MS
+        r.run(11, 1, at, at + MS)
+        stamp = r.publish(100, 1, at + MS // 2)
+        r.receive(17, 2, at + 2 * MS, at + (11 if k == 5 else 3) * MS, stamp)
+        for callback in (12, 15) if k % 2 else ():
+            r.receive(callback, callback, at, at + MS, at - MS)
+    r.receive(14, 4, 50 * MS, 51 * MS, 49 * MS)
+    r.write()
+    done = call('graph', 'from-trace', 'r.mcap', '-o', 'blank.yaml', cwd=tmp_path)
+    assert done.returncode == 0
+    assert call('graph', 'check', 'blank.yaml', cwd=tmp_path).returncode == 2
+    done = call('graph', 'from-trace', 'r.mcap', '--accept', '-o', 'g.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout == (
+        "no blanks to fill in\n4 callbacks left out: see '# Left out:' in it\n")
+    assert sorted(line for line in (tmp_path / 'g.yaml').read_text().splitlines()
+                  if line.startswith('# Left out:')) == [
+        '# Left out: /n:callback_1 (timer): its period is said to be 100000s',
+        '# Left out: /n:callback_3 (subscription /never): it never ran',
+        '# Left out: /n:callback_4 (subscription /once): it ran once, which gives no rate',
+        '# Left out: /quiet:callback_0 (timer): nothing is recorded that starts it']
+    dags = msg_graph.load(tmp_path / 'g.yaml').dags
+    assert [(dag.name, dag.period_ns, [dag.vertices[sink].deadline_ns for sink in dag.sinks])
+            for dag in dags] == [
+        ('/n/callback_0', 10 * MS, [10 * MS]), ('/n/callback_2', 20 * MS, [20 * MS]),
+        ('/n/callback_5', 20 * MS, [20 * MS])]
+    done = call('replay', 'r.mcap', 'g.yaml', '--json', '-', cwd=tmp_path)
+    assert done.returncode == 0
+    judged = json.loads(done.stdout)['dags']
+    assert {name: [(sink['completed'], sink['late']) for sink in dag['sinks'].values()]
+            for name, dag in judged.items()} == {
+        '/n/callback_0': [(10, 1)], '/n/callback_2': [(5, 0)], '/n/callback_5': [(5, 0)]}
+
+
+def test_from_trace_with_nothing_to_declare(call: Mddag, tmp_path: Path) -> None:
+    r = Recorded(tmp_path / 'r.mcap')
+    r.node(1, '/n')
+    r.subscription(12, 1, '/in')
+    r.write()
+    for options in ([], ['--accept']):
+        done = call('graph', 'from-trace', 'r.mcap', *options, '-o', 'g.yaml', cwd=tmp_path)
+        assert (done.returncode, done.stdout) == (2, '')
+        assert done.stderr == ('error: r.mcap: none of its callbacks has a known rate: record for '
+                               'a longer time\n')
+    assert not (tmp_path / 'g.yaml').exists()
+
+
+def test_from_trace_of_a_cycle_says_so(call: Mddag, tmp_path: Path) -> None:
+    """Proposals do not break it, so the declaration is there to be corrected."""
+    r = Recorded(tmp_path / 'r.mcap')
+    r.node(1, '/n')
+    r.publisher(100, 1, '/ping')
+    r.publisher(101, 1, '/pong')
+    r.subscription(12, 1, '/ping')
+    r.subscription(13, 1, '/pong')
+    for k in range(1, 4):
+        for callback, publisher, at in ((12, 101, k * 10 * MS), (13, 100, k * 10 * MS + 5 * MS)):
+            r.run(callback, 1, at, at + MS)
+            r.publish(publisher, 1, at + MS // 2)
+    r.write()
+    done = call('graph', 'from-trace', 'r.mcap', '--accept', '-o', 'g.yaml', cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith('error: g.yaml:') and done.stderr.count('\n') == 1
+    assert 'start each other in a cycle' in done.stderr
+    assert (tmp_path / 'g.yaml').exists()
+
+
+def test_a_coroutine_is_one_execution_however_often_it_is_resumed(
+        call: Mddag, tmp_path: Path) -> None:
+    pytest.importorskip('rclpy')
+    (tmp_path / 'ask.py').write_text(ASKING)
+    done = subprocess.run(
+        [sys.executable, 'ask.py'], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    asked = int(done.stdout)
+    done = call('graph', 'from-trace', 'ask.mcap', '-o', 'g.yaml', cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    counts = dict(re.findall(
+        r'name: (\w+)\n(?:(?!.*- name).*\n)*? *# measured in (\d+) ex',
+        (tmp_path / 'g.yaml').read_text()))
+    # the last execution of the timer's callback asks nothing
+    assert counts == {'ask': str(asked + 1), 'inner': str(2 * asked), 'outer': str(asked)}
 
 
 def test_from_trace_of_something_else(call: Mddag, tmp_path: Path) -> None:

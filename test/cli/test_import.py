@@ -4,13 +4,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 import sys
 
 from mddag_executor.trace import ctf, read_events
 import pytest
 
-from .helpers import caller
+from ..cli.helpers import caller
+from ..trace.ctf_session import session
 
 call = caller('import')
 
@@ -72,6 +74,93 @@ def test_bad_sessions(name: str, what: str, tmp_path: Path,
     assert (status, text, errors.count('\n')) == (2, '', 1)
     assert errors.startswith(f'error: {tmp_path / name}: {what}')
     assert not list(tmp_path.glob('*.mcap')) + list(tmp_path.glob('.*'))
+
+
+def of_session(
+    folder: Path, name: str, made: str, host: str = 'robot', callback: int = 1
+) -> None:
+    """Write a trace of a session: an event of a callback."""
+    session(folder, [('ros2:callback_end', [('callback', 'u64')])],
+            [(0, callback, callback, 1, 'p', callback)],
+            environment={'domain': 'ust', 'trace_name': name, 'trace_creation_datetime': made,
+                         'hostname': host})
+
+
+@pytest.mark.needs('babeltrace2')
+def test_several_sessions_are_named_one_by_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Parts of one session are one recording, wherever they lie; two sessions need to be named."""
+    out = tmp_path / 'out.mcap'
+    of_session(tmp_path / 'one' / 'ust/uid/1000/64-bit', 'drive', 'monday', callback=1)
+    of_session(tmp_path / 'one' / 'archives/chunk-0/ust/uid/1000/64-bit', 'drive', 'monday',
+               callback=2)
+    of_session(tmp_path / 'one' / 'kernel', 'drive (kernel)', 'mon', callback=3)
+    status, text, errors = call(capsys, 'ctf', tmp_path / 'one', '-o', out)
+    assert (status, errors) == (0, '')
+    assert [event['callback'] for event in read_events(out)] == [1, 2, 3]
+    out.unlink()
+    for name, host in (('another', 'robot'), ('elsewhere', 'tower')):
+        of_session(tmp_path / name / 'ust/uid/1000/64-bit', 'drive', 'tuesday', host, callback=4)
+        status, text, errors = call(capsys, 'ctf', tmp_path, '-o', out)
+        assert (status, text, errors.count('\n')) == (2, '', 1)
+        count = 2 if name == 'another' else 3
+        assert errors.startswith(f'error: {tmp_path}: it holds {count} sessions: another, ')
+        assert 'name the folder of one' in errors
+        assert not out.exists()
+    status, text, errors = call(
+        capsys, 'ctf', tmp_path / 'one', tmp_path / 'elsewhere', '-o', out)
+    assert (status, errors) == (0, '')
+    assert [event['callback'] for event in read_events(out)] == [1, 2, 3, 4]
+    out.unlink()
+    status, _, errors = call(
+        capsys, 'ctf', tmp_path / 'one', tmp_path / 'one' / 'kernel', '-o', out)
+    assert (status, errors.count('\n')) == (2, 1)
+    assert errors.endswith(': a session is named twice: name each once\n')
+
+
+@pytest.mark.needs('babeltrace2')
+def test_processes_of_several_containers_may_have_the_same_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # in both containers process 1 runs a callback of the same address, at overlapping times
+    kinds = [(f'ros2:callback_{what}', [('callback', 'u64')]) for what in ('start', 'end')]
+    for name, made, late in (('camera', '12:00:01', 0), ('control', '12:00:02', 3)):
+        events = [(what, 10 * k + late + 6 * what, 1, 1, name, 0x5550)
+                  for k in range(5) for what in (0, 1)]
+        session(tmp_path / name / 'ust', kinds, events, environment={
+            'trace_name': 'drive', 'trace_creation_datetime': made, 'hostname': 'robot'})
+    out = tmp_path / 'out.mcap'
+    status, text, errors = call(
+        capsys, 'ctf', tmp_path / 'camera', tmp_path / 'control', '-o', out)
+    assert (status, errors) == (0, '') and 'from 2 processes' in text
+    status, text, _ = caller('replay')(capsys, out, '--json', '-')
+    assert status == 0
+    result = json.loads(text)
+    assert [(use['executions'], use['unfinished'], use['busy_ns'])
+            for use in result['recorded_callbacks'].values()] == [(5, 0, 30), (5, 0, 30)]
+
+
+@pytest.mark.parametrize('version, reads', [
+    ('2.0.4', False), ('2.0.6-rc1', False), ('2.1.0', True), ('2.10', True), ('3.0', True)])
+def test_ctf_2_needs_babeltrace_2_1(
+    version: str, reads: bool, recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, metadata = recording.with_name('out.mcap'), recording / 'metadata'
+    metadata.write_text('\x1e{"type": "preamble", "version": 2}\n\x1e{"type": "trace-class", '
+                        '"environment": {"hostname": "robot", "trace_name": "drive"}}\n')
+    helper = recording.with_name('helper.py')
+    helper.write_text(helper.read_text().replace("'2'", repr(version)))
+    status, text, errors = call(capsys, 'ctf', recording, '-o', out)
+    if reads:
+        assert (status, errors) == (0, '')
+        assert [event['callback'] for event in read_events(out)] == [3]
+    else:
+        assert (status, text) == (2, '')
+        assert errors == (
+            f'error: {recording}: it is CTF 2, which babeltrace2 {version} does not read: install '
+            'babeltrace2 2.1 or newer, or record with lttng create --trace-format=ctf-1.8\n')
+        assert not out.exists()
 
 
 def test_bad_outputs(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+import re
 import sys
 from typing import Any
 
@@ -14,6 +15,8 @@ import pytest
 
 from ..cli.helpers import caller
 from ..report.runs import by_hand, GRAPH, MS, START
+
+DEMO = Path(__file__).parents[2] / 'bags' / 'demo_short.mcap'
 
 call = caller('replay')
 
@@ -110,7 +113,8 @@ def test_reschedule(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert ['/driver', 'filter:run', '8', 'ms', '2', 'of', '3', '66.67', '%', '2', 'of', '3',
             '66.67', '%', '5', 'ms', '6', 'ms', '9', 'ms', '10', 'ms', '9', 'ms', '10',
             'ms'] in lines
-    assert 'policy fifo, 1 worker, preemptive, 40 ms, utilisation 0.450' in out
+    assert ('policy fifo, 1 worker, preemptive, 40 ms, utilisation 0.450, workers busy 45.0 %'
+            in out.splitlines())
     assert 'first miss: /filter:run, job 2, 1 ms late' in out
     result = json.loads(call(capsys, trace, '--reschedule', '--json', '-')[1])
     assert (result['policy'], result['workers'], result['preemptive']) == ('rad', 2, False)
@@ -123,6 +127,35 @@ def test_reschedule(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
         sink = result['dags']['/driver']['sinks']['/filter:run']
         assert sink['response_ns']['max'] == longest
         assert result['overheads']['dispatch_median_ns'] == 0
+
+
+def test_utilisation_is_what_is_asked_for_beside_how_busy_workers_were(
+    capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, _ = call(capsys, DEMO, '--reschedule', '--workers', 3)
+    line, = (line for line in out.splitlines() if ', utilisation ' in line)
+    figures = re.fullmatch(r'.*, utilisation ([0-9.]+), workers busy ([0-9.]+) %', line)
+    assert status == 0 and figures is not None
+    assert float(figures[1]) > 1 and float(figures[2]) <= 100
+
+
+def test_a_run_without_jobs_proves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # only an undeclared callback ran, 1.5 s after the recording began
+    trace, report = tmp_path / 'run.mcap', tmp_path / 'report.html'
+    with TraceFile(trace) as file:
+        file.add('task_set', START, 1, 9, GRAPH, 'graph.yaml', 'rad', 2, 100 * MS, 64, False)
+        now = START + 1_500 * MS
+        file.add('dispatch', now, 1, 9, 77, -1, -1, -1, 0, now, 0)
+        file.add('callback_start', now, 1, 9, 77, False)
+        file.add('callback_end', now + MS, 1, 9, 77)
+        file.add('shutdown', now + MS, 1, 9, now + MS)
+    status, out, _ = call(capsys, trace, '--report', report)
+    assert status == 0 and ', 1.501 s, utilisation 0.000 ' in out
+    page = report.read_text()
+    assert 'No deadline was missed' not in page
+    assert 'No job was due at any sink: nothing is proven.' in page
 
 
 def test_a_truncated_trace_gives_what_is_there(
@@ -175,7 +208,8 @@ def no_declaration(path: Path) -> None:
     (b'PK\x03\x04' * 100, 'is no MCAP file: give a trace'),
     (nothing_recorded, 'no run of this executor is recorded in it (it has no event '
      'mddag:task_set): record a run with mddag run'),
-    (no_declaration, 'it was recorded without a declaration, so there are no jobs: record'),
+    (no_declaration,
+     'it was recorded without a declaration, so there are no jobs: give the GRAPH'),
 ])
 @pytest.mark.parametrize('options', [[], ['--reschedule']])
 def test_what_is_no_trace_is_one_line(

@@ -125,6 +125,55 @@ def test_unmodified_programs(drive: Path, tmp_path: Path) -> None:
     assert 'heard 49 messages' in alone.stdout
 
 
+HASHES = """\
+import rclpy
+from std_msgs.msg import Float64, String
+
+def make():
+    node = rclpy.create_node('tracker')
+    node.create_subscription(Float64, '/distance', lambda message: None, 10)
+    node.create_publisher(String, '/hash', 10).publish(String(data=str(hash('tracker'))))
+    return node
+"""
+MADE = ('rerun', 'drive.mcap', 'graph.yaml', '--node', 'hashes:make', '--json', '-')
+
+
+@pytest.fixture
+def hashes(drive: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.delenv('PYTHONHASHSEED', raising=False)
+    (drive / 'hashes.py').write_text(HASHES)
+    return drive
+
+
+def test_hashes_are_fixed_however_the_program_is_installed(hashes: Path) -> None:
+    """`ros2 run` starts PREFIX/lib/PACKAGE/mddag, which colcon has put there."""
+    script = hashes / 'lib' / 'mddag_executor' / 'mddag'
+    script.parent.mkdir(parents=True)
+    script.write_text('import sys\nfrom mddag_executor.cli.main import main\nsys.exit(main())\n')
+    digests = set()
+    for command in ([str(script)], [str(script)], ['-m', 'mddag_executor']):
+        done = subprocess.run(
+            [sys.executable, *command, *MADE], cwd=hashes, capture_output=True, text=True,
+            check=True, timeout=120, env={**os.environ, 'PYTHONPATH': os.getcwd()})
+        digests.add(json.loads(done.stdout)['digest'])
+        assert not done.stderr
+    assert len(digests) == 1
+
+
+@pytest.mark.parametrize(('options', 'remedy'), [
+    (['-E', '-m', 'mddag_executor'], 'leave out -E and -I of Python'),
+    (['-c', 'import sys; from mddag_executor.cli.main import main; sys.exit(main())'],
+     'set PYTHONHASHSEED=0'),
+])
+def test_where_hashes_cannot_be_fixed_that_is_said(
+    hashes: Path, options: list[str], remedy: str
+) -> None:
+    done = subprocess.run(
+        [sys.executable, *options, *MADE], cwd=hashes, capture_output=True, text=True,
+        check=True, timeout=120)
+    assert done.stderr == f'warning: hashes of strings are not the same in each run: {remedy}\n'
+
+
 @pytest.mark.parametrize(('args', 'message'), [
     (('none.mcap', 'graph.yaml', *NODES), 'none.mcap: '),
     (('drive.mcap', 'graph.yaml'), 'the following arguments are required: --node'),

@@ -19,6 +19,7 @@ from mddag_executor.cli import run
 from mddag_executor.core.tally import counts, total
 from mddag_executor.report.tables import percent, short_names, sink_table
 from mddag_executor.trace import read_events, TraceError, TraceReader
+from msg_graph import load
 import pytest
 
 Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
@@ -62,6 +63,10 @@ nodes:
     (['graph.yaml', '--node', 'nowhere:main'], '--node nowhere:main: there is no module'),
     (['bad.yaml', '--node', 'nowhere:main'], 'bad.yaml:1: '),
     (['untimed.yaml', '--synthetic', 'sleep', '--utilisation', '0.5'], 'declare execution_time'),
+    (['--synthetic', 'sleep'], 'it is about the nodes of a declaration: give a GRAPH'),
+    (['--node', 'a:b', '--processes', '2'], '--processes: it is about the nodes of a declaration'),
+    (['--node', 'a:b', '--process', 'x'], '--process: it is about the nodes of a declaration'),
+    (['--node', 'nowhere:main', '--trace', 'r.mcap'], '--node nowhere:main: there is no module'),
 ])
 def test_bad_input_is_one_line_and_starts_nothing(
     graph: Path, call: Mddag, arguments: list[str], message: str
@@ -115,6 +120,59 @@ def test_a_synthetic_run_is_counted_measured_and_recorded(graph: Path, mddag: Md
     for text in ('quick:cb', 'slow:cb', '500 ms', 'sink jobs due', 'measured by the nodes, ',
                  '0 dropped', f'trace: {graph.parent / "out.mcap"}'):
         assert text in process.stdout
+
+
+ROBOT = """\
+from rclpy.node import Node
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+
+class Camera(Node):
+
+    def __init__(self):
+        super().__init__('camera')
+        self.images = self.create_publisher(Header, '/image', 1)
+        self.create_timer(0.02, self.capture)
+        self.create_service(Trigger, 'unused', lambda request, response: response)
+
+    def capture(self):
+        self.images.publish(Header())
+
+
+class Detector(Node):
+
+    def __init__(self):
+        super().__init__('detector')
+        self.create_subscription(Header, '/image', self.detect, 1)
+
+    def detect(self, image):
+        pass
+"""
+
+
+def test_three_commands_from_a_robot_to_a_verdict(folder: Path, mddag: Mddag) -> None:
+    """Recorded without a declaration, which then comes from the recording."""
+    Path('robot.py').write_text(ROBOT)
+    done = mddag('run', '--node', 'robot:Camera', '--node', 'robot:Detector', '--duration', '1s',
+                 '--trace', 'a.mcap')
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0] == 'no declaration was given, so no deadline was judged'
+    assert lines[-1] == ('to judge it: mddag graph from-trace a.mcap --accept -o graph.yaml, then '
+                         'mddag replay a.mcap graph.yaml')
+    done = mddag('graph', 'from-trace', 'a.mcap', '--accept', '-o', 'g.yaml')
+    assert (done.returncode, done.stderr) == (0, '')
+    dag, = load('g.yaml').dags
+    assert [vertex.callback.key for vertex in dag.vertices] == [
+        '/camera:capture', '/detector:detect']
+    assert (dag.period_ns, dag.vertices[1].deadline_ns) == (20_000_000, 20_000_000)
+    done = mddag('replay', 'a.mcap', 'g.yaml', '--json', 'r.json')
+    assert done.returncode == 0, done.stderr
+    ran = int(re.findall(r'/detector: detect \(subscription /image\) (\d+)', '\n'.join(lines))[0])
+    verdicts = counts(json.loads(Path('r.json').read_text())['dags']['/camera']['sinks'][
+        '/detector:detect'])
+    assert verdicts.in_time + verdicts.late == ran > 0
 
 
 def test_spinning_takes_cpu_which_is_not_overhead(graph: Path, mddag: Mddag) -> None:

@@ -292,6 +292,18 @@ def test_who_is_called_by_spin_knows(ros_context, make_node):
     assert found == [False, True]
 
 
+def test_a_node_keeps_its_executor_beside_another_one(make_node, ros_context):
+    node = make_node()
+    kept, runs = (SingleThreadedExecutor(context=ros_context) for _ in range(2))
+    kept.add_node(node)
+    with compat.executor_kept(node):
+        runs.add_node(node)
+    assert node.executor is kept
+    assert kept.get_nodes() == runs.get_nodes() == [node]
+    for executor in (kept, runs):
+        executor.shutdown()
+
+
 def test_the_subscription_that_keeps_time_is_known(make_node):
     node = make_node(parameter_overrides=[rclpy.parameter.Parameter('use_sim_time', value=True)])
     other = node.create_subscription(String, 'said', lambda message: None, 1)

@@ -95,6 +95,25 @@ def test_service_and_client_from_a_coroutine(make_executor, make_node):
     assert set(answers) == {'yes'}
 
 
+def test_a_callback_that_waits_may_lend_its_worker(make_executor, make_node):
+    node, event, seen = make_node(), threading.Event(), []
+
+    def wait() -> None:
+        waiting.cancel()
+        with executor.lend():
+            seen.append(event.wait(15.0))
+
+    waiting = node.create_timer(0.01, wait, ReentrantCallbackGroup())
+    node.create_timer(0.02, event.set, ReentrantCallbackGroup())
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    with executor.lend():  # elsewhere it does nothing
+        pass
+    with Spinning(executor):
+        assert wait_for(lambda: bool(seen), 30.0)
+    assert seen == [True]
+
+
 def test_synchronous_calls_from_all_workers_at_once(make_executor, make_node):
     """A worker that waits lends its place: rclpy#1211 and #1398 hang here."""
     node = make_node()

@@ -138,6 +138,32 @@ nodes:
     agrees(trace, statistics)
 
 
+def test_a_listener_may_handle_exceptions_of_callbacks(make_executor, make_node) -> None:
+    node, ended = make_node(), []
+    numbers = iter(range(1000))
+
+    def tick() -> None:
+        if next(numbers) % 2:
+            raise ValueError('odd')
+
+    async def coroutine() -> None:
+        pass
+
+    def note(entity: Any, error: BaseException | None) -> bool:
+        ended.append((entity, str(error)))
+        return error is not None
+
+    timers = [node.create_timer(0.01, tick), node.create_timer(0.01, coroutine)]
+    executor = make_executor()
+    executor.on_callback_ended(note)
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: len(ended) > 10)
+    assert spinning.error is None
+    assert set(ended) == {
+        (timers[0], 'None'), (timers[0], 'odd'), (timers[1], 'None')}
+
+
 def test_an_exception_that_is_handled_changes_nothing(make_executor, make_node) -> None:
     def handles() -> None:
         try:

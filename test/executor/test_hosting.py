@@ -19,13 +19,14 @@ import time
 from typing import Any
 import weakref
 
-from mddag_executor.executor.hosting import Guest, Host
-from mddag_executor.executor.loading import Program
+from mddag_executor.hosting.host import Host
+from mddag_executor.hosting.loading import Program
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.trace import read_events, TraceError, TraceReader
 import pytest
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
+import rclpy.experimental
 from rclpy.node import Node
 
 from .conftest import wait_for
@@ -108,6 +109,15 @@ def test_unmodified_programs_run_on_our_executor(
     ('chat:spins_in_thread', ['heard five', 'thread joined']),
     ('chat:spins_once', ['heard enough']),
     ('chat:calls_a_service', ['answer: forty-two']),
+    ('chat:ends_in_a_thread', ['over']),
+    ('chat:handles_a_signal', [
+        f'while it worked: signal {signal.SIGUSR1:d}', f'while it spun: signal {signal.SIGUSR1:d}',
+        'one handler: True']),
+    ('chat:handles_its_exceptions', ['<lambda> raised odd', 'spin raised odd']),
+    ('chat:spins_in_callbacks', [
+        'of the node forty-two', 'of rclpy forty-two', 'step by step forty-two',
+        'step by step of rclpy forty-two']),
+    ('chat:steps', ['30 steps']),
 ])
 def test_a_program_goes_on_while_its_callbacks_run(
     world: Path, spec: str, lines: list[str]
@@ -146,9 +156,29 @@ def test_the_run_ends_when_a_callback_shuts_rclpy_down(world: Path) -> None:
     assert 'shut down' in output
 
 
-def test_the_run_ends_when_all_programs_have_ended(world: Path) -> None:
-    _, output = run('chat:calls_a_service')
-    assert 'answer: forty-two' in output
+@pytest.mark.parametrize(('spec', 'line'), [
+    ('chat:calls_a_service', 'answer: forty-two'), ('chat:never_spins', 'typed w')])
+def test_the_run_ends_when_all_programs_have_ended(world: Path, spec: str, line: str) -> None:
+    _, output = run(spec)
+    assert line in output.splitlines()
+
+
+def test_what_programs_ask_in_a_terminal_stays_as_it_is(world: Path) -> None:
+    (world / 'asks.py').write_text(
+        'import time, rclpy\ndef main():\n    rclpy.init()\n'
+        "    print('speed: ', end='', flush=True)\n    time.sleep(3)\n    print('none')\n")
+    leader, follower = os.openpty()
+    with open(leader, 'rb', buffering=0) as terminal:
+        process = subprocess.Popen(
+            [sys.executable, '-m', 'mddag_executor', 'run', 'graph.yaml', '--node', 'asks:main'],
+            stdin=follower, stdout=follower, stderr=follower)
+        os.close(follower)
+        shown = b''
+        with suppress(OSError):  # of a terminal that nobody has open any more
+            while piece := terminal.read(1 << 12):
+                shown += piece
+    assert process.wait(60) == 0
+    assert b'speed: none\r\n' in shown
 
 
 @pytest.mark.parametrize(('spec', 'message'), [
@@ -157,7 +187,7 @@ def test_the_run_ends_when_all_programs_have_ended(world: Path) -> None:
     ('chat:own_context', 'node /alone has a context of its own: let it use the default context'),
     ('chat:other_domain', 'it asks for ROS domain 7, and this process is in another: set '),
     ('chat:returns_text', 'it returned a str, which is no rclpy node'),
-    ('chat:returns_nothing', 'it ended and neither returned a node nor let one spin'),
+    ('chat:returns_nothing', 'it ended and neither returned a node nor initialised rclpy'),
     ('chat:needs_two', 'the function requires the arguments one, two'),
 ])
 def test_a_program_that_cannot_start_ends_the_run_with_one_line(
@@ -181,6 +211,15 @@ def test_an_exception_during_the_run_comes_out_behind_the_summary(
         'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', spec, '--duration', '2s')
     assert process.returncode == 70
     assert message in process.stderr.splitlines()[-1]
+    assert f'--node {spec}: its main has raised {message}' in process.stderr
+    assert 'its nodes run no more' in process.stderr
+    assert 'sink jobs due' in process.stdout
+
+
+def test_exceptions_that_no_spin_waits_for_end_the_run(world: Path, mddag: Mddag) -> None:
+    process = mddag('run', 'graph.yaml', '--node', 'chat:no_longer_spins', '--duration', '50s')
+    assert process.returncode == 70
+    assert 'ZeroDivisionError' in process.stderr.splitlines()[-1]
     assert 'sink jobs due' in process.stdout
 
 
@@ -226,39 +265,54 @@ def test_a_sigterm_ends_the_run(world: Path) -> None:
 
 
 @pytest.fixture
-def host(ros_context: Any) -> Iterator[Host]:
+def default_context(no_thread_leak: None) -> Iterator[None]:
+    """Initialise the default context, in which programs are hosted."""
+    rclpy.init()
+    yield
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
+def host(default_context: None) -> Iterator[Host]:
     """Give a host whose executor nobody spins."""
-    executor = SingleThreadedExecutor(context=ros_context)
-    with Host(executor, lambda: None) as host:
+    with Host() as host:
+        host.start(SingleThreadedExecutor(), [])
         yield host
-    executor.shutdown()
+    host.executor.shutdown()
 
 
-def test_rclpy_is_as_before_when_the_host_is_left(ros_context: Any) -> None:
+def test_rclpy_is_as_before_when_the_host_is_left(default_context: None) -> None:
+    def main() -> None:
+        rclpy.init()
+        signal.signal(signal.SIGUSR1, lambda *_: None)
+
     def parts() -> list[Any]:
+        context = rclpy.get_default_context()
         return [
-            rclpy.init, rclpy.shutdown, rclpy.spin, rclpy.spin_once, signal.signal,
-            *(vars(c).get(name) for c in (Executor, SingleThreadedExecutor, MultiThreadedExecutor)
-              for name in ('spin', 'spin_once', 'add_node', 'create_task', 'shutdown'))]
+            rclpy.shutdown, rclpy.try_shutdown, rclpy.get_global_executor,
+            rclpy.install_signal_handlers, rclpy.experimental.EventsExecutor, signal.signal,
+            signal.getsignal, Executor.__init__, threading.Thread.start, {*vars(context)},
+            signal.getsignal(signal.SIGURG), signal.getsignal(signal.SIGUSR1)]
 
     before = parts()
-    executor = SingleThreadedExecutor(context=ros_context)
-    with Host(executor, lambda: None):
-        assert parts() != before
+    with Host() as host:
+        host.start(SingleThreadedExecutor(), [Program('main', 'main', main)])
+        assert not any(now == was for now, was in zip(parts()[:-2], before))
     assert parts() == before
-    executor.shutdown()
+    host.executor.shutdown()
 
 
-def test_another_executor_gives_its_nodes_to_ours_when_it_spins(
-    host: Host, ros_context: Any
-) -> None:
-    other = MultiThreadedExecutor(2, context=ros_context)
-    first, second = Node('first', context=ros_context), Node('second', context=ros_context)
+@pytest.mark.parametrize('kind', [
+    SingleThreadedExecutor, MultiThreadedExecutor, rclpy.experimental.EventsExecutor])
+def test_another_executor_gives_its_nodes_to_ours_when_it_spins(host: Host, kind: Any) -> None:
+    other = (getattr(rclpy.experimental, kind.__name__) if kind.__name__ == 'EventsExecutor'
+             else kind)()
+    first, second = Node('first'), Node('second')
     other.add_node(first)
     assert host.executor.get_nodes() == []
     other.spin_once(timeout_sec=0.01)
     assert host.executor.get_nodes() == [first]
-    assert first.executor is host.executor
+    assert first.executor is other
     spinning = threading.Thread(target=other.spin)
     spinning.start()
     time.sleep(0.05)
@@ -270,10 +324,26 @@ def test_another_executor_gives_its_nodes_to_ours_when_it_spins(
     other.shutdown()
     spinning.join(2.0)
     assert not spinning.is_alive()
+    assert host.executor.get_nodes() == []
 
 
-def test_another_executors_tasks_run_on_ours(host: Host, ros_context: Any) -> None:
-    other = SingleThreadedExecutor(context=ros_context)
+def test_a_class_of_executors_of_a_program_keeps_what_it_overrides(host: Host) -> None:
+    spun: list[float | None] = []
+
+    class Theirs(SingleThreadedExecutor):
+
+        def spin_once(self, timeout_sec: float | None = None) -> None:
+            spun.append(timeout_sec)
+
+    other = Theirs()
+    other.spin_once(1.0)
+    assert spun == [1.0] and isinstance(other, Theirs)
+    other.spin_until_future_complete(rclpy.task.Future(), 0.01)
+    other.shutdown()
+
+
+def test_another_executors_tasks_run_on_ours(host: Host) -> None:
+    other = SingleThreadedExecutor()
     task = other.create_task(lambda: 42)
     other.spin_until_future_complete(task, timeout_sec=0.05)
     assert not task.done()  # nobody spins ours
@@ -282,9 +352,9 @@ def test_another_executors_tasks_run_on_ours(host: Host, ros_context: Any) -> No
     other.shutdown()
 
 
-def test_executors_of_programs_are_not_kept(host: Host, ros_context: Any) -> None:
+def test_executors_of_programs_are_not_kept(host: Host) -> None:
     def use() -> Any:
-        other = SingleThreadedExecutor(context=ros_context)
+        other = SingleThreadedExecutor()
         other.spin_once(timeout_sec=0.0)
         other.shutdown()
         return weakref.ref(other)
@@ -294,22 +364,25 @@ def test_executors_of_programs_are_not_kept(host: Host, ros_context: Any) -> Non
     assert [executor() for executor in used] == [None] * 5
 
 
-def test_nodes_that_a_program_destroys_are_not_kept(host: Host, ros_context: Any) -> None:
-    guest = Guest(Program('chat:main', 'chat', lambda: None))
+def test_nodes_that_a_program_destroys_are_not_kept(host: Host) -> None:
+    used: list[weakref.ref[Node]] = []
+    stays: list[Node] = []
 
-    def use() -> Any:
-        node = Node('helper', context=ros_context, enable_rosout=False)
-        host.adopt(node, guest)
-        node.destroy_node()
-        return weakref.ref(node)
+    def main() -> None:
+        for _ in range(5):
+            node = Node('helper', enable_rosout=False)
+            rclpy.spin_once(node, timeout_sec=0.0)
+            node.destroy_node()
+            used.append(weakref.ref(node))
+            del node
+        stays.append(Node('stays'))
+        rclpy.spin(stays[0])
 
-    used = [use() for _ in range(5)]
-    stays = Node('stays', context=ros_context)
-    host.adopt(stays, guest)
+    host.start(host.executor, [Program('main', 'main', main)])
+    assert wait_for(lambda: bool(stays) and host.executor.get_nodes() == stays)
+    assert host.guests[0].nodes == stays
     gc.collect()
     assert [node() for node in used] == [None] * 5
-    assert guest.nodes == host.executor.get_nodes() == [stays]
-    stays.destroy_node()
 
 
 def test_the_guests_know_nothing_of_us() -> None:

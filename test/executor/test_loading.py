@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 import sys
 
-from mddag_executor.executor.loading import LoadingError, resolve
+from mddag_executor.hosting.loading import LoadingError, resolve
 import pytest
 
 from .workspace import make_workspace
@@ -58,7 +58,7 @@ def test_a_program_has_a_command_line_of_its_own_while_it_is_imported(
     ('chat_nodes/zzz', "has no executable 'zzz': it has broken.py, native, shell, talker"),
     ('empty_nodes/x', "package 'empty_nodes' has no executable 'x': it has none"),
     ('pip-nodes/lisener', "has no executable 'lisener': did you mean 'listener'?"),
-    ('pip-nodes/stale', "its entry point 'chat:gone' cannot be imported"),
+    ('pip-nodes/stale', "module 'chat' has no 'gone': it has "),
     ('chat_nodes/native', 'only Python nodes can run in this process, and '),
     ('chat_nodes/shell', "shell is no Python program: start it by itself with 'ros2 run'"),
     ('chat_nodes/broken.py', 'broken.py is not valid Python (SyntaxError'),

@@ -41,6 +41,13 @@ class Spec:
         return self.start in ('timer', 'outside', 'service')
 
 
+def name_of_dag(source: Spec, specs: list[Spec]) -> str:
+    """Return the name of the DAG that a source starts."""
+    alike = [spec for spec in specs
+             if spec.is_source and spec.node == source.node and not spec.dag]
+    return source.dag or (source.node if len(alike) == 1 else f'{source.node}/{source.name}')
+
+
 def violations(specs: list[Spec]) -> set[str]:
     """Return which rules the declared callbacks break."""
     found = set()
@@ -68,7 +75,7 @@ def violations(specs: list[Spec]) -> set[str]:
                    if (a, via) in starts and (via, b) in starts}
     if any(a == b for a, b in starts):
         found.add('in a cycle')
-    names = [spec.dag or spec.node for spec in specs if spec.is_source]
+    names = [name_of_dag(spec, specs) for spec in specs if spec.is_source]
     if len(set(names)) < len(names):
         found.add('its DAG has the name')
     return found

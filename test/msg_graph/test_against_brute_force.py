@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from msg_graph import Dag, GraphError, loads, TaskSet
 import yaml
 
-from .brute import all_violations, as_yaml, components, expand, rank, Spec, Vertex
+from .brute import all_violations, as_yaml, components, expand, name_of_dag, rank, Spec, Vertex
 
 TOPICS = [f'/t{i}' for i in range(4)]
 
@@ -119,7 +119,7 @@ def check_same(tasks: TaskSet, specs: list[Spec]) -> None:
     for index, (dag, part) in enumerate(zip(tasks.dags, parts)):
         source, = (v for v in part if not v[1])
         spec = specs[source[0]]
-        assert (dag.index, dag.name) == (index, spec.dag or spec.node)
+        assert (dag.index, dag.name) == (index, name_of_dag(spec, specs))
         assert dag.period_ns == (20_000_000 if spec.start == 'service' else 10_000_000)
         written = provenance(dag, places)
         assert written == sorted(part, key=rank)

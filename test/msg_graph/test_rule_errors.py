@@ -278,13 +278,15 @@ def test_reads_of_what_is_unknown() -> None:
 
 def test_names_of_dags_are_unique() -> None:
     says = (
-        "callback '/n:u': its DAG has the name '/n', as that of '/n:t': give it another one "
+        "callback '/m:u': its DAG has the name '/n', as that of '/n:t': give it another one "
         "with 'dag:'")
     nodes_error(f"""
         - node: /n
           callbacks:
             - {{name: t, timer: 10ms, deadline: 1ms}}
-            - {{name: u, timer: 10ms, deadline: 1ms}} {MARK}
+        - node: /m
+          callbacks:
+            - {{name: u, timer: 10ms, deadline: 1ms, dag: /n}} {MARK}
     """, says)
     nodes_error(f"""
         - node: /n

@@ -77,6 +77,20 @@ def test_or_gives_a_vertex_for_each_publisher_and_so_after_it() -> None:
     assert len(tasks.callbacks) == 4
 
 
+def test_dags_are_called_after_their_sources() -> None:
+    tasks = graph("""
+        - node: /one
+          callbacks:
+            - {name: t, timer: 10ms, deadline: 10ms}
+        - node: /several
+          callbacks:
+            - {name: t, timer: 10ms, deadline: 10ms}
+            - {name: s, service: /s, period: 1s, deadline: 10ms}
+            - {name: u, timer: 20ms, deadline: 10ms, dag: own}
+    """)
+    assert [dag.name for dag in tasks.dags] == ['/one', '/several/t', '/several/s', 'own']
+
+
 def test_or_within_one_dag() -> None:
     """Copies are ordered by their callbacks, then by what starts them, and are numbered."""
     tasks = graph("""

@@ -34,6 +34,7 @@ from msg_graph import loads, TaskSet
 
 START_TIME = 1_732_166_766_000_000_000
 MS = 1_000_000
+US = 1_000
 VPID = 77
 
 SMALL = """\
@@ -118,6 +119,20 @@ def legs_to(task_set: TaskSet, tables: Tables) -> dict[int, list[tuple[int, int]
                     if before == vertex.index:
                         targets.append((first + after, leg))
     return found
+
+
+def begin_trace(path: Path, declaration: str, workers: int = 1) -> TraceFile:
+    """Begin the trace of a run that goes by a declaration."""
+    file = TraceFile(path)
+    file.add('task_set', START_TIME, 1, 1, declaration, 'g.yaml', 'rad', workers, 100 * MS, 64,
+             False, 2)
+    return file
+
+
+def end_trace(file: TraceFile, time: int) -> None:
+    """End a run, and its trace."""
+    file.add('shutdown', time, 1, 1, time)
+    file.finish()
 
 
 def add_execution(

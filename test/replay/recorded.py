@@ -24,6 +24,9 @@ nodes:
 _MORE = {
     'ros2:dispatch_subscription_callback': (
         'message', 'callback', 'source_stamp', 'message_timestamp'),
+    'ros2:dispatch': ('message', 'callback'),
+    'ros2:dispatch_intra_process': ('message', 'callback'),
+    'ros2_hook:take_type_erased': ('source_stamp', 'message'),
     'ros2:rmw_publish': ('message', 'timestamp_'),
     'ros2:rclcpp_intra_publish': ('publisher_handle', 'message'),
     'ros2:message_construct': ('original_message', 'constructed_message'),
@@ -172,10 +175,14 @@ class Recorded:
 
     def receive(self, callback: int, tid: int, start: int, end: int, stamp: int,
                 style: str = 'caret', stated: int = 0, pid: int = 1) -> None:
-        """Add an execution for a message."""
+        """Add an execution for a message, as `caret`, `august_2021` or `take` records it."""
         if style == 'caret':
             self.add('ros2:dispatch_subscription_callback', start - 4 * US, tid, 0x99, callback,
                      BEGIN + stamp, BEGIN + stated if stated else 0, pid=pid)
+        elif style == 'august_2021':
+            self.add('ros2_hook:take_type_erased', start - 6 * US, tid, BEGIN + stamp, 0x99,
+                     pid=pid)
+            self.add('ros2:dispatch', start - 4 * US, tid, 0x99, callback, pid=pid)
         else:
             self.add('ros2:rmw_take', start - 4 * US, tid, callback + 30_000, 0x99, BEGIN + stamp,
                      True, pid=pid)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 import tempfile
 
@@ -15,7 +16,19 @@ from mddag_executor.trace import reading, TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
-from .helpers import Chances, declarations, MS, SMALL, small, START_TIME, VirtualRun, VPID
+from ..cli.helpers import caller
+from ..replay.helpers import (
+    begin_trace,
+    Chances,
+    declarations,
+    end_trace,
+    MS,
+    SMALL,
+    small,
+    START_TIME,
+    VirtualRun,
+    VPID,
+)
 
 
 @given(declarations(), st.integers(0, 2**32), st.integers(1, 4),
@@ -411,3 +424,49 @@ def test_verdicts_begin_when_all_programs_have_started(tmp_path: Path, skip: int
                 file.add('mddag:judge_from', time, pid, thread, start if i else NEVER)
     found = replay(path, skip=skip).result()['dags'].values()
     assert sum(dag['jobs'] for dag in found) == jobs > 0
+
+
+SLOW = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /slow
+    callbacks: [{name: plan, dag: slow, timer: 7200s, deadline: 3600s}]
+  - node: /fast
+    callbacks: [{name: tick, dag: fast, timer: 1s, deadline: 900ms}]
+"""
+
+
+@pytest.mark.parametrize('seconds', [50, 70, 4_000])
+def test_a_callback_that_runs_for_minutes_is_counted_and_judged(
+    seconds: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, second = tmp_path / 'run.mcap', 1_000 * MS
+    with begin_trace(path, SLOW, workers=2) as file:
+        file.add('job_release', START_TIME, 1, 1, 0, 0, START_TIME)
+        for job in range(seconds + 30):
+            if job == seconds:      # as live: an execution is recorded when it has ended
+                over = START_TIME + seconds * second
+                file.extend([('execution', START_TIME, 2, 7, 0, 0, 0, 0, START_TIME, 0, over,
+                              over, True, 0, MS, False)], 1)
+                if seconds > 3600:
+                    file.add('deadline', over, 1, 2, 0, 0, 0, START_TIME + 3600 * second, over)
+            time = START_TIME + job * second
+            file.add('job_release', time, 1, 1, 1, job, time)
+            file.extend([('execution', time, 3, 8, 1, 0, job, 1, time, 0, time + MS, time + MS,
+                          True, 0, MS, False)], 1)
+            if job % 20 == 0:
+                file.flush()
+        end_trace(file, START_TIME + (seconds + 30) * second)
+    for more in ((), ('--reschedule',)):
+        status, out, errors = caller('replay')(capsys, path, *more, '--json', '-')
+        assert (status, errors) == (0, '')
+        result = json.loads(out)
+        sink = result['dags']['slow']['sinks']['/slow:plan']
+        assert sink['response_ns']['max'] == seconds * second
+        assert (sink['completed'], sink['late']) == (1, int(seconds > 3600))
+        if more:
+            assert result['estimated_executions'] == 0
+        else:
+            use = result['callbacks']['/slow:plan']
+            assert (use['executions'], use['busy_ns']) == (1, seconds * second)

@@ -15,10 +15,20 @@ from mddag_executor.cli import main as program
 from mddag_executor.core.tally import total
 from mddag_executor.replay import replay
 from mddag_executor.replay.causes import CAUSES, REMEDIES
+from mddag_executor.report.text import format_ns
 from msg_graph import loads, TaskSet
 import pytest
 
-from .helpers import Chances, MS, small, START_TIME, VirtualRun
+from .helpers import (
+    add_execution,
+    begin_trace,
+    Chances,
+    end_trace,
+    MS,
+    small,
+    START_TIME,
+    VirtualRun,
+)
 
 QUIET = Chances(0, 0, 0, 0, 0, 0, 0)
 VICTIM = """\
@@ -253,3 +263,141 @@ def test_what_people_see(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert program.main(['replay', path, '--report', path + '.html']) == 0
     assert '119 misses: 119 waited' in capsys.readouterr().out
     assert '119 misses: 119 waited' in Path(path + '.html').read_text()
+
+
+MINUTE = 60_000 * MS
+ONE_WORKER = """\
+mddag: 1
+workers: 1
+nodes:
+  - node: /long
+    callbacks: [{name: hog, dag: long, timer: 1min, deadline: 50s}]
+  - node: /short
+    callbacks: [{name: late, dag: short, timer: 1min, deadline: 10ms}]
+"""
+
+
+def explain(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    """Return what `mddag explain --json -` prints."""
+    assert program.main(['explain', *arguments, '--json', '-']) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+@pytest.mark.parametrize('cause', ['waited', 'machine'])
+def test_misses_of_one_cause_have_it_however_long_the_run_is(
+    cause: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # every minute the short one waits 50 ms for the only worker, or for the machine to go on
+    path = tmp_path / 'run.mcap'
+    minutes = 60
+    with begin_trace(path, ONE_WORKER) as file:
+        for job in range(minutes):
+            release = START_TIME + job * MINUTE
+            start = release + 50 * MS
+            if cause == 'machine':
+                file.add('stop', start, 1, 1, release, start)
+                ready = start
+            else:
+                ready = release
+                file.add('job_release', release, 1, 1, 0, job, release)
+                add_execution(file, release, start, 0, 0, job, address=7)
+            file.add('job_release', start, 1, 1, 1, job, release)
+            add_execution(file, start, start + MS, 1, 0, job, ready=ready, address=8)
+        end_trace(file, START_TIME + minutes * MINUTE)
+    result = explain(capsys, str(path))
+    assert result['missed'] == result['causes'][cause] == len(result['jobs']) == minutes
+    for job in result['jobs']:
+        parts = {part['cause']: part['ns'] for part in job['parts']}
+        assert parts == {cause: 50 * MS, 'ran': MS}
+        if cause == 'waited':
+            assert job['parts'][0]['behind'] == [{'callback': '/long:hog', 'ns': 50 * MS}]
+
+
+LENT = """\
+mddag: 1
+workers: 1
+nodes:
+  - node: /a
+    callbacks: [{name: asks, dag: a, timer: 1s, deadline: 990ms}]
+  - node: /x
+    callbacks: [{name: late, dag: x, timer: 1s, deadline: 50ms}]
+"""
+
+
+@pytest.mark.parametrize(('worker', 'cause'), [(-1, 'machine'), (0, 'waited')])
+def test_a_callback_that_has_lent_its_worker_keeps_none_busy(
+    worker: int, cause: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # the one waits for the answer to a service call; the other starts 300 ms after it is ready
+    path = tmp_path / 'run.mcap'
+    with begin_trace(path, LENT) as file:
+        for job in range(5):
+            release = START_TIME + job * 1_000 * MS
+            late = release + 100 * MS
+            file.add('job_release', release, 1, 1, 0, job, release)
+            add_execution(file, release, release + 390 * MS, 0, 0, job, worker, address=7)
+            file.add('job_release', late, 1, 1, 1, job, late)
+            add_execution(file, late + 300 * MS, late + 301 * MS, 1, 0, job, ready=late,
+                          thread=11, address=8)
+        end_trace(file, START_TIME + 5_000 * MS)
+    result = explain(capsys, str(path))
+    assert {job['cause'] for job in result['jobs']} == {cause} and result['missed'] == 5
+    behind = [{'callback': '/a:asks', 'ns': 290 * MS}] if cause == 'waited' else []
+    for job in result['jobs']:
+        assert job['parts'][0]['behind'] == behind
+
+
+def test_only_misses_in_stops_are_said_to_be_in_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # each job's callback starts 20 ms after it was ready, with an idle worker; the machine stood
+    # still twice in that of one job, and once in that of another
+    path = tmp_path / 'run.mcap'
+    declaration = LENT.replace('50ms', '15ms')
+    with begin_trace(path, declaration) as file:
+        file.add('stop', START_TIME, 1, 1, START_TIME, START_TIME)      # stops are recorded
+        for job in range(9):
+            release = START_TIME + job * 1_000 * MS
+            file.add('job_release', release, 1, 1, 1, job, release)
+            start = release + 20 * MS
+            if job in (3, 5):
+                start += 60 * MS
+                for stop in ((10, 35), (40, 70))[job // 5:]:
+                    first, last = (release + each * MS for each in stop)
+                    file.add('stop', last, 1, 1, first, last)
+            add_execution(file, start, start + MS, 1, 0, job, ready=release, address=8)
+        end_trace(file, START_TIME + 9_000 * MS)
+    result = explain(capsys, str(path))
+    assert result['causes']['machine'] == result['missed'] == 9
+    assert sum(stall['misses'] for stall in result['stalls']) == 2
+    for verb in ('explain', 'replay'):
+        assert program.main([verb, str(path)]) == 0
+        line, = (line for line in capsys.readouterr().out.splitlines()
+                 if line.startswith('9 misses: '))
+        assert line.startswith('9 misses: 2 in 2 stops of the machine (0.')
+        assert line.endswith(' s), 7 machine')
+
+
+@pytest.mark.parametrize(('deadline', 'usual'), [(12, True), (1, False)])
+def test_the_mean_of_a_cause_is_that_of_its_parts(
+    deadline: int, usual: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # the callback takes 2 ms, but 20 ms in the last job; a deadline of 1 ms is too short for it
+    path = tmp_path / 'run.mcap'
+    with begin_trace(path, LENT.replace('50ms', f'{deadline}ms')) as file:
+        for job in range(9):
+            release = START_TIME + job * 1_000 * MS
+            file.add('job_release', release, 1, 1, 1, job, release)
+            took = (20 if job == 8 else 2) * MS
+            add_execution(file, release, release + took, 1, 0, job, address=8)
+        end_trace(file, START_TIME + 9_000 * MS)
+    result = explain(capsys, str(path))
+    assert result['causes']['ran long'] == result['missed'] == (1 if deadline == 12 else 9)
+    parts = [part for job in result['jobs'] for part in job['parts']]
+    counted = ['ran long'] if usual else ['ran long', 'ran']
+    mean = sum(part['ns'] for part in parts if part['cause'] in counted) // result['missed']
+    assert program.main(['explain', str(path)]) == 0
+    row, = (line for line in capsys.readouterr().out.splitlines()
+            if line.split()[1:4] == ['x:late', 'ran', 'long'])
+    assert f' {format_ns(mean, 3)} ' in row

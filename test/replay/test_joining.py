@@ -16,6 +16,8 @@ from mddag_executor.replay.joining import label_of
 from mddag_executor.trace import TraceFile
 import pytest
 
+from ..cli.helpers import caller
+
 MS = 1_000_000
 BASE = 10 ** 18
 GRAPH = """
@@ -33,10 +35,12 @@ class Trace:
     """The trace of a process that runs one vertex; its clock is late by some ns."""
 
     def __init__(self, folder: Path, name: str, vertex: int, late: int = 0, graph: str = GRAPH,
-                 judges_from: int = 0, dag: int = 0, boot: str = '', begin: int = 0) -> None:
+                 judges_from: int = 0, dag: int = 0, boot: str = '', begin: int = 0,
+                 pid: int | None = None) -> None:
         self.path = str(folder / f'run.{name}.mcap')
         self.file = TraceFile(self.path)
-        self.vertex, self.late, self.pid, self.job = vertex, late, 100 + vertex + dag, 0
+        self.vertex, self.late, self.job = vertex, late, 0
+        self.pid = 100 + vertex + dag if pid is None else pid
         self.dag = dag
         self.add('task_set', begin, graph, 'graph.yaml', 'rad', 2, 100 * MS, 64, False, 2)
         self.add('caret_init', begin, BASE - late, 'jazzy')
@@ -50,17 +54,19 @@ class Trace:
         self.file.add(name, BASE + at - self.late, self.pid, self.pid, *fields)
 
     def runs(self, release: int, start: int, took: int = MS, completes: bool = True,
-             ready: int | None = None) -> None:
+             ready: int | None = None, worker: int = 0, fails: bool = False) -> None:
         """Run its vertex for the next job; times in ns since the base."""
         t = BASE - self.late
         ready = start if ready is None else ready
         self.add('job_release', ready, self.dag, self.job, t + release)
-        self.add('dispatch', start, ADDRESS, self.dag, self.vertex, self.job, 0, t + ready,
+        self.add('dispatch', start, ADDRESS, self.dag, self.vertex, self.job, worker, t + ready,
                  t + release + 8 * MS)
         self.add('callback_start', start, ADDRESS, False)
         if completes:
             end = start + took
             self.add('callback_end', end, ADDRESS)
+            if fails:
+                self.add('fail', end, self.dag, self.vertex, self.job)
             self.add('complete', end, ADDRESS, self.dag, self.vertex, self.job, True, t + end, 0,
                      took, True)
         self.job += 1
@@ -224,6 +230,35 @@ def test_a_process_that_was_killed_is_said_with_the_jobs_that_ended_with_it(
     assert warning.endswith('it ends 0.087 s before the run; 1 job ended with it: chain 1')
     verdicts = counts(sink(result))
     assert (verdicts.due, verdicts.in_time, verdicts.late) == (4, 1, 3)
+
+
+def test_jobs_that_had_failed_did_not_end_with_a_process_that_was_killed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # the second one of /a's callbacks never runs for what the first one failed to publish
+    graph = GRAPH.replace('dag: chain}', 'dag: chain}, {name: keep, subscription: /x, deadline: '
+                          '8ms}')
+    up, down = Trace(tmp_path, 'up', 0, graph=graph), Trace(tmp_path, 'down', 2, graph=graph)
+    up.add('hosted', 0, 0, '0,1')
+    for i in range(4):
+        up.runs(i * 10 * MS, i * 10 * MS + MS, fails=i < 3)
+    down.runs(30 * MS, 33 * MS)
+    status, out, _ = caller('replay')(
+        capsys, up.end(None), down.end(100 * MS), '--json', '-')
+    warning, = json.loads(out)['warnings']
+    assert status == 0
+    assert warning.endswith('it ends 0.068 s before the run; 1 job ended with it: chain 3')
+
+
+def test_a_lent_worker_counts_for_no_other_process(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
+    up.runs(0, 0, 2 * MS, worker=-1)
+    down.runs(0, 3 * MS, MS)
+    _, out, _ = caller('replay')(capsys, up.end(9 * MS), down.end(9 * MS), '--json', '-')
+    use = json.loads(out)['worker_use']
+    assert (use['lent_ns'], use['busy_ns']) == (2 * MS, {'2': MS})
 
 
 def test_jobs_are_judged_once_all_judge(tmp_path: Path) -> None:
@@ -446,6 +481,29 @@ def test_the_command_takes_several_traces(tmp_path: Path, mddag: Any) -> None:
         ['/a:tick', '0'], ['/b:take', '2']]
     refused = mddag('replay', paths[0], '-', paths[1])
     assert refused.returncode == 2 and 'standard input' in refused.stderr
+
+
+def test_processes_of_containers_may_have_the_same_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = []
+    for pids in ((101, 102), (7, 7)):
+        traces = [Trace(tmp_path, name, vertex, pid=pid)
+                  for vertex, (name, pid) in enumerate(zip(('up', 'down'), pids))]
+        for i in range(9):      # /b:take begins while /a:tick still runs
+            traces[0].runs(i * 10 * MS, i * 10 * MS, 6 * MS)
+            traces[1].runs(i * 10 * MS, i * 10 * MS + 4 * MS, 3 * MS, ready=i * 10 * MS + 3 * MS)
+        paths = [trace.end(100 * MS) for trace in traces]
+        for verb, *more in (('replay', '--callbacks'), ('replay', '--reschedule'),
+                            ('explain',), ('slack',)):
+            status, out, _ = caller(verb)(capsys, *paths, *more, '--json', '-')
+            assert status == 0
+            found.append(json.loads(out))
+    apart, same = found[:4], found[4:]
+    assert {name: (use['executions'], use['busy_ns'])
+            for name, use in same[0]['callbacks'].items()} == {
+        '/a:tick': (9, 54 * MS), '/b:take': (9, 27 * MS)}
+    assert same == apart
 
 
 def test_machines_are_compared_by_way_of_others_and_by_what_is_given() -> None:

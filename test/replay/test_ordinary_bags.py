@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+import json
 from pathlib import Path
 import shutil
 import sqlite3
@@ -213,6 +215,55 @@ def test_several_files(tmp_path: Path, storage: StoragePlugin) -> None:
     (path / f'drive_0.{suffix}').unlink()
     with pytest.raises(BagError, match='none of the bag files that it names is there'):
         Bag(path, {'/points'})
+
+
+def killed_recorder(folder: Path, source: Path) -> Path:
+    """Leave a bag as a killed recorder does: its last messages are in the write-ahead log only."""
+    folder.mkdir()
+    file = folder / 'killed.db3'
+    working = shutil.copy(source / f'{source.name}.db3', folder / 'working')
+    with closing(sqlite3.connect(working)) as storage:
+        storage.execute('PRAGMA journal_mode=WAL')
+        last = storage.execute('SELECT id, topic_id, timestamp, data FROM messages '
+                               'ORDER BY id DESC LIMIT 6').fetchall()
+        storage.execute('DELETE FROM messages WHERE id >= ?', (last[-1][0],))
+        storage.commit()
+        storage.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+        storage.executemany('INSERT INTO messages (id, topic_id, timestamp, data) '
+                            'VALUES (?, ?, ?, ?)', last[::-1])
+        storage.commit()
+        for suffix in ('', '-wal'):
+            shutil.copy(f'{working}{suffix}', f'{file}{suffix}')
+    Path(working).unlink()
+    return file
+
+
+def test_the_write_ahead_log_belongs_to_a_bag(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether the file is named or its folder; the user's files stay as they are."""
+    whole = write_bag(tmp_path / 'bag', StoragePlugin.SQLITE3)
+    file = killed_recorder(tmp_path / 'killed', whole)
+    before = {path: path.read_bytes() for path in file.parent.iterdir()}
+    assert len(before) == 2
+    graph = tmp_path / 'g.yaml'
+    graph.write_text(BY_HEADER)
+    for given in (file, file.parent):
+        assert program.main(['replay', str(given), str(graph), '--reschedule', '--json', '-']) == 0
+        said = capsys.readouterr()
+        assert [line for line in said.err.splitlines() if 'metadata.yaml is missing' not in line
+                ] == []
+        result = json.loads(said.out)
+        assert result['recording']['messages'] == 11
+        assert result['dags']['/lidar']['jobs'] == 10
+    assert {path: path.read_bytes() for path in file.parent.iterdir()} == before
+
+
+def test_a_damaged_write_ahead_log_costs_what_it_held(tmp_path: Path) -> None:
+    whole = write_bag(tmp_path / 'bag', StoragePlugin.SQLITE3)
+    file = killed_recorder(tmp_path / 'killed', whole)
+    Path(f'{file}-wal').write_bytes(b'no log of SQLite')
+    assert len(Bag(file, {'/points'}).stamps['/points'].arrival) == 4
 
 
 @pytest.mark.parametrize('text', [

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 import random
 import tempfile
@@ -24,17 +25,20 @@ from mddag_executor.trace import TraceFile
 from msg_graph import loads, TaskSet
 import pytest
 
-from .helpers import (
+from ..cli.helpers import caller
+from ..replay.helpers import (
     add_execution,
+    begin_trace,
     Chances,
     declarations,
+    end_trace,
     MS,
     small,
     START_TIME,
     VirtualRun,
     VPID,
 )
-from .simulated import executions, loose, write_simulated
+from ..replay.simulated import executions, loose, write_simulated
 
 JOBS = 12
 
@@ -517,3 +521,63 @@ def test_what_is_declared_counts_more_than_what_was_recorded(tmp_path: Path) -> 
     declared = loads(recorded.replace('dag: d', 'holds_interpreter: true, dag: d'), 'g.yaml')
     assert responses(path) == [10, 10]
     assert responses(path, task_set=declared) == [10, 20]
+
+
+SELDOM = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /camera
+    callbacks: [{name: grab, timer: 100ms, publishes: [/image]}]
+  - node: /detect
+    callbacks: [{name: run, subscription: /image, publishes: [/object]}]
+  - node: /brake
+    callbacks: [{name: act, subscription: /object, deadline: 50ms}]
+  - node: /other
+    callbacks: [{name: tick, timer: 100ms, deadline: 90ms}]
+"""
+
+
+@pytest.mark.parametrize('options', [
+    [], ['--workers', '1'], ['--preemptive'], ['--cpus', '1'], ['--overheads', 'none'],
+    ['--processes', '2']])
+@pytest.mark.parametrize('computed', [(), (MS, True)])
+def test_what_was_not_published_is_not_published_again(
+    options: list[str], computed: tuple[Any, ...], tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    # /detect finds an object in every third image; the other jobs expire
+    path, jobs = tmp_path / 'run.mcap', 40
+    with begin_trace(path, SELDOM, workers=2) as file:
+        for publisher, topic in ((51, '/image'), (52, '/object')):
+            file.add('rcl_publisher_init', START_TIME, 1, 1, publisher, 1, publisher, topic, 10)
+        for job in range(jobs):
+            at = START_TIME + job * 100 * MS
+            if job > 10 and (job - 11) % 3:
+                file.add('expire', at, 1, 1, 0, job - 11)
+            for dag in (0, 1):
+                file.add('job_release', at, 1, 1, dag, job, at)
+            add_execution(file, at, at + 2 * MS, 0, 0, job, address=7, computed=computed)
+            file.add('rclcpp_publish', at + MS, 1, 10, 51, 0, 0)
+            add_execution(file, at + 2 * MS, at + 5 * MS, 0, 1, job, address=8,
+                          computed=computed)
+            if job % 3 == 0:
+                file.add('rclcpp_publish', at + 4 * MS, 1, 10, 52, 0, 0)
+                add_execution(file, at + 5 * MS, at + 6 * MS, 0, 2, job, address=9,
+                              computed=computed)
+            add_execution(file, at + 10 * MS, at + 12 * MS, 1, 0, job, ready=at, address=6,
+                          thread=11, worker=1, computed=computed)
+        end_trace(file, START_TIME + jobs * 100 * MS)
+    found = []
+    for more in ([], ['--reschedule', *options]):
+        status, out, _ = caller('replay')(capsys, path, *more, '--json', '-')
+        assert status == 0
+        found.append(json.loads(out))
+    recorded, again = (each['dags']['/camera']['sinks']['/brake:act'] for each in found)
+    for verdict in ('completed', 'late', 'overdue', 'expired'):
+        assert again[verdict] == recorded[verdict], verdict
+    assert (again['completed'], again['expired']) == (14, 19)
+    assert found[1]['estimated_executions'] == 0
+    # 8 ms in each of 40 jobs, but 1 ms less in those without an object
+    assert found[1]['utilisation'] * found[1]['workers'] * found[1]['duration_ns'] == \
+        pytest.approx((40 * 7 + 14) * MS)

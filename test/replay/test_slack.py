@@ -14,7 +14,16 @@ from mddag_executor.replay import slack as module
 from mddag_executor.replay.slack import find_slack, Problem, Search
 import pytest
 
-from .helpers import Chances, MS, small, VirtualRun
+from .helpers import (
+    add_execution,
+    begin_trace,
+    Chances,
+    end_trace,
+    MS,
+    small,
+    START_TIME,
+    VirtualRun,
+)
 
 BY_HAND = """\
 mddag: 1
@@ -65,6 +74,42 @@ def test_what_misses_already_is_left_out(
     assert result['left_out'] == ['/b:last']
     assert 49.5 <= result['callbacks']['/c:alone']['factor'] <= 50
     assert result['callbacks']['/a:first']['factor'] > 10     # the other worker is free
+
+
+def test_a_sink_that_misses_some_deadlines_has_the_factor_at_which_it_misses_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # /some takes 10 ms, but in two jobs more than its deadline; /every is always late
+    path = tmp_path / 'run.mcap'
+    graph = """\
+mddag: 1
+workers: 6
+nodes:
+  - {node: /some, callbacks: [{name: run, dag: some, timer: 100ms, deadline: 90ms}]}
+  - {node: /every, callbacks: [{name: run, dag: every, timer: 100ms, deadline: 10ms}]}
+"""
+    with begin_trace(path, graph, workers=6) as file:
+        for job in range(30):
+            at = START_TIME + job * 100 * MS
+            for dag, took in enumerate((95 if job in (3, 20) else 10, 20)):
+                file.add('job_release', at, 1, 1, dag, job, at)
+                add_execution(file, at, at + took * MS, dag, 0, job, worker=dag, thread=9 + dag,
+                              address=7 + dag)
+                if took in (95, 20):
+                    file.add('deadline', at + took * MS, 1, 1, dag, 0, job,
+                             at + (90, 10)[dag] * MS, at + took * MS)
+        end_trace(file, START_TIME + 3_000 * MS)
+    status, result = slack_of(capsys, str(path), '--cpus', '6', '--fail-under', '1.2')
+    assert status == 1
+    assert result['missed'] == {'/some:run': 2, '/every:run': 30}
+    assert result['left_out'] == ['/every:run']
+    some = result['callbacks']['/some:run']
+    assert 8.9 <= some['factor'] <= 9 and some['breaks'] == '/some:run'
+    assert result['load']['breaks'] == '/some:run'
+    assert program.main(['slack', str(path)]) == 0
+    out = capsys.readouterr().out
+    assert '2 deadlines missed as things are: /some:run (2); the factors say when' in out
+    assert 'left out, because they miss every deadline as things are: /every:run' in out
 
 
 def test_what_is_left_out_and_expires_hides_nothing(
@@ -132,5 +177,5 @@ def test_where_every_sink_misses_nothing_is_told(
         'timer: 100ms, deadline: 100ms', 'timer: 100ms, deadline: 50us'))
     assert program.main(['slack', str(graph)]) == 0
     out = capsys.readouterr().out
-    assert 'every sink misses deadlines as things are' in out
+    assert 'every sink misses every deadline as things are' in out
     assert 'times' not in out.splitlines()[-1]

@@ -14,7 +14,7 @@ from mddag_executor.replay.drafting import System
 from mddag_executor.trace import TraceFile
 from msg_graph import load, loads
 from msg_graph.caret import declaration_from_caret
-from msg_graph.draft import declaration_of, MARK
+from msg_graph.draft import declaration_of, LEFT_OUT, MARK
 import pytest
 
 MS = 1_000_000
@@ -103,7 +103,9 @@ def test_from_a_trace(recorded: Path) -> None:
     assert [(c.key, c.kind, c.topics) for c in task_set.callbacks] == [
         ('/a:callback_0', 'timer', ()), ('/a:callback_1', 'timer', ()),
         ('/b:callback_0', 'subscription', ('/x',)), ('/b:callback_1', 'subscription', ('/out',)),
-        ('/b:callback_2', 'service', ()), ('/ns/quiet:callback_0', 'timer', ())]
+        ('/ns/quiet:callback_0', 'timer', ())]
+    assert [line for line in text.splitlines() if line.startswith(LEFT_OUT)] == [
+        f'{LEFT_OUT} /b:callback_2 (service /serve): it never ran']
     assert task_set.callbacks[0].group == task_set.callbacks[1].group == 'callback_group_0'
     assert task_set.callbacks[1].publishes == ('/x', '/unseen')
     assert task_set.callbacks[3].period_ns == 5 * MS
@@ -135,6 +137,7 @@ def test_names_periods_and_what_no_one_declares(tmp_path: Path) -> None:
         events += [('rcl_service_init', 0, 1, 200 + n, 100, 0, f'/cam/{name}'),
                    ('rclcpp_service_callback_added', 0, 1, 200 + n, 300 + n)]
     events += run(1, 1, 1_000 * MS, MS, 110)
+    events += run(305, 1, 1_100 * MS, MS)       # of /cam/ask/get_state: the others never run
     text = declaration_of(System(trace(tmp_path / 'n.mcap', events)).draft())
     assert re.findall(r'name: (.*)', text) == [
         'grab', 'callback_1', 'grab_2', 'callback_3', 'callback_4']

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 import random
+import threading
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -24,8 +25,11 @@ from mddag_executor.rerun.run import Rerun, Settings
 from mddag_executor.rerun.sources import Recording, Source
 from mddag_executor.rerun.types import canonical
 from msg_graph import load
+import numpy
 import pytest
 import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
@@ -257,6 +261,64 @@ def test_random_numbers_are_those_of_the_seed(bag: str, graph: Path) -> None:
     assert seen[:20] == seen[20:40] != seen[40:]
 
 
+def seeded(function: Callable[[], None]) -> float:
+    function()
+    return random.random()
+
+
+@pytest.mark.parametrize('draw', [
+    lambda: random.Random().random(),
+    lambda: seeded(random.seed),
+    lambda: numpy.random.default_rng().random(),
+    lambda: numpy.random.RandomState().random_sample(),
+])
+def test_generators_without_a_seed_get_one(
+    bag: str, graph: Path, draw: Callable[[], float]
+) -> None:
+    seen: list[float] = []
+
+    def fill(node: Node) -> None:
+        node.create_subscription(Header, '/points', lambda message: seen.append(draw()), 10)
+
+    for seed in (1, 1, 2):
+        rerun(bag, graph, [node_with(fill)], seed=seed)
+    assert len({*seen[:20]}) == 20
+    assert seen[:20] == seen[20:40]
+    assert not {*seen[:20]} & {*seen[40:]}
+    assert draw() not in seen  # it is as before
+
+
+def test_nothing_happens_in_a_pause_of_the_recording(tmp_path: Path, graph: Path) -> None:
+    """The machine got its time when the robot was running already, 300 days later."""
+    later = 300 * 24 * 3600 * 1000
+    bag = write_bag(tmp_path / 'in.mcap', [
+        (time * MS, '/points', Header(frame_id=str(time)))
+        for time in (0, 100, later + 7, later + 107)])
+    ticks: list[float] = []
+    woken: list[float] = []
+
+    def fill(node: Node) -> None:
+        def now() -> float:
+            return (node.get_clock().now().nanoseconds - START) / MS
+
+        def sleep() -> None:
+            for _ in range(3):
+                node.get_clock().sleep_for(Duration(seconds=4))
+                woken.append(now())
+
+        node.create_subscription(Header, '/points', lambda message: None, 10)
+        node.create_timer(
+            0.03, lambda: ticks.append(now()), callback_group=ReentrantCallbackGroup())
+        threading.Thread(target=sleep, daemon=True).start()
+
+    result = rerun(bag, graph, [node_with(fill)])
+    # At once, and then in the phase of before: 300 days are a multiple of 30 ms.
+    assert ticks == [30, 60, 90, later + 7, later + 30, later + 60, later + 90]
+    assert woken == [4000, 8000, later + 7]
+    assert result.warnings == [
+        f'{bag}: timers do not fire in 1 pause of over a minute without any message']
+
+
 def test_raw_messages_and_what_is_told_of_messages(bag: str, graph: Path) -> None:
     seen: list[Any] = []
 
@@ -320,6 +382,27 @@ def test_late_subscriptions_get_what_is_latched(bag: str, graph: Path) -> None:
 
     rerun(bag, graph, [node_with(fill)])
     assert seen == ['a map']
+
+
+def test_a_destroyed_publisher_serves_no_late_subscription(bag: str, graph: Path) -> None:
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    seen: list[str] = []
+
+    def fill(node: Node) -> None:
+        destroyed = node.create_publisher(String, '/map', latched)
+        destroyed.publish(String(data='old'))
+        node.create_publisher(String, '/map', latched).publish(String(data='new'))
+
+        def take(message: Header) -> None:
+            if message.frame_id == '2':
+                node.destroy_publisher(destroyed)
+            elif message.frame_id == '4':
+                node.create_subscription(String, '/map', lambda m: seen.append(m.data), latched)
+
+        node.create_subscription(Header, '/points', take, 10)
+
+    rerun(bag, graph, [node_with(fill)])
+    assert seen == ['new']
 
 
 def test_a_subscription_that_comes_later(tmp_path: Path, graph: Path) -> None:

@@ -6,8 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+import inspect
 from pathlib import Path
 import queue
+import socket
+import subprocess
+import sys
 import threading
 import time
 from typing import Any
@@ -363,7 +368,7 @@ def test_spin_until_future_complete_with_a_timeout(bag: str, graph: Path) -> Non
         rclpy.shutdown()
 
     rerun(bag, graph, [main])
-    assert seen == [(250.0, 'timeout'), (700.0, 7), (1000.0, 'three steps'), (1100.0, 'executor')]
+    assert seen == [(250.0, 'timeout'), (700.0, 7), (910.0, 'three steps'), (1010.0, 'executor')]
 
 
 def test_a_program_waits_for_a_service_of_the_next_one(bag: str, graph: Path) -> None:
@@ -544,3 +549,52 @@ def test_a_node_that_blocks_for_ever_is_named(bag: str, graph: Path) -> None:
     assert str(caught.value).startswith(
         f'/filter:take: it has been blocking at {__file__}:')
     assert 'at 0.300000 s of the run' in str(caught.value)
+
+
+def sleep_for_ever() -> None:
+    while True:
+        time.sleep(0.01)  # the line that is named
+
+
+def read_for_ever() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
+        device.bind(('127.0.0.1', 0))
+        device.settimeout(0.01)
+        while True:
+            with suppress(TimeoutError):
+                device.recv(1)  # the line that is named
+
+
+def pass_on_for_ever() -> None:
+    numbers = queue.Queue[int](maxsize=1)
+    threading.Thread(target=lambda: list(iter(numbers.get, None))).start()
+    while True:
+        time.sleep(0.01)  # the line that is named
+        numbers.put(1)
+
+
+def compute_for_ever() -> None:
+    any(number for number in iter(int, 1))  # the line that is named
+
+
+@pytest.mark.parametrize(('function', 'what'), [
+    (sleep_for_ever, 'blocking'), (read_for_ever, 'blocking'), (pass_on_for_ever, 'blocking'),
+    (compute_for_ever, 'computing')])
+def test_a_thread_that_keeps_virtual_time_from_passing_is_named(
+    tmp_path: Path, bag: str, graph: Path, function: Callable[[], None], what: str
+) -> None:
+    """In a process of its own: the thread never ends."""
+    text = '\n'.join((
+        'from contextlib import suppress', 'import queue', 'import socket', 'import threading',
+        'import time', 'import rclpy', 'from mddag_executor.rerun import rerun, RerunError',
+        inspect.getsource(function), 'def make():', "    node = rclpy.create_node('filter')",
+        f'    threading.Thread(target={function.__name__}).start()', '    return node',
+        'try:', f'    rerun({bag!r}, {str(graph)!r}, [make], patience_s=0.5)',
+        'except RerunError as error:', '    print(error)'))
+    (tmp_path / 'driver.py').write_text(text)
+    line = text.partition('# the line')[0].count('\n') + 1
+    done = subprocess.run(
+        [sys.executable, 'driver.py'], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert f'it has been {what} at {tmp_path}/driver.py:{line} for' in done.stdout, done.stderr
+    assert done.stdout.startswith('thread Thread-')
+    assert done.stdout.count('\n') == 1

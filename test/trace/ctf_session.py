@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 import struct
 from typing import Any
@@ -28,7 +28,7 @@ stream {{
   event.header := struct {{ uint32_t id; time_t timestamp; }};
   event.context := struct {{ {context} }};
 }};
-"""
+{environment}"""
 _INT = 'integer { size = %d; align = 8; signed = %s; }'
 TYPES = {
     'u64': (_INT % (64, 'false'), 'Q'), 'i64': (_INT % (64, 'true'), 'q'),
@@ -43,7 +43,7 @@ Kind = tuple[str, Sequence[tuple[str, str]]]
 
 def session(
     folder: Path, kinds: Sequence[Kind], events: Sequence[tuple[Any, ...]], *,
-    context: bool = True, discarded: int = 0,
+    context: bool = True, discarded: int = 0, environment: Mapping[str, str] | None = None,
 ) -> Path:
     """
     Write a trace into a new folder and return it.
@@ -52,9 +52,13 @@ def session(
         and `TYPE[]`
     :param events: place in `kinds`, time since the clock's offset, pid, tid, procname, values
     :param discarded: events that the tracer says to have discarded in the second of two packets
+    :param environment: what LTTng writes into the metadata, such as the hostname
     """
     folder.mkdir(parents=True)
-    text = _HEAD.format(offset=CLOCK_OFFSET, context=CONTEXT if context else '')
+    lines = ''.join(f'  {name} = "{value}";\n' for name, value in (environment or {}).items())
+    text = _HEAD.format(
+        offset=CLOCK_OFFSET, context=CONTEXT if context else '',
+        environment=f'env {{\n{lines}}};\n' if lines else '')
     for number, (name, fields) in enumerate(kinds):
         text += (f'event {{ name = "{name}"; id = {number}; stream_id = 0; fields := struct {{ '
                  + ' '.join(_declared(*field) for field in fields) + ' }; };\n')

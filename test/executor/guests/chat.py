@@ -134,6 +134,116 @@ def catches_signals():
     rclpy.spin(Listener())
 
 
+def handles_a_signal():
+    import os
+    import signal
+    import threading
+    import time
+
+    def timed_out(number, frame):
+        raise TimeoutError(f'signal {number}')
+
+    rclpy.init()
+    node = Listener()
+    before = signal.getsignal(signal.SIGUSR1)
+    signal.signal(signal.SIGUSR1, timed_out)
+    try:
+        os.kill(os.getpid(), signal.SIGUSR1)
+        while True:
+            time.sleep(0.01)
+    except TimeoutError as error:
+        print('while it worked:', error)
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGUSR1)).start()
+    try:
+        rclpy.spin(node)
+    except TimeoutError as error:
+        print('while it spun:', error)
+    print('one handler:', signal.signal(signal.SIGUSR1, before) is timed_out)
+    rclpy.spin(node)
+
+
+def handles_its_exceptions():
+    rclpy.init()
+    node = Listener()
+    n = iter(range(1000))
+
+    def tick():
+        if next(n) % 2:
+            raise ValueError('odd')
+
+    timer = node.create_timer(0.02, tick)
+    executor = rclpy.executors.SingleThreadedExecutor()
+    executor.add_node(node)
+    for spin in (lambda: rclpy.spin(node), executor.spin):
+        executor.add_node(node) if spin == executor.spin else None
+        for _ in range(3):
+            try:
+                spin()
+            except ValueError as error:
+                print(spin.__name__, 'raised', error)
+    timer.cancel()
+    rclpy.spin(node)
+
+
+def spins_in_callbacks():
+    from rclpy.callback_groups import ReentrantCallbackGroup
+    from std_srvs.srv import Trigger
+    rclpy.init()
+    node = Listener()
+    group = ReentrantCallbackGroup()
+    node.create_service(Trigger, 'own', answer, callback_group=group)
+    client = node.create_client(Trigger, 'own', callback_group=group)
+    ways = {
+        'of the node': lambda future: node.executor.spin_until_future_complete(future),
+        'of rclpy': lambda future: rclpy.spin_until_future_complete(node, future),
+        'step by step': lambda future: step_until(future, node.executor.spin_once),
+        'step by step of rclpy': lambda future: step_until(future, lambda: rclpy.spin_once(node)),
+    }
+
+    def tick():
+        timer.cancel()
+        for way, spin in ways.items():
+            future = client.call_async(Trigger.Request())
+            spin(future)
+            print(way, future.result().message)
+
+    timer = node.create_timer(0.1, tick, callback_group=group)
+    rclpy.spin(node)
+
+
+def step_until(future, step):
+    while not future.done():
+        step()
+
+
+def steps():
+    rclpy.init()
+    node = Listener()
+    node.create_timer(0.02, lambda: None)
+    for _ in range(30):
+        rclpy.spin_once(node, timeout_sec=600.0)
+    print('30 steps')
+    rclpy.spin(node)
+
+
+def never_spins():
+    rclpy.init()
+    node = Node('teleop')
+    node.create_publisher(String, 'typed', 10).publish(String(data='w'))
+    node.destroy_node()
+    rclpy.shutdown()
+    print('typed w')
+
+
+def ends_in_a_thread():
+    import threading
+    rclpy.init()
+    node = Listener()
+    threading.Timer(0.3, rclpy.shutdown).start()
+    rclpy.spin(node)
+    print('over' if not rclpy.ok() else 'it goes on')
+
+
 def starts_slowly():
     import time
     rclpy.init()
@@ -186,6 +296,17 @@ def raises_in_a_callback():
     node = Listener()
     node.create_timer(0.2, lambda: 1 / 0)
     rclpy.spin(node)
+
+
+def no_longer_spins():
+    import time
+    rclpy.init()
+    node = Listener()
+    node.create_timer(0.01, lambda: 1 / 0)
+    try:
+        rclpy.spin(node)
+    except ZeroDivisionError:
+        time.sleep(60)
 
 
 def own_context():

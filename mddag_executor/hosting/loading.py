@@ -22,6 +22,7 @@ any node starts; ``hosting`` then runs the ``Program`` that it returns.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module, metadata
 import inspect
@@ -41,8 +42,6 @@ from ament_index_python.packages import (
 from mddag_executor.errors import MddagError
 from msg_graph.errors import did_you_mean
 from rclpy.node import Node
-
-_FORMS = 'write package/executable, module:function or module:NodeClass'
 
 
 class LoadingError(MddagError):
@@ -100,17 +99,19 @@ def ros_arguments(given: Sequence[str] | None) -> list[str]:
 
 
 def _find(spec: str) -> Program:
-    if ':' in spec:
-        return _resolve_attribute(spec)
-    if spec.count('/') == 1 and all(spec.split('/')):
-        return _resolve_executable(spec)
-    raise LoadingError(spec, 'this names no node', _FORMS)
+    package, slash, executable = spec.partition('/')
+    module, colon, attribute = spec.partition(':')
+    names = [*module.split('.'), *attribute.split('.')]
+    if colon and all(name.isidentifier() for name in names):
+        return _attribute(spec, module, attribute)
+    if not colon and package and executable and '/' not in executable:
+        return _executable(spec, package, executable)
+    raise LoadingError(
+        spec, 'this names no node',
+        'write package/executable, module:function or module:NodeClass')
 
 
-def _resolve_attribute(spec: str) -> Program:
-    module_name, _, attribute = spec.partition(':')
-    if not all(part.isidentifier() for part in (*module_name.split('.'), *attribute.split('.'))):
-        raise LoadingError(spec, 'this names no node', _FORMS)
+def _attribute(spec: str, module_name: str, attribute: str) -> Program:
     if '' not in sys.path and os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())  # as `python -m` does
     module = _import(spec, module_name)
@@ -120,20 +121,16 @@ def _resolve_attribute(spec: str) -> Program:
             target = getattr(target, name)
         except AttributeError:
             raise LoadingError(
-                spec, f"module '{module_name}' has no '{attribute}'",
-                _suggest(attribute, [
+                spec, f"module '{module_name}' has no '{attribute}'", _suggest(attribute, [
                     name for name, value in vars(module).items()
                     if not name.startswith('_') and callable(value)])) from None
-    if isinstance(target, type):
-        if not issubclass(target, Node):
-            raise LoadingError(
-                spec, f"'{attribute}' is a class, but no rclpy node",
-                'name a subclass of rclpy.node.Node, or a function')
+    if isinstance(target, type) and issubclass(target, Node):
         return Program(spec, module_name, target)
-    if not callable(target):
+    if isinstance(target, type) or not callable(target):
+        what = 'a class, but no rclpy node' if isinstance(target, type) else (
+            f'no function and no class, but of type {type(target).__name__}')
         raise LoadingError(
-            spec, f"'{attribute}' is no function and no class, but of type "
-            f'{type(target).__name__}',
+            spec, f"'{attribute}' is {what}",
             'name a function or a subclass of rclpy.node.Node')
     return Program(spec, module_name, lambda: _call(spec, target))
 
@@ -143,7 +140,7 @@ def _import(spec: str, module_name: str) -> ModuleType:
         return import_module(module_name)
     except ModuleNotFoundError as error:
         missing = error.name or module_name
-        if module_name == missing or module_name.startswith(missing + '.'):
+        if f'{module_name}.'.startswith(f'{missing}.'):
             raise LoadingError(
                 spec, f"there is no module '{missing}'",
                 'check its name, or add its folder to PYTHONPATH') from None
@@ -169,75 +166,40 @@ def _call(spec: str, function: Callable[..., Any]) -> Any:
         return function()
     if len(required) == 1 and required[0].kind is not inspect.Parameter.KEYWORD_ONLY:
         return function(sys.argv)
-    names = ', '.join(p.name for p in required)
     raise LoadingError(
-        spec, f'the function requires the arguments {names}',
+        spec, f'the function requires the arguments {", ".join(p.name for p in required)}',
         'name one that needs none, or only the list of command line arguments')
 
 
-def _resolve_executable(spec: str) -> Program:
-    package, executable = spec.split('/')
-    folder = _library_folder(package)
-    if folder is not None and (folder / executable).is_file():
-        return _script(spec, folder / executable)
-    scripts = _console_scripts(package)
-    if scripts is None and folder is None:
-        known = {*_ament_packages(), *_distributions()}
-        raise LoadingError(
-            spec, f"there is no package '{package}'",
-            did_you_mean(package, known, "source its workspace's setup file, or install it"))
-    entry = (scripts or {}).get(executable)
-    if entry is not None:
-        return _entry_point(spec, entry)
-    have = [*(scripts or ()), *_executables(folder)]
-    raise LoadingError(
-        spec, f"package '{package}' has no executable '{executable}'",
-        _suggest(executable, have))
-
-
-def _library_folder(package: str) -> Path | None:
-    """Return ``PREFIX/lib/PACKAGE`` for a package of the ament index."""
+def _executable(spec: str, package: str, name: str) -> Program:
+    found, scripts = False, {}
     try:
-        return Path(get_package_prefix(package), 'lib', package)
-    except (PackageNotFoundError, ValueError, OSError):
-        # No such package, no name for one, or no AMENT_PREFIX_PATH at all.
-        return None
-
-
-def _ament_packages() -> list[str]:
-    try:
-        return list(get_packages_with_prefixes())
-    except OSError:
-        return []
-
-
-def _distributions() -> list[str]:
-    return [name for d in metadata.distributions() if (name := d.metadata['Name'])]
-
-
-def _console_scripts(package: str) -> dict[str, metadata.EntryPoint] | None:
-    """Return the console scripts of a distribution, or None when it is not installed."""
-    try:
-        distribution = metadata.distribution(package)
+        entries = metadata.distribution(package).entry_points
+        scripts = {e.name: e for e in entries if e.group == 'console_scripts'}
+        found = True
     except (metadata.PackageNotFoundError, ValueError):
-        return None
-    return {e.name: e for e in distribution.entry_points if e.group == 'console_scripts'}
-
-
-def _executables(folder: Path | None) -> list[str]:
-    if folder is None or not folder.is_dir():
-        return []
-    return sorted(p.name for p in folder.iterdir() if p.is_file() and os.access(p, os.X_OK))
-
-
-def _entry_point(spec: str, entry: metadata.EntryPoint) -> Program:
+        pass
+    files: list[str] = []
     try:
-        function = entry.load()
-    except Exception as error:
+        folder = Path(get_package_prefix(package), 'lib', package)
+        found = True
+        if (folder / name).is_file():
+            return _script(spec, folder / name)
+        files = [p.name for p in folder.iterdir() if p.is_file() and os.access(p, os.X_OK)]
+    except (PackageNotFoundError, ValueError, OSError):
+        pass  # no such package, no name for one, no folder, or no AMENT_PREFIX_PATH at all
+    if name in scripts:
+        return replace(_attribute(spec, scripts[name].module, scripts[name].attr), argv0=name)
+    if found:
         raise LoadingError(
-            spec, f"its entry point '{entry.value}' cannot be imported ({describe(error)})",
-            'install what it needs, or the package again') from error
-    return Program(spec, entry.name, lambda: _call(spec, function))
+            spec, f"package '{package}' has no executable '{name}'",
+            _suggest(name, [*scripts, *files]))
+    packages = {name for d in metadata.distributions() if (name := d.metadata['Name'])}
+    with suppress(OSError):
+        packages.update(get_packages_with_prefixes())
+    raise LoadingError(
+        spec, f"there is no package '{package}'",
+        did_you_mean(package, packages, "source its workspace's setup file, or install it"))
 
 
 def _script(spec: str, path: Path) -> Program:

@@ -1,0 +1,134 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Signal handlers of hosted programs, none of which runs in the main thread.
+
+Theory of operation
+-------------------
+Python runs handlers in the main thread, and only the main thread may set them.  So the handlers
+of programs are kept here.  For the first one of a signal the main thread is asked to set a handler
+for all programs; a signal of this module interrupts whatever it waits for.  When the signal comes,
+first its handler of before runs (SIGINT ends the run), then those of the programs.  An exception
+of a program's handler is raised in the program's own thread, as soon as that runs Python.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import ctypes
+import os
+import signal
+import threading
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mddag_executor.hosting.host import Guest, Host
+
+_DOORBELL = signal.SIGURG
+"""Without a handler it is ignored, so a late one does no harm."""
+_UNAVAILABLE = (signal.SIGKILL, signal.SIGSTOP, _DOORBELL)
+_PATIENCE_S = 5.0
+
+
+class GuestSignals:
+    """The signal handlers of a host's programs."""
+
+    def __init__(self, host: Host) -> None:
+        self._host = host
+        self._handlers: dict[int, dict[Guest | None, Any]] = {}
+        self._before: dict[int, Any] = {}
+        self._asked: list[tuple[int, Any]] = []
+
+    def install(self, replace: Callable[[Any, str, Callable[[Any], Any]], None]) -> None:
+        """Keep handlers of programs, if the calling thread is the main thread."""
+        self._set = signal.signal
+        if threading.current_thread() is threading.main_thread():
+            self._before[_DOORBELL] = signal.signal(_DOORBELL, self._answer)
+            replace(signal, 'signal', self._signal)
+            replace(signal, 'getsignal', self._getsignal)
+
+    def uninstall(self) -> None:
+        """Restore the handlers of before."""
+        for number, before in self._before.items():
+            self._set(number, signal.SIG_DFL if before is None else before)
+
+    def _signal(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def set_handler(number: int, handler: Any) -> Any:
+            guest = self._host.current_guest()
+            is_main = threading.current_thread() is threading.main_thread()
+            if is_main and guest is None or number in _UNAVAILABLE or (
+                    number not in signal.valid_signals() or not callable(handler)
+                    and handler not in (signal.SIG_DFL, signal.SIG_IGN)):
+                return original(number, handler)
+            before = signal.getsignal(number)
+            handlers = self._handlers.setdefault(number, {})
+            if handler == signal.SIG_DFL:
+                handlers.pop(guest, None)
+            else:
+                handlers[guest] = handler
+                if is_main:
+                    self._handle_too(number)
+                elif number not in self._before:
+                    self._ask_main_thread(number)
+            return before
+
+        return set_handler
+
+    def _getsignal(self, original: Callable[[int], Any]) -> Callable[[int], Any]:
+        def getsignal(number: int) -> Any:
+            handlers, guest = self._handlers.get(number, {}), self._host.current_guest()
+            return handlers[guest] if guest in handlers else self._before.get(
+                number, original(number))
+
+        return getsignal
+
+    def _ask_main_thread(self, number: int) -> None:
+        done = threading.Lock()  # waiting for it takes no virtual time
+        done.acquire()
+        self._asked.append((number, done))
+        main = threading.main_thread().ident
+        assert main is not None
+        signal.pthread_kill(main, _DOORBELL)
+        if not done.acquire(timeout=_PATIENCE_S):
+            raise ValueError(f'signal {number}: the main thread does not answer')
+
+    def _answer(self, *args: Any) -> None:
+        while self._asked:
+            number, done = self._asked.pop()
+            self._handle_too(number)
+            done.release()
+
+    def _handle_too(self, number: int) -> None:
+        if number not in self._before:
+            self._before[number] = self._set(number, self._handle)
+
+    def _handle(self, number: int, frame: Any) -> None:
+        before, handlers = self._before[number], self._handlers[number]
+        if callable(before):
+            before(number, frame)
+        elif before == signal.SIG_DFL and not handlers:  # all have been removed again
+            self._set(number, self._before.pop(number))
+            os.kill(os.getpid(), number)
+        for guest, handler in list(handlers.items()):
+            if callable(handler) and not (guest is not None and guest.ended):
+                self._call(guest, handler, number, frame)
+
+    def _call(self, guest: Guest | None, handler: Any, number: int, frame: Any) -> None:
+        guest_of, main = self._host.guest_of, threading.current_thread()
+        interrupted, guest_of[main] = guest_of.get(main), guest
+        try:
+            handler(number, frame)
+        except BaseException as error:
+            if guest is None or guest.thread is None:
+                raise
+            raise_in(guest.thread, error)
+            self._host.wake()
+        finally:
+            guest_of[main] = interrupted
+
+
+def raise_in(thread: threading.Thread, error: BaseException) -> None:
+    """Raise an exception in another thread as soon as that runs Python."""
+    kind = type(type(error).__name__, (type(error),), {'__new__': lambda kind, *args: error})
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(
+        ctypes.c_ulong(thread.ident or 0), ctypes.py_object(kind))

@@ -1,0 +1,423 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Run unmodified node programs in this process, with all of their nodes on one executor.
+
+Theory of operation
+-------------------
+1. Each program runs in a thread of its own.  A thread that a program starts belongs to it, too.
+2. While a ``Host`` is entered, the following does something else:
+
+   =================================  ============================================================
+   ``init`` of the default context    nothing: the context is initialised already
+   its ``shutdown``                   called by a program's thread, ends that program; called by
+                                      any other thread (in a callback), ends the run
+   its ``ok``                         is also False in the threads of a program that has ended
+   ``Executor.__init__``              makes a ``GuestExecutor`` of the executor
+   ``get_global_executor``            returns a ``GuestExecutor`` of the calling program
+   ``EventsExecutor``                 makes a ``GuestExecutor``
+   ``signal.signal``, ``getsignal``   keep a handler for each program: see ``guest_signals``
+   =================================  ============================================================
+
+3. A program that spins gives its nodes to the host's executor and waits until the run or the
+   program ends.  A program ends by ``rclpy.shutdown`` or when it returns.  Its nodes are removed
+   then, unless it has returned them.  The run ends with the last program.
+4. An exception of a callback is raised by the spin of its program.  The nodes that a program has
+   returned have no such spin: their exceptions end the run.
+
+Differences from a process of its own: callbacks also run between two ``spin_once``; the arguments
+and the domain that a program gives to ``rclpy.init`` are not used; ``sys.argv`` is right only
+until the next program starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, field
+from importlib import import_module
+import sys
+import threading
+import time
+from typing import Any
+import weakref
+
+from mddag_executor.hosting.guest_executor import GuestExecutor, make_guest
+from mddag_executor.hosting.guest_signals import GuestSignals
+from mddag_executor.hosting.loading import describe, LoadingError, Program, resolve
+from mddag_executor.executor.compat import executor_kept
+from mddag_executor.replacements import instead, Replacements
+import rclpy
+from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.logging import get_logger
+from rclpy.node import Node
+import rclpy.utilities
+
+START_TIMEOUT_S = 10.0
+_ENTITIES = ('timers', 'subscriptions', 'services', 'clients', 'guards', 'waitables')
+
+
+@dataclass(eq=False)
+class Guest:
+    """
+    A program that runs.
+
+    :ivar nodes: those that are on the executor.
+    :ivar settled: whether these are all that it has at first, or it has ended.
+    :ivar ended: whether it wants nothing to run any more.
+    :ivar returned: whether its main has returned nodes.
+    :ivar uses_ros: whether it has initialised rclpy.
+    :ivar error: the exception that has ended its main.
+    """
+
+    program: Program
+    nodes: list[Node] = field(default_factory=list)
+    settled: bool = False
+    ended: bool = False
+    returned: bool = False
+    uses_ros: bool = False
+    error: BaseException | None = None
+    thread: threading.Thread | None = None
+    global_executor: Any = None
+
+
+class Host:
+    """
+    Runs programs in the default context; a context manager.
+
+    :ivar executor: runs the nodes of all programs; None before ``start``.
+    """
+
+    def __init__(self) -> None:
+        self.executor: Any = None
+        self.guests: list[Guest] = []
+        self.global_executor: Any = None  # of callbacks, which belong to no program's thread
+        self.end_run: Callable[[], None] = lambda: None
+        self.guest_of: Any = weakref.WeakKeyDictionary()  # by thread
+        self._is_ending: Callable[[], bool] = lambda: False
+        self._lend: Callable[[], Any] = nullcontext
+        self._all_started = self._ended = self._loading = False
+        self._lock = threading.RLock()  # a handler of a signal may interrupt its holder
+        self._node_of: Any = weakref.WeakKeyDictionary()  # by entity
+        self._executors: Any = weakref.WeakSet()
+        self._signals = GuestSignals(self)
+        self._replacements = Replacements()
+
+    def __enter__(self) -> Host:
+        context = self.context = rclpy.utilities.get_default_context()
+        replace = self._replacements.replace
+        self._replacements.callback(self._signals.uninstall)
+        self._signals.install(replace)
+        for name, function in (('init', self._init), ('ok', self._ok),
+                               ('shutdown', self._shutdown), ('try_shutdown', self._shutdown)):
+            setattr(context, name, function)
+            self._replacements.callback(delattr, context, name)
+        for module in (rclpy, rclpy.utilities):  # they would also make a new default context
+            replace(module, 'shutdown', instead(self._shutdown))
+            replace(module, 'try_shutdown', instead(self._shutdown))
+        replace(rclpy, 'install_signal_handlers', instead(lambda *args: None))
+        replace(rclpy, 'get_global_executor', instead(self._global_executor))
+        replace(Executor, '__init__', self._executor_init)
+        replace(threading.Thread, 'start', self._thread_start)
+        for package in ('rclpy.experimental', 'rclpy.experimental.events_executor'):
+            with suppress(ImportError, KeyError):  # not every version has it
+                replace(import_module(package), 'EventsExecutor', instead(SingleThreadedExecutor))
+        context.on_shutdown(self._context_ended)
+        return self
+
+    def __exit__(self, *args: object) -> None:
+        self.end(0.0)
+        self._replacements.close()
+        for executor in (self.global_executor, *(g.global_executor for g in self.guests)):
+            if executor is not None:
+                Executor.shutdown(executor)
+
+    # --- programs --------------------------------------------------------------------------------
+
+    def load(self, specs: Iterable[str], ros_arguments: Iterable[str] = ()) -> list[Program]:
+        """Find programs; what their modules do while they are imported is hosted, too."""
+        self._loading = True
+        try:
+            return [resolve(spec, ros_arguments) for spec in specs]
+        finally:
+            self._loading = False
+
+    def start(
+        self, executor: Any, programs: Iterable[Program], arguments: Iterable[str] = (),
+        end_run: Callable[[], None] = lambda: None, is_ending: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """
+        Run programs, the next one as soon as the nodes of the last one are on the executor.
+
+        A program that takes longer than ``START_TIMEOUT_S`` is not waited for.
+
+        :param executor: runs all nodes; the caller spins it.
+        :param arguments: end each program's command line.
+        :param end_run: called, from any thread, when a callback calls ``rclpy.shutdown``, or all
+            programs have ended.
+        :param is_ending: whether the run ends; no program or node is added then.
+        :raises LoadingError: when a program fails before, or ends without any use of ROS.
+        """
+        self.executor, self.end_run, self._is_ending = executor, end_run, is_ending
+        self._lend = getattr(executor, 'lend', nullcontext)
+        if hasattr(executor, 'on_callback_ended'):
+            executor.on_callback_ended(self._callback_ended)
+        arguments = list(arguments)
+        for program in programs:
+            if is_ending():
+                break
+            guest = Guest(program)
+            self.guests.append(guest)
+            sys.argv = [program.argv0, *program.arguments, *arguments]
+            guest.thread = threading.Thread(
+                target=self._run, args=(guest,), daemon=True, name=f'main of {program.spec}')
+            self.guest_of[guest.thread] = guest
+            guest.thread.start()
+            self._wait_settled(guest)
+            self._check_start(guest)
+        self._all_started = True
+        self._end_run_after_last()
+
+    def _wait_settled(self, guest: Guest) -> None:
+        end = time.monotonic() + START_TIMEOUT_S
+        while not guest.settled and time.monotonic() < end and not self._is_ending():
+            time.sleep(0.01)
+
+    def _check_start(self, guest: Guest) -> None:
+        spec = guest.program.spec
+        if isinstance(guest.error, LoadingError):
+            raise guest.error
+        if guest.error is not None:
+            raise LoadingError(
+                spec, f'it failed while starting ({describe(guest.error)})',
+                'correct it, or see how it runs by itself') from guest.error
+        if guest.ended and not guest.nodes and not guest.uses_ros:
+            raise LoadingError(
+                spec, 'it ended and neither returned a node nor initialised rclpy',
+                'name what makes the node, or a main() that spins it')
+
+    def _run(self, guest: Guest) -> None:
+        """Run a program in its thread."""
+        try:
+            nodes = _nodes_in(guest.program, guest.program.run())
+            guest.returned = bool(nodes)
+            for node in nodes:
+                if node.executor is None:
+                    self._global_executor().add_node(node)
+                self.adopt(node, guest)
+        except SystemExit as error:
+            if error.code not in (None, 0):
+                guest.error = error
+        except BaseException as error:
+            guest.error = error
+        if guest.error is not None or not guest.returned:
+            self.program_ended(guest)
+        guest.settled = True
+
+    def program_ended(self, guest: Guest) -> None:
+        """Remove a program's nodes and end its spins; end the run after the last program."""
+        guest.ended = True
+        if not self._ended:
+            for node in list(guest.nodes):
+                self.executor.remove_node(node)
+            self._end_run_after_last()
+        self.wake()
+        if guest.error is not None:
+            self.program_failed(guest, guest.error)
+
+    def program_failed(self, guest: Guest, error: BaseException) -> None:
+        """Report at once what a program has raised, if others go on without it."""
+        if not all(each.ended for each in self.guests):
+            get_logger('mddag_executor').error(
+                f'--node {guest.program.spec}: its main has raised {describe(error)}: its nodes '
+                'run no more')
+
+    def _end_run_after_last(self) -> None:
+        if self._all_started and all(guest.ended for guest in self.guests):
+            self.end_run()
+
+    def shut_down(self) -> None:
+        """Shut the context down; all spins return."""
+        Context.try_shutdown(self.context)
+
+    def end(self, timeout_s: float = 0.5) -> list[Guest]:
+        """Shut the context down; return the programs that do not end in time."""
+        if self.guests:
+            self.shut_down()
+        end = time.monotonic() + timeout_s
+        for guest in self.guests:
+            if guest.thread is not None:
+                guest.thread.join(max(0.0, end - time.monotonic()))
+        return [g for g in self.guests if g.thread is not None and g.thread.is_alive()]
+
+    # --- nodes and callbacks ---------------------------------------------------------------------
+
+    def adopt(self, node: Node, guest: Guest | None) -> None:
+        """
+        Add a program's node to the executor, unless the program has ended.
+
+        :raises LoadingError: when the node is in another context than the executor.
+        """
+        if node.context is not self.context:
+            name = node.get_fully_qualified_name()
+            raise LoadingError(
+                guest.program.spec if guest else name, f'node {name} has a context of its own',
+                'let it use the default context')
+        if self.executor is None:
+            raise RuntimeError('a module spins a node while it is imported')
+        for each in [] if guest is None else list(guest.nodes):
+            try:
+                with each.handle:
+                    pass
+            except InvalidHandle:  # it was destroyed
+                self.release(each, guest)
+        if self._is_ending() or self.is_over(guest):
+            return
+        if node not in self.executor.get_nodes():
+            with executor_kept(node):
+                self.executor.add_node(node)
+        if guest is not None and node not in guest.nodes:
+            guest.nodes.append(node)
+
+    def release(self, node: Node, guest: Guest | None) -> None:
+        """Remove a program's node from the executor."""
+        self.executor.remove_node(node)
+        if guest is not None:
+            with suppress(ValueError):
+                guest.nodes.remove(node)
+
+    def _callback_ended(self, entity: Any, error: BaseException | None) -> bool:
+        """Note the end of a callback; return whether a spin of its program raises its error."""
+        if entity is None:
+            return False
+        if entity not in self._node_of:
+            self._node_of.update({
+                each: weakref.ref(node) for node in self.executor.get_nodes()
+                for name in _ENTITIES for each in getattr(node, name)})
+        node = self._node_of.get(entity, lambda: None)()
+        executor = None if node is None else node.executor
+        return isinstance(executor, GuestExecutor) and executor.callback_ended(error)
+
+    # --- waiting ---------------------------------------------------------------------------------
+
+    def wait(
+        self, changed: threading.Condition, until: Callable[[], bool], timeout_s: float | None,
+        guest: Guest | None,
+    ) -> None:
+        """
+        Wait until something is true, the run or the program ends, or the time is over.
+
+        The worker of a callback that waits runs other callbacks.
+
+        :param changed: is notified when ``until`` may have become true.
+        """
+        with self._lend(), changed:
+            changed.wait_for(
+                lambda: until() or self.is_over(guest),
+                None if timeout_s is None or timeout_s < 0 else timeout_s)
+
+    def is_over(self, guest: Guest | None) -> bool:
+        """Return whether the run has ended, or the program."""
+        return self._ended or guest is not None and guest.ended
+
+    def wake(self) -> None:
+        """Have all waiting threads check again what they wait for."""
+        with self._lock:
+            executors = list(self._executors)
+        for executor in executors:
+            executor.wake_waiting()
+
+    def _context_ended(self) -> None:
+        self._ended = True
+        self.wake()
+
+    # --- what rclpy and Python do meanwhile ------------------------------------------------------
+
+    def current_guest(self) -> Guest | None:
+        """Return the program that the calling thread belongs to, or None."""
+        guest: Guest | None = self.guest_of.get(threading.current_thread())
+        return guest
+
+    def _thread_start(self, original: Callable[..., None]) -> Callable[..., None]:
+        def start(thread: threading.Thread) -> None:
+            self.guest_of.setdefault(thread, self.current_guest())
+            original(thread)
+
+        return start
+
+    def _init(self, args: Any = None, *, domain_id: int | None = None, **more: Any) -> None:
+        guest = self.current_guest()
+        if guest is not None:
+            guest.uses_ros = True
+        if domain_id is not None and domain_id != self.context.get_domain_id():
+            raise LoadingError(
+                guest.program.spec if guest else 'rclpy.init',
+                f'it asks for ROS domain {domain_id}, and this process is in another',
+                f'set ROS_DOMAIN_ID={domain_id}, or run it by itself')
+
+    def _ok(self) -> bool:
+        guest = self.current_guest()
+        return Context.ok(self.context) and not (guest is not None and guest.ended)
+
+    def _shutdown(self, *, context: Context | None = None, **more: Any) -> None:
+        guest = self.current_guest()
+        if context is not None and context is not self.context:
+            context.try_shutdown()
+        elif guest is None:
+            self.end_run()
+        else:
+            self.program_ended(guest)
+
+    def _executor_init(self, original: Callable[..., None]) -> Callable[..., None]:
+        def init(executor: Executor, *args: Any, **more: Any) -> None:
+            original(executor, *args, **more)
+            # before that, the caller of ``start`` makes the one that runs the nodes
+            if (self.executor is not None or self._loading) and executor.context is self.context:
+                make_guest(executor, self, self.current_guest())
+                with self._lock:
+                    self._executors.add(executor)
+
+        return init
+
+    def _global_executor(self) -> Any:
+        """Return the executor of ``rclpy.spin`` and its kind."""
+        owner: Any = self.current_guest() or self
+        with self._lock:
+            if owner.global_executor is None:
+                owner.global_executor = SingleThreadedExecutor()
+                owner.global_executor.is_global = True
+            return owner.global_executor
+
+
+def nodes_of(specs: Iterable[str], arguments: Iterable[str] = ()) -> list[list[str]]:
+    """
+    Run programs until their nodes are there; return the names of the nodes of each program.
+
+    No callback runs.  The process is to be ended after that.
+
+    :raises LoadingError: as ``Host.load`` and ``start``, or when a program makes no node in time.
+    """
+    arguments = list(arguments)
+    with Host() as host:
+        programs = host.load(specs, arguments)
+        host.start(SingleThreadedExecutor(), programs, arguments)
+        for guest in host.guests:
+            if not guest.nodes:
+                raise LoadingError(
+                    guest.program.spec, f'it has made no node in {START_TIMEOUT_S:g} s, so its '
+                    'process is unknown', f'name that: PROCESS={guest.program.spec}')
+        return [[n.get_fully_qualified_name() for n in guest.nodes] for guest in host.guests]
+
+
+def _nodes_in(program: Program, value: Any) -> list[Node]:
+    """Return the nodes that a program returned; a main() returns None or its exit status."""
+    nodes = list(value) if isinstance(value, (list, tuple, set)) else [value]
+    if all(isinstance(node, Node) for node in nodes):
+        return nodes
+    if value is None or isinstance(value, int):
+        return []
+    raise LoadingError(
+        program.spec, f'it returned a {type(value).__name__}, which is no rclpy node',
+        'let it return a node, a list of nodes, or nothing')
