@@ -113,7 +113,6 @@ def test_works_without_anything_optional(blocked: Blocked, arguments: tuple[str,
     ('rclpy', 'mddag_executor[ros]', ('run', 'graph.yaml', '--synthetic', 'sleep')),
     ('rclpy', 'mddag_executor[ros]', ('top', '--once')),
     ('rclpy', 'mddag_executor[ros]', ('graph', 'from-ros', '-o', 'out.yaml')),
-    ('rclpy', 'mddag_executor[ros]', ('bench', 'live', '--load', 'topics', '--seconds', '1')),
 ], ids=lambda value: value if isinstance(value, str) else ' '.join(value[:1]))
 def test_says_in_one_line_what_is_missing(
     blocked: Blocked, tmp_path: Path, missing: str, says: str, arguments: tuple[str, ...]

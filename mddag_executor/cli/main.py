@@ -24,7 +24,7 @@ as one line each. The exit status is
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import errno
 from importlib import import_module
 import io
@@ -74,8 +74,6 @@ VERBS = {
     'export': Verb('export', 'turn a trace into a file for Perfetto, Foxglove or spreadsheets'),
     'diff': Verb('diff', 'compare two recorded runs sink by sink'),
     'top': Verb('top', 'show the deadlines and workers of running executors, live'),
-    'bench': Verb('bench', 'measure the executor, the core, the replayer and the simulator', (
-        'live', 'core', 'replay', 'evaluate')),
 }
 # What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.
 _ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_python')
@@ -148,11 +146,14 @@ def run(argv: Sequence[str]) -> int:
     return status
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(
+    argv: Sequence[str] | None = None, run: Callable[[Sequence[str]], int] = run
+) -> int:
     """
     Run the program.
 
     :param argv: the arguments after the program's name; those of the process when None
+    :param run: does what they say
     :returns: the exit status
     """
     try:

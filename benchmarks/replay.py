@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The verb `bench replay`: how fast traces are read and linked, and how well reschedule predicts.
+The benchmark `replay`: how fast traces are read and linked, and how well reschedule predicts.
 
 The machine decides about the figures, and whatever else it does: each reader has a process of its
 own, and the best of several runs counts.
@@ -18,16 +18,16 @@ import sys
 import tempfile
 from typing import Any, TYPE_CHECKING
 
+from benchmarks.slack import check_slack
+from benchmarks.slack import show as show_slack
 from mddag_executor.cli import common, options
-from mddag_executor.cli.slack_check import check_slack
-from mddag_executor.cli.slack_check import show as show_slack
 from mddag_executor.cli.text import format_ns, one_line, printable, Progress, table
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.resources import find
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
-    from mddag_executor.replay.measure import Agreement
+    from benchmarks.long_traces import Agreement
 
 HELP = 'measure the replayer'
 DESCRIPTION = """\
@@ -35,13 +35,13 @@ Measure the replayer: the speed and memory of reading and linking, beside other 
 --accuracy how well reschedule predicts a live run; with --slack whether the slack that it finds
 holds in live runs."""
 EXAMPLE = """\
-mddag bench replay
-mddag bench replay --events 10000000 --json replay.json
-mddag bench replay --trace run.mcap
-mddag bench replay --accuracy --utilisation 0.3,0.6,0.8 --seconds 10
-mddag bench replay --accuracy --utilisation 0.6 --workers 7,4
-mddag bench replay --accuracy --bodies spin --seconds 20
-mddag bench replay --slack --utilisation 0.3 --seconds 10"""
+python -m benchmarks replay
+python -m benchmarks replay --events 10000000 --json replay.json
+python -m benchmarks replay --trace run.mcap
+python -m benchmarks replay --accuracy --utilisation 0.3,0.6,0.8 --seconds 10
+python -m benchmarks replay --accuracy --utilisation 0.6 --workers 7,4
+python -m benchmarks replay --accuracy --bodies spin --seconds 20
+python -m benchmarks replay --slack --utilisation 0.3 --seconds 10"""
 
 MEDIAN_LIMIT, P99_LIMIT = 0.05, 0.15
 _FEW = 100
@@ -118,7 +118,7 @@ def _slack(args: argparse.Namespace, folder: str) -> dict[str, Any]:
 # --- speed ---------------------------------------------------------------------------------------
 
 def _speed(args: argparse.Namespace, folder: str) -> dict[str, Any]:
-    from mddag_executor.replay.measure import measure, OTHERS, READERS, write_long_trace
+    from benchmarks.long_traces import measure, OTHERS, READERS, write_long_trace
     from mddag_executor.trace import TraceReader
     path = args.trace
     if path is None:
@@ -198,8 +198,8 @@ def _compared(
     recorded_before: str, path: str, utilisation: float, workers: int, recorded_workers: int
 ) -> dict[str, Any]:
     """Return how well a run is predicted from a recording, which may be of that very run."""
+    from benchmarks.long_traces import agreements
     from mddag_executor.replay import replay, reschedule
-    from mddag_executor.replay.measure import agreements
     skip = _WARM_UP_S * 1_000_000_000
     predicted = reschedule(recorded_before, workers=workers, skip=skip).result()
     ideal = reschedule(recorded_before, workers=workers, skip=skip, overheads=False).result()
@@ -217,7 +217,7 @@ def _row(row: Agreement) -> dict[str, Any]:
 
 def _summaries(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return a row for each setting and sink: of medians over the repeated runs."""
-    from mddag_executor.replay.measure import Agreement
+    from benchmarks.long_traces import Agreement
     found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for run in runs:
         for row in run['sinks']:

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The verb `bench core`: CPU time of the scheduler core in plain Python, under each policy.
+The benchmark `core`: CPU time of the scheduler core in plain Python, under each policy.
 
 This is what the core adds to each callback in a live run, and what simulation takes without numba.
 The machine decides about the figures, and whatever else it does: all are medians.
@@ -21,8 +21,8 @@ from mddag_executor.errors import UsageError
 HELP = 'measure the scheduler core'
 DESCRIPTION = 'Measure the core in plain Python: CPU time for each event and each job of a vertex.'
 EXAMPLE = """\
-mddag bench core
-mddag bench core --policies rad,ros2 --repeat 9 --json core.json"""
+python -m benchmarks core
+python -m benchmarks core --policies rad,ros2 --repeat 9 --json core.json"""
 
 _LONGEST_NS = 60_000_000_000
 
@@ -41,7 +41,7 @@ def main(args: argparse.Namespace) -> int:
     policies = options.policies(args.policies)
     if args.duration > _LONGEST_NS:
         raise UsageError('--duration: that is too long: give at most 60s')
-    from mddag_executor.simulate.measure import time_core
+    from benchmarks.virtual_time import time_core
     task_set = common.load_workload(args.graph)
     workers = defaults.workers(args.workers, task_set)
     rows: list[dict[str, Any]] = []

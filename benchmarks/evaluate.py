@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The verb `bench evaluate`: how long a run takes, and a job of a vertex in task sets of any size.
+The benchmark `evaluate`: how long a run takes, and a job of a vertex in task sets of any size.
 
 The machine decides about the figures, and whatever else it does: all are medians.
 """
@@ -22,8 +22,8 @@ HELP = 'measure the batch evaluation'
 DESCRIPTION = """\
 Measure the batch evaluation: time for each run and policy, and for each vertex job."""
 EXAMPLE = """\
-mddag bench evaluate
-mddag bench evaluate --runs 5000 --jobs 1,2,4 --repeat 5 --json evaluate.json"""
+python -m benchmarks evaluate
+python -m benchmarks evaluate --runs 5000 --jobs 1,2,4 --repeat 5 --json evaluate.json"""
 
 SIZES = (10, 100, 1000, 10_000)
 CORES = ('compiled', 'plain')
@@ -48,9 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Measure and print."""
+    from benchmarks.virtual_time import time_runs, time_vertex_jobs
     from mddag_executor.simulate.compiling import available
     from mddag_executor.simulate.evaluate import Experiment
-    from mddag_executor.simulate.measure import time_runs, time_vertex_jobs
     policies = options.policies(args.policies)
     if max(args.vertices) > 100_000:
         raise UsageError('--vertices: that is too many: give at most 100000')

@@ -1,13 +1,18 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Measure executors of rclpy nodes side by side: this one and those of rclpy.
+The benchmarks behind the figures of the docs; run from a checkout, not installed.
+
+    .venv/bin/python -m benchmarks live|core|replay|evaluate …
+
+``live`` measures executors of rclpy nodes side by side, this one and those of rclpy; ``core`` the
+scheduler core; ``replay`` the replayer; ``evaluate`` the batch evaluation.  How ``live`` works:
 
 Theory of operation
 -------------------
 One measurement is a ``Spec``.  ``campaign`` runs each in a process of its own
-(``python -m mddag_executor.executor.bench``), one after the other, so that none has another's threads,
-caches or nodes beside it; the yardstick is the same for all of them.
+(``python -m benchmarks.child``), one after the other, so that none has another's threads, caches or
+nodes beside it; the yardstick is the same for all of them.
 
 There are two families of loads.  *Declared* loads (``autoware``, ``reference-system``) are the
 synthetic nodes of a declaration, with the same draw of execution times for every executor; they

@@ -19,26 +19,28 @@ when nothing was done for it, it is *missing*.
 from __future__ import annotations
 
 from collections.abc import Sequence
-import gc
 from importlib.util import module_from_spec, spec_from_file_location
 import os
 from pathlib import Path
 import time
 from typing import Any, cast
 
+from benchmarks.campaign import DECLARED, OURS, ROBOT, Spec
+from benchmarks.executors import make_executor, noting, Start, within
+from benchmarks.publisher import PublisherProcess
 from mddag_executor.core.tally import quantiles_us
 from mddag_executor.executor import current_job
-from mddag_executor.executor.bench.campaign import BenchError, DECLARED, OURS, ROBOT, Spec
-from mddag_executor.executor.bench.executors import (
-    make_executor,
-    noting,
-    Start,
-    UnfinishedSession,
-    within,
+from mddag_executor.executor.measure import (
+    ExecutionPlan,
+    judge_sink,
+    Ledger,
+    measure,
+    Mode,
+    totals,
 )
-from mddag_executor.executor.bench.publisher import PublisherProcess
-from mddag_executor.executor.measure import ExecutionPlan, judge_sink, Ledger, measure, Mode, totals
 from mddag_executor.executor.synthetic import no_job, QOS, quiet_node, SyntheticWorkload
+from mddag_executor.hosting.child import ChildError
+from mddag_executor.hosting.peers import run_nodes, UnfinishedSession
 from mddag_executor.resources import find
 from msg_graph import load, TaskSet
 import rclpy
@@ -65,7 +67,7 @@ def run(spec: Spec) -> dict[str, Any]:
     """
     Make a measurement; return its figures.
 
-    :raises BenchError: when the run was over before anything was measured.
+    :raises ChildError: when the run was over before anything was measured.
     :raises mddag_executor.errors.MddagError: when declaration and execution times do not fit, and
         when publishers and subscriptions do not find each other.
     :raises msg_graph.GraphError: when the declaration is wrong.
@@ -85,21 +87,14 @@ def run_declared(spec: Spec) -> dict[str, Any]:
     plan = _plan(spec)
     task_set = plan.task_set
     executor = make_executor(spec, task_set)
-    job_of_thread = current_job if spec.executor in OURS else no_job
+    job_of_thread = current_job if spec.executor == OURS else no_job
     workload = SyntheticWorkload(
         task_set, plan, current_job=job_of_thread, process=spec.process)
     starts: list[Start] = []
     for node in workload.nodes:
         for subscription in node.subscriptions:
             subscription.callback = noting(starts, subscription.callback)
-        executor.add_node(node)
-    session = UnfinishedSession(executor, spec)
-    # for all alike: a full collection of what there is by now stops every thread for 25 ms
-    gc.collect()
-    gc.freeze()
-    with session:
-        measured = workload.run(session, spec.seconds, warm_up_s=spec.warm_up_s)
-    _check(session, measured)
+    run_nodes(executor, workload, spec.seconds, spec.warm_up_s)
     # rclpy's EventsExecutor moves a timer on before it queues the call, so that calls in a backlog
     # do not say for which due time they stand: only messages are counted there.
     if spec.executor != 'events':
@@ -112,16 +107,9 @@ def run_declared(spec: Spec) -> dict[str, Any]:
 
 def _plan(spec: Spec) -> ExecutionPlan:
     if spec.graph is None:
-        raise BenchError(f'--load {spec.load}: it needs a declaration: give --graph')
+        raise ChildError(f'--load {spec.load}: it needs a declaration: give --graph')
     return ExecutionPlan(
         load(spec.graph), spec.seed, spec.utilisation, spec.workers, cast(Mode, spec.bodies))
-
-
-def _check(session: UnfinishedSession, measured: bool) -> None:
-    if session.error is not None:
-        raise session.error
-    if not measured:
-        raise BenchError('the run was ended before anything was measured: run it again')
 
 
 def result_of(plan: ExecutionPlan, ledger: Ledger, latencies: list[int]) -> dict[str, Any]:
@@ -184,7 +172,7 @@ def run_messages(spec: Spec) -> dict[str, Any]:
     for i in range(spec.idle):
         _subscribe(node, f'{prefix}/idle_{i}', starts)
     executor.add_node(node)
-    session = UnfinishedSession(executor, spec)
+    session = UnfinishedSession(executor)
     seed = None if spec.phases == 'together' else spec.seed
     with session, PublisherProcess(topics, spec.rate_hz, seed) as publisher:
         publisher.wait_until_ready()
@@ -198,7 +186,7 @@ def run_messages(spec: Spec) -> dict[str, Any]:
         published = sum(publisher.finish())
         _drain(session, starts, published)
         received = len(starts)
-    _check(session, True)
+    session.check(True)
     latencies = within(starts, begin, end)
     callbacks = len(latencies)
     return {
@@ -264,13 +252,13 @@ def run_robot(spec: Spec) -> dict[str, Any]:
     nodes = _make_nodes(spec.scale)
     for node in nodes:
         executor.add_node(node)
-    session = UnfinishedSession(executor, spec)
+    session = UnfinishedSession(executor)
     with session:
         ended = session.wait(spec.warm_up_s + 1.0)  # discovery takes a moment
         begin, cpu = time.time_ns(), time.process_time_ns()
         ended = ended or session.wait(spec.seconds)
         end, cpu = time.time_ns(), time.process_time_ns() - cpu
-    _check(session, not ended)
+    session.check(not ended)
     logs = {f'{node.get_fully_qualified_name()}:{callback}': log
             for node in nodes for callback, log in getattr(node, 'log', {}).items()}
     sinks = judge(task_set, logs, begin, end)

@@ -25,9 +25,9 @@ import random
 import time
 from typing import Any
 
-from mddag_executor.executor.bench.campaign import BenchError
 from mddag_executor.executor.session import MATCH_TIMEOUT_S
 from mddag_executor.executor.synthetic import QOS, quiet_node
+from mddag_executor.hosting.child import ChildError
 import rclpy
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
@@ -62,7 +62,7 @@ class PublisherProcess:
         """
         Wait until all its topics have a subscription.
 
-        :raises BenchError: when the process ended instead.
+        :raises ChildError: when the process ended instead.
         """
         self._answer()
 
@@ -75,7 +75,7 @@ class PublisherProcess:
         """
         Stop it and return how many messages it published on each topic.
 
-        :raises BenchError: when the process ended before.
+        :raises ChildError: when the process ended before.
         """
         self.begin()
         counts: list[int] = self._answer()
@@ -85,7 +85,7 @@ class PublisherProcess:
         try:
             return self._orders.recv()
         except (EOFError, OSError):
-            raise BenchError('the publishing process ended early: check ROS_DOMAIN_ID and the '
+            raise ChildError('the publishing process ended early: check ROS_DOMAIN_ID and the '
                              'network') from None
 
 

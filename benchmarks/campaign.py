@@ -7,7 +7,6 @@ With repetitions all measurements are made in turn, and then all of them again: 
 machine for a while hits every executor alike.  Of the repetitions the median of each figure is
 taken; messages are counted over all of them, so that no loss is hidden.
 
-A process that does not end in time is killed: rclpy's EventsExecutor holds off SIGTERM.
 Nothing of ROS is imported here.
 """
 
@@ -17,20 +16,17 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 import json
-import os
 import statistics
-import subprocess
 import sys
-import tempfile
-import time
 from typing import Any
 
 from mddag_executor.core import policy as find_policy
-from mddag_executor.errors import MddagError, UsageError
+from mddag_executor.errors import UsageError
+from mddag_executor.hosting.child import ChildError, CrashError, run_child, Tick
 from msg_graph import GraphError, load
 
-OURS = {'rad-events': 'events', 'rad-waitset': 'waitset'}
-"""The names of this executor, by intake."""
+OURS = 'rad'
+"""The name of this executor."""
 
 PEERS = ('single', 'multi', 'events')
 """rclpy's SingleThreadedExecutor, MultiThreadedExecutor and EventsExecutor."""
@@ -38,7 +34,7 @@ PEERS = ('single', 'multi', 'events')
 NONE = 'none'
 """No executor: what the nodes of a declared load cost by themselves (see ``executors``)."""
 
-EXECUTORS = (*OURS, *PEERS)
+EXECUTORS = (OURS, *PEERS)
 ROBOT = 'robot'
 """The load that is the ordinary nodes of an example."""
 LOADS = ('autoware', 'topics', 'entities', 'reference-system', ROBOT)
@@ -51,15 +47,6 @@ PHASES = ('drawn', 'together')
 
 PATIENCE_S = 90.0
 """What a process may take besides its window and warm-up: discovery and the end."""
-_KILLED = -9
-
-Tick = Callable[[float], None]
-"""Called now and then with how many seconds a measurement has been going on."""
-
-
-class BenchError(MddagError):
-    """A measurement that cannot be made."""
-
 
 @dataclass(frozen=True)
 class Spec:
@@ -118,7 +105,7 @@ def parse_executors(text: str, policies: str | None = None) -> list[tuple[str, s
     """
     Return executors and policies that a comma separated list names.
 
-    :param text: as ``rad-events,rad-events:fifo,multi``.
+    :param text: as ``rad,rad:fifo,multi``.
     :param policies: comma separated; ours without a policy of its own runs with each of them.
     :raises UsageError: on an unknown name, and one that stands there twice.
     """
@@ -131,23 +118,18 @@ def parse_executors(text: str, policies: str | None = None) -> list[tuple[str, s
         if name not in (*EXECUTORS, NONE):
             raise UsageError(
                 f"--executors: '{name}' is unknown: give some of {', '.join((*EXECUTORS, NONE))}")
-        if colon and name not in OURS:
+        if colon and name != OURS:
             raise UsageError(
                 f"--executors: '{item.strip()}': only this executor knows policies: leave it out")
         if colon:
             find_policy(policy)
-        for each in [policy] if colon else default if name in OURS else ['rad']:
+        for each in [policy] if colon else default if name == OURS else ['rad']:
             if (name, each) in found:
                 raise UsageError(f"--executors: '{item.strip()}' stands there twice: name it once")
             found.append((name, each))
-    if policies is not None and not any(name in OURS for name, _ in found):
-        raise UsageError(
-            '--policies: they are those of this executor: name rad-events or rad-waitset')
+    if policies is not None and not any(name == OURS for name, _ in found):
+        raise UsageError(f'--policies: they are those of this executor: name {OURS}')
     return found
-
-
-class CrashError(BenchError):
-    """A measurement whose executor crashed or hung."""
 
 
 def measure(
@@ -159,45 +141,19 @@ def measure(
     Of a declaration with ``processes:`` each is one, all at a time.
 
     :raises CrashError: when the process crashed, did not end and was killed, or gave no result.
-    :raises BenchError: when the measurement cannot be made.
+    :raises ChildError: when the measurement cannot be made.
     """
     names = _processes(spec)
     if len(names) > 1:
-        from mddag_executor.executor.bench.loads import of_processes
+        from benchmarks.loads import of_processes
         with ThreadPoolExecutor(len(names)) as threads:
             parts = threads.map(lambda name: measure(
                 replace(spec, process=name), tick if name == names[0] else None, patience_s),
                 names)
             return of_processes(spec, list(parts))
-    # Of this machine only: it must not find another one's nodes, nor be found by them.
-    environment = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ}
-    command = [sys.executable, '-m', 'mddag_executor.executor.bench', spec.to_json()]
-    limit = spec.seconds + spec.warm_up_s + patience_s + spec.idle * 0.05
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        # Not communicate(), which would close standard input: that ends the process.
-        process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=out, stderr=err, env=environment)
-        try:
-            _wait(process, limit, tick)
-        finally:
-            process.kill()
-            process.wait()
-            if process.stdin is not None:
-                process.stdin.close()
-        out.seek(0)
-        err.seek(0)
-        lines = err.read().decode(errors='replace').strip().splitlines()
-        if process.returncode == 2 and lines:
-            raise BenchError(lines[-1])
-        if process.returncode != 0:
-            raise CrashError(f'{spec.name}: {_reason(process.returncode, limit, lines)}')
-        text = out.read()
-        try:
-            result: dict[str, Any] = json.loads(text)
-        except ValueError:
-            raise CrashError(
-                f'{spec.name}: it ended well but gave no result: {text[:60]!r}') from None
-        return result
+    return run_child(
+        [sys.executable, '-m', 'benchmarks.child', spec.to_json()], spec.name,
+        spec.seconds + spec.warm_up_s + patience_s + spec.idle * 0.05, tick)
 
 
 def _processes(spec: Spec) -> list[str]:
@@ -207,27 +163,7 @@ def _processes(spec: Spec) -> list[str]:
     try:
         return [process.name for process in load(spec.graph).processes]
     except GraphError as error:
-        raise BenchError(str(error)) from None
-
-
-def _wait(process: subprocess.Popen[bytes], limit: float, tick: Tick | None) -> None:
-    begin = time.monotonic()
-    while (passed := time.monotonic() - begin) < limit:
-        if tick is not None:
-            tick(passed)
-        try:
-            process.wait(0.5)
-            return
-        except subprocess.TimeoutExpired:
-            continue
-
-
-def _reason(status: int, limit: float, lines: Sequence[str]) -> str:
-    if status == _KILLED:
-        return f'it did not end within {limit:.0f} s and was killed'
-    if status < 0:
-        return f'it crashed with signal {-status}'
-    return lines[-1] if lines else f'it ended with status {status}'
+        raise ChildError(str(error)) from None
 
 
 def run_all(
@@ -239,7 +175,7 @@ def run_all(
 
     :param tick: gets now and then which one goes on, how many were made, and for how many s.
     :param warn: gets each that crashed; its figures are None when it never succeeded.
-    :raises BenchError: when a measurement cannot be made, or when all of them crashed.
+    :raises ChildError: when a measurement cannot be made, or when all of them crashed.
     """
     runs: list[list[dict[str, Any]]] = [[] for _ in specs]
     made = 0
@@ -254,7 +190,7 @@ def run_all(
                 warn(str(error))
             made += 1
     if not any(runs):
-        raise BenchError('no measurement succeeded: see the warnings')
+        raise ChildError('no measurement succeeded: see the warnings')
     return [combine(spec, results, repeat) for spec, results in zip(specs, runs)]
 
 
@@ -270,7 +206,7 @@ def combine(spec: Spec, runs: Sequence[dict[str, Any]], repeat: int = 1) -> dict
     """
     Return the result of a measurement from its repetitions.
 
-    :return: an object of ``bench live --json``; ``runs`` in it has the repetitions' figures.
+    :return: an object of ``live --json``; ``runs`` in it has the repetitions' figures.
     """
     result: dict[str, Any] = {
         'load': spec.load, 'executor': spec.name, 'workers': spec.workers,

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What `bench replay --slack` does: whether the slack that was found holds in live runs.
+What `replay --slack` does: whether the slack that was found holds in live runs.
 
 Theory of operation
 -------------------
@@ -44,7 +44,7 @@ Record = Callable[[str, str], None]
 def check_slack(
     args: argparse.Namespace, task_set: TaskSet, folder: str, record: Record
 ) -> dict[str, Any]:
-    """Return the result of `bench replay --slack`."""
+    """Return the result of `replay --slack`."""
     from mddag_executor.replay.slack import find_slack, NOTHING, Problem
     from mddag_executor.simulate import draw_execution_times, periodic_load, Settings
     from msg_graph import loads
@@ -60,7 +60,7 @@ def check_slack(
                        if i >= 0 and one.factor is not None and LEAST <= one.factor <= MOST)
         if not found:
             raise MddagError(
-                'bench replay --slack: no callback has a factor that can be tried: give another '
+                '--slack: no callback has a factor that can be tried: give another '
                 '--utilisation')
         step = max(1, len(found) // args.callbacks)
         rows: list[dict[str, Any]] = []

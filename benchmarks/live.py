@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The verb `bench live`: executors of rclpy nodes side by side, each in a process of its own.
+The benchmark `live`: executors of rclpy nodes side by side, each in a process of its own.
 
 Everything that can be wrong with the command line is found before the first measurement.
 """
@@ -16,12 +16,7 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from mddag_executor import defaults
-from mddag_executor.cli import common, options
-from mddag_executor.cli.text import Cell, Progress, table, warn
-from mddag_executor.core import POLICIES
-from mddag_executor.errors import UsageError
-from mddag_executor.executor.bench.campaign import (
+from benchmarks.campaign import (
     DECLARED,
     EXECUTORS,
     LOADS,
@@ -30,8 +25,14 @@ from mddag_executor.executor.bench.campaign import (
     PHASES,
     ROBOT,
     ROBOT_GRAPH,
+    run_all,
     Spec,
 )
+from mddag_executor import defaults
+from mddag_executor.cli import common, options
+from mddag_executor.cli.text import Cell, Progress, table, warn
+from mddag_executor.core import POLICIES
+from mddag_executor.errors import UsageError
 from mddag_executor.report.tables import percent
 from mddag_executor.resources import find
 from mddag_executor.text import counted
@@ -39,10 +40,10 @@ from mddag_executor.text import counted
 HELP = 'measure executors of rclpy nodes, this one and those of rclpy, side by side'
 DESCRIPTION = 'Measure executors of rclpy nodes, this one and those of rclpy, side by side.'
 EXAMPLE = """\
-mddag bench live --load autoware --utilisation 0.3,0.6,0.8 --seconds 10
-mddag bench live --load autoware --executors rad-events,multi --policies rad,fifo,rm,wc,gedf
-mddag bench live --load robot --scale 1,1.2 --seconds 20
-mddag bench live --load topics --topics 50 --rate 100 --repeat 3 --json topics.json
+python -m benchmarks live --load autoware --utilisation 0.3,0.6,0.8 --seconds 10
+python -m benchmarks live --load autoware --executors rad,multi --policies rad,fifo,rm,wc,gedf
+python -m benchmarks live --load robot --scale 1,1.2 --seconds 20
+python -m benchmarks live --load topics --topics 50 --rate 100 --repeat 3 --json topics.json
 """
 
 UTILISATIONS = (0.3, 0.6, 0.8)
@@ -66,9 +67,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'empty callbacks of many topics; entities: one active topic beside idle subscriptions; '
         'robot: the ordinary nodes of examples/robot')
     add('--executors', default=','.join(EXECUTORS), metavar='E[,E…]',
-        help=f'some of {", ".join(EXECUTORS)}; the first two are this one, by intake, also with a '
-        'policy as rad-events:fifo (default: all); and none: what the nodes of a declaration cost '
-        'without an executor')
+        help=f'some of {", ".join(EXECUTORS)}; the first is this one, also with another policy as '
+        'rad:fifo (default: all); and none: what the nodes of a declaration cost without an '
+        'executor')
     add('--policies', metavar='P[,P…]',
         help=f'run this executor with each of these: {", ".join(POLICIES)} (default: rad)')
     add('--utilisation', type=options.list_of(options.positive_float), metavar='U[,U…]',
@@ -191,7 +192,6 @@ def make_specs(
 
 
 def _measure(specs: Sequence[Spec], repeat: int) -> list[dict[str, Any]]:
-    from mddag_executor.executor.bench.campaign import run_all
     each = specs[0].seconds + specs[0].warm_up_s + 2.0
     with Progress('measuring', len(specs) * repeat * each) as progress:
         def tick(spec: Spec, made: int, passed: float) -> None:

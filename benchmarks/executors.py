@@ -8,7 +8,7 @@ Theory of operation
 *No executor at all* (``NoExecutor``) shows what the nodes of a declaration cost by themselves.
 A thread for each timer waits until that is due and calls it.  Whoever
 publishes takes the message from each subscription of the topic, and runs its callback, in its own
-thread.  There is no intake, queue, order, pool, callback group or attribution; nothing is handed
+thread.  There is no queue, order, pool, callback group or attribution; nothing is passed
 from one thread to another.  What is left is what every executor pays for: waiting for timers,
 emulated execution, publishing, the middleware, taking messages, and the bodies themselves.  So the
 difference to an executor's CPU time is what that executor takes.  Callbacks that one message
@@ -29,23 +29,14 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.executor.bench.campaign import NONE, OURS, Spec
+from benchmarks.campaign import NONE, OURS, Spec
 from mddag_executor.executor.compat import message_taker, timer_functions
-from mddag_executor.executor.session import Session
+from mddag_executor.hosting.peers import make_peer
 from msg_graph import TaskSet
-from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
-from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.executors import Executor
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
-from rclpy.task import Future
 from rclpy.timer import Timer
-from rclpy.utilities import ok as context_ok
-
-
-def spin_events_executor(executor: Executor) -> None:
-    """Spin rclpy's events executor, whose spin() without a timeout never dispatches (7.1.5)."""
-    while context_ok():
-        executor.spin_until_future_complete(Future(), 1000.0)
 
 
 def make_executor(spec: Spec, task_set: TaskSet | None) -> Executor:
@@ -54,36 +45,12 @@ def make_executor(spec: Spec, task_set: TaskSet | None) -> Executor:
 
     :param task_set: the declared tasks, which only this executor makes use of.
     """
-    if spec.executor in OURS:
+    if spec.executor == OURS:
         # Here: the others are measured without a trace of this executor in the process.
         from mddag_executor.executor.executor import MultiDeadlineExecutor
         return MultiDeadlineExecutor(
-            task_set, num_workers=spec.workers, policy=spec.policy, intake=OURS[spec.executor],
-            process=spec.process)
-    if spec.executor == NONE:
-        return NoExecutor()
-    if spec.executor == 'multi':
-        return MultiThreadedExecutor(spec.workers)
-    return SingleThreadedExecutor() if spec.executor == 'single' else EventsExecutor()
-
-
-class UnfinishedSession(Session):
-    """
-    A session whose executor is not shut down: the process ends instead.
-
-    rclpy's executors cannot be stopped in an orderly way while callbacks wait for their pool.
-    """
-
-    def __init__(self, executor: Executor, spec: Spec) -> None:
-        """Make a session that knows how to spin each of the compared executors."""
-        events = spec.executor == 'events'
-        super().__init__(executor, (lambda: spin_events_executor(executor)) if events else None)
-
-    def end(self) -> None:
-        """Let a moment pass for what just completes."""
-        if not self.stopped:
-            self.stop()
-            time.sleep(0.05)
+            task_set, num_workers=spec.workers, policy=spec.policy, process=spec.process)
+    return NoExecutor() if spec.executor == NONE else make_peer(spec.executor, spec.workers)
 
 
 class NoExecutor(Executor):
