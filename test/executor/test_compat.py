@@ -351,11 +351,6 @@ def test_names_of_services(pair):
         ['/asked', '/asked'], ['asked', 'asked'])
 
 
-def test_the_native_executor_is_there():
-    modules = compat.events_executor_modules()
-    assert modules and all(hasattr(module, 'EventsExecutor') for module in modules)
-
-
 # --- what is behind a handle ---------------------------------------------------------------------
 
 def is_written(fd: int) -> bool:
