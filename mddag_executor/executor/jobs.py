@@ -12,9 +12,8 @@ Theory of operation
 2.  A subscription of this process is served by the thread that publishes (``publishing``), which
     knows its publication: if nothing else has arrived, there is nothing to look up.
 3.  Any other message belongs to the publication of its topic whose window holds its timestamp and
-    whose number is the message's publication sequence number.  A publisher may have published
-    before anybody counted: the difference between the two numbers is learnt, and corrected when
-    two messages agree on another one.
+    which has its publication sequence number.  A publisher is expected to have sent nothing before
+    it was counted; two messages in a row that differ by the same number show that it had.
 4.  When no publication fits (a publisher in another process) or several do, the answer is None and
     the message runs as an undeclared callback: never dropped, never guessed.
 
@@ -38,6 +37,8 @@ ROUNDING_NS = 2
 """DDS stamps are multiples of 2**-32 s: they may lie this far outside of the window."""
 
 _STILL_PUBLISHING = 2 ** 63 - 1
+NO_NUMBER = -(2 ** 62)
+"""The count of a publication within another one of its publisher, in a signal handler."""
 
 
 class Origin(NamedTuple):
@@ -72,29 +73,36 @@ class PublisherNumbers:
     """
     How a publisher's own count and the middleware's publication sequence numbers differ.
 
-    :ivar offset: what the sequence number is more than the count; None: not known yet.
+    A publisher is expected to have sent nothing before it was counted.
+
+    :ivar offset: what the sequence number is more than the count.
     """
 
-    __slots__ = ('offset', '_other')
+    __slots__ = ('offset', '_unlike')
 
     def __init__(self) -> None:
-        self.offset: int | None = None
-        self._other: int | None = None
+        self.offset = 0
+        # the offset and the count of the last message that another offset would explain
+        self._unlike: tuple[int, int] | None = None
 
-    def agree(self, count: int, sequence: int | None) -> bool:
-        """Return whether a message with this number may be the publication of this count."""
-        if sequence is None:
-            return True
-        return self.offset is None or count + self.offset == sequence
+    def agree(self, count: int, sequence: int) -> bool:
+        """
+        Return whether a message is the publication of this count, whose window alone fits.
 
-    def learn(self, count: int, sequence: int | None) -> None:
-        """Learn from a message whose window fits only the publication of this count."""
-        if sequence is None:
-            return
+        Messages of two publications in a row that differ from the count by the same number show
+        that the publisher had sent something before.
+        """
         offset = sequence - count
-        if self.offset is None or offset == self._other:
-            self.offset = offset
-        self._other = offset
+        if offset == self.offset:
+            self._unlike = None
+            return True
+        if count == NO_NUMBER:
+            return False
+        if self._unlike is not None and self._unlike[0] == offset and self._unlike[1] != count:
+            self.offset, self._unlike = offset, None
+            return True
+        self._unlike = offset, count
+        return False
 
 
 class PublisherState:
@@ -103,11 +111,12 @@ class PublisherState:
 
     :ivar is_tracked: whether a declared callback has published a trigger topic with it: from then
         on its publications are counted.
+    :ivar sending: the publication that is just being sent.
     :ivar lock: serialises the publications of a trigger topic; a signal handler may publish in the
         thread that holds it.
     """
 
-    __slots__ = ('lock', 'topic', 'count', 'numbers', 'is_tracked')
+    __slots__ = ('lock', 'topic', 'count', 'numbers', 'is_tracked', 'sending')
 
     def __init__(self, topic: str) -> None:
         self.lock = threading.RLock()
@@ -115,6 +124,7 @@ class PublisherState:
         self.count = 0
         self.numbers = PublisherNumbers()
         self.is_tracked = False
+        self.sending: Publication | None = None
 
 
 class Publication:
@@ -183,28 +193,36 @@ class Jobs:
         if topic.on_header is not None:
             topic.on_header(header_stamp(msg), origin)
         publication = Publication(time_ns(), state.numbers, origin, state.count)
+        interrupted, state.sending = state.sending, publication
+        if interrupted is not None:  # by a signal handler: who gets which number is not known
+            interrupted.sequence = publication.sequence = NO_NUMBER
         topic.publications.append(publication)
-        if not topic.is_announced or self.announce is None:
-            try:
-                send(publisher, msg)
-            finally:
-                publication.end = time_ns()
-            return publication
-        with topic.lock:
-            topic.open += 1
+        is_announced = topic.is_announced and self.announce is not None
+        if is_announced:
+            with topic.lock:
+                topic.open += 1
+        publication.begin = time_ns()  # again: the thread may have waited for the GIL
         try:
             send(publisher, msg)
         finally:
             publication.end = time_ns()
-            with topic.lock:
-                topic.open -= 1
-                topic.to_announce.append(publication)
-                several: list[Publication] = []
-                if not topic.open:  # stamps of messages may lie in the windows of all
-                    several, topic.to_announce = topic.to_announce, []
-        if several:
-            self.announce(send, state.topic, several)
+            state.sending = interrupted
+            if is_announced:
+                self._announce_when_alone(send, state.topic, topic, publication)
         return publication
+
+    def _announce_when_alone(
+        self, send: Callable[[Any, Any], None], name: str, topic: Topic, publication: Publication
+    ) -> None:
+        """Announce a topic's publications when none of them is being sent: windows overlap."""
+        several: list[Publication] = []
+        with topic.lock:
+            topic.open -= 1
+            topic.to_announce.append(publication)
+            if not topic.open:
+                several, topic.to_announce = topic.to_announce, []
+        if several and self.announce is not None:
+            self.announce(send, name, several)
 
     def announce_on(self, topics: set[str]) -> None:
         """Have the publications on these topics announced."""
@@ -239,18 +257,16 @@ class Jobs:
                 if p.begin - ROUNDING_NS <= stamp <= p.end + ROUNDING_NS]
         if len(fits) == 1:
             found = fits[0]
-            agrees = found.numbers.agree(found.sequence, sequence)
-            found.numbers.learn(found.sequence, sequence)
-            if agrees:
+            if sequence is None or found.numbers.agree(found.sequence, sequence):
                 return found.origin
         elif fits and sequence is not None:
-            matches = [p for p in fits if p.numbers.offset is not None
-                       and p.sequence + p.numbers.offset == sequence]
+            matches = [p for p in fits if p.sequence + p.numbers.offset == sequence]
             if len(matches) == 1:
                 return matches[0].origin
+        if len(fits) > 1:
             self.doubtful += counted
-            return None
-        self.unknown += counted
+        else:
+            self.unknown += counted
         return None
 
     def is_released_at_arrival(self, dag: int) -> bool:

@@ -65,29 +65,28 @@ def replace_delivery(topic: str, old: Delivery | None, new: Delivery | None) -> 
 def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Publication | None:
     """Publish; return the publication if it is of a trigger topic, by a callback."""
     running = current.running
-    if running is None:
-        if state.is_tracked:
-            with state.lock:
-                state.count += 1
-                original(publisher, msg)
-        else:
-            original(publisher, msg)
-        return None
-    work = running.work
-    running.publishes(publisher, msg, state.topic)
-    topic = running.engine.jobs.topics.get(state.topic)
-    if topic is None:
+    topic = None
+    if running is not None:
+        running.publishes(publisher, msg, state.topic)
+        topic = running.engine.jobs.topics.get(state.topic)
+    if topic is None and not state.is_tracked:
         original(publisher, msg)
         return None
     with state.lock:
-        if not state.is_tracked:
-            state.is_tracked = True
-            state.numbers.offset = None
         state.count += 1
-        origin = NO_ORIGIN if work is None or work.origin is None else work.origin
-        publication: Publication = running.engine.jobs.publish(
-            original, publisher, msg, state, topic, origin)
-    return publication
+        try:
+            if running is None or topic is None:
+                original(publisher, msg)
+                return None
+            state.is_tracked = True
+            work = running.work
+            origin = NO_ORIGIN if work is None or work.origin is None else work.origin
+            publication: Publication = running.engine.jobs.publish(
+                original, publisher, msg, state, topic, origin)
+            return publication
+        except BaseException:
+            state.count -= 1  # the middleware has not counted it
+            raise
 
 
 def install() -> None:

@@ -163,9 +163,10 @@ class SubscriptionSource(Source):
         if publication is not None:
             if not publication.holds(info['source_timestamp']):
                 publication = None
-            elif publication.numbers.offset is None:
-                publication.numbers.learn(
-                    publication.sequence, info.get('publication_sequence_number'))
+            else:
+                sequence = info.get('publication_sequence_number')
+                if sequence is not None:
+                    publication.numbers.offset = sequence - publication.sequence
         self._arrivals.message(
             entity, taken if self._with_info else taken[:1], info, publication)
         return True
