@@ -89,7 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'as one timer does (default: drawn)')
     add('--scale', type=options.list_of(options.positive_float), metavar='F[,F…]',
         help='with --load robot: factor of the time that its nodes compute (default: 1)')
-    add('--workers', type=options.positive_int, default=defaults.WORKERS, metavar='M',
+    add('--workers', type=options.workers, default=defaults.WORKERS, metavar='M',
         help='threads of this executor and of MultiThreadedExecutor (default: %(default)s)')
     add('--seconds', type=options.positive_float, default=10.0, metavar='S',
         help='how long each measurement is, after a warm-up of 1 s (default: 10)')

@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--seconds', type=options.positive_float, default=30.0, metavar='S',
         help='with --accuracy: how long each live run is, after 2 s that are left out '
         '(default: 30)')
-    add('--workers', type=options.list_of(options.positive_int), metavar='M[,M…]',
+    add('--workers', type=options.list_of(options.workers), metavar='M[,M…]',
         help='with --accuracy: of the live runs; the runs with further numbers are predicted '
         'from the recording with the first (default: 7 for callbacks that sleep, else 7,1,2)')
     options.add(parser, '--graph', '--json')
@@ -187,7 +187,7 @@ def _record(
     done = subprocess.run(
         [sys.executable, '-m', 'mddag_executor', 'run', graph, '--synthetic', args.bodies,
          *scaled, '--workers', str(workers), '--duration', f'{args.seconds + _WARM_UP_S:g}s',
-         '--trace', path],
+         '--trace', path, '--overwrite'],
         capture_output=True, text=True, check=False, timeout=args.seconds + 120)
     if done.returncode != 0 or not os.path.exists(path):
         lines = done.stderr.strip().splitlines()

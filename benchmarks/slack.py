@@ -99,13 +99,23 @@ def _run(task_set: TaskSet, times: dict[str, int], folder: str, record: Record) 
 def with_times(task_set: TaskSet, times: dict[str, int]) -> str:
     """Return a declaration with fixed execution times, ns, by callback."""
     import yaml
-    declared = yaml.safe_load(task_set.text)
-    for node in declared['nodes']:
-        for callback in node['callbacks']:
-            key = f'{node["node"]}:{callback["name"]}'
+    text = 'tag:yaml.org,2002:str'
+    # As nodes, not as values: a name such as on or 0x10 stays what it is.
+    declaration = yaml.compose(task_set.text, yaml.SafeLoader)
+    for node in _entries(declaration)['nodes'].value:
+        of_node = _entries(node)
+        for callback in of_node['callbacks'].value:
+            key = f'{of_node["node"].value}:{_entries(callback)["name"].value}'
             if key in times:
-                callback['execution_time'] = f'{times[key]}ns'
-    return str(yaml.safe_dump(declared, sort_keys=False))
+                callback.value = [each for each in callback.value
+                                  if each[0].value != 'execution_time']
+                callback.value.append((yaml.ScalarNode(text, 'execution_time'),
+                                       yaml.ScalarNode(text, f'{times[key]}ns')))
+    return str(yaml.serialize(declaration, Dumper=yaml.SafeDumper))
+
+
+def _entries(node: Any) -> dict[str, Any]:
+    return {key.value: value for key, value in node.value}
 
 
 def _misses(trace: str) -> tuple[int, int]:

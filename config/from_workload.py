@@ -5,13 +5,14 @@ Write `autoware.yaml` and `autoware_multi.yaml` from the figures of the paper's 
 
     python config/from_workload.py WORKLOAD.json [DIRECTORY]
 
-The workload is that of Yano and Azumi, "Multi-Deadline DAG Scheduling Model for Autonomous Driving
-Systems" (RTSS 2024 work in progress), published in its evaluation repository
+The workload is that of Yano and Azumi, "Multi-Deadline DAG Scheduling Model for Autonomous
+Driving Systems" (RTSS 2024 work in progress), published in its evaluation repository
 2024_RTSS_WiP_Evaluation. WORKLOAD.json holds its facts: for each of `dags` the `name`,
 `period_us`, `edges` (pairs of ids) and `vertices` with `id`, `node`, `callback`,
-`execution_time_us` (29 quantiles of what was measured) and, for a sink, `relative_deadline_us`.
-The facts have no topics and no queue edges; those stand in the tables below and are named as in
-Autoware. The two files that this program wrote are what counts; nothing needs it to run.
+`execution_time_us` (quantiles of what was measured, at `quantiles_percent`) and, for a sink,
+`relative_deadline_us`. The facts have no topics and no queue edges; those stand in the tables
+below and are named as in Autoware. The two files that this program wrote are what counts;
+nothing needs it to run.
 """
 
 from __future__ import annotations
@@ -205,7 +206,12 @@ def main(arguments: list[str]) -> int:
     workload = json.loads(Path(arguments[0]).read_text(encoding='utf-8'))
     target = Path(arguments[1]) if len(arguments) == 2 else Path(__file__).parent
     for name, multi in (('autoware.yaml', False), ('autoware_multi.yaml', True)):
-        (target / name).write_text('\n'.join(declaration(workload, multi)), encoding='utf-8')
+        text = '\n'.join(declaration(workload, multi))
+        percent = textwrap.fill(
+            f'percent: &percent {workload["quantiles_percent"]}', 99,
+            initial_indent=' ' * 10, subsequent_indent=' ' * 12).lstrip()
+        text = text.replace('percent: *percent', percent, 1)  # the others are as in the first
+        (target / name).write_text(text, encoding='utf-8')
     return 0
 
 
@@ -279,6 +285,7 @@ def callback(
     yield textwrap.fill(
         f'quantiles_us: [{quantiles}]', 99,
         initial_indent=' ' * 10, subsequent_indent=' ' * 12)
+    yield '          percent: *percent'
 
 
 def listing(name: str, items: list[str]) -> Iterator[str]:

@@ -10,6 +10,8 @@ including launch file do not reach them. Every argument below has the meaning of
 `mddag run` of that name.
 """
 
+from datetime import datetime
+
 ARGUMENTS = (
     ('synthetic', 'sleep', 'how a callback takes its time: sleep or spin'),
     ('utilisation', '0.6', 'normalised utilisation that the execution times are scaled to'),
@@ -17,7 +19,8 @@ ARGUMENTS = (
     ('duration', '20s', 'how long to run'),
     ('workers', '7', 'how many worker threads run callbacks'),
     ('policy', 'rad', 'the scheduling policy'),
-    ('trace', 'autoware_demo.mcap', 'where to record'),
+    # with the time in its name, for nothing is recorded over a file
+    ('trace', f'autoware_demo_{datetime.now():%Y_%m_%d-%H_%M_%S}.mcap', 'where to record'),
 )
 
 

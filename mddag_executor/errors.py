@@ -45,5 +45,15 @@ class InputError(MddagError):
         return type(self), (self.file, self.problem, self.remedy, self.line)
 
 
+class UserCodeError(MddagError):
+    """
+    A node raised an exception, which is the cause of this one.
+
+    The command line shows the traceback of the cause and exits with status 70: the line alone,
+    and the status of bad input, would take the node's `FileNotFoundError` for one of this program.
+    Without a text the traceback says it all.
+    """
+
+
 class UsageError(MddagError):
     """A command line that asks for something impossible."""

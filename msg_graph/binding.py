@@ -20,6 +20,7 @@ with periods, subscriptions with topics and services with names.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 from heapq import heappop, heappush
 import re
 from typing import NamedTuple
@@ -100,6 +101,11 @@ class Binder:
         self._bound.add((place, entity))
         return self._callbacks[place]
 
+    def unbound(self) -> list[Callback]:
+        """Return the callbacks that no entity is bound to, or of a sync not one for each leg."""
+        places = {place for free in list(self._free.values()) for place in free}
+        return [self._callbacks[place] for place in sorted(places)]
+
     def release(self, callback: Callback, topic: str | None = None) -> None:
         """
         Take a binding back, as its entity is gone; the callback can be bound anew.
@@ -126,9 +132,11 @@ def meant(callback: Callback, undeclared: Iterable[Entity]) -> str | None:
     """
     Return which entity a declared callback that nothing stands for probably means, as a question.
 
-    That is one of another node or topic whose name has a namespace more or less, or a timer of its
-    node with another period.
+    That is one of another node or topic whose name has a namespace more or less, a timer of its
+    node with another period, or one of a node or topic whose name is similar.  Of a node with
+    another name it may also be the only one that is started alike.
     """
+    undeclared = list(undeclared)
     timers = []
     for wanted in entities_of(callback):
         for other in undeclared:
@@ -146,7 +154,21 @@ def meant(callback: Callback, undeclared: Iterable[Entity]) -> str | None:
             return f'did you mean its timer of {format_duration(other.period_ns or 0)}?'
         if is_period(other.period_ns or 0, period):
             return f'did you mean the node {shown(other.node)}?'
+    for wanted in entities_of(callback):
+        alike = [other for other in undeclared if other.kind == wanted.kind]
+        nodes = sorted({other.node for other in alike if other.node != wanted.node
+                        and _starts_alike(other, wanted)})
+        if found := get_close_matches(wanted.node, nodes, 1) or nodes[:len(nodes) == 1]:
+            return f'did you mean the node {shown(found[0])}?'
+        starts = {other.start for other in alike if other.node == wanted.node}
+        if wanted.start and (found := get_close_matches(wanted.start, sorted(starts), 1)):
+            return f'did you mean the {_WORDS[wanted.kind]} {shown(found[0])}?'
     return None
+
+
+def _starts_alike(entity: Entity, other: Entity) -> bool:
+    return entity.start == other.start and (
+        entity.kind != 'timer' or is_period(entity.period_ns or 0, other.period_ns or 0))
 
 
 def _same_below(name: str, other: str) -> bool:

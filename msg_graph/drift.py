@@ -122,15 +122,12 @@ def drift(task_set: TaskSet, observed: Observed) -> list[Drift]:
 
 def _suspects(task_set: TaskSet, observed: Observed) -> dict[str, Drift]:
     """Return what disagrees by rules 2, 3 and 4, by callback."""
-    dags: dict[str, list[Dag]] = {}
-    for vertex in task_set.vertices:
-        dags.setdefault(vertex.callback.key, []).append(task_set.dags[vertex.dag])
+    dags = dags_of(task_set)
     suspects = {}
     for callback in task_set.callbacks:
         of_callback = dags.get(callback.key, [])
-        if (observed.nodes is not None and callback.node not in observed.nodes
-                and (task_set.processes
-                     or all(dag.release_from == 'header_stamp' for dag in of_callback))):
+        if observed.nodes is not None and may_run_elsewhere(
+                callback, of_callback, observed.nodes, task_set):
             continue
         why = _never_ran(callback, of_callback, observed)
         if why is None:
@@ -141,6 +138,22 @@ def _suspects(task_set: TaskSet, observed: Observed) -> dict[str, Drift]:
         if why is not None:
             suspects[callback.key] = why
     return suspects
+
+
+def dags_of(task_set: TaskSet) -> dict[str, list[Dag]]:
+    """Return the DAGs of each callback."""
+    dags: dict[str, list[Dag]] = {}
+    for vertex in task_set.vertices:
+        dags.setdefault(vertex.callback.key, []).append(task_set.dags[vertex.dag])
+    return dags
+
+
+def may_run_elsewhere(
+    callback: Callback, dags: Sequence[Dag], nodes: Set[str], task_set: TaskSet
+) -> bool:
+    """Return whether a callback of these DAGs may run in another process (rule 5)."""
+    return callback.node not in nodes and (
+        bool(task_set.processes) or all(dag.release_from == 'header_stamp' for dag in dags))
 
 
 def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift | None:

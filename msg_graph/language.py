@@ -29,7 +29,7 @@ from typing import Any
 
 from msg_graph.duration import DAY, DurationError, MICROSECOND, parse_duration, UNITS
 from msg_graph.errors import did_you_mean, GraphError, listed, shown
-from msg_graph.model import ExecutionTime
+from msg_graph.model import ExecutionTime, MOST_WORKERS
 from msg_graph.yamltext import Mapping, Scalar, Sequence, Tree
 
 Schema = dict[str, Any]
@@ -366,11 +366,6 @@ def _described(tree: Tree) -> str:
 
 FORMAT = '1'
 
-# The quantiles that the published figures of the Autoware workload come with.
-_PERCENT_29 = (
-    0.0, 0.1, 0.5, 1.0, 2.0, *(float(percent) for percent in range(5, 100, 5)),
-    98.0, 99.0, 99.5, 99.9, 100.0)
-
 
 def _check_format(given: str) -> tuple[str, str] | None:
     if given == FORMAT:
@@ -420,11 +415,9 @@ def _read_processes(entry: Entry, key: str, value: Tree) -> dict[str, dict[str, 
 
 
 def _percent(entry: Entry, count: int) -> tuple[float, ...]:
-    """Return the shares that the quantiles belong to, declared or the default for their number."""
+    """Return the shares that the quantiles belong to: declared, or evenly spaced."""
     percent = entry.get('percent')
     if percent is None:
-        if count == len(_PERCENT_29):
-            return _PERCENT_29
         return tuple(100.0 * i / (count - 1) for i in range(count)) if count > 1 else (50.0,)
     if len(percent) != count:
         raise entry.error(
@@ -467,7 +460,7 @@ FILE = {
                      'Arguments of this file, $(name) in its values, with their defaults.'),
     'include': Key(_entries('include'),
                    'Files whose nodes and paths come before those of this one.'),
-    'workers': Key(whole(1, 1024), 'Number of workers that the system is made for.'),
+    'workers': Key(whole(1, MOST_WORKERS), 'Number of workers that the system is made for.'),
     'nodes': Key(_entries('node'),
                  'The nodes; a node may have several entries, and their order counts for ties.',
                  needed=True),

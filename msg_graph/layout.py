@@ -224,5 +224,5 @@ class _Writer:
 
 def without_lines(task_set: TaskSet) -> TaskSet:
     """Return the task set without the places in the text."""
-    nowhere = {callback.key: {'line': 0} for callback in task_set.callbacks}
+    nowhere = {callback.key: {'line': 0, 'file': None} for callback in task_set.callbacks}
     return replace(task_set.with_callbacks(nowhere), text='')

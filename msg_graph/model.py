@@ -18,6 +18,9 @@ Kind = Literal['timer', 'subscription', 'sync', 'service']
 ReleaseFrom = Literal['arrival', 'source_timestamp', 'header_stamp']
 OnMiss = Literal['continue', 'abort']
 
+MOST_WORKERS = 4096
+"""Of one executor, declared or asked for."""
+
 
 @dataclass(frozen=True, slots=True)
 class ExecutionTime:

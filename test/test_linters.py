@@ -38,22 +38,25 @@ THIRD_PARTY: dict[str, tuple[str | None, str | None]] = {
     'diagnostic_msgs': ('diagnostic_msgs', None),
     'dask': (None, 'distributed'),
     'distributed': (None, 'distributed'),  # Dask has no rosdep key; it is an extra
+    'geometry_msgs': ('geometry_msgs', None),
     'launch': ('launch', None),
     'launch_ros': ('launch_ros', None),
-    'llvmlite': ('python3-numba', 'numba'),
+    'llvmlite': (None, 'numba'),  # of the extra `batch`
     'lz4': ('mcap-ros2-support', 'lz4'),
     'mcap': ('mcap-ros2-support', 'mcap'),
-    'matplotlib': ('python3-matplotlib', 'matplotlib'),
-    'numba': ('python3-numba', 'numba'),
+    'matplotlib': (None, 'matplotlib'),  # of the extra `batch`
+    'nav_msgs': ('nav_msgs', None),
+    'numba': (None, 'numba'),  # of the extra `batch`
     'numpy': ('python3-numpy', 'numpy'),
     'perfetto': (None, 'perfetto'),  # of the extra `export`
     'pyarrow': (None, 'pyarrow'),  # of the extra `export`
     'rcl_interfaces': ('rcl_interfaces', None),
     'rclpy': ('rclpy', None),
-    'rich': ('python3-rich', 'rich'),
+    'rich': (None, 'rich'),  # of the extra `top`
     'rosbags': ('python3-rosbags-pip', 'rosbags'),
     'rosgraph_msgs': ('rosgraph_msgs', None),
     'rosidl_parser': ('rosidl_parser', None),
+    'sensor_msgs': ('sensor_msgs', None),
     'std_msgs': ('std_msgs', None),
     'yaml': ('python3-yaml', 'PyYAML'),
     'zstandard': ('mcap-ros2-support', 'zstandard'),
@@ -148,7 +151,9 @@ def run_nodes(node: ast.AST) -> Iterator[ast.AST]:
 def test_what_is_imported_is_declared() -> None:
     imported: dict[str, str] = {}
     for path in SOURCES:
-        if path.relative_to(TOP).parts[0] not in ('mddag_executor', 'msg_graph', 'launch'):
+        parts = path.relative_to(TOP).parts
+        if parts[0] not in ('mddag_executor', 'msg_graph', 'launch') and (
+                parts[:2] != ('examples', 'robot')):    # it is installed, too
             continue
         for node in run_nodes(ast.parse(path.read_text(encoding='utf-8'))):
             if isinstance(node, ast.Import):
@@ -171,6 +176,17 @@ def test_what_is_imported_is_declared() -> None:
             f'{name}, imported by {imported[name]}, is not in package.xml')
         assert requirement is None or f"'{requirement}>=" in requirements, (
             f'{name}, imported by {imported[name]}, is not in setup.py')
+
+
+def test_what_is_an_extra_is_not_forced_on_a_robot() -> None:
+    """An extra of setup.py is not a dependency in package.xml, which has no optional ones."""
+    text = (TOP / 'setup.py').read_text(encoding='utf-8')
+    needed = text[text.index('install_requires'):text.index('extras_require')]
+    extras = {name for name, (_, requirement) in THIRD_PARTY.items()
+              if requirement is not None and f"'{requirement}>=" not in needed}
+    assert {'numba', 'matplotlib', 'rich', 'bokeh'} <= extras
+    assert {f'python3-{name}' for name in extras}.isdisjoint(dependencies('exec_depend'))
+    assert 'graphviz' not in dependencies('exec_depend')
 
 
 def test_ruff_finds_a_mistake(tmp_path: Path) -> None:

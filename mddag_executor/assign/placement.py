@@ -57,6 +57,10 @@ class Placing:
         self._apart: set[tuple[int, int]] = set()
         for group in apart:
             self._check(group)
+            if len(set(group)) > n_processes:
+                raise UsageError(
+                    f'--apart {",".join(group)}: these are {len(set(group))} nodes for '
+                    f'{counted(n_processes, "process", "processes")}: give more processes')
             for one, other in combinations(group, 2):
                 pair = self._block[one], self._block[other]
                 if pair[0] == pair[1]:
@@ -143,7 +147,10 @@ class Placing:
         """Return a placement with more blocks, None where they cannot be kept apart."""
         if not blocks:
             return place
-        allowed = [p for p in range(self._n) if self._fits(place, blocks[0], p)]
+        empty = [p for p in range(self._n) if p not in place.values()]
+        # one empty process is as good as another: all would fail alike
+        allowed = [p for p in range(self._n)
+                   if self._fits(place, blocks[0], p) and p not in empty[1:]]
         return next((found for p in self._best(place, blocks[0], allowed) if (
             found := self._kept_apart({**place, blocks[0]: p}, blocks[1:])) is not None), None)
 

@@ -25,6 +25,7 @@ from typing import Any, BinaryIO, cast, TYPE_CHECKING, TypeVar
 
 from mddag_executor.cli.options import Input, NamedFile, Output, Report
 from mddag_executor.errors import InputError, UsageError
+from mddag_executor.output_rules import check_distinct, check_replaced
 from mddag_executor.resources import find
 
 if TYPE_CHECKING:
@@ -181,17 +182,23 @@ def _claim_stdin() -> BinaryIO:
 
 
 def check_files(args: argparse.Namespace) -> None:
-    """Find out whether the files of a command line can be written, before the work starts."""
+    """
+    Find out whether the files of a command line can be written, before the work starts.
+
+    What an output may replace says `output_rules`.
+    """
     for kind, stream in ((Input, 'input'), (Output, 'output')):
         same = [name for name, each in _files(args) if isinstance(each, kind) and each == '-']
         if len(same) > 1:
             raise UsageError(f'-: standard {stream} can be only one of {" and ".join(same)}: '
                              'name a file for each other one')
+    check_distinct(*([(name, each) for name, each in _files(args)
+                      if isinstance(each, kind) and each != '-'] for kind in (Input, Output)))
     for name, each in _files(args):
         if isinstance(each, NamedFile) and each == '-':
             raise UsageError(f'--{name} -: it is not written to standard output: name a file')
-        if isinstance(each, Output):
-            check_output(each)
+        if isinstance(each, Output) and each.checked_early:
+            check_output(each, each.is_recording, getattr(args, 'overwrite', False))
         if isinstance(each, Report):
             _check_report(each)
 
@@ -203,11 +210,12 @@ def _files(args: argparse.Namespace) -> Iterator[tuple[str, Input | Output]]:
                 yield name.replace('_', ' '), each
 
 
-def check_output(path: str | None) -> None:
+def check_output(path: str | None, recording: bool = False, overwrite: bool = False) -> None:
     """
     Find out whether a file can be written.
 
     :param path: as given on the command line; None and `-` are always fine
+    :param recording: whether it will be a recording; `overwrite`: whether it may replace one
     """
     if path is None or path == '-':
         return
@@ -221,6 +229,7 @@ def check_output(path: str | None) -> None:
         return
     if not os.access(folder.resolve(), os.W_OK | os.X_OK):
         raise InputError(path, 'the directory cannot be written to', 'name another file')
+    check_replaced(path, recording=recording, overwrite=overwrite)
 
 
 def _is_special(path: Path) -> bool:
@@ -273,13 +282,15 @@ def output_file(path: str) -> Iterator[BinaryIO]:
 def output_trace(path: str) -> Iterator[str]:
     """Give a file that becomes `path` when the block ends well; errors speak of `path`."""
     from mddag_executor.trace import TraceError
+    from mddag_executor.trace.trace_file import KEPT
     with output_file(path) as file:
         try:
             yield file.name
         except TraceError as error:
             if error.file != file.name:
                 raise
-            raise TraceError(path, error.problem, error.remedy) from None
+            # the file is taken away
+            raise TraceError(path, error.problem, error.remedy.removeprefix(KEPT)) from None
 
 
 def write_text(path: str, text: str) -> None:

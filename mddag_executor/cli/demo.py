@@ -136,7 +136,8 @@ def _in_several(
     say(f'\n== Under MultiDeadlineExecutor({WORKERS}) each, recording, {args.seconds:g} s ==')
     live = json_of(mddag(
         'run', str(placed), '--synthetic', 'spin', *load, '--duration', f'{args.seconds:.3f}s',
-        '--trace', str(output / 'demo.mcap'), '--json', '-'), 'running', args.seconds + 3)
+        '--trace', str(output / 'demo.mcap'), '--overwrite', '--json', '-'), 'running',
+        args.seconds + 3)
     say(sink_table(live['dags']))
     for line in summary(live):
         say(line)
@@ -204,7 +205,7 @@ def run_live(args: argparse.Namespace, graph: Path, output: Path) -> dict[str, A
     command = [
         'run', str(graph), '--synthetic', 'sleep', '--utilisation', str(args.utilisation),
         '--seed', str(args.seed), '--workers', str(WORKERS), '--duration', f'{seconds:.3f}s',
-        '--trace', str(output / 'demo.mcap'), '--json', '-']
+        '--trace', str(output / 'demo.mcap'), '--overwrite', '--json', '-']
     result = json_of(mddag(*command), 'running', seconds + 3)
     measured(result)
     return result

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--fail-on-worse', action='store_true',
         help='exit with status 1 if a sink missed a larger share of its deadlines in B, or its '
         'p99 response time grew by more than the tolerance')
-    add('--tolerance', type=_share, metavar='P%',
+    add('--tolerance', type=_share, metavar='SHARE',
         help='with --fail-on-worse and in the tables: how much the p99 response time of a sink '
         'may grow, as 10%% (default: by any amount)')
     options.add(parser, '--skip', '--offset', '--json')

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded
-from mddag_executor.cli.text import printable, warn
+from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -33,7 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     options.add_recording(parser, "a recorded run, an MCAP file ('-': standard input)")
-    add('--sink', metavar='S', help='only jobs of this sink, as /node:callback')
+    add('--sink', metavar='S',
+        help='only jobs of this sink: /node:callback, or the end of its name, as tables show it')
     add('--job', type=options.or_zero(options.positive_int), metavar='K',
         help='only the job of this number')
     options.add(parser, '--skip', '--json')
@@ -58,13 +59,16 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _sink(name: str, task_set: TaskSet) -> int:
-    """Return the global vertex of a sink."""
-    from msg_graph.errors import did_you_mean
+    """Return the global vertex of a sink, given by its name or a unique end of it."""
+    from msg_graph.errors import did_you_mean, listed, shown
     sinks = {v.name: i for i, v in enumerate(task_set.vertices) if v.deadline_ns is not None}
-    if name not in sinks:
-        raise UsageError(f"--sink: there is no sink '{printable(name)}': " + did_you_mean(
+    meant = [name] if name in sinks else [each for each in sinks if each.endswith(name)]
+    if len(meant) > 1:
+        raise UsageError(f'--sink: {shown(name)} may be any of {listed(meant)}: write more of it')
+    if not meant:
+        raise UsageError(f'--sink: there is no sink {shown(name)}: ' + did_you_mean(
             name, sinks, 'mddag graph check lists them'))
-    return sinks[name]
+    return sinks[meant[0]]
 
 
 def _lines(outcome: Replay, explainer: Explainer) -> Iterator[str]:

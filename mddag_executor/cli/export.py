@@ -4,10 +4,10 @@
 The verb `export`: a trace as a file for other tools.
 
 The end of the file's name says which: `.pftrace` for Perfetto's viewer, `.csv` for spreadsheets,
-`.parquet` for data frames, `.mcap` for Foxglove, Lichtblick and PlotJuggler.  The run is judged as
-`replay` does it, and recordings are of the same kinds: traces of this executor, imported ones, and
-with `--reschedule` ordinary bags.  A name that ends in `/` is a folder, for a session as LTTng
-records it, with the events of the trace as they are.
+`.parquet` for data frames, `.foxglove.mcap` for Foxglove, Lichtblick and PlotJuggler.  The run is
+judged as `replay` does it, and recordings are of the same kinds: traces of this executor, imported
+ones, and with `--reschedule` ordinary bags.  A name that ends in `/` is a folder, for a session as
+LTTng records it, with the events of the trace as they are.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ mddag export run.mcap -o run.foxglove.mcap
 mddag export run.mcap -o session/
 mddag export drive/ graph.yaml --reschedule --workers 4 -o drive.pftrace"""
 
-FORMS = ('pftrace', 'csv', 'parquet', 'mcap')
-_FOLDER = 'folder'
+FORMS = {'.pftrace': 'pftrace', '.csv': 'csv', '.parquet': 'parquet', '.foxglove.mcap': 'mcap'}
+_FOXGLOVE, _FOLDER = 'mcap', 'folder'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_recording(
         parser, "a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
         'ordinary bag, a folder or a file')
-    add('-o', '--output', metavar='OUT', required=True,
+    add('-o', '--output', metavar='OUT', type=options.Export, required=True,
         help='the file to write: OUT.pftrace for Perfetto (ui.perfetto.dev; needs '
         "mddag_executor[export]), OUT.csv ('-': CSV to standard output), OUT.parquet (needs "
         'mddag_executor[export]), OUT.foxglove.mcap with a layout OUT.foxglove.json, or OUT/, a '
@@ -57,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     recorded.add_arguments(
         parser, 'export what the scheduler would have done with the recorded releases and '
         'execution times')
+    options.add(parser, '--overwrite')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -66,14 +67,18 @@ def main(args: argparse.Namespace) -> int:
     form = _form(args)
     if form == _FOLDER:
         return _export_session(args)
-    common.check_output(args.output)
+    common.check_output(args.output, form == _FOXGLOVE, args.overwrite)
     check_available(form)
     with recorded.opened(args) as (path, name, task_set), \
             common.output_file(args.output) as file:
         writes = target(form, file, args.rows == 'jobs')
-        warnings = _export(args, path, name, task_set, writes)
+        try:
+            warnings = _export(args, path, name, task_set, writes)
+        except BaseException:
+            writes.abandon()
+            raise
     warn(*warnings)
-    if form == 'mcap':
+    if form == _FOXGLOVE:
         common.write_json(str(PurePath(args.output).with_suffix('.json')), layout_of(writes))
     if args.output != '-':
         print(f'exported: {printable(args.output)}')
@@ -123,12 +128,14 @@ def _form(args: argparse.Namespace) -> str:
         return _FOLDER
     if args.caret:
         raise UsageError("--caret: it is for a folder: let the name of -o end in '/'")
-    form = 'csv' if args.output == '-' else PurePath(args.output).suffix[1:].lower()
-    if form not in FORMS:
+    name = PurePath(args.output).name.lower()
+    form = 'csv' if args.output == '-' else next(
+        (form for ending, form in FORMS.items() if name.endswith(ending)), None)
+    if form is None:
         raise UsageError(
             f'-o {args.output}: it is not known what to write: let the name end in '
-            f'{", ".join("." + each for each in FORMS)} or /')
-    if form in ('pftrace', 'mcap') and args.rows is not None:
+            f'{", ".join(FORMS)} or /')
+    if form in ('pftrace', _FOXGLOVE) and args.rows is not None:
         raise UsageError(
             f'--rows: a .{form} gets both, executions and jobs: leave the option out')
     recorded.check(args)

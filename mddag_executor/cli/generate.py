@@ -68,7 +68,7 @@ def _pair(kind: Callable[[str], T]) -> Callable[[str], tuple[T, T]]:
 _KINDS: dict[str, Callable[[str], Any]] = {
     **dict.fromkeys(('dags', 'vertices', 'sinks'), _pair(options.positive_int)),
     **dict.fromkeys(('utilisation', 'tightness'), _pair(options.number)),
-    'workers': options.positive_int, 'seed': int,
+    'workers': options.workers, 'seed': int,
     'periods_ns': lambda text: tuple(options.list_of(options.duration)(text))}
 
 

@@ -24,6 +24,7 @@ HELP = 'test whether the deadlines can hold, before the first run'
 EXAMPLE = """\
 mddag graph analyse config/autoware.yaml --budget p99
 mddag graph analyse config/autoware.yaml --workers 4 --json -
+mddag graph analyse graph.yaml --fail-on-unschedulable
 mddag graph analyse graph.yaml --sag jobs --sag-binary ~/np-schedulability-analysis/build/nptest
 """
 DESCRIPTION = """\
@@ -42,6 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--budget', choices=defaults.BUDGETS, default='max',
         help='what of each execution time counts: its maximum (default), 99 %% quantile or mean')
     options.add(parser, 'graph', '--workers', '--json')
+    parser.add_argument(
+        '--fail-on-unschedulable', action='store_true',
+        help='exit with status 1 if no scheduler can keep the deadlines')
     parser.add_argument(
         '--sag', metavar='DIR',
         help='write the jobs of one hyperperiod there, for schedule-abstraction analysis: '
@@ -75,7 +79,7 @@ def main(args: argparse.Namespace) -> int:
         table(_HEADER, ((v.name, v.kind, v.verdict, v.figure, v.reason) for v in found)),
         table(_ABOUT, ((v.name, v.source, v.scheduler, v.assumption) for v in found)),
         _summary(analysis)))
-    return 0
+    return int(args.fail_on_unschedulable and _is_impossible(analysis))
 
 
 def _sag(args: argparse.Namespace, task_set: TaskSet, analysis: Analysis) -> Analysis:
@@ -101,12 +105,18 @@ def _sag(args: argparse.Namespace, task_set: TaskSet, analysis: Analysis) -> Ana
     return with_sag(analysis, tasks, jobs, answer)
 
 
+def _is_impossible(analysis: Analysis) -> bool:
+    """Return whether a necessary test fails."""
+    from mddag_executor.analysis import FAILS
+    return any(each.verdict == FAILS for each in analysis.verdicts)
+
+
 def _summary(analysis: Analysis) -> str:
-    from mddag_executor.analysis import FAILS, HOLDS
+    from mddag_executor.analysis import HOLDS
     from mddag_executor.analysis.verdicts import SHARED
     assumed = f'All sufficient tests assume: {SHARED}.\n'
     begin = f'{assumed}{counted(analysis.workers, "worker")}, budget {analysis.budget}: '
-    if any(each.verdict == FAILS for each in analysis.verdicts):
+    if _is_impossible(analysis):
         return begin + 'no scheduler can keep these deadlines'
     proven = {each.scheduler: None for each in analysis.verdicts
               if each.kind == 'sufficient' and each.verdict == HOLDS}

@@ -15,7 +15,7 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
-from mddag_executor.cli.text import Cell, format_ns, table
+from mddag_executor.cli.text import Cell, format_ns, table, warn
 from mddag_executor.text import counted, listed
 
 if TYPE_CHECKING:
@@ -29,7 +29,8 @@ mddag graph check config/autoware.yaml --json -
 DESCRIPTION = """\
 Validate a declaration and show the DAG tasks that it gives: period, number of vertices, sinks with
 deadlines, critical path and load in cores, the last two with the mean execution times (- where one
-is not declared). The utilisation is the load of all DAGs divided by the workers."""
+is not declared). The utilisation is the load of all DAGs divided by the workers. A path that takes
+longer than its deadline, and a load that the workers or CPUs cannot do, are warned of."""
 
 _HEADER = ('DAG', 'period', 'vertices', 'critical path', 'load', 'sink', 'deadline')
 
@@ -43,6 +44,7 @@ def main(args: argparse.Namespace) -> int:
     """Check."""
     task_set = common.load_graph(args.graph)
     result = check_result(task_set)
+    warn(*_warnings(task_set, result))
     common.show(args, result, (table(_HEADER, _rows(result)), _summary(task_set, result)))
     return 0
 
@@ -92,6 +94,26 @@ def _dag_result(dag: Dag, rad_offsets: list[int], workers: int) -> dict[str, Any
         'load': load,
         'utilisation': None if load is None else load / workers,
     }
+
+
+def _warnings(task_set: TaskSet, result: dict[str, Any]) -> Iterator[str]:
+    """Yield what keeps the deadlines from holding, with the mean execution times."""
+    from msg_graph.model import mean_execution_times, path_lengths
+    for dag in task_set.dags:
+        means = mean_execution_times(dag)
+        lengths = [] if means is None else path_lengths(dag, means)
+        for length, vertex in zip(lengths, dag.vertices):
+            if vertex.deadline_ns is not None and length > vertex.deadline_ns:
+                yield (f'{vertex.name}: the longest path to it takes {format_ns(length)}, more '
+                       f'than its deadline of {format_ns(vertex.deadline_ns)}: no scheduler can '
+                       'keep it')
+    load, workers, cpus = result['load'], result['workers'], defaults.processors()
+    if load is not None and load > workers:
+        yield (f'{task_set.file}: a load of {load:.3f} is more than '
+               f'{counted(workers, "worker")} can do: no scheduler can keep the deadlines')
+    elif load is not None and load > cpus:
+        yield (f'{task_set.file}: a load of {load:.3f} is more than the {counted(cpus, "CPU")} of '
+               'this machine can do, unless callbacks wait instead of computing')
 
 
 def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:

@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add(parser, '--cpus', otherwise='those of this machine')
     options.add(parser, '--workers', only='in each process, ')
     options.add_policy(parser)
-    add('--trace', metavar='TRACE', action='append', default=[],
+    add('--trace', metavar='TRACE', type=options.Input, action='append', default=[],
         help='take execution times, and who computes in Python, from a recorded run (default: '
         'those that are declared); repeat it for the traces of several processes')
     add('--utilisation', type=options.positive_float, metavar='U',

@@ -6,8 +6,7 @@ from __future__ import annotations
 
 import argparse
 
-from mddag_executor.cli import common
-from mddag_executor.cli.options import NamedFile
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import printable, Progress, warn
 from mddag_executor.text import counted
 
@@ -26,8 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'session', metavar='SESSION', nargs='+',
         help='the folder that was recorded to; of a run on several computers the folder of each')
-    parser.add_argument('-o', '--output', metavar='OUT.mcap', required=True, type=NamedFile,
+    parser.add_argument('-o', '--output', metavar='OUT.mcap', required=True, type=options.Trace,
                         help='the trace to write')
+    options.add(parser, '--overwrite')
 
 
 def main(args: argparse.Namespace) -> int:

@@ -5,16 +5,17 @@ Entry point of `mddag`: find the verb, run it, turn errors into one line and an 
 
 Theory of operation: the table of verbs below holds the one-line helps, so that `mddag --help`
 imports nothing but argparse; the module of a verb is imported when that verb is named first on the
-command line, and only then. Whatever the user can cause comes up as an exception of a known tree
-and leaves as one line `error: PLACE: what is wrong: what to do`, several errors of a declaration
-as one line each. The exit status is
+command line, and only then. Options and files follow the verb, in any order (`parsing.py`).
+Whatever the user can cause comes up as an exception of a known tree and leaves as one line
+`error: PLACE: what is wrong: what to do`, several errors of a declaration as one line each. The
+exit status is
 
 | status | meaning |
 | --- | --- |
 | 0 | done |
 | 1 | done, and with `--fail-on-miss` a deadline was missed |
 | 2 | bad input or usage |
-| 70 | a defect of this program or of a node's callback, with its traceback (EX_SOFTWARE) |
+| 70 | a defect of this program or of a node, with its traceback (EX_SOFTWARE) |
 | 130 | interrupted with Ctrl-C |
 | 141 | the reader of the output went away |
 
@@ -23,21 +24,19 @@ as one line each. The exit status is
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 import errno
 from importlib import import_module
 import io
-from itertools import takewhile
 import os
 import sys
 from types import ModuleType
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 from mddag_executor import __version__
-from mddag_executor.cli.options import add_verb, add_verbs
+from mddag_executor.cli.parsing import group_parser, Parser, verb_parser
 from mddag_executor.cli.text import one_line
-from mddag_executor.errors import MddagError, UsageError
+from mddag_executor.errors import MddagError, UsageError, UserCodeError
 
 EXIT_BAD_INPUT = 2
 EXIT_DEFECT = 70
@@ -79,54 +78,57 @@ VERBS = {
 _ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_python')
 
 
-class Parser(argparse.ArgumentParser):
-    """An argument parser that reports a wrong command line as a `UsageError`."""
-
-    _given: Sequence[str] = ()
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse; what is left over is an error here, where the options of the verb are known."""
-        self._given = args or ()
-        parsed, left = super().parse_known_args(args, namespace)
-        if left:
-            self.error(f'unrecognized arguments: {" ".join(left)}')
-        return parsed, left
-
-    def error(self, message: str) -> NoReturn:
-        """Raise instead of printing the usage over several lines and exiting."""
-        remedy = f"see '{self.prog} --help'"
-        for option in takewhile(lambda each: each not in ('--', '--ros-args'), self._given):
-            name = option.partition('=')[0]
-            if name.startswith('--') and name not in self._option_string_actions:
-                from msg_graph.errors import did_you_mean
-                message = f"there is no option '{name}'"
-                remedy = did_you_mean(name, self._option_string_actions, remedy)
-                break
-        raise UsageError(f'{self.prog}: {message}: {remedy}')
-
-
 def load(verb: Verb) -> ModuleType:
     """Import the module of a verb."""
     return import_module(f'mddag_executor.cli.{verb.module}')
 
 
-def build_parser(chosen: str | None) -> Parser:
-    """Return the program's parser, with the arguments of the chosen verb only."""
+def load_inner(verb: Verb, name: str) -> ModuleType:
+    """Import the module of a verb of a verb."""
+    return import_module(f'mddag_executor.cli.{verb.module}_{name.replace("-", "_")}')
+
+
+def find_verb(argv: Sequence[str]) -> tuple[Parser, Sequence[str]]:
+    """
+    Find the verb that a command line names.
+
+    :returns: its parser and its arguments
+    :raises mddag_executor.errors.UsageError: when there is no such verb
+    """
+    name, rest = _first_word(program_parser, 'mddag', VERBS, argv)
+    verb = VERBS[name]
+    sentence = f'{verb.summary[:1].upper()}{verb.summary[1:]}.'
+    if not verb.verbs:
+        return verb_parser(f'mddag {name}', load(verb), sentence), rest
+    modules = dict.fromkeys(verb.verbs)
+    inner, rest = _first_word(
+        lambda: group_parser(f'mddag {name}', {each: load_inner(verb, each) for each in modules},
+                             sentence), f'mddag {name}', modules, rest)
+    module = load_inner(verb, inner)
+    return verb_parser(f'mddag {name} {inner}', module, module.DESCRIPTION), rest
+
+
+def _first_word(
+    parser: Callable[[], Parser], prog: str, verbs: Collection[str], argv: Sequence[str]
+) -> tuple[str, Sequence[str]]:
+    """Return the verb that comes first, and what follows; do what an option there says."""
+    if not argv or argv[0].startswith('-'):
+        parser().parse(argv[:1])   # shows help or version, or fails
+    if argv[0] not in verbs:
+        from msg_graph.errors import did_you_mean, shown
+        remedy = did_you_mean(argv[0], verbs, f"see '{prog} --help'")
+        raise UsageError(f'{prog}: there is no verb {shown(argv[0])}: {remedy}')
+    return argv[0], argv[1:]
+
+
+def program_parser() -> Parser:
+    """Return the parser of what stands before the verb."""
     parser = Parser(
         prog='mddag', allow_abbrev=False,
         description='Run ROS 2 callbacks by their deadlines, and check recorded runs offline.',
         epilog="'mddag VERB --help' explains a verb and shows an example.")
     parser.add_argument('--version', action='version', version=f'mddag {__version__}')
-    verbs = parser.add_subparsers(dest='verb', metavar='VERB', required=True, title='verbs')
-    for name, verb in VERBS.items():
-        if name == chosen:
-            sentence = f'{verb.summary[:1].upper()}{verb.summary[1:]}.'
-            if verb.verbs:
-                add_verbs(verbs, name, verb.verbs, verb.summary, sentence)
-            else:
-                add_verb(verbs, name, load(verb), verb.summary, sentence)
-        else:
-            verbs.add_parser(name, help=verb.summary, add_help=False)
+    parser.add_verbs({name: verb.summary for name, verb in VERBS.items()})
     return parser
 
 
@@ -136,8 +138,8 @@ def run(argv: Sequence[str]) -> int:
 
     :returns: the verb's exit status
     """
-    parser = build_parser(argv[0] if argv else None)
-    args = parser.parse_args(argv)
+    parser, rest = find_verb(argv)
+    args = parser.parse(rest)
     from mddag_executor.cli.common import check_files
     check_files(args)
     status = int(args.main(args))
@@ -170,14 +172,15 @@ def main(
         if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
             _silence_stdout()
         line = user_line(error)
-        if line is None or os.environ.get('MDDAG_DEBUG') == '1':
+        raised = error.__cause__ if isinstance(error, UserCodeError) else error
+        if line is None or raised is not error or os.environ.get('MDDAG_DEBUG') == '1':
             import traceback
-            traceback.print_exception(type(error), error, error.__traceback__)
+            traceback.print_exception(raised)
         if line is None:
             return EXIT_DEFECT
-        for each in _user_lines(error, line):
+        for each in filter(None, _user_lines(error, line)):
             print(f'error: {each}', file=sys.stderr)
-        return EXIT_BAD_INPUT
+        return EXIT_BAD_INPUT if raised is error else EXIT_DEFECT
 
 
 def _user_lines(error: BaseException, line: str) -> list[str]:

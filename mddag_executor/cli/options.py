@@ -10,10 +10,8 @@ help are the same, too. Like the verbs' modules this one imports nothing heavy.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
-from importlib import import_module
+from collections.abc import Callable
 import math
-from types import ModuleType
 from typing import Any, TypeVar
 
 from mddag_executor import defaults
@@ -37,6 +35,13 @@ def duration(text: str) -> int:
 def positive_int(text: str) -> int:
     """Return a whole number from 1 up."""
     return _parsed(text, int, lambda value: value >= 1, 'whole number from 1 up')
+
+
+def workers(text: str) -> int:
+    """Return a number of workers."""
+    from msg_graph.model import MOST_WORKERS
+    return _parsed(text, int, lambda value: 1 <= value <= MOST_WORKERS,
+                   f'whole number from 1 to {MOST_WORKERS}')
 
 
 def seed(text: str) -> int:
@@ -118,7 +123,10 @@ class Input(str):
 
 
 class Output(str):
-    """A file to write, `-` for standard output; `common.check_files` looks at it early."""
+    """A file to write, `-` for standard output; `common.check_files` checks it early."""
+
+    is_recording = False    # see `output_rules`
+    checked_early = True
 
 
 class Report(Output):
@@ -127,6 +135,30 @@ class Report(Output):
 
 class NamedFile(Output):
     """A file to write that cannot be standard output."""
+
+
+class Bag(Output):
+    """A bag to write."""
+
+    is_recording = True
+
+
+class Trace(NamedFile):
+    """A trace to write."""
+
+    is_recording = True
+
+
+class TraceOfRun(Trace):
+    """What `run` records to: a trace, or a folder of them, which the verb itself checks."""
+
+    checked_early = False
+
+
+class Export(Output):
+    """What `export` writes: a file or a folder, which the verb itself checks."""
+
+    checked_early = False
 
 
 # --- options that several verbs have -------------------------------------------------------------
@@ -150,7 +182,7 @@ _SHARED: dict[str, dict[str, Any]] = {
         'help': 'write tables and pictures of the run as one HTML file that needs no network '
         "(needs mddag_executor[report]; '-': to standard output)"},
     '--workers': {
-        'type': positive_int, 'metavar': 'M', 'help': 'threads that run callbacks',
+        'type': workers, 'metavar': 'M', 'help': 'threads that run callbacks',
         'otherwise': f"the declaration's, else {defaults.WORKERS}"},
     '--cpus': {
         'type': positive_int, 'metavar': 'C',
@@ -188,6 +220,8 @@ _SHARED: dict[str, dict[str, Any]] = {
         'help': 'for recordings of several machines: how far the clock of process NAME (the one '
         "of RUN.NAME.mcap, or a trace) is ahead of the first trace's, for instance 2.5ms, or "
         '-2.5ms if it is behind', 'otherwise': 'estimated from messages in both directions'},
+    '--overwrite': {
+        'action': 'store_true', 'help': 'replace a recording that is there already'},
     '--ros-args': {
         'nargs': argparse.REMAINDER, 'metavar': '…',
         'help': 'pass the rest of the command line to rclpy.init, for instance -r from:=to'},
@@ -258,40 +292,3 @@ def add_repeat(
     """Declare `--repeat` of a benchmark."""
     parser.add_argument('--repeat', type=positive_int, default=default, metavar='R',
                         help=f'{what} (default: %(default)s)')
-
-
-# --- verbs ---------------------------------------------------------------------------------------
-
-def add_verb(parsers: Any, name: str, module: ModuleType, summary: str, description: str) -> None:
-    """
-    Add a verb, or a verb of a verb, to the parsers that `add_subparsers` returned.
-
-    :param module: has `EXAMPLE`, `add_arguments`, and `main`, which becomes `args.main`.
-    :param summary: for the list of verbs
-    """
-    parser = _add_parser(parsers, name, summary, description, module.EXAMPLE.strip().splitlines())
-    module.add_arguments(parser)
-    parser.set_defaults(main=module.main)
-
-
-def add_verbs(
-    parsers: Any, verb: str, names: Sequence[str], summary: str, description: str
-) -> None:
-    """Add a verb that has verbs; each of these is a module, `VERB_NAME`."""
-    modules = {name: import_module(f'mddag_executor.cli.{verb}_{name.replace("-", "_")}')
-               for name in names}
-    parser = _add_parser(parsers, verb, summary, description,
-                         [module.EXAMPLE.split('\n')[0] for module in modules.values()])
-    inner = parser.add_subparsers(
-        dest=f'{verb}_verb', metavar='VERB', required=True, title='verbs')
-    for name, module in modules.items():
-        add_verb(inner, name, module, module.HELP, module.DESCRIPTION)
-
-
-def _add_parser(
-    parsers: Any, name: str, summary: str, description: str, examples: Sequence[str]
-) -> Any:
-    return parsers.add_parser(
-        name, help=summary, allow_abbrev=False, description=description,
-        epilog='\n  '.join(('example:', *examples)),
-        formatter_class=argparse.RawDescriptionHelpFormatter)

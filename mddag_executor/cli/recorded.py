@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
     add('--reschedule', action='store_true', help=what)
     options.add(parser, '--workers', only=f'{_WITH}in each process, ', otherwise='as recorded')
     options.add(parser, '--cpus', only=_WITH, otherwise='as recorded, else enough for all')
-    add('--processes', metavar='N|FILE',
+    add('--processes', metavar='N|FILE', type=options.Input,
         help=f'{_WITH}run the nodes in N processes, packed by the recorded times, or in those of '
         'a YAML file with `processes:` (default: as recorded)')
     options.add_policy(parser, _WITH, 'as recorded')

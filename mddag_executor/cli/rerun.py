@@ -3,7 +3,7 @@
 """
 The verb `rerun`: real nodes again from a recording, in virtual time, the same every time.
 
-Exit status: 0 done; 1 with `--expect` when the outputs differ; 2 bad input, or a callback raised.
+Exit status: 0 done; 1 with `--expect` when the outputs differ; 2 bad input; 70 a node raised.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from contextlib import ExitStack, redirect_stdout
 from dataclasses import replace
 import os
 import sys
-import traceback
 from typing import Any, BinaryIO, TYPE_CHECKING
 
 from mddag_executor import defaults
@@ -30,7 +29,7 @@ mddag rerun drive.mcap graph.yaml --node my_package/tracker -o before.mcap
 mddag rerun drive.mcap graph.yaml --node my_package/tracker --expect before.mcap
 mddag rerun drive.mcap graph.yaml --node my_package.tracker:main --times run.mcap --workers 2
 
-exit status: 0 done; 1 the outputs are not those of --expect; 2 bad input, or a callback raised"""
+exit status: 0 done; 1 the outputs are not those of --expect; 2 bad input; 70 a node raised"""
 
 _PROGRAMS = ('mddag', 'ros2')  # wherever pip, colcon or a user has put them
 _MODULE = 'mddag_executor/__main__.py'
@@ -42,20 +41,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('recording', metavar='BAG|TRACE', type=options.Input,
         help="a bag with the messages that the nodes take, or a trace of mddag run ('-': standard "
         'input)')
-    options.add(parser, 'graph', '--workers', '--json', '--ros-args')
+    options.add(parser, 'graph', '--workers', '--json', '--overwrite', '--ros-args')
     add('--node', metavar='SPEC', action='append', required=True,
         help='run this node, as mddag run does; repeat it for more nodes')
-    add('-o', '--output', metavar='OUT.mcap', type=options.Output,
+    add('-o', '--output', metavar='OUT.mcap', type=options.Bag,
         help='write what the nodes publish to this bag, with virtual times')
-    add('--trace', metavar='RUN.mcap', type=options.NamedFile,
+    add('--trace', metavar='RUN.mcap', type=options.Trace,
         help='record the run to this file, for mddag replay')
-    add('--expect', metavar='OUT.mcap',
+    add('--expect', metavar='OUT.mcap', type=options.Input,
         help='compare what the nodes publish with this bag, and exit with status 1 where it '
         'differs')
     add('--tolerance', type=options.not_negative, default=0.0, metavar='X',
         help='with --expect: floating-point numbers may differ by this much, or by this share of '
         'the larger one (default: 0)')
-    add('--times', metavar='WHICH',
+    add('--times', metavar='WHICH', type=options.Input,
         help='how long callbacks take: recorded (the default for a trace), declared (the default '
         'for a bag), or a file: a trace, or JSON with execution times')
     options.add(parser, '--cpus', otherwise='as many as are needed')
@@ -106,7 +105,7 @@ def _fix_hashes() -> None:
 
 
 def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
-    from mddag_executor.rerun import CallbackFailed, compare, programs
+    from mddag_executor.rerun import compare, programs
     from mddag_executor.rerun.run import Rerun, Settings
     from mddag_executor.rerun.sources import open_source
     task_set = common.load_graph(args.graph)
@@ -128,13 +127,9 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
             trace = files.enter_context(common.output_trace(args.trace))
         run = Rerun(source, task_set, settings, output, trace, keep=args.expect is not None)
         with Progress('running', (source.end - source.start) / 1e9) as line:
-            try:
-                result = run.run(
-                    lambda: programs(args.node, args.ros_args),
-                    lambda done: line.update(done / 1e9))
-            except CallbackFailed as error:
-                traceback.print_exception(error.__cause__)
-                raise
+            result = run.run(
+                lambda: programs(args.node, args.ros_args),
+                lambda done: line.update(done / 1e9))
         if args.expect is None:
             return result, None
         return result, compare(result, args.expect, args.tolerance)

@@ -33,7 +33,7 @@ from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.stuck import dump_when_stuck
 from mddag_executor.cli.text import Progress, warn
-from mddag_executor.errors import MddagError, UsageError
+from mddag_executor.errors import MddagError, UsageError, UserCodeError
 from mddag_executor.report.live_runs import summary
 from mddag_executor.report.tables import sink_table
 from mddag_executor.report.text import listed
@@ -86,10 +86,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
         help="how often to publish the executor's state on /diagnostics, for mddag top and other "
         "tools; 'off': never (default: 1s)")
-    add('--trace', metavar='OUT.mcap',
+    add('--trace', metavar='OUT.mcap', type=options.TraceOfRun,
         help='record the run to this file; of several processes each to OUT.NAME.mcap, or to '
         'NAME.mcap in OUT where that is a directory')
-    add('--processes', metavar='N|FILE',
+    add('--processes', metavar='N|FILE', type=options.Input,
         help='run the nodes in N processes, or in those of a YAML file with `processes:` '
         "(default: those of the declaration); '1': in this process")
     add('--process', metavar='NAME',
@@ -103,7 +103,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'graph', metavar='GRAPH', nargs='?', type=options.Input,
         help="the declaration, a YAML file ('-': standard input); with --node it may be left out: "
         'then nothing is judged, and a trace shows what there is to declare')
-    options.add(parser, '--workers', '--json', '--ros-args')
+    options.add(parser, '--workers', '--json', '--overwrite', '--ros-args')
 
 
 def _or_off(text: str) -> int:
@@ -157,7 +157,7 @@ def run_here(
     :return: the result (with what those of several processes are put together from, if it is one
         of these), and what a node raised.
     """
-    common.check_output(args.trace)
+    common.check_output(args.trace, recording=True, overwrite=args.overwrite)
     workers = defaults.workers(args.workers, task_set)
     plan = None
     host: Host | None = None
@@ -176,7 +176,8 @@ def run_here(
         from mddag_executor.executor.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
-            freeze_gc=True, diagnostics_period=args.diagnostics, process=args.process)
+            freeze_gc=True, diagnostics_period=args.diagnostics, process=args.process,
+            overwrite=args.overwrite)
         # With `--json -` what nodes print must not get into the JSON.
         output = sys.stdout if common.wants_tables(args) else sys.stderr
         try:
@@ -194,6 +195,8 @@ def _end(error: BaseException | None) -> int:
 
     The process ends here if a node's thread would keep the interpreter from ending.
     """
+    if isinstance(error, Exception):
+        raise UserCodeError from error
     if error is not None:
         raise error
     left = [t.name for t in threading.enumerate()
@@ -209,8 +212,6 @@ def _end(error: BaseException | None) -> int:
 def _check_arguments(args: argparse.Namespace) -> None:
     from mddag_executor.executor.settings import diagnostics_period_ns
     diagnostics_period_ns(args.diagnostics)
-    if args.trace == '-':
-        raise UsageError('--trace -: a trace is not written to standard output: name a file')
     if args.processes is not None and args.processes.isdecimal() and not int(args.processes):
         raise UsageError('--processes 0: give 1 or more, or a file')
     needs_graph = next((name for name in ('synthetic', 'processes', 'process')
@@ -305,15 +306,15 @@ def _run(
             if args.part is None:
                 warn_of(plan, args.ros_args)
             ledger = _run_synthetic(args, session, task_set, plan, seconds, progress)
-    result = {
-        'file': task_set.file or None, 'nodes': args.node, 'synthetic': args.synthetic,
-        **executor.statistics(),
+    counts = executor.statistics()
+    result: dict[str, Any] = {
+        'file': task_set.file or None, 'nodes': args.node, 'synthetic': args.synthetic, **counts,
         'measured': None if ledger is None or plan is None else measure(ledger, plan)}
-    result['drift'] = [each.result() for each in watch.drift(result)]
+    result['drift'] = [each.result() for each in watch.drift(counts)]
     if not session.clean:
         warn('a callback has not ended in time; it is left behind')
     if args.part is not None:
-        result.update(observed=asdict(watch.observed(result)), ledger=ledger and vars(ledger))
+        result.update(observed=asdict(watch.observed(counts)), ledger=ledger and vars(ledger))
     return result, session.error
 
 

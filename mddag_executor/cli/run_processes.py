@@ -14,6 +14,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 import tempfile
@@ -70,7 +71,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         names = [process.name for process in task_set.processes]
         _warn_of_contested(task_set)
         for name in names:
-            common.check_output(_trace(args.trace, name))
+            _check_traces(args, name)
         if plan is not None:
             warn_of(plan, args.ros_args, len(names))
 
@@ -206,6 +207,8 @@ def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> lis
     command = [sys.executable, '-m', 'mddag_executor', 'run', args.graph, '--part', folder,
                '--policy', args.policy,
                '--diagnostics', f'{args.diagnostics}ns' if args.diagnostics else 'off']
+    if args.overwrite:
+        command.append('--overwrite')
     if args.synthetic is None:
         for spec in specs:
             command += ['--node', spec]
@@ -217,6 +220,12 @@ def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> lis
         if value is not None:
             command += [option, str(value)]
     return command
+
+
+def _check_traces(args: argparse.Namespace, name: str) -> None:
+    """Find out whether a process can record."""
+    common.check_output(
+        _trace(args.trace, name), recording=True, overwrite=args.overwrite)
 
 
 def _trace(given: str | None, name: str) -> str | None:

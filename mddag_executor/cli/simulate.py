@@ -36,12 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'jobs are judged (completions, as in the paper)')
     add('--stop-at-first-miss', action='store_true',
         help='end the run with the first missed deadline')
-    add('--trace', metavar='OUT.mcap', type=options.NamedFile, help='record the run to this file')
+    add('--trace', metavar='OUT.mcap', type=options.Trace, help='record the run to this file')
     add('--fail-on-miss', action='store_true',
         help='exit with status 1 if a deadline was missed, or no job was due')
     options.add(
         parser, 'graph', '--workers', '--cpus', '--preemptive', '--execution-times',
-        '--duration', '--utilisation', '--report', '--json')
+        '--duration', '--utilisation', '--report', '--json', '--overwrite')
 
 
 def main(args: argparse.Namespace) -> int:

@@ -13,8 +13,9 @@ import argparse
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor import defaults
-from mddag_executor.cli import common, options, recorded, simulate
+from mddag_executor.cli import common, options, recorded, simulate, verdicts
 from mddag_executor.cli.text import Progress, warn
+from mddag_executor.core.tally import total
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -48,8 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--jobs', type=options.positive_int, metavar='N',
         help='how many processes search (default: one for each processor)')
     add('--fail-under', type=options.positive_float, metavar='FACTOR',
-        help='exit with status 1 if some callback may not take this many times as long, or if a '
-        'deadline is missed already')
+        help='exit with status 1 if some callback may not take this many times as long, if a '
+        'deadline is missed already, or if no job was due')
     add('--report', metavar='OUT.html', type=options.Output,
         help="write the tables with bars as one HTML file ('-': to standard output)")
     options.add(parser, '--skip', '--json')
@@ -58,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Find the slack and print it."""
     from mddag_executor.replay.slack import find_slack, slack_result
+    from mddag_executor.replay.tolerances import NOTHING_DUE
     from mddag_executor.report.slack import lines, page
     common.recording_and_graph(args)
     is_graph = str(args.trace).lower().endswith(_GRAPHS)
@@ -71,6 +73,9 @@ def main(args: argparse.Namespace) -> int:
     common.show(args, result, lines(result))
     if args.fail_under is None:
         return 0
+    if not total(dags).due:
+        return verdicts.unproven(
+            str(args.trace), NOTHING_DUE, 'give a longer run, or a longer --duration')
     return int(bool(result['missed']) or any(
         one['factor'] is not None and one['factor'] < args.fail_under
         for one in result['callbacks'].values()))

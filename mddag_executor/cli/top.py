@@ -13,13 +13,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+import os
 import sys
 import time
 
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import printable
 from mddag_executor.errors import MddagError, UsageError
-from mddag_executor.report.board import Board, picture, plain
+from mddag_executor.report.board import Board, KEYS, picture, plain
 
 EXAMPLE = """\
 mddag top
@@ -57,9 +58,11 @@ def main(args: argparse.Namespace) -> int:
             if args.once:
                 _wait(spin, board, args.timeout / 1e9)
             elif live:
-                _show_live(spin, board, seconds)
+                _show_live(_ticks(spin, board, seconds, args.timeout / 1e9), board, seconds)
             else:
-                _print_now_and_then(spin, board, seconds, common.wants_tables(args))
+                _print_now_and_then(
+                    _ticks(spin, board, seconds, args.timeout / 1e9), board,
+                    common.wants_tables(args))
         except KeyboardInterrupt:
             pass  # how one leaves it
     if (args.once or args.duration is not None) and not board.statuses():
@@ -90,33 +93,64 @@ def _wait(spin: Callable[[float], None], board: Board, seconds: float) -> None:
         spin(0.1)
 
 
-def _show_live(spin: Callable[[float], None], board: Board, seconds: float | None) -> None:
+def _show_live(ticks: Iterator[None], board: Board, seconds: float | None) -> None:
     from rich.console import Console
     from rich.live import Live
     from rich.text import Text
     console = Console()
-    waiting = Text('waiting for an executor to publish its state (Ctrl-C ends this)')
-    with Live(waiting, console=console, auto_refresh=False, screen=seconds is None) as screen:
-        for _ in _ticks(spin, seconds):
+    waiting = Text(
+        'waiting for an executor to publish its state: mddag run does, and a program with '
+        f'diagnostics_period ({KEYS})')
+    with _keys() as pressed, Live(
+            waiting, console=console, auto_refresh=False, screen=seconds is None) as screen:
+        for _ in ticks:
             statuses = board.statuses()
-            screen.update(picture(statuses) if statuses else waiting, refresh=True)
+            screen.update(
+                picture(statuses, console.width) if statuses else waiting, refresh=True)
+            if 'q' in pressed():
+                return
 
 
-def _print_now_and_then(
-    spin: Callable[[float], None], board: Board, seconds: float | None, tables: bool
-) -> None:
-    for _ in _ticks(spin, seconds):
+@contextmanager
+def _keys() -> Iterator[Callable[[], str]]:
+    """Give a function that returns what was typed since; nothing if there is no terminal."""
+    if not sys.stdin.isatty():
+        yield str
+        return
+    import select
+    import termios
+    import tty
+    number = sys.stdin.fileno()
+    before = termios.tcgetattr(number)
+    tty.setcbreak(number)
+
+    def typed() -> str:
+        ready = select.select([number], [], [], 0)[0]
+        return os.read(number, 1024).decode('utf-8', 'replace') if ready else ''
+
+    try:
+        yield typed
+    finally:
+        termios.tcsetattr(number, termios.TCSADRAIN, before)
+
+
+def _print_now_and_then(ticks: Iterator[None], board: Board, tables: bool) -> None:
+    for _ in ticks:
         statuses = board.statuses()
         if statuses and tables:
             print(plain(statuses), flush=True)
 
 
-def _ticks(spin: Callable[[float], None], seconds: float | None) -> Iterator[None]:
-    """Listen; yield once an interval until the time is over."""
+def _ticks(
+    spin: Callable[[float], None], board: Board, seconds: float | None, patience_s: float
+) -> Iterator[None]:
+    """Listen; yield once an interval until the time is over, or nothing has arrived in time."""
     begin = time.monotonic()
     due = begin + INTERVAL_S
-    while seconds is None or time.monotonic() - begin < seconds:
+    while seconds is None or (passed := time.monotonic() - begin) < seconds:
         spin(0.1)
+        if seconds is not None and passed > patience_s and not board.statuses():
+            return
         if time.monotonic() >= due:
             due += INTERVAL_S
             yield

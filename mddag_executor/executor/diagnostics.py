@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 Once a period a thread of its own reads the executor's counters and publishes one
 ``DiagnosticArray``: a status for each DAG that has a callback in this process, and one for the
-pool.  It takes no lock and touches nothing that a callback's way goes through: counters are read
+pool.  It takes no lock and touches nothing on a callback's way: counters are read
 as they stand (a count that moves on while others are read shows one period later), so neither
 workers nor intake ever wait for it.
 

@@ -36,6 +36,7 @@ from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE
 from mddag_executor.core.state import (
     IDLE,
+    JUDGE_FROM,
     N_IDLE,
     OPEN,
     SUSPENDED,
@@ -476,8 +477,11 @@ class Engine:
         x, work.x = work.x, -1
         if self.holders:
             self._let_go(work)
-        if end < self._judged_at:  # that it was overdue was reported before this was known
-            end = self._judged_at
+        if self.verdicts.tally.overdue and work.origin is not None:
+            deadline = self.verdicts.tally.overdue.get((work.origin.vertex, work.origin.job), -1)
+            if end <= deadline:  # that it was overdue was reported before this was known
+                entity.busy_ns += deadline + 1 - end
+                end = deadline + 1
         end_it = self.scheduler.fail if failed else self.scheduler.complete
         if self.record is None:
             end_it(x, end)
@@ -575,6 +579,11 @@ class Engine:
                 work.x = -1
                 self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'aborted', now)
 
+    @property
+    def is_judging(self) -> bool:
+        """Return whether there are verdicts about jobs that are released now."""
+        return self._state.scalars[JUDGE_FROM] < NEVER
+
     def set_judging(self, judging: bool, since: int | None, now: int) -> None:
         """Give verdicts about jobs released from now (or a time) on, or about none for now."""
         release = NEVER if not judging else now if since is None else since
@@ -588,7 +597,6 @@ class Engine:
             return
         self.deadlines.judge(now)
         if self._state.decisions:
-            self._judged_at = now
             self._decided(now)
 
     # --- the end ---------------------------------------------------------------------------------

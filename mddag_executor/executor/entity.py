@@ -37,8 +37,8 @@ class Entity:
         'kind', 'rclpy', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
         'busy_ns', 'unattributed', 'removed', 'address', 'handle', 'remote_publishers',
-        'awaits', 'is_own', 'tail_ns', 'publishes', 'at_once', 'habit', 'since', 'gate',
-        'most_waiting', 'collect_more', 'classify', 'is_nested', '__weakref__')
+        'awaits', 'is_own', 'incompatible_qos', 'tail_ns', 'publishes', 'at_once', 'habit',
+        'since', 'gate', 'most_waiting', 'collect_more', 'classify', 'is_nested', '__weakref__')
 
     def __init__(
         self, kind: str, rclpy: Any, node: str, callback: Callback | None, group: int,
@@ -73,6 +73,8 @@ class Entity:
         self.unattributed = 0
         # how long its callback goes on after it has published first, lately
         self.tail_ns = 0
+        # of a subscription: the policy for which a publisher's messages do not come
+        self.incompatible_qos: str | None = None
         # the topics that its callback has published on
         self.publishes: set[str] = set()
         self.removed = False
@@ -130,12 +132,13 @@ class Entity:
             return
         total = counts.setdefault(self.name, {
             'kind': self.kind, 'declared': self.callback is not None, 'waiting': 0,
-            'holds_interpreter': False, 'interpreter_share': None,
+            'holds_interpreter': False, 'interpreter_share': None, 'incompatible_qos': None,
             **dict.fromkeys(COUNTS, 0)})
         for key in COUNTS:
             total[key] += getattr(self, key)
         total['waiting'] += len(self.waiting)
         total['holds_interpreter'] |= bool(self.habit.holds)
+        total['incompatible_qos'] = total['incompatible_qos'] or self.incompatible_qos
         share = self.habit.share
         if share is not None:
             total['interpreter_share'] = max(total['interpreter_share'] or 0.0, round(share, 3))

@@ -17,8 +17,8 @@ What has been taken and not run yet stays with the core and runs with the next s
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 import gc
 import os
 import select
@@ -45,6 +45,7 @@ from mddag_executor.executor.gil import short_switch_interval
 from mddag_executor.executor.inbox import Inbox
 from mddag_executor.executor.miss_log import MissLog
 from mddag_executor.executor.miss_notifier import MissNotifier
+from mddag_executor.executor.name_check import NameCheck
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
 from mddag_executor.executor.settings import Thresholds
@@ -55,6 +56,7 @@ from mddag_executor.executor.shutdown import (
     is_over,
 )
 from mddag_executor.executor.statistics import statistics
+from mddag_executor.executor.statistics_types import Statistics
 from mddag_executor.executor.tasks import make_task, Unclaimed
 from mddag_executor.executor.upkeep import Upkeep
 from mddag_executor.executor.verdicts import DeadlineMiss
@@ -62,6 +64,7 @@ from mddag_executor.executor.waitables import WaitSetThread
 from mddag_executor.executor.work import current, QuickCallback, Work
 from mddag_executor.executor.workers import WorkerPool
 from msg_graph import TaskSet
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, TimeoutObject
 from rclpy.task import Future, Task
@@ -69,6 +72,7 @@ from rclpy.task import Future, Task
 if TYPE_CHECKING:
     from rclpy.context import Context
     from rclpy.node import Node
+    from typing_extensions import Self
 
 SETTLE_TURNS = 20
 """So many milliseconds after a future is done its action's callbacks may still take."""
@@ -100,21 +104,25 @@ class MultiDeadlineExecutor(BareExecutor):
     :param num_workers: threads of the pool; by default what the declaration says, else seven.
     :param policy: ``rad`` or another of ``mddag_executor.core.POLICIES``.
     :param context: the context that the executor belongs to, or None for the default one.
-    :param trace: path of an MCAP file to record to, or None.
+    :param trace: path of an MCAP file to record to, or None. A file that is there already is kept:
+        the constructor raises, unless ``overwrite`` is true.
     :param on_deadline_miss: called with each ``DeadlineMiss``, in a thread of its own; what it
         raises comes out of the spin.  If it takes too long, misses are counted and not reported
         (``unreported_misses`` in ``statistics()``).
-    :param default_deadline: relative deadline of undeclared callbacks: ns, or text as ``100ms``.
+    :param default_deadline: relative deadline of undeclared callbacks: ns, text as ``100ms``, or
+        an rclpy ``Duration``.
     :param worker_policy: real-time policy of the workers, ``SCHED_FIFO`` or ``SCHED_RR``.
     :param worker_priority: their priority under it.
     :param worker_cpus: the CPUs that they may use.
     :param freeze_gc: when the first spin begins, collect garbage and have the collector leave
         alone what there is by then (``gc.freeze``): for programs that make their nodes first.
-    :param diagnostics_period: how often to publish on ``/diagnostics`` while it spins: ns, or text
-        as ``1s``; None or 0: not at all.
+    :param diagnostics_period: how often to publish on ``/diagnostics`` while it spins: as
+        ``default_deadline``; None or 0: not at all.
     :param thresholds: what makes a status of the diagnostics worse than OK.
     :param process: which of the declared ``processes`` this is; what runs in the others is not
         counted as missing.
+    :param num_threads: ``num_workers`` under the name that ``MultiThreadedExecutor`` has for it.
+    :param overwrite: whether ``trace`` may replace a file.
     :raises msg_graph.GraphError: when the declaration is not right.
     :raises mddag_executor.errors.MddagError: on an unknown policy or thread setting, a
         value of the wrong kind, and when the trace cannot be written.
@@ -128,20 +136,22 @@ class MultiDeadlineExecutor(BareExecutor):
         *,
         policy: str = 'rad',
         context: Context | None = None,
-        trace: str | None = None,
+        trace: str | os.PathLike[str] | None = None,
         on_deadline_miss: Callable[[DeadlineMiss], None] | None = None,
-        default_deadline: int | str = DEFAULT_DEADLINE_NS,
+        default_deadline: int | str | Duration = DEFAULT_DEADLINE_NS,
         max_active_jobs: int = MAX_ACTIVE_JOBS,
         worker_policy: str | None = None,
         worker_priority: int | None = None,
-        worker_cpus: set[int] | None = None,
+        worker_cpus: Iterable[int] | None = None,
         freeze_gc: bool = False,
-        diagnostics_period: int | str | None = None,
+        diagnostics_period: int | str | Duration | None = None,
         thresholds: Thresholds | None = None,
         process: str | None = None,
+        num_threads: int | None = None,
+        overwrite: bool = False,
     ) -> None:
         task_set, num_workers, deadline_ns = settings.resolve(
-            graph, num_workers, default_deadline)
+            graph, num_workers, default_deadline, num_threads)
         prepare = settings.thread_setting(worker_policy, worker_priority, worker_cpus)
         every_ns = settings.diagnostics_period_ns(diagnostics_period)
         max_active_jobs = settings.whole_number(
@@ -155,12 +165,14 @@ class MultiDeadlineExecutor(BareExecutor):
         publishing.install()
         self._trace_clock = TraceClock()
         self._recorder = None if trace is None else Recorder(
-            trace, task_set, policy, num_workers, deadline_ns, max_active_jobs, self._trace_clock)
+            os.fspath(trace), task_set, policy, num_workers, deadline_ns, max_active_jobs,
+            self._trace_clock, overwrite=overwrite)
         self._errors: deque[BaseException] = deque()
         self._process = process
         self._unclaimed = Unclaimed(self._fail, lambda: self._at_once.ring())
         self._spinning = threading.Lock()
         self._finished = False
+        self._ended_by_callback = False
         # reentrant: a signal's handler may end the run in the thread that ends it
         self._ending = threading.RLock()
         self._freeze_gc = freeze_gc
@@ -185,6 +197,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._task_entity = Entity(TASK, None, '', None, -1, 0, '')
         if self._recorder is not None:
             self._recorder.entities((), [self._task_entity])
+        self._names = NameCheck(task_set, self._registry, process)
         self._announcements: Announcements | None = None
         self._checks = ContextChecks()
         self._stepping: select.epoll | None = None
@@ -207,7 +220,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._registry.own = {*self._announcements.subscriptions}
         # What is ready still would run before the spin notices.
         call_at_shutdown(self.context, self._pool.start_no_more)
-        call_at_shutdown(self.context, self.wake)
+        call_at_shutdown(self.context, self._context_ends)
         halt_at_exit(self)
 
     def _nodes_to_serve(self) -> list[Any]:
@@ -216,6 +229,14 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _context_ended(self) -> bool:
         return is_over(self.context)
+
+    def _context_ends(self) -> None:
+        """Take note of who ends the context: one of this executor's callbacks, or not."""
+        running = current.running
+        self._ended_by_callback = (
+            running is not None and running.engine is self._engine
+            or self._notifier is not None and self._notifier.is_calling())
+        self.wake()
 
     # --- nodes -----------------------------------------------------------------------------------
 
@@ -310,12 +331,16 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         Run callbacks on the pool until shutdown.
 
-        :raises ExternalShutdownException: when the context ends.
+        It returns also when a callback ends the context (``rclpy.shutdown``), and at once when
+        that has ended before.
+
+        :raises ExternalShutdownException: when something else ends the context.
         :raises RuntimeError: when the executor spins already.
         :raises Exception: what a callback raised.
         """
         with short_switch_interval():
             self._spin(lambda: False, None)
+        self._raise_error()  # of the callback that has ended the context, after that
 
     def spin_until_future_complete(
         self, future: Future, timeout_sec: float | None = None
@@ -333,9 +358,8 @@ class MultiDeadlineExecutor(BareExecutor):
         if not self._spinning.acquire(blocking=False):
             raise RuntimeError('Executor is already spinning')
         try:
-            if self.is_ending():
+            if self.is_ending() or is_over(self.context):
                 return
-            self._check_context()
             if self._freeze_gc:
                 self._freeze_gc = False
                 gc.collect()
@@ -353,10 +377,12 @@ class MultiDeadlineExecutor(BareExecutor):
                     self._settle()
                     self._raise_error()  # of what ran before it was done
                     return
-                self._check_context()
+                if self._was_ended():
+                    return
                 self._submit_tasks()
                 if self._diagnostics is not None:
                     self._diagnostics.start()
+                self._names.look(self._engine.is_judging)
                 rest = self._upkeep.rest_s()
                 if rest == 0.0:
                     self._upkeep.refresh()
@@ -367,8 +393,8 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._at_once.handle(self._at_once.loop.wait(-1 if left is None else left))
             self._raise_error()
         except RCL_ERRORS:
-            self._check_context()
-            raise
+            if not self._was_ended():
+                raise
         finally:
             self._pool.pause()
             if is_over(self.context):
@@ -381,7 +407,7 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _patience_s(self, deadline: float | None, rest: float | None) -> float | None:
         """Return for how long the spinning thread may wait; None: until something rings."""
-        times = [rest, self._unclaimed.rest_s()]
+        times = [rest, self._unclaimed.rest_s(), self._names.rest_s()]
         if self._checks.at is not None:
             self._checks.due()
             times.append(self._checks.seconds())
@@ -405,6 +431,20 @@ class MultiDeadlineExecutor(BareExecutor):
                 return
             time.sleep(0.001)
 
+    def _was_ended(self) -> bool:
+        """
+        Return whether a callback has ended the context.
+
+        :raises ExternalShutdownException: when something else has.
+        """
+        if not is_over(self.context):
+            return False
+        with suppress(InvalidHandle):
+            self.context.ok()  # it has a lock, so whoever is just ending it has noted that now
+        if not self._ended_by_callback:
+            raise ExternalShutdownException()
+        return True
+
     def _check_context(self) -> None:
         if is_over(self.context):
             raise ExternalShutdownException()
@@ -422,8 +462,11 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _raise_error(self) -> None:
         self._unclaimed.look()
-        if self._errors:
-            raise self._errors.popleft()
+        while self._errors:
+            error = self._errors.popleft()
+            # what others raised just because a callback has ended their context
+            if not (self._ended_by_callback and isinstance(error, RCL_ERRORS)):
+                raise error
 
     @contextmanager
     def _serve_meanwhile(self) -> Iterator[None]:
@@ -556,6 +599,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._pool.loop.close()
                 self._at_once.loop.close()
 
+
     def _end_run(self) -> None:
         """Judge what is open and close the trace, once; whoever comes second waits for that."""
         with self._ending:
@@ -574,8 +618,6 @@ class MultiDeadlineExecutor(BareExecutor):
             now = self._pool.tick()
             end = min(now, self._pool.stopped_at or now)
             self._engine.finish(now, end)
-        if self._notifier is not None:
-            self._notifier.stop()
         if self._recorder is not None:
             self._recorder.close(now, end)
 
@@ -616,7 +658,12 @@ class MultiDeadlineExecutor(BareExecutor):
             pass  # destroyed meanwhile
         return found
 
-    def statistics(self) -> dict[str, Any]:
-        """Return a snapshot of what has happened so far (see the module ``statistics``)."""
+    def __enter__(self) -> Self:
+        """Return the executor; it is shut down at the end of the block."""
+        super().__enter__()
+        return self
+
+    def statistics(self) -> Statistics:
+        """Return a snapshot of what has happened so far: see ``Statistics`` for its keys."""
         return statistics(
             self._pool, self._registry, self._recorder, self._process, self._notifier)

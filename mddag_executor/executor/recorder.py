@@ -28,6 +28,7 @@ class Recorder:
     for the entity (``Entity``).
 
     :param writer: writes the file, as a ``TraceWriter``; None: one that keeps nobody waiting.
+    :param overwrite: whether the file may replace one that is there.
     :param cpus: that there are, 0: nobody knows; None: the machine's.
     :raises mddag_executor.trace.TraceError: when the file cannot be written.
     """
@@ -35,11 +36,11 @@ class Recorder:
     def __init__(
         self, path: str, task_set: TaskSet | None, policy: str, workers: int,
         default_deadline: int, max_active_jobs: int, clock: TraceClock, writer: Any = None,
-        cpus: int | None = None,
+        cpus: int | None = None, overwrite: bool = False,
     ) -> None:
         if writer is None:
             from mddag_executor.trace.writer import TraceWriter  # late: it loads the compression
-            writer = TraceWriter(path, clock_offset=clock.offset_ns)
+            writer = TraceWriter(path, clock_offset=clock.offset_ns, overwrite=overwrite)
         self.writer = writer
         self.record = self.writer.record
         self.path = path

@@ -30,10 +30,12 @@ from mddag_executor.executor.work import Work
 from msg_graph import binding, Callback, TaskSet
 from msg_graph.duration import exact_duration
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import EventHandler, QoSSubscriptionEventType
 from rclpy.exceptions import InvalidHandle
-from rclpy.qos import HistoryPolicy
+from rclpy.qos import HistoryPolicy, qos_policy_name_from_kind
 
 _MOST_UNDECLARED = 4096
+_INCOMPATIBLE = QoSSubscriptionEventType.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS
 
 KINDS = (TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE)
 """In the order of ``snapshot.LISTS``."""
@@ -106,9 +108,10 @@ class Registry:
         made = [self._new_entity(*each) for each in new]
         added = [each for each in made if each is not None]
         present.update((id(each.rclpy), each) for each in added)
-        self.by_id = present
-        self._retired.extend(gone)
-        self._fold()
+        with self._counting:
+            self.by_id = present
+            self._retired.extend(gone)
+            self._fold()
         self._free_groups()
         return added, gone
 
@@ -150,18 +153,20 @@ class Registry:
 
     def publishes(self) -> dict[str, set[str]]:
         """Return on which topics each declared callback has published."""
-        found = {callback.key: set(self._published.get(callback.key, ()))
-                 for callback in self.declared}
-        for entity in (*self._retired, *self.by_id.values()):
-            if entity.callback is not None:
-                found[entity.callback.key] |= entity.publishes
+        with self._counting:
+            found = {callback.key: set(self._published.get(callback.key, ()))
+                     for callback in self.declared}
+            for entity in (*self._retired, *self.by_id.values()):
+                if entity.callback is not None:
+                    found[entity.callback.key] |= entity.publishes
         return found
 
     def counts(self) -> dict[str, dict[str, Any]]:
         """Return the counts of all entities there have been, by callback (see ``Entity``)."""
-        counts = {name: dict(past) for name, past in self._past.items()}
-        for entity in (*self._retired, *self.by_id.values()):
-            entity.count_into(counts)
+        with self._counting:
+            counts = {name: dict(past) for name, past in self._past.items()}
+            for entity in (*self._retired, *self.by_id.values()):
+                entity.count_into(counts)
         return counts
 
     def computing(self) -> int:
@@ -175,13 +180,14 @@ class Registry:
         Unlike ``counts`` this costs next to nothing for an entity that nobody uses.
         """
         totals = dict.fromkeys(COUNTS, 0)
-        for past in list(self._past.values()):
-            for key in COUNTS:
-                totals[key] += past[key]
-        for entity in (*self._retired, *self.by_id.values()):
-            if entity.ready or entity.skipped:
+        with self._counting:
+            for past in self._past.values():
                 for key in COUNTS:
-                    totals[key] += getattr(entity, key)
+                    totals[key] += past[key]
+            for entity in (*self._retired, *self.by_id.values()):
+                if entity.ready or entity.skipped:
+                    for key in COUNTS:
+                        totals[key] += getattr(entity, key)
         return totals
 
     def hosted(self) -> set[str]:
@@ -196,6 +202,10 @@ class Registry:
             return set()
         return {c.key for c in self.declared if self._task_set.process_of(c.node) != process}
 
+    def unbound(self) -> list[Callback]:
+        """Return the declared callbacks that no entity is bound to now."""
+        return [] if self._binder is None else self._binder.unbound()
+
     def undeclared(self) -> list[binding.Entity]:
         """Return the timers, subscriptions and services there were that are not declared."""
         return list(self._undeclared)
@@ -203,6 +213,14 @@ class Registry:
     def subscriptions(self) -> list[Entity]:
         """Return the subscriptions that there are now."""
         return [entity for entity in self.by_id.values() if entity.kind == SUBSCRIPTION]
+
+    def note_event(self, handler: EventHandler, status: Any) -> None:
+        """Take note of a QoS event: of the policy for which a subscription gets nothing."""
+        if status is None or handler.event_type != _INCOMPATIBLE:
+            return
+        for entity in self.subscriptions():
+            if handler in entity.rclpy.event_handlers:
+                entity.incompatible_qos = qos_policy_name_from_kind(status.last_policy_kind)
 
     def timers(self) -> list[Entity]:
         """Return the timers that there are now."""

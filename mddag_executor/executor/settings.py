@@ -19,13 +19,14 @@ from mddag_executor.errors import UsageError
 from msg_graph import load, parse_duration, TaskSet
 from msg_graph.duration import DAY
 from msg_graph.errors import did_you_mean, listed, shown
+from msg_graph.model import MOST_WORKERS
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.exceptions import NotInitializedException
 from rclpy.utilities import get_default_context
 
 THREAD_POLICIES = ('SCHED_OTHER', 'SCHED_BATCH', 'SCHED_FIFO', 'SCHED_RR')
 SHORTEST_DIAGNOSTICS_NS = 10_000_000
-MOST_WORKERS = 4096
 MOST_JOBS = 1_000_000
 
 
@@ -111,14 +112,20 @@ class Thresholds:
             whole_number(field, getattr(self, field), MOST_JOBS)
 
 
-def diagnostics_period_ns(period: int | str | None) -> int | None:
+def _nanoseconds(time: Any) -> Any:
+    """Return the ns of a text as ``1s`` or of rclpy's ``Duration``; else what it is."""
+    if isinstance(time, str):
+        return parse_duration(time)
+    return time.nanoseconds if isinstance(time, Duration) else time
+
+
+def diagnostics_period_ns(period: int | str | Duration | None) -> int | None:
     """
     Return the period of the diagnostics in ns, None for none.
 
-    :param period: ns, or text as ``1s``; None or 0: no diagnostics.
+    :param period: ns, text as ``1s``, or a ``Duration``; None or 0: no diagnostics.
     """
-    if isinstance(period, str):
-        period = parse_duration(period)
+    period = _nanoseconds(period)
     if period is None or period == 0:
         return None
     period = whole_number('diagnostics_period', period, DAY, ' ns')
@@ -131,23 +138,28 @@ def diagnostics_period_ns(period: int | str | None) -> int | None:
 
 def resolve(
     graph: str | os.PathLike[str] | TaskSet | None, num_workers: int | None,
-    default_deadline: int | str,
+    default_deadline: int | str | Duration, num_threads: int | None = None,
 ) -> tuple[TaskSet | None, int, int]:
     """
     Return the task set, the number of workers and the default deadline (ns) of an executor.
 
+    :param num_threads: what ``MultiThreadedExecutor`` calls ``num_workers``.
     :raises msg_graph.GraphError: when the declaration is not right.
     """
     task_set = load(graph) if isinstance(graph, (str, os.PathLike)) else graph
     if task_set is not None and not isinstance(task_set, TaskSet):
         raise UsageError(f'graph: {graph!r} is no declaration: give the path of one, a TaskSet, '
-                         'or None')
+                         'or None' + (f'; a number of threads is num_workers={graph}'
+                                      if type(graph) is int else ''))
+    if num_threads is not None:
+        if num_workers is not None:
+            raise UsageError('num_threads: num_workers is given, too: give one of the two')
+        num_workers = whole_number('num_threads', num_threads, MOST_WORKERS)
     if num_workers is None:
         num_workers = workers(None, task_set)
     num_workers = whole_number('num_workers', num_workers, MOST_WORKERS)
-    if isinstance(default_deadline, str):
-        default_deadline = parse_duration(default_deadline)
-    default_deadline = whole_number('default_deadline', default_deadline, DAY, ' ns')
+    default_deadline = whole_number(
+        'default_deadline', _nanoseconds(default_deadline), DAY, ' ns')
     return task_set, num_workers, default_deadline
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What an executor has done: a snapshot in plain dictionaries, as ``--json`` has them, and drift.
+What an executor has done: a snapshot in plain dictionaries (``statistics_types``), and drift.
 
 The rules of drift are in ``msg_graph.drift``. What they need to know of a live run the executor
 keeps anyway, but for the releases: ``Watch`` gets each of them.
@@ -9,13 +9,14 @@ keeps anyway, but for the releases: ``Watch`` gets each of them.
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import cast, TYPE_CHECKING
 
 from mddag_executor.core.tally import counts, never_due
 from mddag_executor.executor.miss_notifier import MissNotifier
 from mddag_executor.executor.workers import WorkerPool
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
+from mddag_executor.executor.statistics_types import CallbackCounts, Statistics, Stops
 from msg_graph import TaskSet
 from msg_graph.drift import Drift, drift, Observed, Releases
 
@@ -26,41 +27,29 @@ if TYPE_CHECKING:
 def statistics(
     pool: WorkerPool, registry: Registry, recorder: Recorder | None, process: str | None = None,
     notifier: MissNotifier | None = None,
-) -> dict[str, Any]:
-    """
-    Return the counts of a run.
-
-    ``dags``, ``deadline_missed`` and ``first_miss`` are as in ``replay --json``.  ``callbacks``
-    has for each entity what became ready, ran, failed (raised), waits, was dropped (QoS depth,
-    destroyed, aborted) or skipped (timers), its busy time in ns, whether it holds the interpreter
-    while it runs, and for which part of its time it needs that (None: not known yet).
-    ``unattributed`` counts messages of declared callbacks whose publication was not found; they
-    ran as undeclared ones.  ``stops`` has how often and for how long no thread of the process ran
-    while it spun, how many misses these stops explain, and the times of the last ones (ns since
-    the epoch).  ``unreported_misses`` counts those that ``on_deadline_miss``
-    was not called with, because it had not returned from earlier ones in time.
-    """
+) -> Statistics:
+    """Return the counts of a run; ``statistics_types`` says what each means."""
     engine = pool.engine
     with pool.lock:
         result = engine.verdicts.tally.result()
-        stops = engine.verdicts.stops.result()
+        stops = cast(Stops, engine.verdicts.stops.result())
         waiting = engine.scheduler.queue_length
         idle = engine.scheduler.idle_workers
         undeclared = engine.undeclared
-        callbacks = registry.counts()
         elsewhere = set() if engine.other_processes is None else engine.other_processes.elsewhere()
     elsewhere |= registry.elsewhere(process)
+    callbacks = cast('dict[str, CallbackCounts]', registry.counts())
     never_ran = [c.key for c in registry.declared
                  if c.key not in elsewhere
                  and (c.key not in callbacks or not callbacks[c.key]['ran'])]
     for dag in result['dags'].values():  # their sinks are judged where they are
         dag['sinks'] = {name: sink for name, sink in dag['sinks'].items()
                         if name.partition('@')[0] not in elsewhere or counts(sink).due}
-    result['never_due'] = never_due(result['dags'])
     return {
         'policy': engine.scheduler.policy.name, 'workers': engine.n_workers,
-        **result, 'stops': stops, 'callbacks': callbacks,
-        'undeclared': undeclared,
+        'deadline_missed': result['deadline_missed'], 'first_miss': result['first_miss'],
+        'never_due': never_due(result['dags']), 'dags': result['dags'], 'stops': stops,
+        'callbacks': callbacks, 'undeclared': undeclared,
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
         'queue': waiting, 'idle_workers': idle, 'lent': pool.lent,
         'unattributed': {
@@ -93,11 +82,11 @@ class Watch:
         if dag < len(self._releases):
             self._releases[dag].add(release)
 
-    def drift(self, statistics: dict[str, Any]) -> list[Drift]:
+    def drift(self, statistics: Statistics) -> list[Drift]:
         """Return where the run and the declaration disagree; ``statistics`` are its counts."""
         return drift(self._task_set, self.observed(statistics))
 
-    def observed(self, statistics: dict[str, Any]) -> Observed:
+    def observed(self, statistics: Statistics) -> Observed:
         """Return what was seen; ``statistics`` are the counts of the run."""
         first = min((r.first for r in self._releases if r.count), default=self._begin)
         counts = statistics['callbacks']

@@ -11,6 +11,7 @@ from typing import Any
 from mddag_executor.errors import MddagError
 from mddag_executor.text import counted
 from msg_graph.duration import DAY
+from msg_graph.model import MOST_WORKERS
 
 METHODS = ('dirichlet', 'uunifast')
 BASES = ('period', 'path')
@@ -57,7 +58,7 @@ class Options:
         0.5, 'U[:U]', 'utilisation: the load of all DAGs divided by the workers, with mean '
         'execution times; with --sets two bounds, over which the sets are spread evenly',
         most=100.0, above=True)
-    workers: int = _of(4, 'M', 'declared number of workers', 1, 1024)
+    workers: int = _of(4, 'M', 'declared number of workers', 1, MOST_WORKERS)
     method: str = _of(
         'dirichlet', '', 'how the utilisation is distributed over DAGs and callbacks: '
         'Dirichlet-rescale or UUniFast(-Discard)', choices=METHODS)

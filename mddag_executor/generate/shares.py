@@ -30,6 +30,8 @@ T = TypeVar('T')
 
 _MOST_TRIES = 10_000
 _MOST_STRETCHES = 1_000
+_NEGLIGIBLE = 1e-6
+"""A bound of this part of the total is treated as 0: a draw would hardly ever be below it."""
 
 
 class Dice:
@@ -99,7 +101,11 @@ def dirichlet_rescale(dice: Dice, total: float, most: Sequence[float]) -> list[f
 def _stretched(dice: Dice, total: float, most: Sequence[float]) -> list[float]:
     if total <= 0.0:
         return [0.0] * len(most)
-    while True:
+    some = [limit for limit in most if limit > total * _NEGLIGIBLE]
+    if len(some) < len(most):
+        dealt = iter(_stretched(dice, total, some))
+        return [next(dealt) if limit > total * _NEGLIGIBLE else 0.0 for limit in most]
+    for _ in range(_MOST_TRIES):
         # A flat Dirichlet distribution: exponential numbers by their sum.
         numbers = [-math.log(1.0 - dice.number()) for _ in most]
         factor = total / sum(numbers)
@@ -115,3 +121,6 @@ def _stretched(dice: Dice, total: float, most: Sequence[float]) -> list[float]:
                 break  # nothing but rounding is left to stretch
             lower = [limit if is_over else 0.0 for limit, is_over in zip(most, over)]
             shares = [(share - less) * total / rest for share, less in zip(shares, lower)]
+    raise GenerateError(
+        f'--method dirichlet: {_MOST_TRIES} draws did not fit: give more --dags, or a larger '
+        '--max-dag-load')

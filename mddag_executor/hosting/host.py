@@ -44,8 +44,8 @@ import weakref
 
 from mddag_executor.hosting.guest_executor import GuestExecutor, make_guest
 from mddag_executor.hosting.guest_signals import GuestSignals
-from mddag_executor.hosting.loading import describe, LoadingError, Program, resolve
 from mddag_executor.executor.compat import executor_kept
+from mddag_executor.hosting.loading import describe, LoadingError, Program, ProgramFailed, resolve
 from mddag_executor.replacements import instead, Replacements
 import rclpy
 from rclpy.context import Context
@@ -190,7 +190,8 @@ class Host:
         if isinstance(guest.error, LoadingError):
             raise guest.error
         if guest.error is not None:
-            raise LoadingError(
+            failure = ProgramFailed if isinstance(guest.error, Exception) else LoadingError
+            raise failure(
                 spec, f'it failed while starting ({describe(guest.error)})',
                 'correct it, or see how it runs by itself') from guest.error
         if guest.ended and not guest.nodes and not guest.uses_ros:

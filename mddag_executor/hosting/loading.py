@@ -39,7 +39,7 @@ from ament_index_python.packages import (
     get_packages_with_prefixes,
     PackageNotFoundError,
 )
-from mddag_executor.errors import MddagError
+from mddag_executor.errors import MddagError, UserCodeError
 from msg_graph.errors import did_you_mean
 from rclpy.node import Node
 
@@ -50,6 +50,10 @@ class LoadingError(MddagError):
     def __init__(self, spec: str, problem: str, remedy: str) -> None:
         super().__init__(f'--node {spec}: {problem}: {remedy}')
         self.spec = spec
+
+
+class ProgramFailed(LoadingError, UserCodeError):
+    """A program that raised before its nodes were there; its cause is what it raised."""
 
 
 @dataclass(frozen=True)
@@ -148,9 +152,14 @@ def _import(spec: str, module_name: str) -> ModuleType:
             spec, f"'{module_name}' needs the module '{missing}', which is not installed",
             'install it') from error
     except Exception as error:
-        raise LoadingError(
+        raise _failure(error)(
             spec, f"'{module_name}' cannot be imported ({describe(error)})",
             'correct it') from error
+
+
+def _failure(error: Exception) -> type[LoadingError]:
+    """Return the kind of error that an import is which failed: something missing, or a defect."""
+    return LoadingError if isinstance(error, (ImportError, SyntaxError)) else ProgramFailed
 
 
 def _call(spec: str, function: Callable[..., Any]) -> Any:

@@ -33,9 +33,8 @@ from mddag_executor.simulate.load import edge_numbers
 from mddag_executor.text import counted, listed
 from msg_graph import Process, TaskSet
 from msg_graph.derive import no_garbage
+from msg_graph.model import MOST_WORKERS
 import numpy as np
-
-MAX_WORKERS = 4096
 
 
 class Reschedule:
@@ -181,8 +180,8 @@ def reschedule(
     """
     if policy is not None:
         find_policy(policy).mode(bool(preemptive))
-    if workers is not None and not 1 <= workers <= MAX_WORKERS:
-        raise UsageError(f'workers: {workers} is out of range: give 1 to {MAX_WORKERS}')
+    if workers is not None and not 1 <= workers <= MOST_WORKERS:
+        raise UsageError(f'workers: {workers} is out of range: give 1 to {MOST_WORKERS}')
     run = open_run(path, task_set, name, needs_declaration=True)
     head = run.head
     each, ran = (run.workers_each, run.placed) if isinstance(run, OwnRun) else (head.workers, ())
@@ -267,7 +266,7 @@ def _settings(
                 f'give --policy, one of {", ".join(POLICIES)}')
     if workers is None:
         workers = head.workers
-        if not 1 <= workers <= MAX_WORKERS:
+        if not 1 <= workers <= MOST_WORKERS:
             raise ReplayError(
                 name, f'it says that it was recorded with {counted(workers, "worker")}',
                 'give --workers')

@@ -9,10 +9,10 @@ On a terminal rich draws the tables (the extra ``top``), elsewhere they are plai
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from mddag_executor.report.text import printable, table
 
@@ -22,14 +22,39 @@ GONE_AFTER_S = 5.0
 MOST_STATUSES = 1000
 _STYLES = {'OK': 'green', 'WARN': 'yellow', 'ERROR': 'bold red', 'STALE': 'magenta', GONE: 'dim'}
 
-_DAG_TITLES = ('process', 'DAG', 'state', 'period ms', 'jobs', 'lately', 'missed', 'p50 ms',
-               'p99 ms', 'max ms', 'of deadline', 'least margin ms', 'message')
-_DAG_KEYS = ('period_ms', 'jobs', 'window_results', 'window_missed', 'response_p50_ms',
-             'response_p99_ms', 'response_max_ms', 'deadline_used_max', 'margin_min_ms')
-_POOL_TITLES = ('process', 'workers of', 'state', 'idle', 'queue', 'per s', 'busy', 'CPU',
-                'us each', 'compute', 'dropped', 'skipped', 'no job', 'message')
-_POOL_KEYS = ('idle_workers', 'queue', 'callbacks_per_s', 'busy_ratio', 'cpu_ratio',
-              'cpu_us_per_callback', 'computing', 'dropped', 'skipped', 'unattributed')
+
+class Column(NamedTuple):
+    """
+    A column of a table: its title, and the field or the value of a status that it shows.
+
+    :ivar unit: ``ms`` or ``%`` (the value is a share), or nothing.
+    """
+
+    title: str
+    key: str
+    unit: str = ''
+
+
+# The most important ones first: a narrow terminal leaves columns out from the right.
+_DAG_COLUMNS = (
+    Column('DAG', 'name'), Column('state', 'level'), Column('results', 'window_results'),
+    Column('missed', 'window_missed'), Column('p99', 'response_p99_ms', 'ms'),
+    Column('of deadline', 'deadline_used_max', '%'), Column('p50', 'response_p50_ms', 'ms'),
+    Column('max', 'response_max_ms', 'ms'), Column('jobs', 'jobs'),
+    Column('period', 'period_ms', 'ms'), Column('least margin', 'margin_min_ms', 'ms'),
+    Column('message', 'message'))
+_POOL_COLUMNS = (
+    Column('workers of', 'name'), Column('state', 'level'), Column('busy', 'busy_ratio', '%'),
+    Column('CPU', 'cpu_ratio', '%'), Column('idle', 'idle_workers'), Column('queue', 'queue'),
+    Column('dropped', 'dropped'), Column('per s', 'callbacks_per_s'),
+    Column('us each', 'cpu_us_per_callback'), Column('compute', 'computing'),
+    Column('skipped', 'skipped'), Column('no job', 'unattributed'), Column('message', 'message'))
+_PROCESS = Column('process', 'process')
+_WORDS = ('process', 'name', 'level', 'message')
+_LEAST = 3          # so many columns stay
+_MESSAGE = 20       # a message has this much room, or no column
+_MOST_MESSAGES = 5  # of what is not OK, below the tables
+KEYS = 'q or Ctrl-C: quit'
 
 
 @dataclass(frozen=True)
@@ -94,48 +119,97 @@ class Board:
              'values': s.values} for s in self.statuses()]}
 
 
-def dag_rows(statuses: list[Status]) -> list[list[str]]:
-    """Return the rows of the table of DAGs: one list for all processes, DAG by DAG."""
-    return [_row(s, _DAG_KEYS) for s in sorted(statuses, key=lambda s: (s.name, s.process))
-            if not s.is_pool]
+def of_dags(statuses: list[Status]) -> list[Status]:
+    """Return the statuses of DAGs: one list for all processes, DAG by DAG."""
+    return sorted((s for s in statuses if not s.is_pool), key=lambda s: (s.name, s.process))
 
 
-def pool_rows(statuses: list[Status]) -> list[list[str]]:
-    """Return the rows of the table of workers."""
-    return [_row(s, _POOL_KEYS) for s in statuses if s.is_pool]
+def of_pools(statuses: list[Status]) -> list[Status]:
+    """Return the statuses of workers."""
+    return [s for s in statuses if s.is_pool]
 
 
-def _row(status: Status, keys: tuple[str, ...]) -> list[str]:
-    name = status.name
-    if status.is_pool:
-        name = name.rpartition(': ')[0] or name
-    cells = (status.process, name, status.level, *(status.values.get(k) or '-' for k in keys),
-             status.message)
-    return [printable(cell) for cell in cells]
+def _cell(status: Status, column: Column) -> str:
+    """Return what a column shows of a status."""
+    if column.key == 'name' and status.is_pool:
+        return printable(status.name.rpartition(': ')[0] or status.name)
+    if column.key in _WORDS:
+        return printable(getattr(status, column.key))
+    value = status.values.get(column.key) or '-'
+    if column.unit == '%':
+        try:
+            return f'{100 * float(value):.0f} %'
+        except (ValueError, OverflowError):
+            return printable(value)
+    return printable(value if value == '-' or not column.unit else f'{value} {column.unit}')
+
+
+def columns_that_fit(
+    columns: Sequence[Column], rows: Sequence[Status], width: int | None
+) -> list[Column]:
+    """
+    Return the columns for a terminal: as many as there is room for.
+
+    The process is shown if there are several.
+
+    :param width: of the terminal; None: there is room for all.
+    """
+    kept = [*([_PROCESS] if width is None or len({s.process for s in rows}) > 1 else []), *columns]
+
+    def needed(column: Column) -> int:
+        widest = max((len(_cell(s, column)) for s in rows), default=0)
+        return max(len(column.title), min(widest, _MESSAGE) if column.key == 'message' else widest)
+
+    while width is not None and len(kept) > _LEAST and (
+            sum(needed(column) + 2 for column in kept) - 2 > width):
+        kept.pop()
+    return kept
 
 
 def plain(statuses: list[Status]) -> str:
-    """Return both tables as text."""
-    return (table(_DAG_TITLES, dag_rows(statuses)) + '\n'
-            + table(_POOL_TITLES, pool_rows(statuses)))
+    """Return both tables as text, with all columns."""
+    return '\n'.join(
+        table([column.title for column in columns],
+              ([_cell(s, column) for column in columns] for s in rows))
+        for columns, rows in (
+            (columns_that_fit(_DAG_COLUMNS, of_dags(statuses), None), of_dags(statuses)),
+            (columns_that_fit(_POOL_COLUMNS, of_pools(statuses), None), of_pools(statuses))))
 
 
-def picture(statuses: list[Status]) -> Any:
-    """Return both tables for rich; nothing in them is taken for markup."""
+def picture(statuses: list[Status], width: int) -> Any:
+    """
+    Return for rich both tables, what is not OK, and the keys; nothing is taken for markup.
+
+    :param width: of the terminal.
+    """
     from rich.console import Group
-    tables = (_rich(_DAG_TITLES, dag_rows(statuses)), _rich(_POOL_TITLES, pool_rows(statuses)))
-    return Group(*tables)
+    from rich.text import Text
+    parts: list[Any] = []
+    messages = []
+    for every, rows in ((_DAG_COLUMNS, of_dags(statuses)), (_POOL_COLUMNS, of_pools(statuses))):
+        columns = columns_that_fit(every, rows, width)
+        parts += [_rich(columns, rows), Text('')]
+        if columns[-1].key != 'message':
+            messages += [s for s in rows if s.level != 'OK']
+    for s in messages[:_MOST_MESSAGES]:
+        parts.append(Text(printable(f'{s.level} {s.name}: {s.message}'), overflow='ellipsis',
+                          no_wrap=True, style=_STYLES.get(s.level, '')))
+    return Group(*parts, Text(KEYS, style='dim'))
 
 
-def _rich(titles: tuple[str, ...], rows: list[list[str]]) -> Any:
+def _rich(columns: Sequence[Column], rows: Sequence[Status]) -> Any:
     from rich.table import Table
     from rich.text import Text
-    made = Table(box=None, pad_edge=False, header_style='bold')
-    for i, title in enumerate(titles):
-        words = i < 3 or i == len(titles) - 1
-        made.add_column(Text(title), justify='left' if words else 'right', no_wrap=i != 1,
-                        overflow='fold' if i == 1 else 'ellipsis')
-    for row in rows:
-        style = _STYLES.get(row[2], '')
-        made.add_row(*(Text(cell, style=style if i == 2 else '') for i, cell in enumerate(row)))
+    made = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style='bold')
+    for column in columns:
+        name, message = column.key == 'name', column.key == 'message'
+        made.add_column(
+            Text(column.title), justify='left' if column.key in _WORDS else 'right',
+            no_wrap=not name, overflow='fold' if name else 'ellipsis',
+            min_width=None if name or message else max(
+                (len(_cell(s, column)) for s in rows), default=0))
+    for s in rows:
+        style = _STYLES.get(s.level, '')
+        made.add_row(*(Text(_cell(s, column), style=style if column.key == 'level' else '')
+                       for column in columns))
     return made

@@ -126,6 +126,9 @@ class Target:
     def finish(self) -> None:
         """Write what is left."""
 
+    def abandon(self) -> None:
+        """Write nothing more, after an error."""
+
 
 class Exporter(Observer):
     """Makes rows of a replay that it watches."""
@@ -290,6 +293,10 @@ class Ordered(Target):
             self._target.verdict(*verdict)
         self._target.finish()
 
+    def abandon(self) -> None:
+        """Write nothing more, after an error."""
+        self._target.abandon()
+
 
 def by_release(row: ExecutionRow) -> int:
     """Return the release of an execution's job, the readiness of what has none."""
@@ -328,6 +335,10 @@ class Rows(Target):
         """Write what is left."""
         self._writer.end()
 
+    def abandon(self) -> None:
+        """Write nothing more, after an error."""
+        self._writer.abandon()
+
 
 class CsvWriter:
     """Writes rows as CSV (RFC 4180, UTF-8) below a line of titles; no value is an empty cell."""
@@ -345,6 +356,9 @@ class CsvWriter:
         """Leave the file to its owner."""
         self._text.flush()
         self._text.detach()
+
+    def abandon(self) -> None:
+        """Leave the file to its owner, without what is buffered."""
 
 
 def _cell(value: Any) -> Any:
@@ -392,6 +406,10 @@ class ParquetWriter:
         """Write what is left, and the footer."""
         self._flush()
         self._writer.close()
+
+    def abandon(self) -> None:
+        """Keep pyarrow from writing a footer when it is collected: the file is closed by then."""
+        self._writer.is_open = False
 
 
 def check_available(form: str) -> None:

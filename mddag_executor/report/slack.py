@@ -45,6 +45,12 @@ def _margins(sink: Mapping[str, Any]) -> list[Cell]:
 
 def _summary(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines that stand below the tables."""
+    never = [name for name, sink in result['sinks'].items()
+             if sink['margin_ns'] is None and not result['missed'].get(name)]
+    if never:
+        yield f'never completed, so not judged: {counted(len(never), "sink")}: {listed(never)}'
+    if len(never) == len(result['sinks']):
+        return
     if len(result['left_out']) == len(result['sinks']):
         yield 'every sink misses every deadline as things are: nothing is left that could break'
         return

@@ -22,6 +22,7 @@ from typing import Any
 from mddag_executor import defaults
 from mddag_executor.core import policy as find_policy
 from mddag_executor.hosting.loading import Program, resolve, ros_arguments
+from mddag_executor.output_rules import check_distinct, check_replaced
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.outputs import Output
@@ -51,6 +52,7 @@ def rerun(
     output: str | os.PathLike[str] | None = None,
     trace: str | os.PathLike[str] | None = None,
     patience_s: float = PATIENCE_S,
+    overwrite: bool = False,
 ) -> Result:
     """
     Run nodes from a recording in virtual time.
@@ -62,6 +64,7 @@ def rerun(
     :param nodes: as for ``mddag run --node``; or classes of nodes, or functions that return nodes.
     :param times: ``recorded``, ``declared``, or a file (see ``sources.open_source``).
     :param output: a file that gets the outputs as a bag; ``trace``: one that gets the run.
+    :param overwrite: whether ``output`` and ``trace`` may replace files that are there.
     :param patience_s: a callback or thread that waits for this long, and not in virtual time, ends
         the run.
     :raises mddag_executor.errors.MddagError: on whatever keeps the run from going on; a
@@ -70,6 +73,11 @@ def rerun(
     """
     task_set = graph if isinstance(graph, TaskSet) else load(os.fspath(graph))
     find_policy(policy)
+    written = [(name, os.fspath(path)) for name, path in (('output', output), ('trace', trace))
+               if path is not None]
+    check_distinct([('recording', os.fspath(recording))], written)
+    for _, path in written:
+        check_replaced(path, recording=True, overwrite=overwrite)
     settings = Settings(
         defaults.workers(workers, task_set), cpus, policy, seed, all_clocks, patience_s,
         tuple(ros_args))

@@ -4,14 +4,14 @@
 
 from __future__ import annotations
 
-from mddag_executor.errors import MddagError
+from mddag_executor.errors import MddagError, UserCodeError
 
 
 class RerunError(MddagError):
     """A run that cannot go on; its text is `PLACE: what is wrong: what to do`."""
 
 
-class CallbackFailed(RerunError):
+class CallbackFailed(RerunError, UserCodeError):
     """
     A callback, or a program's main, has raised: the cause of this exception.
 

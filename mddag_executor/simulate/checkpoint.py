@@ -161,8 +161,9 @@ def _difference(key: str, question: dict[str, Any], now: Any) -> str:
 
 
 def _digest(task_set: TaskSet) -> str:
-    """Return a hash of what a declaration means, wherever it stands in whichever file."""
-    text = repr(without_lines(task_set).dags)
+    """Return a hash of what a declaration means for a run, in whichever files it is written."""
+    plain = without_lines(task_set)
+    text = repr((plain.dags, plain.processes))
     return hashlib.sha256(text.encode()).hexdigest()
 
 

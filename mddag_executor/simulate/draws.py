@@ -153,28 +153,67 @@ def utilisations(task_set: TaskSet, times: Times, workers: int) -> Floats:
 
 
 def feasible(
-    task_set: TaskSet, times: Times, workers: int, duration_ns: int
+    task_set: TaskSet, times: Times, workers: int, duration_ns: int, judge: str = 'horizon',
+    overhead_ns: int = 0,
 ) -> npt.NDArray[np.bool_]:
     """
-    Return for each run whether a scheduler could meet all deadlines, as far as is easily known.
+    Return for each run whether it could be accepted, as far as that is easily known.
 
-    It could not where the longest path to a sink is longer than the sink's deadline, nor where
-    more has to be executed by deadlines within the duration than the workers can by then.
+    A run is not accepted by any scheduler that never lets a worker idle without need,
+
+    * judged by the ``horizon``: if the longest path to a sink is longer than its deadline, or if
+      more has to be executed by deadlines within the duration than the workers can by then;
+    * judged by ``completions``: if the longest path to a sink is longer than its deadline, and the
+      first job of the sink surely completes within the duration (or is aborted at its deadline).
+      Jobs that never complete are not judged, so that an overload alone proves nothing.
+
+    :param overhead_ns: of each dispatch
     """
+    horizon = judge == 'horizon'
     possible = np.ones(len(times), dtype=np.bool_)
     demand = np.zeros(len(times), dtype=np.float64)
+    latest = np.zeros(len(times)) if horizon else _waiting(
+        task_set, times, workers, duration_ns, overhead_ns)
     first = 0
     for dag in task_set.dags:
         offsets = rad_offsets(dag)
         lengths = np.empty((len(dag.vertices), len(times)), dtype=np.int64)
+        # a vertex that has been preempted is dispatched again
+        overheads = 2 * overhead_ns * len(dag.vertices)
         for index in topological_order(dag):
             vertex = dag.vertices[index]
             lengths[index] = times[:, first + index]
             if vertex.predecessors:
                 lengths[index] += lengths[list(vertex.predecessors)].max(axis=0)
             if vertex.deadline_ns is not None and vertex.deadline_ns <= duration_ns:
-                possible &= lengths[index] <= vertex.deadline_ns
+                late = lengths[index] > vertex.deadline_ns
+                if not horizon and dag.on_miss != 'abort':
+                    late &= lengths[index] + overheads + latest < duration_ns
+                possible &= ~late
             jobs = max(0, (duration_ns - offsets[index]) // dag.period_ns + 1)
             demand += float(jobs) * times[:, first + index]
         first += len(dag.vertices)
-    return possible & (demand <= float(workers) * duration_ns)
+    return possible & (demand <= float(workers) * duration_ns) if horizon else possible
+
+
+def _waiting(
+    task_set: TaskSet, times: Times, workers: int, duration_ns: int, overhead_ns: int
+) -> Floats:
+    """
+    Return for how long a job can wait at most while nothing of its own longest path runs, ns.
+
+    All workers are busy then (Graham), with what is released within the duration. With callback
+    groups, processes or the interpreter's lock at least one is.
+    """
+    shared = bool(task_set.processes) or any(
+        callback.group is not None or callback.holds_interpreter
+        for callback in task_set.callbacks)
+    work = np.zeros(len(times))
+    first = 0
+    for dag in task_set.dags:
+        jobs = -(-duration_ns // dag.period_ns)
+        end = first + len(dag.vertices)
+        work += jobs * (times[:, first:end] + 2 * overhead_ns).sum(axis=1)
+        first = end
+    waiting: Floats = work / (1 if shared else workers)
+    return waiting

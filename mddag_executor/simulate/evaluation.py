@@ -149,7 +149,7 @@ class Evaluation:
                 for i, name in enumerate(self.experiment.policies)}
 
     def bound(self) -> Acceptance:
-        """Return the acceptance that no scheduler can exceed."""
+        """Return the acceptance that no scheduler can exceed (see ``feasible``)."""
         return self._acceptance(self.possible)
 
     def _acceptance(self, accepted: Bools) -> Acceptance:

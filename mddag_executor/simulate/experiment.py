@@ -175,5 +175,6 @@ class Evaluator:
         times = draws.times(first, count)
         return (
             utilisations(one.task_set, times, one.workers),
-            feasible(one.task_set, times, one.workers, one.duration_ns),
+            feasible(one.task_set, times, one.workers, one.duration_ns, one.judge,
+                     one.overhead_ns),
             np.array([judge(one.settings(name), times) for name in one.policies]))

@@ -15,6 +15,7 @@ from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.schedule import schedule, Settings
 from msg_graph import TaskSet
+from msg_graph.model import MOST_WORKERS
 
 JUDGES = ('horizon', 'completions')
 
@@ -77,8 +78,9 @@ def simulate(
 
 def check(settings: Settings) -> None:
     """Check that settings make sense."""
-    if settings.workers < 1:
-        raise SimulationError(f'workers: {settings.workers} is too few: give at least 1')
+    if not 1 <= settings.workers <= MOST_WORKERS:
+        raise SimulationError(
+            f'workers: {settings.workers} is out of range: give 1 to {MOST_WORKERS}')
     if settings.duration_ns < 1:
         raise SimulationError(f'duration: {settings.duration_ns} ns is too short: give at least 1')
     if settings.cpus is not None and settings.cpus < 1:

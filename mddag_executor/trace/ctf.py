@@ -41,6 +41,7 @@ import subprocess
 import sys
 from typing import Any, IO, NamedTuple
 
+from mddag_executor.output_rules import holds_data
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.ctf_helper import PATIENCE_S, SESSION
@@ -75,14 +76,16 @@ class Imported:
 def import_ctf(
     session: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str], *, progress: Callable[[int], None] | None = None,
+    overwrite: bool = False,
 ) -> Imported:
     """
     Write the events of a CTF session into a trace file.
 
     :param session: the folder of the session; traces are looked for in all folders below it.
         Several sessions are one run that was recorded on several computers.
-    :param output: the trace; it is not complete when an exception comes up
+    :param output: the trace; there is none after an exception
     :param progress: called now and then with the number of events so far
+    :param overwrite: whether the trace may replace a file that is there
     :raises TraceError: where the session or the file cannot be used, or babeltrace2 is missing
     """
     paths = [os.fspath(path) for path in (
@@ -94,15 +97,22 @@ def import_ctf(
         raise TraceError(name, 'a session is named twice', 'name each once')
     sessions = [_check_sessions(path, each) for path, each in zip(paths, found)]
     places = {each: place for place, (_, several) in enumerate(sessions) for each in several}
-    with TraceFile(output) as file:
-        importer = _Importer(name, file, places)
-        for row in _rows(name, paths, any(is_ctf_2 for is_ctf_2, _ in sessions)):
-            importer.take(row)
-            if progress is not None and row[0] == 'event' and importer.result.events % 5000 == 0:
-                progress(importer.result.events)
-        if importer.result.events == 0:
-            raise TraceError(name, 'no event is recorded in it', _RECORD)
-        importer.finish()
+    file = TraceFile(output, overwrite=overwrite)
+    try:
+        with file:
+            importer = _Importer(name, file, places)
+            for row in _rows(name, paths, any(is_ctf_2 for is_ctf_2, _ in sessions)):
+                importer.take(row)
+                events = importer.result.events
+                if progress is not None and row[0] == 'event' and events % 5000 == 0:
+                    progress(events)
+            if importer.result.events == 0:
+                raise TraceError(name, 'no event is recorded in it', _RECORD)
+            importer.finish()
+    except BaseException:
+        if holds_data(file.path):   # no pipe
+            os.unlink(file.path)
+        raise
     return importer.result
 
 

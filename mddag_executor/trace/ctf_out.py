@@ -29,7 +29,7 @@ from typing import Any, BinaryIO
 from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.errors import renamed, TraceError
 from mddag_executor.trace.reader import TraceReader
-from mddag_executor.trace.schema import EVENTS, PROCESS
+from mddag_executor.trace.schema import EVENTS, PREAMBLE, PROCESS
 
 _MAGIC = 0xC1FC1FC1
 _PACKET_BYTES = 256 * 1024
@@ -185,7 +185,8 @@ class CtfSession:
         self._metadata.append(
             f'event {{ name = "{name}"; id = {number}; stream_id = 0; loglevel = 13; '
             'fields := struct { '
-            + ' '.join(_declared(*each) for each in zip(fields, types)) + ' }; };\n')
+            + ' '.join(_declared(_original(name, fields), kind)
+                       for name, kind in zip(fields, types)) + ' }; };\n')
         kind = self._kinds[name, fields, types] = number, _packer(types)
         return kind
 
@@ -200,6 +201,12 @@ class CtfSession:
         except OSError as error:
             raise self._error(error) from None
         self._packet, self._size = [], 0
+
+
+def _original(name: str, fields: Sequence[str]) -> str:
+    """Return the name that a field had before the import gave way to a field of each event."""
+    given = name.removesuffix('_')
+    return given if given in dict(PREAMBLE) and given not in fields else name
 
 
 def _declared(name: str, kind: FieldType) -> str:

@@ -43,6 +43,7 @@ from mcap.records import (
     Schema,
     Statistics,
 )
+from mddag_executor.output_rules import EXISTS, open_recording, REMEDY
 from mddag_executor.trace import cdr, records
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.groups import Group, GROUPS
@@ -50,6 +51,8 @@ from mddag_executor.trace.schema import camel_case, EVENTS, EventType
 import zstandard
 
 CHUNK_LIMIT = 256 * 1024
+KEPT = 'what was written before is there; '
+"""What the remedy begins with where events are in the file that failed."""
 _TWICE = 'mddag:task_set'
 _COMPRESSION_LEVEL = 1      # of zstd; higher levels cost more than they save on such data
 
@@ -152,11 +155,13 @@ class TraceFile:
     """
 
     def __init__(self, path: str | os.PathLike[str], *,
-                 extra_events: Iterable[EventType] = ()) -> None:
+                 extra_events: Iterable[EventType] = (), overwrite: bool = False) -> None:
         """
-        Open the file, over what was there.
+        Open the file.
 
         :param extra_events: events beyond the table, or other fields for one of the table
+        :param overwrite: whether it may replace a file that is there
+        :raises TraceError: when it cannot be written, or must not be replaced
         """
         self.path = os.fspath(path)
         #: Events that are in the file, in whole chunks.
@@ -180,7 +185,9 @@ class TraceFile:
         self._start: int | None = None      # least and greatest time of all messages
         self._end = 0
         try:
-            self._stream = open(self.path, 'wb', buffering=0)
+            self._stream = open_recording(self.path, overwrite)
+        except FileExistsError:
+            raise TraceError(self.path, EXISTS, REMEDY) from None
         except (OSError, ValueError) as error:
             reason = getattr(error, 'strerror', None) or str(error)
             raise TraceError(self.path, f'cannot be written ({reason})',
@@ -389,7 +396,7 @@ class TraceFile:
             self._cut_back()
             reason = getattr(error, 'strerror', None) or str(error)
             raise TraceError(self.path, f'writing failed ({reason})',
-                             'what was written before is there; free space, then record again'
+                             f'{KEPT if self.written else ""}free space, then try again'
                              ) from None
         self._offset += len(data)
 

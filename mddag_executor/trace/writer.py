@@ -52,15 +52,16 @@ class TraceWriter:
 
     def __init__(self, path: str | os.PathLike[str], *, clock_offset: int | None = None,
                  flush_interval_s: float = 0.25, capacity: int = 1 << 17,
-                 extra_events: Iterable[EventType] = ()) -> None:
+                 extra_events: Iterable[EventType] = (), overwrite: bool = False) -> None:
         """
-        Open the file, over what was there, and start the writer thread.
+        Open the file and start the writer thread.
 
         :param clock_offset: ns between the trace's clock and `time.monotonic_ns()`; without it,
             such that the trace's clock counts from the epoch
         :param flush_interval_s: how often what was recorded goes to the operating system
         :param capacity: how many events may wait for the writer thread
         :param extra_events: events beyond the table
+        :param overwrite: whether it may replace a file that is there
         """
         if clock_offset is None:
             clock_offset = epoch_offset_ns()
@@ -68,7 +69,7 @@ class TraceWriter:
         self.clock_offset = clock_offset
         #: Why recording ended early, None while all is well.
         self.error: TraceError | None = None
-        self._file = TraceFile(path, extra_events=extra_events)
+        self._file = TraceFile(path, extra_events=extra_events, overwrite=overwrite)
         self._interval_s = flush_interval_s
         self._pending: deque[tuple[Any, ...]] = deque()
         self._capacity = capacity       # 0: nothing is taken any more

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import combinations, product
 
 from mddag_executor.assign.placement import Placing
 from mddag_executor.errors import UsageError
@@ -67,8 +67,10 @@ def test_together_and_apart() -> None:
     with pytest.raises(UsageError, match='together'):
         placed(tasks, 2, *times, together=[('/n0', '/n1'), ('/n1', '/n2')],
                apart=[('/n0', '/n2')])
-    with pytest.raises(UsageError, match='cannot keep'):
+    with pytest.raises(UsageError, match='/n0,/n1,/n2: these are 3 nodes for 2 processes'):
         placed(tasks, 2, *times, apart=[('/n0', '/n1', '/n2')])
+    with pytest.raises(UsageError, match='cannot keep'):
+        placed(tasks, 2, *times, apart=[('/n0', '/n1'), ('/n1', '/n2'), ('/n0', '/n2')])
     with pytest.raises(UsageError, match='does not declare'):
         placed(tasks, 2, *times, together=[('/n0', '/n9')])
     with pytest.raises(UsageError, match='only 4 nodes'):
@@ -90,3 +92,22 @@ nodes:
 """)
     placing = Placing(tasks, 2, [[4 * MS, MS], [4 * MS, MS]])
     assert [p.nodes for p in placing.processes(placing.place())] == [('/a', '/b'), ('/c',)]
+
+
+def test_one_node_too_many_to_keep_apart_is_found_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which of the empty processes a node comes into does not matter: no search through all."""
+    times = (10.0,) * 11
+    tried = 0
+    cost = Placing._cost
+
+    def counted(self: Placing, place: dict[int, int]) -> tuple[float, float]:
+        nonlocal tried
+        tried += 1
+        assert tried < 1000
+        return cost(self, place)
+
+    monkeypatch.setattr(Placing, '_cost', counted)
+    pairs = list(combinations([f'/n{i}' for i in range(11)], 2))
+    with pytest.raises(UsageError, match='10 processes cannot keep all these nodes apart'):
+        placed(workload(*times), 10, *times, apart=pairs)
+    assert len(placed(workload(*times), 11, *times, apart=pairs)) == 11

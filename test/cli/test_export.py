@@ -8,6 +8,8 @@ from contextlib import redirect_stdout
 import io
 import json
 from pathlib import Path
+import re
+import subprocess
 import sys
 from typing import Any
 
@@ -15,7 +17,8 @@ from mcap.reader import make_reader
 from mddag_executor.cli import main as program
 from mddag_executor.replay import caret_events
 from mddag_executor.replay.for_caret import CARET_EVENTS
-from mddag_executor.trace import read_events, TraceReader
+from mddag_executor.trace import read_events, TraceFile, TraceReader
+from mddag_executor.trace.schema import EventType
 import pytest
 
 from .helpers import caller
@@ -87,7 +90,8 @@ def test_another_graph_judges(
 
 @pytest.mark.parametrize(('arguments', 'error'), [
     (['export', 'TRACE', '-o', 'out.xlsx'], 'it is not known what to write'),
-    (['export', 'TRACE', '-o', 'out'], 'let the name end in .pftrace, .csv, .parquet, .mcap or /'),
+    (['export', 'TRACE', '-o', 'out'], '.pftrace, .csv, .parquet, .foxglove.mcap or /'),
+    (['export', 'TRACE', '-o', 'copy.mcap'], 'it is not known what to write'),
     (['export', 'TRACE', '-o', 'out.pftrace', '--rows', 'jobs'], '--rows: '),
     (['export', '-', '-', '-o', 'out.csv'], 'standard input can be only one'),
     (['export', 'GRAPH', '-o', 'out.csv'], 'error: '),
@@ -278,9 +282,41 @@ def test_a_session_for_caret_has_what_its_tracer_sees(
 @pytest.mark.parametrize(('arguments', 'error'), [
     (('--caret', '-o', 'x.csv'), "--caret: it is for a folder: let the name of -o end in '/'"),
     (('--rows', 'jobs', '-o', 'x/'), 'leave GRAPH, --reschedule and --rows out'),
-    (('--rows', 'jobs', '-o', 'x.mcap'), 'a .mcap gets both')])
+    (('--rows', 'jobs', '-o', 'x.foxglove.mcap'), 'a .mcap gets both')])
 def test_options_of_sessions_and_foxglove(
     arguments: tuple[str, ...], error: str, trace: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, _, said = call(capsys, 'export', trace, *arguments)
     assert status == 2 and error in said
+
+
+@pytest.mark.parametrize('command', [
+    'export g.mcap -o out.parquet', 'export run.mcap other.yaml -o out.parquet --rows jobs'])
+def test_a_parquet_export_that_fails_is_one_line(
+    trace: Path, tmp_path: Path, command: str
+) -> None:
+    """In a process of its own: pyarrow complains when its writer is collected."""
+    pytest.importorskip('pyarrow', reason='pyarrow is not installed')
+    (tmp_path / 'g.mcap').write_text('no recording')
+    (tmp_path / 'other.yaml').write_text(GRAPH.replace('/n', '/other') % '1ms')
+    done = subprocess.run(
+        [sys.executable, '-m', 'mddag_executor', *command.split()], cwd=tmp_path, text=True,
+        capture_output=True, check=False)
+    assert (done.returncode, done.stdout) == (2, '')
+    assert done.stderr.startswith('error: ') and done.stderr.count('\n') == 1
+    assert not (tmp_path / 'out.parquet').exists()
+
+
+def test_a_session_has_the_names_that_were_imported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A trace calls an event's own field `timestamp` otherwise; a session does not."""
+    kind = EventType('my_app', 'frame', (
+        ('timestamp_', 'int64'), ('other_', 'int64'), ('vpid_', 'int64'), ('vtid__', 'int64'),
+        ('vtid_', 'int64')))
+    with TraceFile(tmp_path / 'a.mcap', extra_events=[kind]) as file:
+        file.add('my_app:frame', 1, 2, 3, 4, 5, 6, 7, 8)
+    assert call(capsys, 'export', tmp_path / 'a.mcap', '-o', f'{tmp_path}/s/')[0] == 0
+    metadata = (tmp_path / 's' / 'ust' / 'metadata').read_text()
+    line = next(line for line in metadata.splitlines() if 'my_app:frame' in line)
+    assert re.findall(r'} _(\w+);', line) == ['timestamp', 'other_', 'vpid', 'vtid__', 'vtid']

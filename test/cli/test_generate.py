@@ -71,7 +71,7 @@ def test_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (['--sinks', '5', '--vertices', '5'], '--sinks 5: a DAG of 5 vertices has at most 4: '),
     (['--dags', '3:1'], '--dags 3:1: the first is larger: write the smaller one first'),
     (['--dags', '0'], "mddag generate: argument --dags: '0' is no whole number from 1 up: "),
-    (['--workers', '0'], "mddag generate: argument --workers: '0' is no whole number from 1 up"),
+    (['--workers', '0'], "mddag generate: argument --workers: '0' is no whole number from 1 to"),
     (['--periods', '10'], 'mddag generate: argument --periods: '),
     (['--method', 'best'], "mddag generate: argument --method: invalid choice: 'best' "),
     (['--edge-probability', '2'], '--edge-probability 2: it is out of range: give from 0 to 1'),

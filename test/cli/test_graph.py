@@ -62,7 +62,8 @@ def test_table(call: Mddag, tmp_path: Path) -> None:
         '2 DAGs, 4 vertices, 4 callbacks, 1 queue edge, 1 path')
 
 
-def test_standard_input_and_output(call: Mddag) -> None:
+def test_standard_input_and_output(call: Mddag, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 8)
     text = (CONFIG / 'autoware_multi.yaml').read_text()
     done = call('graph', 'check', '-', '--json', '-', stdin=text)
     assert (done.returncode, done.stderr) == (0, '')
@@ -121,3 +122,29 @@ def test_missing_file_and_bad_usage(call: Mddag, tmp_path: Path) -> None:
         assert done.returncode == 2
         assert done.stderr.startswith('error: ')
         assert done.stderr.count('\n') == 1
+
+
+@pytest.mark.parametrize(('text', 'workers', 'says'), [
+    ('deadline: 10ms, execution_time: 25ms', 4,
+     '/n:t: the longest path to it takes 25 ms, more than its deadline of 10 ms: no scheduler'),
+    ('deadline: 10s, execution_time: 5s', 7,
+     'g.yaml: a load of 250.000 is more than 7 workers can do: no scheduler can keep the deadlin'),
+    ('deadline: 10s, execution_time: 5s', 512,
+     'g.yaml: a load of 250.000 is more than the 2 CPUs of this machine can do, unless callbacks'),
+    ('deadline: 20ms, execution_time: 19ms', 1, None),
+    ('deadline: 10ms', 1, None)])
+def test_what_cannot_hold_is_warned_of(
+    call: Mddag, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, workers: int,
+    says: str | None,
+) -> None:
+    monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 2)
+    (tmp_path / 'g.yaml').write_text(
+        f'mddag: 1\nworkers: {workers}\nnodes:\n'
+        f'  - {{node: /n, callbacks: [{{name: t, timer: 20ms, {text}}}]}}\n')
+    done = call('graph', 'check', 'g.yaml', '--json', '-', cwd=tmp_path)
+    assert done.returncode == 0
+    if says is None:
+        assert done.stderr == ''
+    else:
+        assert any(line.startswith(f'warning: {says}') for line in done.stderr.splitlines())
+    assert 'dags' in json.loads(done.stdout)

@@ -35,6 +35,14 @@ def test_table(call: Mddag) -> None:
         '2 workers, budget max: no scheduler can keep these deadlines')
 
 
+def test_ci_learns_of_deadlines_that_cannot_hold(call: Mddag) -> None:
+    for budget, status in (('mean', 0), ('max', 1)):
+        done = call('graph', 'analyse', '-', '--budget', budget, '--fail-on-unschedulable',
+                    stdin=GRAPH)
+        assert (done.returncode, done.stderr) == (status, '')
+        assert ('no scheduler can keep' in done.stdout) == bool(status)
+
+
 def test_json(call: Mddag) -> None:
     done = call('graph', 'analyse', CONFIG / 'autoware.yaml', '--budget', 'mean', '--workers',
                 '5', '--json', '-')

@@ -52,7 +52,7 @@ def test_what_was_there_stays_when_the_import_fails(
     out.write_text('precious')
     recording.with_name('helper.py').write_text(HELPER.format(last='nothing'))
     before = sorted(recording.parent.iterdir())
-    status, text, errors = call(capsys, 'ctf', recording, '-o', out)
+    status, text, errors = call(capsys, 'ctf', recording, '-o', out, '--overwrite')
     assert (status, text) == (2, '')
     assert errors.startswith(f'error: {recording}: babeltrace2 gave up')
     assert errors.count('\n') == 1

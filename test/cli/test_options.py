@@ -6,17 +6,22 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from contextlib import nullcontext
 import importlib
+from pathlib import Path
 
 from mddag_executor import defaults
 from mddag_executor.cli import main as program
 from mddag_executor.cli import options
 from mddag_executor.core import POLICIES, PolicyError
-from mddag_executor.errors import UsageError
-from mddag_executor.simulate import JUDGES
+from mddag_executor.errors import MddagError, UsageError
+from mddag_executor.simulate import JUDGES, Settings
 from mddag_executor.simulate.evaluate import CORES
-from msg_graph import loads
+from mddag_executor.simulate.run import check
+from msg_graph import GraphError, loads
 import pytest
+
+ONE = 'nodes: [{node: /n, callbacks: [{name: t, timer: 1s, deadline: 1s, execution_time: 1us}]}]\n'
 
 
 @pytest.mark.parametrize(('kind', 'text', 'value'), [
@@ -96,3 +101,22 @@ def test_the_help_of_verbs_of_verbs(
         assert 'example: mddag ' in out
     assert all(line.startswith((f'mddag {verb[0]} ', 'mddag run', 'mddag replay'))
                for line in module.EXAMPLE.strip().splitlines())
+
+
+def test_the_limit_of_workers_is_the_same_everywhere(tmp_path: Path) -> None:
+    from mddag_executor.executor.settings import resolve
+    graph = tmp_path / 'g.yaml'
+    simulate = ['simulate', str(graph), '--duration', '1us', '--workers']
+    for workers, status in ((4096, 0), (4097, 2)):
+        refused = nullcontext() if status == 0 else pytest.raises((MddagError, GraphError))
+        graph.write_text(f'mddag: 1\nworkers: {workers}\n' + ONE)
+        assert program.main(['graph', 'check', str(graph)]) == status
+        graph.write_text('mddag: 1\n' + ONE)
+        assert program.main([*simulate, str(workers)]) == status
+        assert program.main(
+            ['generate', '--workers', str(workers), '--utilisation', '0.001', '-o',
+             str(tmp_path / 'made.yaml')]) == status
+        with refused:
+            resolve(str(graph), workers, 1, 'auto')
+        with refused:
+            check(Settings(workers=workers))

@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import json
 from pathlib import Path
 import re
+import subprocess
 import sys
 from typing import Any
 
@@ -256,7 +258,8 @@ def test_other_bad_input_is_one_line(
         ([trace, '--reschedule', '--callbacks'], '--callbacks: '),
         ([trace, '--reschedule', '--policy', 'best'], "policy 'best': there is no such policy: "),
         ([trace, '--reschedule', '--workers', '0'], 'mddag replay: argument --workers: '),
-        ([trace, '--reschedule', '--workers', '99999'], 'workers: 99999 is out of range: give'),
+        ([trace, '--reschedule', '--workers', '99999'],
+         "mddag replay: argument --workers: '99999' is no whole number from 1 to 4096"),
         (['-', '-'], '-: standard input can be only one of trace and trace: name a file '),
         ([], 'mddag replay: the following arguments are required: TRACE'),
     ):
@@ -276,3 +279,26 @@ def test_help_and_start_up_load_neither_ros_nor_numpy(mddag, trace: Path) -> Non
     shown = mddag('replay', '--help')
     assert shown.returncode == 0
     assert 'mddag replay run.mcap graph.yaml --fail-on-miss' in shown.stdout
+
+
+def test_a_sink_is_named_as_tables_do_or_by_a_unique_end(
+    call: Callable[..., subprocess.CompletedProcess[str]], folder: Path
+) -> None:
+    Path('g.yaml').write_text("""\
+mddag: 1
+workers: 1
+nodes:
+  - {node: /a/one, callbacks: [{name: t, timer: 10ms, deadline: 1ms, execution_time: 2ms}]}
+  - {node: /b/two, callbacks: [{name: t, timer: 10ms, deadline: 2ms, execution_time: 2ms}]}
+""")
+    assert call('simulate', 'g.yaml', '--duration', '50ms', '--trace', 'r.mcap').returncode == 0
+    table = call('replay', 'r.mcap').stdout
+    assert '  one:t  ' in table
+    for name in ('one:t', '/a/one:t', '/one:t', 'ne:t'):
+        done = call('explain', 'r.mcap', '--sink', name, '--job', '1')
+        assert (done.returncode, done.stderr) == (0, '')
+        assert done.stdout.startswith('Job 1 of /a/one:t: late by ')
+    for name, says in ((':t', "':t' may be any of '/a/one:t', '/b/two:t': write more of it"),
+                       ('ona:t', "there is no sink 'ona:t': did you mean '/a/one:t'?")):
+        done = call('explain', 'r.mcap', '--sink', name)
+        assert (done.returncode, done.stderr) == (2, f'error: --sink: {says}\n')

@@ -206,7 +206,8 @@ def test_a_callback_that_raises_shows_its_traceback(drive: Path, tmp_path: Path)
     (tmp_path / 'robot.py').write_text(text.replace(
         '        if self.distance is None:', '        if message.data < 40:\n'
         "            raise ValueError('too near')\n        if self.distance is None:"))
-    done = mddag(tmp_path, 'rerun', 'drive.mcap', 'graph.yaml', *NODES, '-o', 'out.mcap', status=2)
+    done = mddag(
+        tmp_path, 'rerun', 'drive.mcap', 'graph.yaml', *NODES, '-o', 'out.mcap', status=70)
     assert "raise ValueError('too near')" in done.stderr
     last = done.stderr.splitlines()[-1]
     assert last.startswith('error: /tracker:track: it raised ValueError: too near at ')

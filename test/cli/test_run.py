@@ -393,3 +393,58 @@ def test_names_are_short_where_that_is_enough() -> None:
     (1, 100_000, '0.01 %'), (1, 3, '33.33 %')])
 def test_a_share_is_never_rounded_to_all_or_nothing(part: int, whole: int, text: str) -> None:
     assert percent(part, whole) == text
+
+
+# --- what a node raises --------------------------------------------------------------------------
+
+BAD_NODES = """\
+from rclpy.node import Node
+
+
+class Calibrated(Node):
+
+    def __init__(self):
+        super().__init__('n')
+        self.create_timer(0.02, self.tick)
+
+    def tick(self):
+        open('/calibration/lidar.yaml')
+
+
+class Uncalibrated(Node):
+
+    def __init__(self):
+        open('/calibration/lidar.yaml')
+
+
+def main():
+    open('/calibration/lidar.yaml')
+"""
+ONE_TIMER = """\
+mddag: 1
+nodes:
+  - {node: /n, callbacks: [{name: tick, timer: 20ms, deadline: 10ms, execution_time: 1ms}]}
+"""
+
+
+@pytest.mark.parametrize('spec', [
+    'bad:Calibrated', 'bad:Uncalibrated', 'bad:main', 'bad_module:main'])
+@pytest.mark.parametrize('verb', ['run', 'rerun'])
+def test_what_a_node_raises_has_its_traceback_and_is_no_bad_input(
+    folder: Path, mddag: Mddag, verb: str, spec: str
+) -> None:
+    Path('n.yaml').write_text(ONE_TIMER)
+    Path('bad.py').write_text(BAD_NODES)
+    Path('bad_module.py').write_text("open('/calibration/lidar.yaml')\n")
+    recording = []
+    if verb == 'rerun':
+        recording = ['drive.mcap']
+        assert mddag(
+            'simulate', 'n.yaml', '--duration', '100ms', '--trace', 'drive.mcap').returncode == 0
+    done = mddag(verb, *recording, 'n.yaml', '--node', spec)
+    assert done.returncode == 70, done.stderr
+    lines = done.stderr.splitlines()
+    assert 'Traceback (most recent call last):' in lines
+    assert any('bad' in line and "open('/calibration/lidar.yaml')" in after
+               for line, after in zip(lines, lines[1:]))
+    assert 'FileNotFoundError' in lines[-1]

@@ -5,8 +5,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import errno
 import json
+import os
 from pathlib import Path
+import resource
 import subprocess
 import sys
 from typing import Any
@@ -193,7 +196,7 @@ def changed(**times: Any) -> str:
 
 
 @pytest.mark.parametrize(('arguments', 'times', 'says'), [
-    (['--workers', '0'], None, "--workers: '0' is no whole number from 1 up"),
+    (['--workers', '0'], None, "--workers: '0' is no whole number from 1 to 4096"),
     (['--workers', '-2'], None, '--workers'),
     (['--workers', 'many'], None, '--workers'),
     (['--policy', 'edf'], None,
@@ -272,3 +275,15 @@ def test_nothing_of_ros_is_loaded(graph: Path) -> None:
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
                           check=False)
     assert (done.returncode, done.stderr) == (0, '')
+
+
+def test_a_disk_that_gets_full_leaves_nothing_and_promises_nothing(graph: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, '-m', 'mddag_executor', 'simulate', str(graph), '--duration', '10min',
+         '--trace', 'out.mcap'], cwd=graph.parent, text=True, capture_output=True, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000)))
+    assert done.returncode == 2
+    assert done.stderr == (
+        f'error: out.mcap: writing failed ({os.strerror(errno.EFBIG)}): free space, then try '
+        'again\n')
+    assert not [path for path in graph.parent.iterdir() if path != graph]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+import io
 import json
 import os
 from pathlib import Path
@@ -17,12 +18,15 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-from mddag_executor.report.board import Board, dag_rows, GONE_AFTER_S, picture, plain
+from mddag_executor.cli.top import _ticks
+from mddag_executor.report.board import Board, GONE_AFTER_S, KEYS, of_dags, picture, plain
+from msg_graph import load
 import pytest
 
 from .test_run import GRAPH
 
 Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
 EVIL = 'mddag: \x1b]0;owned\x07\x1b[2J[bold]x[/bold]\nrm'
 
 
@@ -35,7 +39,7 @@ def array(*statuses: tuple[str, str, int, dict[str, str]]) -> Any:
 
 
 DAG = {'window_missed_ratio': '0', 'jobs': '7', 'period_ms': '20.000'}
-POOL = {'idle_workers': '5', 'callbacks_per_s': '12.5'}
+POOL = {'idle_workers': '5', 'callbacks_per_s': '12.5', 'busy_ratio': '0.250'}
 
 
 # --- what is shown -------------------------------------------------------------------------------
@@ -47,8 +51,8 @@ def test_the_newest_status_of_each_process_is_shown():
     assert [(s.process, s.level) for s in board.statuses()] == [
         ('a/1', 'OK'), ('a/1', 'ERROR'), ('b/2', 'OK')]
     text = plain(board.statuses())
-    assert re.search(r'a/1 +mddag: x +ERROR +20.000 +8 ', text)
-    assert re.search(r'a/1 +mddag +OK +5 +- +12.5 ', text)
+    assert re.search(r'a/1 +mddag: x +ERROR .* +8 +20.000 ms ', text)
+    assert re.search(r'a/1 +mddag +OK +25 % +- +5 .* +12.5 ', text)
 
 
 def test_statuses_of_others_are_left_out():
@@ -69,17 +73,59 @@ def test_a_process_that_says_nothing_any_more_is_gone():
 
 
 def test_names_cannot_command_the_terminal():
-    import io
-
     from rich.console import Console
     board = Board()
-    board.take(array((EVIL, EVIL, 1, {**DAG, 'jobs': EVIL}), (EVIL, EVIL, 9, POOL)))
+    board.take(array((EVIL, EVIL, 1, {**DAG, 'jobs': EVIL}), (EVIL + 'b', EVIL, 9, POOL)))
     out = io.StringIO()
-    Console(file=out, width=400, force_terminal=True).print(picture(board.statuses()))
+    Console(file=out, width=400, force_terminal=True).print(picture(board.statuses(), 400))
     coloured = re.sub(r'\x1b\[[0-9;]*m', '', out.getvalue())
     for text in (plain(board.statuses()), coloured):
         assert '\x1b' not in text and '\x07' not in text
         assert '[bold]x[/bold]' in text and '\\x1b]0;owned' in text
+
+
+def board_of_autoware(*processes: str) -> Board:
+    """Return what a run of Autoware's workload reports."""
+    values = {
+        'window_missed_ratio': '0.0123', 'window_missed': '12', 'window_results': '970',
+        'jobs': '12345', 'period_ms': '100.000', 'response_p50_ms': '34.567',
+        'response_p99_ms': '93.210', 'response_max_ms': '123.456', 'deadline_used_max': '1.23',
+        'margin_min_ms': '-23.456'}
+    pool = {'idle_workers': '3', 'queue': '12', 'callbacks_per_s': '1234.5', 'busy_ratio': '0.712',
+            'cpu_ratio': '0.950', 'cpu_us_per_callback': '123.4', 'computing': '2'}
+    board = Board()
+    names = [dag.name for dag in load(CONFIG / 'autoware.yaml').dags]
+    for process in processes:
+        board.take(array(
+            *((process, f'mddag: {name}', int(name == 'perception'), values) for name in names),
+            (process, 'mddag: workers', 0, pool)))
+    return board
+
+
+@pytest.mark.parametrize('processes', [('robot/4711',), ('robot/4711', 'robot/4712')])
+@pytest.mark.parametrize('width', [60, 80, 100, 120, 150, 170, 200, 240])
+def test_names_and_verdicts_are_whole_in_every_terminal(
+    width: int, processes: tuple[str, ...]
+) -> None:
+    from rich.console import Console
+    statuses = board_of_autoware(*processes).statuses()
+    out = io.StringIO()
+    Console(file=out, width=width, height=60).print(picture(statuses, width))
+    lines = out.getvalue().splitlines()
+    assert max(map(len, lines)) <= width
+    for status in statuses:
+        if not status.is_pool:
+            row = next(line for line in lines if line.startswith((
+                f'{status.name} ', f'{status.process}  {status.name} ')))
+            assert status.level in row
+    title = next(line for line in lines if 'DAG' in line)
+    assert 'missed' in title or len(processes) > 1 and width < 80
+    assert ('process' in title) == (len(processes) > 1)
+    assert ('least margin' in title) == (width >= 150)
+    assert '…' not in ''.join(line for line in lines if 'fine' not in line)
+    if width < 150:
+        assert 'WARN mddag: perception: fine\\x1b[31m' in lines
+    assert lines[-1] == KEYS
 
 
 # --- over ROS ------------------------------------------------------------------------------------
@@ -106,19 +152,21 @@ def test_once_shows_another_process(running: Any, mddag: Mddag):
     assert found['mddag: main']['process'].endswith(f'/{running.pid}')
     assert found['mddag: main']['values']['period_ms'] == '20.000'
     done = mddag('top', '--once')
-    assert done.returncode == 0 and re.search(r'/\d+ +mddag: main +\w+ +20.000 ', done.stdout)
+    assert done.returncode == 0 and re.search(
+        r'/\d+ +mddag: main +\w+ .* 20.000 ms ', done.stdout)
     done = mddag('top', '--duration', '5s')
     assert done.returncode == 0 and done.stdout.count('workers of') >= 2
 
 
-def test_live_in_a_terminal_and_ctrl_c_ends_it(running: Any):
+@pytest.mark.parametrize('how', ['q', 'Ctrl-C'])
+def test_live_in_a_terminal_until_the_user_ends_it(running: Any, how: str):
     pid, terminal = pty.fork()
     if pid == 0:
-        os.environ.update(TERM='xterm-256color', COLUMNS='200', LINES='40')
+        os.environ.update(TERM='xterm-256color', COLUMNS='80', LINES='40')
         os.execv(sys.executable, [sys.executable, '-m', 'mddag_executor', 'top'])
     shown = b''
     end = time.monotonic() + 30
-    interrupted = False
+    ended = False
     while time.monotonic() < end:
         if select.select([terminal], [], [], 0.2)[0]:
             try:
@@ -128,9 +176,12 @@ def test_live_in_a_terminal_and_ctrl_c_ends_it(running: Any):
             if not data:
                 break
             shown += data
-        if shown.count(b'mddag: main') >= 3 and not interrupted:
-            interrupted = True
-            os.kill(pid, signal.SIGINT)
+        if shown.count(b'mddag: main') >= 3 and not ended:
+            ended = True
+            if how == 'q':
+                os.write(terminal, b'q')
+            else:
+                os.kill(pid, signal.SIGINT)
     _, status = os.waitpid(pid, 0)
     os.close(terminal)
     assert os.waitstatus_to_exitcode(status) == 0
@@ -145,6 +196,10 @@ def test_nobody_to_hear(call: Mddag):
     assert done.stderr.startswith('error: /nobody: no executor has published its state here: ')
     done = call('top', '--duration', '300ms', '--topic', '/nobody')
     assert done.returncode == 2
+    spent: list[float] = []
+    board = Board()
+    list(_ticks(spent.append, board, 3600.0, 0.05))     # gives up long before an hour
+    assert spent
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
@@ -171,5 +226,5 @@ def test_processes_share_one_list_of_dags():
     board = Board()
     board.take(array(('h/up', 'mddag: x', 0, DAG), ('h/up', 'mddag: z', 0, DAG),
                      ('h/down', 'mddag: y', 0, DAG), ('h/down', 'mddag: x', 1, DAG)))
-    assert [(row[1], row[0]) for row in dag_rows(board.statuses())] == [
+    assert [(s.name, s.process) for s in of_dags(board.statuses())] == [
         ('mddag: x', 'h/down'), ('mddag: x', 'h/up'), ('mddag: y', 'h/down'), ('mddag: z', 'h/up')]

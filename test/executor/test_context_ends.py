@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""A context that is shut down or destroyed while an executor spins: the spin ends, and says so."""
+"""A context that is shut down or destroyed while an executor spins: the spin ends."""
 
 from __future__ import annotations
 
@@ -10,14 +10,21 @@ import itertools
 import signal
 import sys
 import threading
+import time
 from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor.shutdown import call_at_shutdown
+from msg_graph import loads
 import pytest
 import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import (
+    ExternalShutdownException,
+    MultiThreadedExecutor,
+    SingleThreadedExecutor,
+)
 from rclpy.node import Node
 from std_msgs.msg import Empty
 
@@ -62,11 +69,61 @@ def test_spin_ends_with_its_context(way, end, inside, no_thread_leak, monkeypatc
         ENDS[end](context)
     thread.join(10.0)
     assert not thread.is_alive()
-    assert [type(error) for error in errors] == [ExternalShutdownException]
+    # As rclpy's: spin returns when a callback has shut the context down.
+    returns = inside and end != 'destroy' and intake != 'steps'
+    assert [type(error) for error in errors] == (
+        [] if returns else [ExternalShutdownException])
     assert executor.shutdown(5.0)
     assert in_threads == []
     with contextlib.suppress(Exception):
         node.destroy_node()
+
+
+@pytest.mark.parametrize('kind', [
+    SingleThreadedExecutor, MultiThreadedExecutor, MultiDeadlineExecutor])
+def test_spin_returns_when_a_callback_shuts_down_as_rclpy_s_do(
+        kind: Any, ros_context, make_node, capfd) -> None:
+    """Also those that fail meanwhile, just because the context has ended, end nothing."""
+    node = make_node()
+    publisher = node.create_publisher(Empty, '/topic', 1)
+    node.create_timer(0.01, lambda: publisher.publish(Empty()), ReentrantCallbackGroup())
+    node.create_timer(0.1, lambda: rclpy.shutdown(context=ros_context))
+    executor = kind(context=ros_context)
+    rclpy.spin(node, executor)
+    assert not ros_context.ok()
+    executor.spin()     # and at once when it has ended before
+    executor.shutdown()
+    assert 'Traceback' not in capfd.readouterr().err
+
+
+def test_what_the_callback_raises_that_shuts_down_comes_out(make_executor, make_node, ros_context):
+    node = make_node()
+
+    def end() -> None:
+        rclpy.shutdown(context=ros_context)
+        time.sleep(0.05)
+        raise SystemExit('done')
+
+    node.create_timer(0.01, end)
+    executor = make_executor()
+    executor.add_node(node)
+    with pytest.raises(SystemExit, match='done'):
+        executor.spin()
+
+
+def test_the_handler_of_misses_may_shut_down(ros_context, make_node):
+    node = make_node('node')
+    node.create_timer(0.01, lambda: None)
+    executor = MultiDeadlineExecutor(
+        loads("""
+mddag: 1
+nodes:
+  - node: /node
+    callbacks: [{name: tick, timer: 10ms, deadline: 1us}]
+"""), context=ros_context, on_deadline_miss=lambda miss: ros_context.try_shutdown())
+    executor.add_node(node)
+    executor.spin()
+    assert not ros_context.ok()
 
 
 def test_what_a_callback_raises_of_a_context_that_is_there_comes_out(make_executor):

@@ -14,8 +14,10 @@ from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.jobs import Origin
+from mddag_executor.executor.verdicts import DeadlineMiss
 from mddag_executor.executor.work import Work
-from msg_graph import TaskSet
+from msg_graph import loads, TaskSet
+import pytest
 
 from ..core.task_sets import Case, cases, Event, examples, TICK
 
@@ -99,6 +101,37 @@ def test_the_same_events_give_the_same_answers_as_the_simulator(case: Case) -> N
     driver.engine.finish(HORIZON * TICK)
     verdicts = driver.engine.verdicts.tally.result()
     assert verdicts['dags'] == run.result()['dags']
+
+
+def test_what_was_reported_as_overdue_is_late() -> None:
+    """Also when the thread in which it completed in time gets the lock only after that."""
+    task_set = loads("""
+mddag: 1
+nodes:
+  - node: /n
+    callbacks: [{name: tick, timer: 100us, deadline: 100us}]
+""")
+    reported: list[DeadlineMiss] = []
+    recorded: list[tuple[object, ...]] = []
+    engine = Engine(
+        task_set, 2, 'rad', default_deadline=1, max_active_jobs=NEVER, expire_after=NEVER,
+        on_miss=reported.append, record=lambda *event: recorded.append(event))
+    entity = entity_of(engine, task_set, 0, 0)
+    for release in (0, 100_000):
+        engine.timer_due(Work(None, print, entity=entity), release, release)
+    first, second = engine.dispatch(100_000), engine.dispatch(100_000)
+    assert first is not None and second is not None
+    engine.judge_overdue(150_000)
+    engine.finished(first, 0, 90_000, 151_000, 0, 0)
+    engine.finished(second, 100_000, 149_000, 152_000, 0, 1)
+    engine.finish(200_000)
+    assert [(miss.job, miss.kind) for miss in reported] == [(0, 'overdue')]
+    sink = engine.verdicts.tally.result()['dags']['/n']['sinks']['/n:tick']
+    assert (sink['completed'], sink['late'], sink['overdue']) == (2, 1, 0)
+    assert sink['response_ns']['max'] == 100_001
+    # what a trace has of it judges the same
+    assert [event[5:] for event in recorded if event[0] == 'deadline'] == [(0, 100_000, 100_001)]
+    assert entity.busy_ns == 10_001  # it would have ended that much later
 
 
 @examples(150)

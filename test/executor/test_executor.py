@@ -7,6 +7,7 @@ from __future__ import annotations
 from contextlib import nullcontext
 import gc
 import os
+import sys
 import threading
 import time
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.errors import MddagError
+from mddag_executor.trace import TraceWriter
 import pytest
 import rclpy
 from rclpy.action import ActionClient, ActionServer
@@ -508,3 +510,69 @@ def test_executors_that_are_shut_down_leave_no_files(ros_context):
         use(spin)
     gc.collect()
     assert files() <= before
+
+
+def test_statistics_while_entities_come_and_go(make_executor, make_node):
+    """No exception, and nothing that has been counted is lost."""
+    node, errors, counts = make_node(), [], [0]
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    ended = threading.Event()
+
+    def ask() -> None:
+        while not ended.is_set():
+            try:
+                callbacks = executor.statistics()['callbacks']
+            except RuntimeError as error:
+                errors.append(error)
+                return
+            counts.append(sum(each['ran'] for each in callbacks.values()))
+
+    interval = sys.getswitchinterval()
+    asking = threading.Thread(target=ask)
+    try:
+        with Spinning(executor):
+            sys.setswitchinterval(1e-6)
+            asking.start()
+            for number in range(100):
+                # each period has a name of its own in the counts
+                timers = [node.create_timer((1_000_000 + 20 * number + i) / 1e9, lambda: None)
+                          for i in range(20)]
+                assert wait_for(lambda n=number: counts[-1] >= 10 * n or errors)
+                for timer in timers:
+                    node.destroy_timer(timer)
+            ended.set()
+            asking.join()
+    finally:
+        ended.set()
+        sys.setswitchinterval(interval)
+    assert errors == []
+    assert counts == sorted(counts)
+
+
+def test_who_shuts_down_second_waits_until_the_trace_is_closed(
+        make_executor, make_node, monkeypatch, tmp_path):
+    closing, go_on, closed = threading.Event(), threading.Event(), []
+    close = TraceWriter.close
+
+    def late(writer: Any, *args: Any) -> None:
+        closing.set()
+        go_on.wait(30.0)
+        close(writer, *args)
+        closed.append(1)
+
+    monkeypatch.setattr(TraceWriter, 'close', late)
+    executor = make_executor(trace=tmp_path / 'run.mcap')
+    executor.add_node(make_node())
+    executor.spin_once(0.0)
+    seen: list[list[int]] = []
+    first, second = (threading.Thread(
+        target=lambda: (executor.shutdown(), seen.append([*closed]))) for _ in range(2))
+    first.start()
+    assert closing.wait(15.0)
+    second.start()
+    second.join(0.2)
+    go_on.set()
+    for thread in (first, second):
+        thread.join()
+    assert seen == [[1], [1]]

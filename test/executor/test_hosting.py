@@ -63,8 +63,9 @@ def run(
         finally:
             process.kill()
     assert process.returncode == 0, err
-    # A busy machine skips releases, and this is said.
-    assert [line for line in err.splitlines() if 'cannot keep its rate' not in line] == []
+    # A busy machine skips releases and misses deadlines, and this is said.
+    assert [line for line in err.splitlines() if 'cannot keep its rate' not in line
+            and not re.search(r'\d deadlines? missed', line)] == []
     result: dict[str, Any] = json.loads(Path('result.json').read_text())
     return result, Path('out.txt').read_text()
 
@@ -182,7 +183,6 @@ def test_what_programs_ask_in_a_terminal_stays_as_it_is(world: Path) -> None:
 
 
 @pytest.mark.parametrize(('spec', 'message'), [
-    ('chat:fails', 'it failed while starting (RuntimeError: no camera found, '),
     ('chat:exits', 'it failed while starting (SystemExit: 3'),
     ('chat:own_context', 'node /alone has a context of its own: let it use the default context'),
     ('chat:other_domain', 'it asks for ROS domain 7, and this process is in another: set '),

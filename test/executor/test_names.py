@@ -8,9 +8,13 @@ import csv
 from pathlib import Path
 from typing import Any
 
+from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.cli import main as program
+from mddag_executor.executor.name_check import LEAST_S
 from msg_graph import loads
+import pytest
 from rclpy.action import ActionClient, ActionServer
+from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
@@ -96,3 +100,66 @@ def test_names_in_an_export(make_executor: Any, make_node: Any, tmp_path: Path) 
         names = {row['vertex'] for row in csv.DictReader(file)}
     assert names == {'/robot:a', '/robot: tick (timer 33.3ms)', '/robot: wake (guard condition)',
                      'callback (task)'}
+
+
+CAMERA = """
+mddag: 1
+nodes:
+  - node: /camera
+    callbacks: [{name: capture, timer: 50ms, publishes: [/image], dag: vision}]
+  - node: /detector
+    callbacks: [{name: detect, subscription: /image, deadline: 50ms}]
+"""
+
+
+@pytest.mark.parametrize(('node', 'topic', 'expected'), [
+    ('camera', 'image', None),
+    ('kamera', 'image', 'no node here has 1 declared callback: /camera:capture '
+     "(did you mean the node '/kamera'?); undeclared callbacks that ran: "
+     '/kamera: tick (timer 50ms): '),
+    ('camera', 'robot/image', 'no node here has 1 declared callback: /detector:detect '
+     "(did you mean the topic '/robot/image'?); undeclared callbacks that ran: /detector: hear "
+     '(subscription /robot/image): ')])
+def test_a_wrong_name_is_warned_of_once(
+        ros_context: Any, make_node: Any, capfd: Any, node: str, topic: str, expected: str | None
+) -> None:
+    camera, detector = make_node(node), make_node('detector')
+    publisher = camera.create_publisher(String, topic, 10)
+    heard: list[Any] = []
+
+    def tick() -> None:
+        publisher.publish(String())
+
+    def hear(message: String) -> None:
+        heard.append(message)
+
+    camera.create_timer(0.05, tick)
+    detector.create_subscription(String, topic, hear, 10)
+    executor = MultiDeadlineExecutor(loads(CAMERA, 'camera.yaml'), context=ros_context)
+    executor.add_node(camera)
+    executor.add_node(detector)
+    executor.spin_until_future_complete(Future(), 2 * LEAST_S + 0.5)
+    executor.shutdown()
+    assert heard
+    warned = [line for line in capfd.readouterr().err.splitlines() if 'no node here has' in line]
+    if expected is None:
+        assert warned == []
+    else:
+        line, = warned
+        assert f'camera.yaml: {expected}' in line
+
+
+@pytest.mark.parametrize('change', [
+    ('', ''), ('dag: vision', 'dag: vision, release_from: header_stamp')])
+def test_what_may_run_elsewhere_is_not_missed(
+        ros_context: Any, make_node: Any, capfd: Any, change: tuple[str, str]) -> None:
+    """Neither is anything where the executor has no node yet."""
+    text = CAMERA.replace('timer: 50ms', 'subscription: /light, period: 50ms').replace(*change)
+    executor = MultiDeadlineExecutor(loads(text, 'camera.yaml'), context=ros_context)
+    if change[0]:
+        detector = make_node('detector')
+        detector.create_subscription(String, '/image', lambda message: None, 10)
+        executor.add_node(detector)
+    executor.spin_until_future_complete(Future(), LEAST_S + 0.5)
+    executor.shutdown()
+    assert 'no node here has' not in capfd.readouterr().err

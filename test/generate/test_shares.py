@@ -91,3 +91,13 @@ def test_dice_are_the_same_everywhere() -> None:
 
 
 FIRST = [5, 5, 4, 4, 2, 5, 4, 2, 4, 3]
+
+
+@pytest.mark.parametrize('limits', [[1.0, 0.0, 1.0], [1.0, 1e-12, 1.0], [0.0, 0.5], [1.0, 1e-5]])
+@pytest.mark.parametrize('part', [0.1, 0.49, 0.9, 1.0])
+def test_dirichlet_rescale_with_no_room_for_one(limits: list[float], part: float) -> None:
+    total = part * sum(limits)
+    for seed in range(10):
+        shares = dirichlet_rescale(Dice(str(seed)), total, limits)
+        assert sum(shares) == pytest.approx(total)
+        assert all(0 <= share <= limit for share, limit in zip(shares, limits))

@@ -16,6 +16,7 @@ import msg_graph
 import pytest
 import rclpy
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.exceptions import NotInitializedException
 
 GRAPH = """
@@ -26,15 +27,18 @@ nodes: [{node: /n, callbacks: [{name: tick, timer: 10ms, deadline: 10ms, dag: d}
 WRONG = [
     *(('graph', value) for value in (42, b'x', ['a'], {'mddag': 1}, object(), True)),
     *(('num_workers', value) for value in ('7', 0, -1, 2.5, True, float('nan'), 10**9, [])),
+    *(('num_threads', value) for value in ('7', 0, -1, 2.5, True, 10**9)),
     *(('policy', value) for value in (None, 5, 'x', [], {})),
-    *(('default_deadline', value) for value in (None, 1.5, -5, 0, True, [], 10**30)),
+    *(('default_deadline', value) for value in (
+        None, 1.5, -5, 0, True, [], 10**30, Duration(seconds=-1))),
     *(('intake', value) for value in (None, 5, 'x')),
     *(('max_active_jobs', value) for value in ('x', 0, -1, 1.5, None, True)),
     *(('on_deadline_miss', value) for value in (5, 'x', [])),
     *(('worker_policy', value) for value in (5, 'x', '__class__', 'sched_yield')),
     *(('worker_priority', value) for value in (5, 'x')),
     *(('worker_cpus', value) for value in ('x', '0', 5, {'a'}, set(), [], {10**6}, {-1}, [[0]])),
-    *(('diagnostics_period', value) for value in ([], -5, 1.5, True, 10**30)),
+    *(('diagnostics_period', value) for value in (
+        [], -5, 1.5, True, 10**30, Duration(nanoseconds=1))),
     *(('thresholds', value) for value in (5, {'warn_ratio': 1.0})),
     *(('context', value) for value in (5, 'x', object())),
 ]
@@ -51,6 +55,18 @@ def test_a_wrong_argument_is_named_in_one_line(
     assert name in str(caught.value) and '\n' not in str(caught.value)
     # Nothing was begun: no file, and (as ros_context looks) no thread.
     assert not trace.exists()
+
+
+def test_arguments_as_rclpy_has_them(ros_context: Any) -> None:
+    executor = MultiDeadlineExecutor(
+        num_threads=3, context=ros_context, default_deadline=Duration(seconds=0.2),
+        diagnostics_period=Duration(seconds=1))
+    assert executor.statistics()['workers'] == 3
+    executor.shutdown()
+    with pytest.raises(MddagError, match='give one of the two'):
+        MultiDeadlineExecutor(num_threads=3, num_workers=3, context=ros_context)
+    with pytest.raises(MddagError, match='num_workers=4'):
+        MultiDeadlineExecutor(4, context=ros_context)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize('period', ['soon', '', '5', '1 parsec'])

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, KW_ONLY
 import importlib.util
 from pathlib import Path
+import re
 import sys
 from types import ModuleType
 from typing import Any
@@ -124,8 +125,9 @@ def test_it_starts_the_program_where_colcon_puts_it(description: Description) ->
 
 
 def test_the_defaults_are_a_command_that_mddag_run_takes(description: Description) -> None:
-    args = program.build_parser('run').parse_args(description.command())
-    assert args.verb == 'run'
+    assert description.command()[0] == 'run'
+    parser, rest = program.find_verb(description.command())
+    args = parser.parse(rest)
     # With a name there, every node of the process would get it.
     assert args.ros_args == []
     assert Path(args.graph) == TOP / 'config' / 'autoware.yaml'
@@ -133,6 +135,7 @@ def test_the_defaults_are_a_command_that_mddag_run_takes(description: Descriptio
     assert (args.synthetic, args.utilisation) == ('sleep', 0.6)
     assert (args.workers, args.policy) == (7, 'rad')
     assert args.duration == 20_000_000_000
+    assert re.fullmatch(r'autoware_demo_\d{4}_[\d_]+-[\d_]+\.mcap', args.trace)
 
 
 def test_every_argument_reaches_the_command(description: Description) -> None:

@@ -84,9 +84,14 @@ def test_the_nearest_period_is_meant() -> None:
 
 def test_every_callback_can_be_bound_once() -> None:
     binder = Binder(TASKS)
+    assert binder.unbound() == list(TASKS.callbacks)
     for callback in reversed(TASKS.callbacks):
         for entity in entities_of(callback):
             assert binder.bind(entity) is not None
+    assert binder.unbound() == []
+    binder.release(TASKS.callback('/a:j0'), '/y')
+    assert [callback.key for callback in binder.unbound()] == ['/a:j0']
+    assert binder.bind(Entity('/a', 'subscription', '/y')) is not None
     for callback in TASKS.callbacks:
         for entity in entities_of(callback):
             assert binder.bind(entity) is None
@@ -133,7 +138,13 @@ def test_release_of_what_is_not_bound() -> None:
     ('/b:t', Entity('/b', 'timer', '', 50_000_000), 'did you mean its timer of 50ms?'),
     ('/b:t', Entity('/robot/b', 'timer', '', 33_333_333), "did you mean the node '/robot/b'?"),
     ('/b:t', Entity('/robot/b', 'timer', '', 50_000_000), None),
-    ('/b:s', Entity('/bb', 'subscription', '/x'), None),
+    ('/b:s', Entity('/bb', 'subscription', '/x'), "did you mean the node '/bb'?"),
+    ('/b:s', Entity('/xyz', 'subscription', '/x'), "did you mean the node '/xyz'?"),
+    ('/b:s', Entity('/bb', 'subscription', '/y'), None),
+    ('/b:s', Entity('/b', 'subscription', '/xx'), "did you mean the topic '/xx'?"),
+    ('/b:s', Entity('/b', 'subscription', '/other_topic'), None),
+    ('/b:t', Entity('/bb', 'timer', '', 33_333_333), "did you mean the node '/bb'?"),
+    ('/b:t', Entity('/bb', 'timer', '', 50_000_000), None),
     ('/b:s', Entity('/robot/b', 'subscription', '/y'), None),
     ('/b:s', Entity('/robot/b', 'service', '/x'), None),
 ])
@@ -141,6 +152,14 @@ def test_a_namespace_more_or_another_period_is_probably_meant(
         callback: str, seen: Entity, question: str | None) -> None:
     assert meant(TASKS.callback(callback), [Entity('/other', seen.kind, '/z', 1000), seen]) \
         == question
+
+
+def test_of_several_that_are_started_alike_only_a_similar_name_is_probably_meant() -> None:
+    callback = TASKS.callback('/b:t')
+    others = [Entity(node, 'timer', '', 33_333_333) for node in ('/xyz', '/uvw')]
+    assert meant(callback, others) is None
+    assert meant(callback, [*others, Entity('/bb', 'timer', '', 33_333_333)]) == \
+        "did you mean the node '/bb'?"
 
 
 def test_a_namespace_less_is_probably_meant() -> None:

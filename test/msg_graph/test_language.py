@@ -92,8 +92,9 @@ def test_every_key() -> None:
         ('frame_to_show', 3), ('set_to_show', 3)]
 
 
-def test_default_percents_of_29_quantiles() -> None:
-    numbers = ', '.join(map(str, range(29)))
+@pytest.mark.parametrize('count', [2, 28, 29, 30])
+def test_quantiles_without_shares_are_evenly_spaced(count: int) -> None:
+    numbers = ', '.join(str(100 * i / (count - 1)) for i in range(count))
     tasks = graph(f"""
         - node: /a
           callbacks:
@@ -104,10 +105,8 @@ def test_default_percents_of_29_quantiles() -> None:
     """)
     time = tasks.callbacks[0].execution_time
     assert time is not None
-    assert time.percent == (
-        0, .1, .5, 1, 2, 5, 10, 15, 20, 25, 30, 35, 40, 45, 50, 55, 60, 65, 70, 75, 80, 85, 90,
-        95, 98, 99, 99.5, 99.9, 100)
-    assert time.draw(0.5) == 14_000
+    assert time.percent == pytest.approx([100 * i / (count - 1) for i in range(count)])
+    assert (time.mean_ns, time.draw(0.99)) == (50_000, 99_000)
 
 
 def test_a_period_that_agrees_with_the_timer_is_allowed() -> None:
@@ -136,9 +135,9 @@ HEAD = 'nodes:\n- node: /a\n  callbacks:\n  - {name: t, timer: 1ms, deadline: 1m
     (f'mddag: 1\nnode: [] {MARK}\n', "unknown key 'node': did you mean 'nodes'?"),
     (f'mddag: 1\nxyz: [] {MARK}\n',
      "unknown key 'xyz': use mddag, arguments, include, workers, nodes, processes, paths"),
-    (f'mddag: 1\nworkers: 0 {MARK}\n' + HEAD, 'from 1 to 1024'),
-    (f'mddag: 1\nworkers: -7 {MARK}\n' + HEAD, 'from 1 to 1024'),
-    (f'mddag: 1\nworkers: 1025 {MARK}\n' + HEAD, 'from 1 to 1024'),
+    (f'mddag: 1\nworkers: 0 {MARK}\n' + HEAD, 'from 1 to 4096'),
+    (f'mddag: 1\nworkers: -7 {MARK}\n' + HEAD, 'from 1 to 4096'),
+    (f'mddag: 1\nworkers: 4097 {MARK}\n' + HEAD, 'from 1 to 4096'),
     (f'mddag: 1\nworkers: seven {MARK}\n' + HEAD, 'whole number'),
     (f'mddag: 1\nworkers: 7.0 {MARK}\n' + HEAD, 'whole number'),
     (f'mddag: 1\nworkers: "7" {MARK}\n' + HEAD, 'whole number'),

@@ -212,7 +212,7 @@ class VirtualRun:
         self._aborted: set[tuple[int, int]] = set()
         self._jobs = [0] * self.tables.n_dags
         self._events = 0
-        self.file = TraceFile(self.path)
+        self.file = TraceFile(self.path, overwrite=True)
         self._run()
 
     # --- the run ---------------------------------------------------------------------------------

@@ -73,7 +73,7 @@ class Recorded:
             provider, _, short = name.partition(':')
             extra.append(EventType(provider, short, tuple(
                 (field, 'int64' if field.endswith('stamp') else 'uint64') for field in fields)))
-        with TraceFile(self.path, extra_events=extra) as file:
+        with TraceFile(self.path, extra_events=extra, overwrite=True) as file:
             file.define(_JAZZY)
             ordered = sorted(self._events, key=lambda event: event[0])
             for place, (time, pid, tid, name, fields) in enumerate(ordered[:stop]):

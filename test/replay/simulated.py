@@ -54,7 +54,7 @@ def write_simulated(
         if kind == SINK_LATE:
             events.append(
                 ('deadline', time, 2, dag, legs.index_in_dag[vertex], job, deadline, time))
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         file.add('task_set', START_TIME - 1, VPID, 1, task_set.text, task_set.file, policy,
                  workers, 100 * MS, 0, False)
         for event in sorted(events, key=lambda e: e[1]):

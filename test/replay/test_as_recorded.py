@@ -98,7 +98,7 @@ def test_breakdowns_add_up_to_the_response_times(tmp_path: Path) -> None:
 
 def write(path: Path, *events: tuple[object, ...], text: str = SMALL, workers: int = 2,
           policy: str = 'rad') -> Path:
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         file.add('task_set', START_TIME, VPID, 1, text, 'small.yaml', policy, workers, 100 * MS,
                  64, False)
         for name, time, vtid, *fields in events:
@@ -382,7 +382,7 @@ def test_a_trace_without_a_usable_declaration(tmp_path: Path, text: str, says: s
 
 def test_a_trace_of_another_program(tmp_path: Path) -> None:
     path = tmp_path / 'caret.mcap'
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         file.add('caret_init', START_TIME, VPID, 1, 5, 'jazzy')
     with pytest.raises(ReplayError, match=(
             r'caret.mcap: no run of this executor is recorded in it \(it has no event '
@@ -417,7 +417,7 @@ def test_verdicts_begin_when_all_programs_have_started(tmp_path: Path, skip: int
     start = events[len(events) // 3][1]
     jobs = sum(name == 'mddag:job_release' and release >= start + skip
                for name, *_, release in events)
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         for i, (name, time, pid, thread, *fields) in enumerate(events):
             file.add(name, time, pid, thread, *fields)
             if i in (0, len(events) // 3):

@@ -28,7 +28,7 @@ def mutated(source: Path, target: Path, seed: int) -> Path:
     rng = random.Random(seed)
     reader = TraceReader(source)
     events: list[tuple[Any, ...]] = list(reader.layout_events(None))
-    with TraceFile(target) as file:
+    with TraceFile(target, overwrite=True) as file:
         for layout, time, pid, tid, *values in _shuffled(events, rng):
             kinds = []
             for place, (field, value) in enumerate(zip(layout.fields, values)):

@@ -38,7 +38,7 @@ class Trace:
                  judges_from: int = 0, dag: int = 0, boot: str = '', begin: int = 0,
                  pid: int | None = None) -> None:
         self.path = str(folder / f'run.{name}.mcap')
-        self.file = TraceFile(self.path)
+        self.file = TraceFile(self.path, overwrite=True)
         self.vertex, self.late, self.job = vertex, late, 0
         self.pid = 100 + vertex + dag if pid is None else pid
         self.dag = dag

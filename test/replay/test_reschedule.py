@@ -205,7 +205,7 @@ nodes:
 def write_with_groups(path: Path, text: str, *shared: str) -> None:
     """Record two overlapping jobs of two callbacks, and the callback groups that they had."""
     kind = 'mutually_exclusive' if shared else 'reentrant'
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         def add(name: str, ms: int, *fields: object, vtid: int = 5) -> None:
             file.add(name, START_TIME + ms * MS, VPID, vtid, *fields)
 
@@ -262,7 +262,7 @@ nodes:
       - {name: b, service: /s, period: 100ms, deadline: 50ms, dag: b}
 """
     path = tmp_path / 'a.mcap'
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         file.add('task_set', START_TIME, VPID, 1, text, 'g.yaml', 'rad', 2, 100 * MS, 64, False)
         for dag in (0, 1):
             file.add('job_release', START_TIME + 30 * MS, VPID, 1, dag, 0, START_TIME)
@@ -281,7 +281,7 @@ nodes:
 def test_what_was_not_recorded_takes_the_median_then_the_declared_mean(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     text = TWO.replace('timer: 100ms,', 'timer: 100ms, execution_time: 7ms,')
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         file.add('task_set', START_TIME, VPID, 1, text, 'g.yaml', 'rad', 2, 100 * MS, 64, False)
         for job, took in enumerate((1, 3, 2, 0)):
             release = START_TIME + job * 10 * MS
@@ -314,7 +314,7 @@ nodes:
       - {name: b, sync: [/x, /y], deadline: 90ms}
 """
     path = tmp_path / 'a.mcap'
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         def piece(vertex: int, ready: int, start: int, end: int) -> None:
             file.add('dispatch', START_TIME + start * MS, VPID, 8, 9, 0, vertex, 0, 0,
                      START_TIME + ready * MS, 0)
@@ -365,7 +365,7 @@ def test_a_run_with_losses_is_rescheduled_whole(tmp_path: Path, seed: int) -> No
 def test_jobs_are_called_as_in_the_recording(tmp_path: Path) -> None:
     """Inside the engine jobs are counted from 0; a trace may begin with any."""
     path = tmp_path / 'a.mcap'
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         file.add('task_set', START_TIME, VPID, 1, TWO, 'g.yaml', 'rad', 2, 100 * MS, 64, False)
         for job in (2**40, 2**40 + 7):
             file.add('job_release', START_TIME + job % 8 * MS, VPID, 1, 1, job,
@@ -390,7 +390,7 @@ def test_settings_that_can_not_be(tmp_path: Path) -> None:
     for policy, workers, says in (('newest', 2, "policy 'newest'.*give --policy"),
                                   ('rad', 2**31 - 1, '2147483647 workers: give --workers'),
                                   ('rad', -3, '-3 workers')):
-        with TraceFile(path) as file:
+        with TraceFile(path, overwrite=True) as file:
             file.add('task_set', START_TIME, VPID, 1, TWO, 'g.yaml', policy, workers, 100 * MS,
                      64, False)
         with pytest.raises(ReplayError, match=says):
@@ -431,7 +431,7 @@ def test_what_a_timer_skipped_is_skipped_again(tmp_path: Path) -> None:
     """A job that expired at its release never ran, and would not have with other workers."""
     path, text = tmp_path / 'a.mcap', 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, ' \
         'timer: 10ms, deadline: 10ms, dag: a}]}]'
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
         for job in range(3):
             now = START_TIME + (0, 25 * MS, 25 * MS)[job]
@@ -463,7 +463,7 @@ def of_python(path: Path, jobs: list[tuple[int, int, int, int, bool]], cpus: int
         ends.append((end, dag, seen.count(dag), start, cpu, held))
         seen.append(dag)
     ends.sort()
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 3, 100 * MS, 64, False, cpus)
         for _, dag, job, start, *_ in sorted(ends, key=lambda each: each[3]):
             now = START_TIME + start * MS

@@ -124,6 +124,20 @@ def test_what_is_left_out_and_expires_hides_nothing(
     assert result['load']['breaks'] == '/c:alone' and result['load']['factor'] <= 9
 
 
+def test_where_nothing_was_due_nothing_is_proven(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph = tmp_path / 'g.yaml'
+    graph.write_text(BY_HAND)
+    arguments = ['slack', str(graph), '--duration', '1us']
+    assert program.main(arguments) == 0
+    out = capsys.readouterr().out
+    assert 'never completed, so not judged: 2 sinks: ' in out and '100 times' not in out
+    assert program.main([*arguments, '--fail-under', '1.2']) == 1
+    err = capsys.readouterr().err
+    assert err.startswith(f'error: {graph}: no job was due at any sink') and err.count('\n') == 1
+
+
 def test_what_people_see(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     graph, page = tmp_path / 'g.yaml', tmp_path / 's.html'
     graph.write_text(BY_HAND)

@@ -140,7 +140,7 @@ def changed(source: Path, target: Path, rng: random.Random) -> None:
             event[place := rng.choice(places)] ^= 1 << rng.randrange(63)
             if event[place] < 2**63:
                 break
-    with TraceFile(target) as file:
+    with TraceFile(target, overwrite=True) as file:
         for name, time, pid, thread, *fields in events:
             file.extend(((name, time, thread, *fields),), pid)
 

@@ -43,7 +43,7 @@ def by_hand(
     path: Path, hostile: bool = False, finished: bool = True, undeclared: bool = True
 ) -> Path:
     """Write a trace of three jobs; the third is 2 ms late; then an undeclared callback runs."""
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         def add(name: str, ms: int, *fields: Any) -> None:
             file.add(name, START + ms * MS, 1, 9, *fields)
 

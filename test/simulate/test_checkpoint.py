@@ -17,7 +17,7 @@ from mddag_executor.errors import InputError
 from mddag_executor.simulate import evaluate as module
 from mddag_executor.simulate.checkpoint import Checkpoint
 from mddag_executor.simulate.evaluate import evaluate, Evaluation, Experiment
-from msg_graph import loads
+from msg_graph import load, loads
 import numpy as np
 import pytest
 
@@ -36,7 +36,8 @@ nodes:
         deadline: 20ms
         execution_time: {quantiles_us: [9000, 20000]}
 """
-BASE = Experiment(loads(GRAPH), ('rad', 'rm'), workers=1, duration_ns=100_000_000, seed=2)
+BASE = Experiment(
+    loads(GRAPH), ('rad', 'rm'), workers=1, duration_ns=100_000_000, seed=2, judge='horizon')
 OTHER = replace(BASE, task_set=loads(GRAPH.replace('9000', '7000')))
 RUNS = 40
 WHOLE = evaluate(BASE, RUNS, core='plain')
@@ -132,11 +133,26 @@ def test_where_the_graph_stands_does_not_matter(tmp_path: Path) -> None:
     assert evaluate(moved, 5, core='plain', checkpoint=kept).resumed == 5
 
 
+def test_nor_do_the_files_that_it_includes(tmp_path: Path) -> None:
+    for name in ('before', 'after'):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / 'top.yaml').write_text('mddag: 1\ninclude: [part.yaml]\n')
+        (folder / 'part.yaml').write_text(GRAPH)
+    kept = checkpoint(tmp_path / 'kept.npz')
+    before, after = (replace(BASE, task_set=load(tmp_path / name / 'top.yaml'))
+                     for name in ('before', 'after'))
+    evaluate(before, 5, core='plain', checkpoint=kept)
+    assert evaluate(after, 5, core='plain', checkpoint=kept).resumed == 5
+
+
 SAMPLES = {'/n:fast': np.array([2_500_000]), '/n:slow': np.array([9_000_000, 20_000_000])}
 
 
 @pytest.mark.parametrize(('change', 'problem'), [
     ({'task_set': OTHER.task_set}, 'it holds another evaluation: of another graph'),
+    ({'task_set': loads(GRAPH + 'processes: {p: [/n]}\n')},
+     'it holds another evaluation: of another graph'),
     ({'policies': ('rad', 'fifo')}, 'another evaluation: --policies was ["rad", "rm"], and now '),
     ({'workers': 2}, 'another evaluation: --workers was [1], and now it is [2]: '),
     ({'duration_ns': 10}, 'another evaluation: --duration was 100000000, and now it is 10: '),
@@ -144,7 +160,7 @@ SAMPLES = {'/n:fast': np.array([2_500_000]), '/n:slow': np.array([9_000_000, 20_
     ({'samples': SAMPLES}, 'it holds another evaluation: with other --samples: '),
     ({'preemptive': False}, '--non-preemptive was false, and now it is true: '),
     ({'overhead_ns': 9}, 'it holds another evaluation: --overhead was 0, and now it is 9: '),
-    ({'judge': 'horizon'}, 'another evaluation: --judge was completions, and now it is horizon: '),
+    ({'judge': 'completions'}, '--judge was horizon, and now it is completions: '),
 ])
 def test_another_question(tmp_path: Path, change: dict[str, object], problem: str) -> None:
     path = tmp_path / 'kept.npz'

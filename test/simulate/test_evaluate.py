@@ -15,6 +15,7 @@ import math
 from pathlib import Path
 
 from mddag_executor.core import POLICIES, PolicyError
+from mddag_executor.generate import generate, Options
 from mddag_executor.simulate import (
     compiled,
     compiling,
@@ -30,6 +31,7 @@ from mddag_executor.simulate.evaluation import BINS, WIDE_BINS
 from msg_graph import load, loads, TaskSet
 import numpy as np
 import pytest
+import yaml
 
 CONFIG = Path(__file__).parents[2] / 'config'
 NEEDS_NUMBA = pytest.mark.skipif(not compiling.available(), reason='numba is not there')
@@ -108,13 +110,77 @@ def test_verdicts_are_those_of_simulate(autoware: TaskSet) -> None:
     assert 0 < outcome.accepted.mean() < 1
 
 
+STARVES = """\
+mddag: 1
+workers: 1
+nodes:
+  - {node: /a, callbacks: [{name: a, timer: 10ms, deadline: 10ms, execution_time: 10ms}]}
+  - {node: /b, callbacks: [{name: b, timer: 20ms, deadline: 30ms, execution_time: 10ms}]}
+"""
+ENDS_TOO_LATE = """\
+mddag: 1
+workers: 1
+nodes:
+  - {node: /n, callbacks: [{name: a, timer: 5s, deadline: 1s, execution_time: 4s}]}
+"""
+
+
+@pytest.mark.parametrize('text', [STARVES, ENDS_TOO_LATE])
+def test_the_bound_is_that_of_the_judge(text: str) -> None:
+    task_set = loads(text)
+    accepted = {}
+    for judge in ('completions', 'horizon'):
+        outcome = evaluate(
+            Experiment(task_set, ('rad', 'rm'), workers=1, judge=judge), 1, core='plain')
+        assert outcome.accepted.max() <= outcome.possible[0]
+        accepted[judge] = bool(outcome.accepted.any())
+    assert accepted == {'completions': True, 'horizon': False}
+
+
+def test_a_late_completion_that_no_scheduler_avoids_bounds_completions() -> None:
+    text = ENDS_TOO_LATE.replace('timer: 5s', 'timer: 500ms').replace('1s', '20ms')
+    for time, possible in (('19ms', True), ('21ms', False)):
+        outcome = evaluate(Experiment(
+            loads(text.replace('4s', time)), ('rad',), workers=1), 1, core='plain')
+        assert (outcome.possible[0], outcome.accepted[0, 0]) == (possible, possible)
+
+
+@pytest.mark.parametrize('judge', ['completions', 'horizon'])
+@pytest.mark.parametrize('change', [
+    {}, {'group': 'g'}, {'holds_interpreter': True}, {'on_miss': 'abort'}])
+def test_no_policy_exceeds_the_bound(judge: str, change: dict[str, object]) -> None:
+    count = {True: 0, False: 0}
+    for seed in range(12):
+        options = Options(
+            dags=(3, 4), vertices=(2, 6), sinks=(1, 2), tightness=(0.2, 1.0), seed=seed,
+            workers=2, utilisation=0.1 + 0.1 * seed, periods_ns=(10_000_000, 20_000_000))
+        declared = yaml.safe_load(generate(options))
+        for node in declared['nodes']:
+            for callback in node['callbacks']:
+                if 'on_miss' not in change or 'timer' in callback:
+                    callback.update(change)
+        for overhead in (0, 50_000):
+            outcome = evaluate(Experiment(
+                loads(yaml.safe_dump(declared)), ('rad', 'rm', 'fifo', 'wc'), workers=2,
+                duration_ns=200_000_000, seed=seed, judge=judge, overhead_ns=overhead), 1,
+                core='plain')
+            assert (outcome.accepted <= outcome.possible).all()
+            for possible in outcome.possible.tolist():
+                count[possible] += 1
+    assert min(count.values()) > 0      # it says something
+
+
 def test_by_hand(small: TaskSet) -> None:
     """At 16 ms slow does not fit beside two fast ones; nothing else matters for preemptive rad."""
     outcome = evaluate(Experiment(small, ('rad',), workers=1, duration_ns=10 ** 9), 40)
     lengths = Draws(small, 0).times(0, 40)[:, 1]
     assert set(lengths.tolist()) == {10_000_000, 16_000_000}
     assert outcome.accepted[0].tolist() == (lengths == 10_000_000).tolist()
-    assert outcome.possible.tolist() == outcome.accepted[0].tolist()
+    assert outcome.possible.all()       # whoever starves slow is accepted
+    strict = evaluate(Experiment(
+        small, ('rad',), workers=1, duration_ns=10 ** 9, judge='horizon'), 40)
+    assert strict.possible.tolist() == strict.accepted[0].tolist()
+    assert strict.accepted.tolist() == outcome.accepted.tolist()
     assert outcome.utilisation.tolist() == pytest.approx(
         (0.25 + lengths / 20_000_000).tolist())
 
@@ -234,7 +300,7 @@ def test_bad_input(
 def test_bad_experiments(small: TaskSet) -> None:
     with pytest.raises(PolicyError, match="policy 'edf': there is no such policy"):
         evaluate(Experiment(small, ('rad', 'edf')), 1)
-    with pytest.raises(SimulationError, match='workers: 0 is too few'):
+    with pytest.raises(SimulationError, match='workers: 0 is out of range: give 1 to 4096'):
         evaluate(Experiment(small, workers=0), 1)
     with pytest.raises(SimulationError, match='overhead'):
         evaluate(Experiment(small, overhead_ns=-1), 1)

@@ -52,6 +52,7 @@ def trace() -> Iterator[Path]:
 
 def record(case: Case, horizon: int, trace: Path, **how: Any) -> SimulatedRun:
     run = case.run(horizon, **how)
+    trace.unlink(missing_ok=True)
     write_trace(trace, case.task_set, case.load(how.get('last_release') or horizon), run)
     return run
 
@@ -183,6 +184,7 @@ nodes:
     horizon = 160_000_000
     load_ = periodic_load(task_set, draw_execution_times(task_set, 0), horizon)
     run = simulate(task_set, load_, Settings(workers=2, duration_ns=horizon, cpus=cpus), log=True)
+    trace.unlink(missing_ok=True)
     write_trace(trace, task_set, load_, run)
     result = reschedule(trace).result()
     assert result['dags'] == run.result()['dags']

@@ -103,7 +103,8 @@ def test_progress_is_told_the_virtual_time() -> None:
 # --- settings ------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize(('setting', 'says'), [
-    ({'workers': 0}, 'workers: 0 is too few'), ({'workers': -1}, 'workers: -1 is too few'),
+    ({'workers': 0}, 'workers: 0 is out of range: give 1 to 4096'),
+    ({'workers': -1}, 'workers: -1 is out of range'),
     ({'duration_ns': 0}, 'duration: 0 ns is too short'),
     ({'judge': 'me'}, "judge 'me': .*: choose one of horizon, completions"),
     ({'policy': 'edf'}, "policy 'edf': .*: choose one of rad, rm"),

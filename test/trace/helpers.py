@@ -77,7 +77,7 @@ def read_back(recorded: list[tuple[Any, ...]], vpid: int = VPID) -> list[tuple[A
 
 def write_chunks(path: Path, chunks: list[list[tuple[Any, ...]]], finish: bool = True) -> None:
     """Write a file with the given recordings in each chunk."""
-    file = TraceFile(path)
+    file = TraceFile(path, overwrite=True)
     for chunk in chunks:
         file.extend(chunk, VPID)
         file.flush()

@@ -138,6 +138,7 @@ def test_damage_is_one_error(tmp_path: Path) -> None:
         stream.write_bytes(damaged)
         with pytest.raises(TraceError, match=UNREADABLE):
             import_ctf(folder, tmp_path / 'out.mcap')
+        assert not (tmp_path / 'out.mcap').exists()
     stream.write_bytes(b'')
     with pytest.raises(TraceError, match='no event is recorded'):
         import_ctf(folder, tmp_path / 'out.mcap')

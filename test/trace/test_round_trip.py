@@ -175,7 +175,7 @@ def test_chunks_keep_their_limit(tmp_path: Path) -> None:
 def test_definitions_count_for_the_limit(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     size = 9 + 22 + 4 + 24      # of a callback_end
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         for number in range((CHUNK_LIMIT - 400) // size):
             file.add('callback_end', number, 1, 2, 3)
         for event in list(EVENTS.values())[:5]:
@@ -197,7 +197,7 @@ def test_events_beyond_the_table(tmp_path: Path) -> None:
         # other fields for one of the table
         EventType('ros2', 'rcl_publish', (('message', 'uint64'), ('node', 'string'))),
     ]
-    with TraceFile(path, extra_events=extra) as file:
+    with TraceFile(path, extra_events=extra, overwrite=True) as file:
         file.add('rcl_node_init', 1, VPID, 2, 3, 4, 'name', '/')        # the table's goes first
         file.add('ros2_caret:rcl_node_init', 2, VPID, 2, 3, -4)
         file.add('rmw_publisher_init', 3, VPID, 2, range(16), ['a', 'b'])
@@ -275,7 +275,7 @@ def test_optional_fields_of_older_files(tmp_path: Path) -> None:
     cases: list[tuple[Any, ...]] = [
         ((before,), (), -1, False), ((), (), -1, False), ((), (700, True), 700, True)]
     for events, fields, cpu_time, held in cases:
-        with TraceFile(path, extra_events=events) as file:
+        with TraceFile(path, extra_events=events, overwrite=True) as file:
             for job in range(3):
                 file.add('complete', 1000 + job, 1, 2, 5, 0, 1, job, True, 900, 0, *fields)
         read = list(TraceReader(path).events())

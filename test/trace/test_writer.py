@@ -66,7 +66,7 @@ def test_the_clock(tmp_path: Path) -> None:
     with TraceWriter(tmp_path / 'a.mcap') as writer:
         assert abs(writer.now() - time.time_ns()) < 1_000_000_000
         assert writer.now() - writer.clock_offset <= time.monotonic_ns()
-    with TraceWriter(tmp_path / 'a.mcap', clock_offset=0) as writer:
+    with TraceWriter(tmp_path / 'b.mcap', clock_offset=0) as writer:
         before = time.monotonic_ns()
         assert before <= writer.now() <= time.monotonic_ns()
 
@@ -259,7 +259,7 @@ def test_a_disk_that_gets_full(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     output = run_child(LIMITED, path).splitlines()
     assert output[0] == (f'{path}: writing failed ({os.strerror(errno.EFBIG)}): what was written '
-                         'before is there; free space, then record again')
+                         'before is there; free space, then try again')
     recorded, dropped = map(int, output[1].split())
     events, warnings = read(path)
     there = [event for event in events if event[0] == 'ros2:callback_end']

@@ -1,0 +1,97 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What an output may replace: the one rule for all verbs and for the Python API.
+
+1. A recording cannot be made again. So a new recording replaces no file, and no other output
+   replaces a file that holds a recording, unless the user asks for it: `--overwrite` on the
+   command line, `overwrite=True` in Python.
+2. An output is never an input of the same command, and no two outputs are the same file.
+3. Other results (tables, pictures, declarations) replace what was there, as with every tool.
+4. Pipes, devices and empty files hold nothing that could be lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import os
+import stat
+from typing import BinaryIO, cast
+
+from mddag_executor.errors import InputError, UsageError
+
+EXISTS = 'there is a file already'
+REMEDY = 'name another file, or replace this one with --overwrite (in Python overwrite=True)'
+_RECORDINGS = (b'\x89MCAP', b'SQLite format 3\0')
+_ENDINGS = ('.mcap', '.db3')
+
+
+def check_replaced(path: str, *, recording: bool, overwrite: bool = False) -> None:
+    """
+    Find out whether an output may take the place of what is there (rule 1).
+
+    :param recording: whether the output is a recording
+    :raises mddag_executor.errors.InputError: when it may not
+    """
+    if overwrite or not holds_data(path):
+        return
+    if recording:
+        raise InputError(path, EXISTS, REMEDY)
+    if is_recording(path):
+        raise InputError(path, 'this file is a recording', 'name another file for the result')
+
+
+def open_recording(path: str, overwrite: bool = False) -> BinaryIO:
+    """
+    Open a new recording, unbuffered (rule 1).
+
+    :raises FileExistsError: when a file is there and must not be replaced
+    """
+    try:
+        return cast(BinaryIO, open(path, 'xb', buffering=0))
+    except FileExistsError:
+        if not overwrite and holds_data(path):
+            raise
+        return cast(BinaryIO, open(path, 'wb', buffering=0))
+
+
+def check_distinct(inputs: Sequence[tuple[str, str]], outputs: Sequence[tuple[str, str]]) -> None:
+    """
+    Find out whether every output is a file of its own (rule 2).
+
+    :param inputs: name of the argument, and path; outputs likewise
+    :raises mddag_executor.errors.UsageError: when one is an input or another output, too
+    """
+    for i, (name, path) in enumerate(outputs):
+        for other, there in (*inputs, *outputs[:i]):
+            if _same_file(path, there):
+                raise UsageError(
+                    f'{path}: it cannot be both {other} and {name}: name another file for {name}')
+
+
+def holds_data(path: str) -> bool:
+    """Return whether a file is there that is not empty (rule 4)."""
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError):
+        return False
+    return stat.S_ISREG(status.st_mode) and status.st_size > 0
+
+
+def is_recording(path: str) -> bool:
+    """Return whether a file holds a recording, or is named like one: it may be damaged."""
+    if path.lower().endswith(_ENDINGS):
+        return True
+    try:
+        with open(path, 'rb') as file:
+            return file.read(16).startswith(_RECORDINGS)
+    except OSError:
+        return False
+
+
+def _same_file(one: str, other: str) -> bool:
+    try:
+        first, second = os.stat(one), os.stat(other)
+    except (OSError, ValueError):   # one of them is not there yet
+        return os.path.realpath(one) == os.path.realpath(other)
+    return stat.S_ISREG(first.st_mode) and os.path.samestat(first, second)

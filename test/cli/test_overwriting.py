@@ -1,0 +1,185 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What is recorded stays: no output is an input, and no recording is replaced unasked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+from mddag_executor.cli import main as program
+from mddag_executor.trace import TraceError, TraceFile, TraceWriter
+import pytest
+
+from .helpers import caller
+
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: t, timer: 10ms, publishes: [/a], execution_time: 2ms}
+      - {name: s, subscription: /a, deadline: 5ms, execution_time: 4ms}
+"""
+call = caller()
+
+
+@pytest.fixture
+def run(graph: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """Give a recorded run, run.mcap in the working directory."""
+    assert program.main(
+        ['simulate', 'graph.yaml', '--duration', '100ms', '--trace', 'run.mcap']) == 0
+    capsys.readouterr()
+    return Path('run.mcap')
+
+
+@pytest.mark.parametrize('command', [
+    'export run.mcap -o run.mcap',
+    'export run.mcap -o ./run.mcap --overwrite',
+    'export run.mcap -o link.csv',
+    'replay run.mcap --json run.mcap',
+    'replay run.mcap graph.yaml --json graph.yaml',
+    'replay run.mcap --junit run.mcap',
+    'replay run.mcap --report run.html --json run.html',
+    'diff run.mcap run.mcap graph.yaml --json graph.yaml',
+    'explain run.mcap --json run.mcap',
+    'slack run.mcap --report run.mcap',
+    'graph from-trace run.mcap -o run.mcap',
+    'graph from-caret graph.yaml --trace run.mcap -o run.mcap',
+    'graph place graph.yaml --processes 2 --trace run.mcap -o run.mcap',
+    'graph assign-deadlines graph.yaml -o graph.yaml',
+    'graph check graph.yaml --json graph.yaml',
+    'simulate graph.yaml --trace graph.yaml --overwrite',
+    'simulate graph.yaml --trace link.csv --json run.mcap --overwrite',
+    'run graph.yaml --synthetic sleep --trace graph.yaml --overwrite',
+    'run graph.yaml --synthetic sleep --json graph.yaml',
+    'rerun run.mcap graph.yaml --node a:b -o run.mcap --overwrite',
+    'rerun run.mcap graph.yaml --node a:b --expect out.mcap -o out.mcap',
+    'evaluate graph.yaml --csv graph.yaml',
+])
+def test_an_output_is_never_an_input_or_another_output(
+    run: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    Path('link.csv').symlink_to(run)
+    before = {path.name: path.read_bytes() for path in Path().iterdir()}
+    status, out, err = call(capsys, *command.split())
+    assert (status, out, err.count('\n')) == (2, '', 1)
+    assert 'it cannot be both' in err
+    assert {path.name: path.read_bytes() for path in Path().iterdir()} == before
+
+
+@pytest.mark.parametrize('command', [
+    'simulate graph.yaml --duration 50ms --trace run.mcap',
+    'import ctf . -o run.mcap',
+    'rerun drive.mcap graph.yaml --node a:b -o run.mcap',
+    'rerun drive.mcap graph.yaml --node a:b --trace run.mcap',
+    'run graph.yaml --synthetic sleep --duration 100ms --trace run.mcap',
+    'simulate graph.yaml --duration 50ms --trace precious.txt',
+])
+def test_a_recording_replaces_no_file(
+    run: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    Path('precious.txt').write_text('precious')
+    before = {path.name: path.read_bytes() for path in Path().iterdir()}
+    status, out, err = call(capsys, *command.split())
+    assert (status, out) == (2, '')
+    name = command.split()[-1]
+    assert err == (f'error: {name}: there is a file already: name another file, or replace this '
+                   'one with --overwrite (in Python overwrite=True)\n')
+    assert {path.name: path.read_bytes() for path in Path().iterdir()} == before
+
+
+@pytest.mark.parametrize('command', [
+    'graph check graph.yaml --json run.mcap',
+    'evaluate graph.yaml --runs 2 --csv other.dat',
+    'generate -o other.dat',
+    'simulate graph.yaml --report damaged.mcap.html --json damaged.mcap',
+])
+def test_no_other_output_replaces_a_recording(
+    run: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    Path('other.dat').write_bytes(run.read_bytes())
+    Path('damaged.mcap').write_bytes(b'\0' + run.read_bytes()[1:])
+    before = {path.name: path.read_bytes() for path in Path().iterdir()}
+    status, out, err = call(capsys, *command.split())
+    assert (status, out) == (2, '')
+    assert 'this file is a recording: name another file for the result' in err
+    assert {path.name: path.read_bytes() for path in Path().iterdir()} == before
+
+
+def test_overwrite_replaces_a_recording(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = run.read_bytes()
+    command = ['simulate', 'graph.yaml', '--duration', '50ms', '--trace', run, '--overwrite']
+    assert call(capsys, *command)[0] == 0
+    assert run.read_bytes() != before
+    assert call(capsys, 'replay', run)[0] == 0
+
+
+def test_empty_files_and_other_results_are_replaced(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path('new.mcap').touch()    # as mktemp leaves it
+    Path('result.json').write_text('{"old": true}')
+    assert call(capsys, 'simulate', 'graph.yaml', '--trace', 'new.mcap')[0] == 0
+    assert call(capsys, 'replay', 'new.mcap', '--json', 'result.json')[0] == 0
+    assert 'dags' in json.loads(Path('result.json').read_text())
+    assert call(capsys, 'replay', run, '--json', '/dev/null', '--junit', '/dev/null')[0] == 0
+
+
+@pytest.mark.parametrize('there', ['run.p.mcap', 'run.q.2.mcap'])
+def test_several_processes_replace_no_trace(
+    folder: Path, capsys: pytest.CaptureFixture[str], there: str
+) -> None:
+    Path('two.yaml').write_text(
+        GRAPH + '  - {node: /m, callbacks: [{name: t, timer: 10ms, deadline: 9ms}]}\n'
+        'processes: {p: [/n], q: [/m]}\n')
+    Path(there).write_text('precious')
+    status, out, err = call(
+        capsys, 'run', 'two.yaml', '--synthetic', 'sleep', '--duration', '10ms', '--trace',
+        'run.mcap')
+    assert (status, out) == (2, '')
+    assert f'{there}: there is a file already' in err
+    assert Path(there).read_text() == 'precious'
+
+
+@pytest.mark.parametrize('make', [TraceFile, TraceWriter])
+def test_writers_keep_what_is_there(tmp_path: Path, make: Callable[..., object]) -> None:
+    path = tmp_path / 'run.mcap'
+    path.write_text('precious')
+    with pytest.raises(TraceError, match='run.mcap: there is a file already'):
+        make(path)
+    assert path.read_text() == 'precious'
+
+
+def test_the_executor_keeps_what_is_there(folder: Path) -> None:
+    Path('run.mcap').write_text('precious')
+    code = ('import rclpy\n'
+            'from mddag_executor import MultiDeadlineExecutor\n'
+            'from mddag_executor.errors import MddagError\n'
+            'rclpy.init()\n'
+            'try:\n'
+            "    MultiDeadlineExecutor(trace='run.mcap')\n"
+            'except MddagError as error:\n'
+            '    print(error)\n'
+            "assert open('run.mcap').read() == 'precious'\n"
+            "MultiDeadlineExecutor(trace='run.mcap', overwrite=True).shutdown()\n")
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert 'run.mcap: there is a file already: name another file' in done.stdout
+    assert Path('run.mcap').read_bytes().startswith(b'\x89MCAP')
+
+
+def test_rerun_in_python_keeps_what_is_there(run: Path) -> None:
+    from mddag_executor.errors import MddagError
+    from mddag_executor.rerun import rerun
+    Path('precious.mcap').write_text('precious')
+    for name in ('output', 'trace'):
+        with pytest.raises(MddagError, match='precious.mcap: there is a file already'):
+            rerun(run, 'graph.yaml', [], **{name: 'precious.mcap'})
+        with pytest.raises(MddagError, match=f'it cannot be both recording and {name}'):
+            rerun(run, 'graph.yaml', [], overwrite=True, **{name: run})
+    assert Path('precious.mcap').read_text() == 'precious'
