@@ -775,6 +775,7 @@ class WorkerPool:
         me.begin()
         with self.lock:
             self._visitors.append(me)
+            self._bell_rings = False  # the caller has just been woken, or has looked
         try:
             work = self._turn(me, None, events)
             while work is not None:

@@ -193,6 +193,31 @@ def test_what_is_new_wakes_a_spin_once_that_waits(make_executor, make_node, what
         waiting.join()
 
 
+def test_every_task_wakes_a_loop_of_spin_once_and_a_spin_after_it(make_executor, make_node):
+    """Not only the first one: what wakes has to be ready to wake again."""
+    executor, ran = make_executor(), [threading.Event() for _ in range(20)]
+
+    def loop() -> None:
+        while not ran[9].is_set():
+            executor.spin_once()
+        executor.spin_until_future_complete(done, 30.0)
+
+    done = Future()
+    thread = threading.Thread(target=loop)
+    thread.start()
+    try:
+        for event in ran:
+            time.sleep(0.01)  # it waits
+            executor.create_task(event.set)
+            assert event.wait(5.0)
+    finally:
+        done.set_result(None)
+        while thread.is_alive():  # where it waits for ever, it may do so for each of them
+            executor.wake()
+            ran[9].set()
+            thread.join(0.1)
+
+
 def test_spinning_twice_is_an_error(make_executor):
     executor = make_executor()
     assert not executor.is_spinning
