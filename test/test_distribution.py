@@ -217,7 +217,8 @@ def test_the_source_distribution_holds_the_clone(built: Path) -> None:
     assert set(shipped()) <= names
     for name in ('LICENSE', 'Makefile', 'README.md', 'package.xml', 'setup.py', '.ci/environment',
                  'config/from_workload.py', 'docs/graphs.md', 'examples/README.md',
-                 'examples/sensor_fusion/run.sh', 'test/conftest.py', 'test/live/guests/chat.py'):
+                 'examples/sensor_fusion/run.sh', 'test/conftest.py',
+                 'test/hosting/guests/chat.py'):
         assert name in names, name
     # MANIFEST.in names what there is; something of a new kind has to be added there.
     checkout = built / 'checkout'
