@@ -164,7 +164,8 @@ def test_the_executor_loads_little_besides_rclpy() -> None:
         'ctypes', 'mcap', 'yaml'}
     assert {name for name in more if name.startswith('mcap')} == {'mcap', 'mcap.opcode'}
     parts = {name.split('.')[1] for name in more if name.startswith(f'{NAME}.')}
-    assert parts == {'clocks', 'core', 'defaults', 'errors', 'lazy', 'live', 'text', 'trace'}
+    assert parts == {
+        'clocks', 'core', 'defaults', 'errors', 'executor', 'lazy', 'text', 'trace'}
     assert {f'{NAME}.trace.writer', f'{NAME}.trace.reader', f'{NAME}.trace.ctf'} & more == set()
 
 

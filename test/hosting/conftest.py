@@ -4,6 +4,6 @@
 
 from __future__ import annotations
 
-from ..executor.conftest import make_node
+from ..executor.conftest import make_node, wait_for
 
-__all__ = ['make_node']
+__all__ = ['make_node', 'wait_for']

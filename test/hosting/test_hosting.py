@@ -29,7 +29,7 @@ from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecu
 import rclpy.experimental
 from rclpy.node import Node
 
-from ..executor.conftest import wait_for
+from .conftest import wait_for
 from .workspace import GRAPH, GUESTS, make_workspace
 
 
