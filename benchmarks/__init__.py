@@ -11,8 +11,8 @@ scheduler core; ``replay`` the replayer; ``evaluate`` the batch evaluation.  How
 Theory of operation
 -------------------
 One measurement is a ``Spec``.  ``campaign`` runs each in a process of its own
-(``python -m benchmarks.child``), one after the other, so that none has another's threads, caches or
-nodes beside it; the yardstick is the same for all of them.
+(``python -m benchmarks.child``), one after the other, so that none has another's threads, caches
+or nodes beside it; the yardstick is the same for all of them.
 
 There are two families of loads.  *Declared* loads (``autoware``, ``reference-system``) are the
 synthetic nodes of a declaration, with the same draw of execution times for every executor; they

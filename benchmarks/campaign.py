@@ -48,6 +48,7 @@ PHASES = ('drawn', 'together')
 PATIENCE_S = 90.0
 """What a process may take besides its window and warm-up: discovery and the end."""
 
+
 @dataclass(frozen=True)
 class Spec:
     """

@@ -30,7 +30,8 @@ from benchmarks.executors import make_executor, noting, Start, within
 from benchmarks.publisher import PublisherProcess
 from mddag_executor.core.tally import quantiles_us
 from mddag_executor.executor import current_job
-from mddag_executor.executor.measure import (
+from mddag_executor.hosting.child import ChildError
+from mddag_executor.hosting.measure import (
     ExecutionPlan,
     judge_sink,
     Ledger,
@@ -38,9 +39,8 @@ from mddag_executor.executor.measure import (
     Mode,
     totals,
 )
-from mddag_executor.executor.synthetic import no_job, QOS, quiet_node, SyntheticWorkload
-from mddag_executor.hosting.child import ChildError
 from mddag_executor.hosting.peers import run_nodes, UnfinishedSession
+from mddag_executor.hosting.synthetic import no_job, QOS, quiet_node, SyntheticWorkload
 from mddag_executor.resources import find
 from msg_graph import load, TaskSet
 import rclpy

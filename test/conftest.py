@@ -136,9 +136,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 # What runs ROS, or waits as time passes. Side by side (`make test`) a process takes whole files of
 # these, which come first: most of their time they wait, so that both take what is left then.
 ROS = (
-    'executor', 'hosting', 'benchmarks', 'launch', 'examples', 'hardening/test_misuse.py', 'cli/test_run.py',
-    'cli/test_demo.py', 'cli/test_top.py', 'cli/test_graph_systems.py',
-    'replay/test_live_replay.py', 'test_docs.py', 'test_readme.py', 'endurance/test_soak.py')
+    'executor', 'hosting', 'benchmarks', 'launch', 'examples', 'hardening/test_misuse.py',
+    'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_graph_systems.py',
+    'replay/test_known_causes.py', 'replay/test_live_replay.py', 'test_docs.py', 'test_readme.py',
+    'endurance/test_soak.py')
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -7,7 +7,7 @@ Theory of operation: each step is a process of its own, one after the other, so 
 another's threads, caches or nodes beside it: `mddag run --synthetic sleep`, which records; two
 times `mddag replay`; and rclpy's own MultiThreadedExecutor with the same nodes, seed and number of
 threads.  Both executors are measured by the nodes themselves, in the same way
-(`mddag_executor.executor.measure`), so the figures side by side mean the same.
+(`mddag_executor.hosting.measure`), so the figures side by side mean the same.
 
 With `--processes N` callbacks compute in Python, in N processes.  The steps are `graph place`;
 `run --synthetic spin` of what that wrote, which records; `replay` of all traces; and rclpy's
@@ -178,7 +178,7 @@ def _peer(
 
 
 def _introduction(args: argparse.Namespace, graph: Path) -> Iterator[str]:
-    from mddag_executor.executor.measure import ExecutionPlan
+    from mddag_executor.hosting.measure import ExecutionPlan
     from msg_graph import load
     task_set = load(graph)
     plan = ExecutionPlan(task_set, args.seed, args.utilisation, WORKERS)

@@ -40,12 +40,12 @@ from mddag_executor.report.text import listed
 from msg_graph import loads, NO_GRAPH
 
 if TYPE_CHECKING:
+    from mddag_executor.executor.executor import MultiDeadlineExecutor
     from mddag_executor.hosting.host import Host
     from mddag_executor.hosting.loading import Program
-    from mddag_executor.executor.executor import MultiDeadlineExecutor
-    from mddag_executor.executor.measure import ExecutionPlan, Ledger
-    from mddag_executor.executor.processes import Supervisor
-    from mddag_executor.executor.session import Session
+    from mddag_executor.hosting.measure import ExecutionPlan, Ledger
+    from mddag_executor.hosting.processes import Supervisor
+    from mddag_executor.hosting.session import Session
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -131,7 +131,7 @@ def main(args: argparse.Namespace) -> int:
 
 def part(args: argparse.Namespace) -> int:
     """Run one process of several, and leave what came of it in the folder of the run."""
-    from mddag_executor.executor.processes import belong_to_parent, Part
+    from mddag_executor.hosting.processes import belong_to_parent, Part
     the_part = Part.read(args.part)
     belong_to_parent(the_part.parent)
     task_set = loads(the_part.text, name=args.graph)
@@ -163,7 +163,7 @@ def run_here(
     host: Host | None = None
     programs: list[Program] = []
     if args.synthetic is not None:
-        from mddag_executor.executor.measure import ExecutionPlan
+        from mddag_executor.hosting.measure import ExecutionPlan
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
     with dump_when_stuck() as ends, Signals(
             _PART_ENDS_S if args.part else 0) as signals, _rclpy(
@@ -285,9 +285,9 @@ def _run(
     ends: Callable[[], None],
 ) -> tuple[dict[str, Any], BaseException | None]:
     """Run until the end; see ``run_here``."""
-    from mddag_executor.executor.measure import measure
-    from mddag_executor.executor.session import Session
     from mddag_executor.executor.statistics import Watch
+    from mddag_executor.hosting.measure import measure
+    from mddag_executor.hosting.session import Session
 
     def end_begins() -> None:
         ends()
@@ -323,7 +323,7 @@ def _run_synthetic(
     seconds: float | None, progress: Progress,
 ) -> Ledger | None:
     from mddag_executor.executor import current_job
-    from mddag_executor.executor.synthetic import SyntheticWorkload
+    from mddag_executor.hosting.synthetic import SyntheticWorkload
     workload = SyntheticWorkload(
         task_set, plan, current_job=current_job, process=args.process)
     for node in workload.nodes:
@@ -339,8 +339,8 @@ def _run_synthetic(
 
 def _begin(args: argparse.Namespace, task_set: TaskSet) -> Callable[..., int | None]:
     """Return what waits until publishers and subscriptions have met, and for other processes."""
-    from mddag_executor.executor.processes import Part
-    from mddag_executor.executor.session import Session
+    from mddag_executor.hosting.processes import Part
+    from mddag_executor.hosting.session import Session
     if args.part is None:
         return Session.wait_until_matched
     return partial(Part.read(args.part).start_together, args.process,
@@ -352,7 +352,7 @@ def _run_programs(
     programs: list[Program], seconds: float | None,
 ) -> None:
     from mddag_executor.hosting.loading import ros_arguments
-    from mddag_executor.executor.session import SessionError
+    from mddag_executor.hosting.session import SessionError
     executor: Any = session.executor
     executor.set_judging(False)
     try:

@@ -14,7 +14,6 @@ import argparse
 from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
-import re
 import subprocess
 import sys
 import tempfile
@@ -58,8 +57,8 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     from mddag_executor.hosting.loading import ros_arguments
-    from mddag_executor.executor.measure import ExecutionPlan
-    from mddag_executor.executor.processes import left, Part, Run, Supervisor, together
+    from mddag_executor.hosting.measure import ExecutionPlan
+    from mddag_executor.hosting.processes import left, Part, Run, Supervisor, together
     plan = None
     if args.synthetic is not None:
         workers = defaults.workers(args.workers, task_set)
@@ -179,7 +178,7 @@ def _probe(
 ) -> Mapping[str, Sequence[str]]:
     """Return the names of the nodes that each SPEC brings."""
     from mddag_executor.hosting.loading import ros_arguments
-    from mddag_executor.executor.processes import left, ProcessError
+    from mddag_executor.hosting.processes import left, ProcessError
     # Nobody is to hear of these nodes.
     environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
     with subprocess.Popen(

@@ -37,7 +37,13 @@ import struct
 import time
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.executor.jobs import Announced, NO_ORIGIN, Origin, Publication, PublisherNumbers
+from mddag_executor.executor.jobs import (
+    Announced,
+    NO_ORIGIN,
+    Origin,
+    Publication,
+    PublisherNumbers,
+)
 from mddag_executor.executor.other_processes import contested
 from mddag_executor.executor.work import Work
 from msg_graph import TaskSet

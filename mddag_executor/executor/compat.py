@@ -6,8 +6,8 @@ All that this program uses of rclpy beyond its documented interface.
 Nobody else uses a private name of rclpy, or what is behind a handle: ``test/test_layers.py`` holds
 that. Each entry says in which versions it was seen. *7.1* is Jazzy: 7.1.5, which the package index
 has, and what is known of the releases up to 7.1.9. *9.1* is Kilted: 9.1.2. Where nothing else is
-said, it is in both, and the executor cannot do without it. ``test/live/test_compat.py`` tries each
-on the rclpy that is installed.
+said, it is in both, and the executor cannot do without it. ``test/executor/test_compat.py`` tries
+each on the rclpy that is installed.
 
 Two adapters have modules of their own: ``listeners`` (``handle.pointer``) and ``waitsets``.
 """
@@ -29,7 +29,6 @@ import rclpy
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import Executor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
-from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.task import Future, Task
 from rclpy.time_source import TimeSource

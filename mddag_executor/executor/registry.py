@@ -7,6 +7,7 @@ Which entities there are: the declared callback of each, its callback group in t
 from __future__ import annotations
 
 from collections.abc import Callable
+import threading
 from typing import Any
 import weakref
 
@@ -64,6 +65,7 @@ class Registry:
         # and all that are not given back yet
         self._groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
         self._numbers: set[int] = set()
+        self._counting = threading.Lock()
         self.by_id: dict[int, Entity] = {}
         # the executor's own subscriptions
         self.own: set[Any] = set()

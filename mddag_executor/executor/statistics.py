@@ -13,10 +13,10 @@ from typing import cast, TYPE_CHECKING
 
 from mddag_executor.core.tally import counts, never_due
 from mddag_executor.executor.miss_notifier import MissNotifier
-from mddag_executor.executor.workers import WorkerPool
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
 from mddag_executor.executor.statistics_types import CallbackCounts, Statistics, Stops
+from mddag_executor.executor.workers import WorkerPool
 from msg_graph import TaskSet
 from msg_graph.drift import Drift, drift, Observed, Releases
 

@@ -42,9 +42,9 @@ import time
 from typing import Any
 import weakref
 
+from mddag_executor.executor.compat import executor_kept
 from mddag_executor.hosting.guest_executor import GuestExecutor, make_guest
 from mddag_executor.hosting.guest_signals import GuestSignals
-from mddag_executor.executor.compat import executor_kept
 from mddag_executor.hosting.loading import describe, LoadingError, Program, ProgramFailed, resolve
 from mddag_executor.replacements import instead, Replacements
 import rclpy

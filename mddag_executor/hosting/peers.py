@@ -19,10 +19,10 @@ import sys
 import time
 from typing import Any
 
-from mddag_executor.executor.measure import ExecutionPlan, Ledger, measure, Mode
-from mddag_executor.executor.session import Session
-from mddag_executor.executor.synthetic import no_job, SyntheticWorkload
 from mddag_executor.hosting.child import answer, ChildError, run_child, Tick
+from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure, Mode
+from mddag_executor.hosting.session import Session
+from mddag_executor.hosting.synthetic import no_job, SyntheticWorkload
 from msg_graph import load
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor

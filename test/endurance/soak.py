@@ -45,7 +45,7 @@ from typing import Any
 from mddag_executor.defaults import LIVE_SEED
 from mddag_executor.executor import DeadlineMiss
 from mddag_executor.executor.executor import MultiDeadlineExecutor
-from mddag_executor.executor.measure import ExecutionPlan
+from mddag_executor.hosting.measure import ExecutionPlan
 from msg_graph import load, TaskSet
 import rclpy
 from rclpy.executors import ExternalShutdownException

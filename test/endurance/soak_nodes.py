@@ -9,8 +9,8 @@ import threading
 from typing import Any
 
 from mddag_executor.executor import current_job
-from mddag_executor.executor.measure import ExecutionPlan
-from mddag_executor.executor.synthetic import quiet_node, SyntheticWorkload
+from mddag_executor.hosting.measure import ExecutionPlan
+from mddag_executor.hosting.synthetic import quiet_node, SyntheticWorkload
 from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node

@@ -17,7 +17,6 @@ from mddag_executor.executor.jobs import Origin
 from mddag_executor.executor.verdicts import DeadlineMiss
 from mddag_executor.executor.work import Work
 from msg_graph import loads, TaskSet
-import pytest
 
 from ..core.task_sets import Case, cases, Event, examples, TICK
 

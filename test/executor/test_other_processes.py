@@ -335,7 +335,7 @@ def test_two_publishers_elsewhere_are_a_doubt(make_executor, make_node):
 
 # --- two processes -------------------------------------------------------------------------------
 
-GUESTS = Path(__file__).resolve().parent / 'guests'
+GUESTS = Path(__file__).resolve().parents[1] / 'hosting' / 'guests'
 
 
 class Run:

@@ -122,7 +122,7 @@ def test_a_goal_expires_when_its_time_is_over(make_executor, make_node, stepwise
     counting.destroy()
 
 
-class spun:  # noqa: N801
+class spun:
     """Spin in a thread while entered, without shutting the executor down."""
 
     def __init__(self, executor: Any) -> None:

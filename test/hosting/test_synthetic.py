@@ -11,9 +11,9 @@ from typing import Any
 
 from mddag_executor.executor import current_job
 from mddag_executor.executor.executor import MultiDeadlineExecutor
-from mddag_executor.executor.measure import BODIES, ExecutionPlan, Ledger, measure, PlanError
-from mddag_executor.executor.session import Session
-from mddag_executor.executor.synthetic import (
+from mddag_executor.hosting.measure import BODIES, ExecutionPlan, Ledger, measure, PlanError
+from mddag_executor.hosting.session import Session
+from mddag_executor.hosting.synthetic import (
     Grid,
     JOIN_LIMIT,
     native,

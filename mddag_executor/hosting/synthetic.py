@@ -54,8 +54,8 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.executor.measure import Body, ExecutionPlan, Ledger
-from mddag_executor.executor.session import Session, Tick
+from mddag_executor.hosting.measure import Body, ExecutionPlan, Ledger
+from mddag_executor.hosting.session import Session, Tick
 from msg_graph import Callback, TaskSet, Vertex
 from rcl_interfaces.srv import ListParameters
 from rclpy.callback_groups import (
@@ -341,8 +341,8 @@ class SyntheticWorkload:
 
     :param task_set: the declaration.
     :param plan: how long each vertex executes.
-    :param current_job: ``mddag_executor.executor.current_job`` under our executor; leave it out under
-        others.
+    :param current_job: ``mddag_executor.executor.current_job`` under our executor; leave it out
+        under others.
     :param context: where the nodes belong to; None is rclpy's default context.
     :param keep: how much of each series the ledger keeps; None: all.
     :param process: make only the nodes that the declaration puts into this process.
@@ -408,7 +408,7 @@ class SyntheticWorkload:
             timers; None: until the session is stopped.
         :param begin: waits until publishers and subscriptions have met, and for other processes.
         :return: whether there is a window: the run was not stopped before it began.
-        :raises mddag_executor.executor.session.SessionError: when they do not find each other.
+        :raises mddag_executor.hosting.session.SessionError: when they do not find each other.
         """
         ledger, was_measured = self.ledger, False
         ledger.warm_up_ns = round(warm_up_s * 1e9)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 
-from mddag_executor.executor.measure import ExecutionPlan, Ledger, measure, Reading
+from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure, Reading
 from msg_graph import loads
 
 MS = 1_000_000

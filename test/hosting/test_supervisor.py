@@ -13,8 +13,8 @@ import sys
 import threading
 import time
 
-from mddag_executor.executor import processes as module
-from mddag_executor.executor.processes import ProcessError, Run, Supervisor
+from mddag_executor.hosting import processes as module
+from mddag_executor.hosting.processes import ProcessError, Run, Supervisor
 import pytest
 
 WAITS = """
@@ -143,7 +143,7 @@ def test_one_that_ends_when_the_run_is_over_takes_no_other_along(tmp_path: Path)
 
 def test_it_ends_with_who_started_it(tmp_path: Path) -> None:
     mark = tmp_path / 'pid'
-    child = ('import os, sys; from mddag_executor.executor.processes import belong_to_parent; '
+    child = ('import os, sys; from mddag_executor.hosting.processes import belong_to_parent; '
              'belong_to_parent(int(sys.argv[1])); from pathlib import Path; '
              f'Path({str(mark)!r} + "x").write_text(str(os.getpid())); '
              f'os.rename({str(mark)!r} + "x", {str(mark)!r}); import time; time.sleep(60)')

@@ -17,7 +17,7 @@ from typing import Any
 
 from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
-from mddag_executor.executor import processes
+from mddag_executor.hosting import processes
 from mddag_executor.replay import replay
 from mddag_executor.trace import read_events
 from msg_graph import loads

@@ -10,7 +10,7 @@ import re
 import threading
 from typing import Any
 
-from mddag_executor.executor.graph_probe import draft_of, Endpoints, Probe, probe, Seen
+from mddag_executor.hosting.graph_probe import draft_of, Endpoints, Probe, probe, Seen
 from msg_graph import loads
 from msg_graph.draft import declaration_of, MARK
 import pytest
@@ -114,7 +114,7 @@ def test_a_real_system(system: None) -> None:
 
 def test_types_that_are_not_there(
         system: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mddag_executor.executor import graph_probe
+    from mddag_executor.hosting import graph_probe
 
     def broken(kind: str) -> Any:
         raise ModuleNotFoundError(f'No module named {kind!r}')

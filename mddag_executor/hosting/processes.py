@@ -50,8 +50,8 @@ from typing import Any, BinaryIO, TextIO
 from mddag_executor.core.tally import of_processes
 from mddag_executor.errors import MddagError
 from mddag_executor.executor.entity import COUNTS
-from mddag_executor.executor.measure import ExecutionPlan, Ledger, measure
-from mddag_executor.executor.session import MATCH_TIMEOUT_S, Session
+from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure
+from mddag_executor.hosting.session import MATCH_TIMEOUT_S, Session
 from msg_graph import TaskSet
 from msg_graph.binding import Entity
 from msg_graph.drift import drift, Observed, Releases
@@ -297,7 +297,7 @@ class Part:
 
         :param unmatched: returns the topics where publishers and subscriptions have not met yet;
             ``patience_s``: for how long to wait until more of them have.
-        :raises mddag_executor.executor.session.SessionError: when they do not meet.
+        :raises mddag_executor.hosting.session.SessionError: when they do not meet.
         """
         self._come_to('made', name, names, session)
         session.wait_until_matched(

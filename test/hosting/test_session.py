@@ -9,7 +9,7 @@ import threading
 from types import FrameType
 from typing import Any
 
-from mddag_executor.executor.session import Session
+from mddag_executor.hosting.session import Session
 import pytest
 
 DEEPEST = 60
