@@ -3,9 +3,9 @@
 """
 What is done at once, where it is taken: it completes something that callbacks may wait for.
 
-Responses complete futures, ``/clock`` sets simulated time, and the timer of a ``Rate`` ends a sleep.
-All of these are rclpy's own code, which only takes note of something.  The thread that spins does
-them, from an epoll of its own, so they come through though all workers wait for them.
+Responses complete futures, ``/clock`` sets simulated time, and the timer of a ``Rate`` ends a
+sleep. All of these are rclpy's own code, which only takes note of something.  The thread that
+spins does them, from an epoll of its own, so they come through though all workers wait for them.
 """
 
 from __future__ import annotations

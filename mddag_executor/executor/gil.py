@@ -8,20 +8,20 @@ Theory of operation
 Python's global interpreter lock lets one thread compute at a time.  The core therefore starts a
 callback that holds the GIL only if nothing as urgent holds it (rule 11 of ``core.rules``).
 
-1.  *Measured.*  An execution takes some time (wall), its thread computes for a part of it (own), and
-    the other threads of the process compute meanwhile (others).  If it computed for over four
+1.  *Measured.*  An execution takes some time (wall), its thread computes for a part of it (own),
+    and the other threads of the process compute meanwhile (others).  If it computed for over four
     fifths of its time, it holds the GIL.  If it computed for less than half of the time in which
     no other thread computed, it waits for something else than the GIL, and does not hold it.
     Anything between says nothing.
-2.  *Unknown.*  As long as nothing is known, and after ``UNCLEAR_RUNS`` executions that said nothing,
-    the next execution is treated as one that holds the GIL: no other one computes then, which
-    shows what it does.
+2.  *Unknown.*  As long as nothing is known, and after ``UNCLEAR_RUNS`` executions that said
+    nothing, the next execution is treated as one that holds the GIL: no other one computes then,
+    which shows what it does.
 3.  *A callback that computes with the GIL released* (numpy, hashlib) looks as if it held it.
     Declare ``holds_interpreter: false`` to have several of these run in parallel.
-4.  *A callback that waits though it usually computes* would keep others from the GIL.  ``GilCheck``
-    reads the CPU clock of its thread, first after ``FIRST_CHECK_NS`` and then ever more seldom,
-    but only while something waits for the GIL.  If the thread has not computed since the last
-    check, the execution gives the GIL back.
+4.  *A callback that waits though it usually computes* would keep others from the GIL.
+    ``GilCheck`` reads the CPU clock of its thread, first after ``FIRST_CHECK_NS`` and then ever
+    more seldom, but only while something waits for the GIL.  If the thread has not computed since
+    the last check, the execution gives the GIL back.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What is done with something that was taken: which job is it of, and when was that released?
+What is done with something that was taken: it is given its job, and that its release.
 
 All of it happens under the engine's lock, at the time ``now`` that whoever has the lock has set.
 """

@@ -3,17 +3,16 @@
 """
 The one place in which idle workers wait: an epoll over everything that can happen.
 
-Theory of operation
--------------------
-1.  *Channels.*  The middleware announces what arrives by writing to an eventfd (``listeners``).  A
-    channel is such a descriptor with the sources that share it: most sources have one of their
+Theory of operation -------------------
+1.  *Channels.*  The middleware announces what arrives by writing to an eventfd (``listeners``).
+    A channel is such a descriptor with the sources that share it: most sources have one of their
     own; when there are more than ``fd_budget`` of them, several share one.
 2.  *Waiting.*  All descriptors are registered edge-triggered in one epoll.  However many workers
     wait, the kernel wakes exactly one for each event.  ``wake`` wakes one more.
 3.  *Time.*  One timerfd stands for the earliest of all times at which something has to be done.
-4.  *Muting.*  Nobody is woken for what cannot start.  While a callback holds the GIL for long, what
-    holds it, too, and has more time than the callback needs stays in the middleware.  So sources
-    whose callbacks hold the GIL are registered in nested epolls by relative deadline
+4.  *Muting.*  Nobody is woken for what cannot start.  While a callback holds the GIL for long,
+    what holds it, too, and has more time than the callback needs stays in the middleware.  So
+    sources whose callbacks hold the GIL are registered in nested epolls by relative deadline
     (``URGENCIES_NS``), and ``mute`` switches off those with at least a given relative deadline:
     one system call each.  ``unmute`` switches them on again, and returns what has arrived.
 5.  Descriptors of removed sources are used again, never closed before the end: if an entity is

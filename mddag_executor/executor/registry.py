@@ -1,8 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""
-Which entities there are: the declared callback of each, its callback group in the core.
-"""
+"""Which entities there are: the declared callback of each, its callback group in the core."""
 
 from __future__ import annotations
 

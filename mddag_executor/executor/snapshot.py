@@ -3,8 +3,8 @@
 """
 What an executor's nodes have to wait for.
 
-Nodes notify an executor that *something* has changed (``Executor.wake``) but not what, so the set is
-taken again and compared.
+Nodes notify an executor that *something* has changed (``Executor.wake``) but not what, so the set
+is taken again and compared.
 """
 
 from __future__ import annotations

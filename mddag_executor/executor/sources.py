@@ -8,9 +8,9 @@ something arrives (``loop``), and ``collect`` then takes what is there.  Message
 taken under the engine's lock, so they stay in order whoever takes them; rclpy keeps the GIL while
 it takes, so nothing else could run meanwhile anyway.
 
-What exceeds a bound stays in the middleware: requests beyond ``SERVICE_DEPTH``, and messages beyond
-``KEEP_ALL_DEPTH`` if the QoS profile keeps all.  They are collected when one of those that wait
-starts (``Entity.collect_more``).
+What exceeds a bound stays in the middleware: requests beyond ``SERVICE_DEPTH``, and messages
+beyond ``KEEP_ALL_DEPTH`` if the QoS profile keeps all.  They are collected when one of those that
+wait starts (``Entity.collect_more``).
 """
 
 from __future__ import annotations

@@ -58,7 +58,8 @@ class TimerSource:
 
     __slots__ = (
         'entity', 'timer', 'handle', 'fd', 'urgency', 'due', 'entry', 'simulated',
-        'may_be_simulated', '_queue', '_next_call', '_call', '_until', '_period', '_offset', '_clock')
+        'may_be_simulated', '_queue', '_next_call', '_call', '_until', '_period', '_offset',
+        '_clock')
 
     def __init__(self, entity: Entity, queue: TimerQueue) -> None:
         timer = entity.rclpy
@@ -300,7 +301,7 @@ class TimerQueue:
         return None if work is None else (source, work, _now(), 0)
 
     def _failed(self, source: TimerSource, error: Exception) -> None:
-        """Sort an exception of rcl out: the timer was destroyed or cancelled, or it is an error."""
+        """Sort an exception of rcl out: the timer is gone or cancelled, or it is an error."""
         source.entry = 0
         if isinstance(error, InvalidHandle) or not alive(source.timer):
             self._timers.pop(id(source), None)

@@ -117,9 +117,8 @@ class FilledSet:
             for waitable in self.waitables:
                 if waitable.is_ready(self._set):
                     take(waitable)
-            return [
-                self._guards[address] for address in self._set.get_ready_entities('guard_condition')
-                if address in self._guards]
+            ready = self._set.get_ready_entities('guard_condition')
+            return [self._guards[address] for address in ready if address in self._guards]
 
 
 class _Held(AbstractContextManager[None]):

@@ -3,28 +3,28 @@
 """
 The worker threads: they wait for what happens, tell the engine, and run what it dispatches.
 
-Theory of operation
--------------------
+Theory of operation -------------------
 1.  *A turn.*  A worker thread reports the end of its last execution, takes what has arrived, and
     asks the engine for the next execution: all of it in one section under one lock.  If there is
     none, it waits in the epoll (``loop``); the kernel wakes exactly one thread for each event.
-2.  *Nothing is overlooked.*  When no thread waits in the epoll after an execution, the thread polls
-    it before it asks the engine, so that an urgent arrival is known before the next choice.
-3.  *Waking others.*  If more than one execution may start, one waiting thread is woken, which does
-    the same.  What a callback makes ready by publishing is left to its own thread if the callback
-    has ended within ``TAIL_NS`` after publishing lately; in any case another thread is woken
-    ``WAKE_GUARD_NS`` later, so a wrong guess costs no more than that.
+2.  *Nothing is overlooked.*  When no thread waits in the epoll after an execution, the thread
+    polls it before it asks the engine, so that an urgent arrival is known before the next choice.
+3.  *Waking others.*  If more than one execution may start, one waiting thread is woken, which
+    does the same.  What a callback makes ready by publishing is left to its own thread if the
+    callback has ended within ``TAIL_NS`` after publishing lately; in any case another thread is
+    woken ``WAKE_GUARD_NS`` later, so a wrong guess costs no more than that.
 4.  *Threads wait in the epoll as they are needed.*  A spin begins with one of them; another is
-    admitted when an execution starts and none waits.  All others are parked, each on a lock of its
-    own, which is released exactly once for each admission.
-5.  *Time.*  One timerfd stands for the next timer, deadline of an open job, check of who holds the
-    GIL, and call that somebody asked for (``call_at``).
+    admitted when an execution starts and none waits.  All others are parked, each on a lock of
+    its own, which is released exactly once for each admission.
+5.  *Time.*  One timerfd stands for the next timer, deadline of an open job, check of who holds
+    the GIL, and call that somebody asked for (``call_at``).
 6.  *Lending.*  A callback that waits inside ``Client.call`` gives its worker back to the core; if
     fewer threads are left than there are workers, a new one is made.  ``MOST_LENT`` may do so at
     the same time; more of them keep their workers.
-7.  *Coroutines.*  A coroutine that waits for a future is suspended: it keeps its callback group but
-    no worker, and becomes ready again, under the key it had, when the future is done.
-8.  Whatever a callback raises, or a thread of the pool itself, goes to ``fail`` and ends the spin.
+7.  *Coroutines.*  A coroutine that waits for a future is suspended: it keeps its callback group
+    but no worker, and becomes ready again, under the key it had, when the future is done.
+8.  Whatever a callback raises, or a thread of the pool itself, goes to ``fail`` and ends the
+    spin.
 """
 
 from __future__ import annotations
@@ -227,7 +227,7 @@ class WorkerPool:
             self._wake_for_more()
 
     def _is_inside(self) -> bool:
-        """Return whether the calling thread has the lock: this is a signal handler, or a finalizer."""
+        """Return whether the calling thread has the lock: in a signal handler or a finalizer."""
         return self.lock._is_owned()  # type: ignore[attr-defined, no-any-return]
 
     def _defer(self, function: Callable[[], None]) -> None:
@@ -611,7 +611,8 @@ class WorkerPool:
                 self.inbox.timer(fired)
 
     def _thread_of(self, work: Work) -> WorkerThread | None:
-        return next((each for each in (*self._threads, *self._visitors) if each.work is work), None)
+        return next(
+            (each for each in (*self._threads, *self._visitors) if each.work is work), None)
 
     def _watch_holder(self, now: int) -> None:
         """Check whether what holds the GIL computes, as something waits for that."""
@@ -723,10 +724,9 @@ class WorkerPool:
     @contextmanager
     def lend(self, me: WorkerThread) -> Iterator[None]:
         """Lend the worker of a running callback to other threads."""
-        lends = False
         with self.lock:
             if not me.has_lent and me.work is not None and self._waiting_calls < MOST_LENT:
-                lends = me.has_lent = True
+                me.has_lent = True
                 self._waiting_calls += 1
                 self.lent += 1
                 self.tick()

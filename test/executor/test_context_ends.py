@@ -70,7 +70,7 @@ def test_spin_ends_with_its_context(way, end, inside, no_thread_leak, monkeypatc
     thread.join(10.0)
     assert not thread.is_alive()
     # As rclpy's: spin returns when a callback has shut the context down.
-    returns = inside and end != 'destroy' and intake != 'steps'
+    returns = inside and end != 'destroy' and way != 'steps'
     assert [type(error) for error in errors] == (
         [] if returns else [ExternalShutdownException])
     assert executor.shutdown(5.0)
