@@ -10,7 +10,8 @@ import sys
 
 from benchmarks import core, evaluate, live, replay
 from mddag_executor.cli.common import check_files
-from mddag_executor.cli.main import main, Parser
+from mddag_executor.cli.main import main
+from mddag_executor.cli.parsing import Parser
 
 BENCHMARKS = {'live': live, 'core': core, 'replay': replay, 'evaluate': evaluate}
 

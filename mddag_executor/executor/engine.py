@@ -18,7 +18,7 @@ its lock, so that times never decrease.  Nobody but the engine and its parts (``
     For that the turn is the callback's and not the message's: where a queue overflows all the
     time, none of its messages waits for long, and it would have its turn after everybody who has
     waited longer.  So the next message takes the place of the one that goes.
-3.  *What to run* (``next``) and *what became of it* (``finished``,
+3.  *What to run* (``dispatch``) and *what became of it* (``finished``,
     ``suspended``, ``refused``, …) is the core's decision, see ``core.rules``.
 4.  *What the core decides beside* (verdicts, ends of jobs, what an abort drops) is counted,
     recorded and reported to the user (``verdicts``).
@@ -338,7 +338,7 @@ class Engine:
         """Return how many workers run nothing."""
         return self._state.scalars[N_IDLE]
 
-    def next(self, worker: int, now: int) -> Work | None:
+    def dispatch(self, worker: int, now: int) -> Work | None:
         """
         Dispatch the next execution on a worker that runs nothing; None: nothing may start.
 

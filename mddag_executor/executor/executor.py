@@ -3,10 +3,11 @@
 """
 The executor: rclpy's contract on top of intake, core and workers.
 
-Theory of operation ------------------- ``spin`` lets the workers wait for what happens and run
-callbacks (``workers``).  The calling thread waits, too, for what ends the spin (an exception, a
-shutdown, a done future, a timeout), for entities that come and go (``upkeep``), and for what is
-done at once (``at_once``).
+Theory of operation
+-------------------
+``spin`` lets the workers wait for what happens and run callbacks (``workers``).  The calling
+thread waits, too, for what ends the spin (an exception, a shutdown, a done future, a timeout),
+for entities that come and go (``upkeep``), and for what is done at once (``at_once``).
 
 ``spin_once`` is one turn of a worker in the calling thread.
 
@@ -597,7 +598,6 @@ class MultiDeadlineExecutor(BareExecutor):
                     self._stepping.close()
                 self._pool.loop.close()
                 self._at_once.loop.close()
-
 
     def _end_run(self) -> None:
         """Judge what is open and close the trace, once; whoever comes second waits for that."""

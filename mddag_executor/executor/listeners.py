@@ -3,11 +3,13 @@
 """
 Descriptors that one epoll can wait for: eventfds that the middleware writes to, and a timerfd.
 
-Theory of operation ------------------- rcl calls a listener ``callback(const void * user_data,
-size_t number_of_events)`` for each message, request, response or event that arrives, and for each
-reset of a timer.  libc's ``eventfd_write(int fd, eventfd_t value)`` fits this call on the ABIs of
-x86-64 and aarch64, so the middleware writes to an eventfd itself: without Python, without the
-GIL, and without a thread of this package.  Setting and clearing a listener is synchronous.
+Theory of operation
+-------------------
+rcl calls a listener ``callback(const void * user_data, size_t number_of_events)`` for each
+message, request, response or event that arrives, and for each reset of a timer.  libc's
+``eventfd_write(int fd, eventfd_t value)`` fits this call on the ABIs of x86-64 and aarch64, so the
+middleware writes to an eventfd itself: without Python, without the GIL, and without a thread of
+this package.  Setting and clearing a listener is synchronous.
 
 An eventfd counts what has arrived.  epoll reports each write once (edge-triggered), so nobody has
 to read the count.

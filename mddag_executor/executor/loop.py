@@ -3,7 +3,8 @@
 """
 The one place in which idle workers wait: an epoll over everything that can happen.
 
-Theory of operation -------------------
+Theory of operation
+-------------------
 1.  *Channels.*  The middleware announces what arrives by writing to an eventfd (``listeners``).
     A channel is such a descriptor with the sources that share it: most sources have one of their
     own; when there are more than ``fd_budget`` of them, several share one.

@@ -3,7 +3,8 @@
 """
 The worker threads: they wait for what happens, tell the engine, and run what it dispatches.
 
-Theory of operation -------------------
+Theory of operation
+-------------------
 1.  *A turn.*  A worker thread reports the end of its last execution, takes what has arrived, and
     asks the engine for the next execution: all of it in one section under one lock.  If there is
     none, it waits in the epoll (``loop``); the kernel wakes exactly one thread for each event.
@@ -494,7 +495,7 @@ class WorkerPool:
     def _choose(self, me: WorkerThread, now: int) -> Work | None:
         """Return what to run; the caller has the lock."""
         engine = self.engine
-        work = engine.next(me.worker, now) if self.running else None
+        work = engine.dispatch(me.worker, now) if self.running else None
         if work is not None:
             me.worker = work.worker
             me.work = work

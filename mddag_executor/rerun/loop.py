@@ -202,7 +202,7 @@ class Loop:
             self.strands.expire(now)
             return True
         engine = self.engine
-        work = engine.next(0, now)
+        work = engine.dispatch(0, now)
         if work is not None:
             self._execute(work)
             return True

@@ -68,7 +68,7 @@ class Driver:
             while releases and releases[0][0] == now:
                 source = self.entities[self.tables.source[releases.pop(0)[1]]]
                 self.engine.timer_due(Work(source, print), now, now)
-            while (work := self.engine.next(0, now)) is not None:
+            while (work := self.engine.dispatch(0, now)) is not None:
                 self.note(now, 'start', work)
                 assert work.origin is not None
                 _, dag, _, vertex = work.origin
@@ -147,12 +147,12 @@ def test_nothing_waits_that_may_run_beside_who_computes(steps: list[bool | int])
         begun: list[Work | None] = []
         if isinstance(step, bool):
             engine.ready(Work(entities[step], print), now)
-            begun.append(engine.next(0, now))
+            begun.append(engine.dispatch(0, now))
         elif step in running:
             engine.finished(running.pop(step), now, now, now, 0, step)
-            begun.append(engine.next(step, now))
+            begun.append(engine.dispatch(step, now))
         while begun and engine.may_start_more(now) and (len(begun) == 1 or begun[-1] is not None):
-            begun.append(engine.next(0, now))
+            begun.append(engine.dispatch(0, now))
         running |= {work.worker: work for work in begun if work is not None}
         if len(running) < engine.n_workers:
             assert not entities[0].waiting
@@ -167,7 +167,7 @@ def test_a_full_queue_drops_the_oldest_and_counts_it() -> None:
     for now, work in enumerate(works):
         engine.arrived(work, None, -1, -1, now)
     ran = []
-    while (ready := engine.next(0, 10)) is not None:
+    while (ready := engine.dispatch(0, 10)) is not None:
         ran.append(ready.args[0])
         engine.finished(ready, 10, 11, 11, 0, ready.worker)
     assert (ran, entity.dropped, entity.ran) == ([3, 4], 3, 2)
@@ -198,14 +198,14 @@ def test_of_a_group_one_runs_and_the_next_one_when_it_has_ended() -> None:
     works = [Work(each, print) for each in (entity, entity, other)]
     for now, work in enumerate(works):
         engine.ready(work, now)
-    assert engine.next(0, 5) is works[0]
+    assert engine.dispatch(0, 5) is works[0]
     assert engine.may_start_more(5)
-    assert engine.next(1, 5) is works[2]
-    assert not engine.may_start_more(5) and engine.next(1, 5) is None
+    assert engine.dispatch(1, 5) is works[2]
+    assert not engine.may_start_more(5) and engine.dispatch(1, 5) is None
     engine.finished(works[2], 5, 6, 6, 0, works[2].worker)
-    assert engine.next(1, 6) is None
+    assert engine.dispatch(1, 6) is None
     engine.finished(works[0], 5, 7, 7, 0, works[0].worker)
-    assert engine.next(1, 7) is works[1]
+    assert engine.dispatch(1, 7) is works[1]
 
 
 def test_a_suspended_execution_keeps_its_group_and_no_worker() -> None:
@@ -214,15 +214,15 @@ def test_a_suspended_execution_keeps_its_group_and_no_worker() -> None:
     works = [Work(each, print) for each in (entity, entity, other)]
     for work in works:
         engine.ready(work, 0)
-    assert engine.next(0, 0) is works[0]
+    assert engine.dispatch(0, 0) is works[0]
     engine.suspended(works[0], 0, 1, 0, works[0].worker)
-    assert engine.next(0, 1) is works[2]
+    assert engine.dispatch(0, 1) is works[2]
     engine.finished(works[2], 1, 2, 2, 0, works[2].worker)
-    assert engine.next(0, 2) is None and engine.idle_workers == 1
+    assert engine.dispatch(0, 2) is None and engine.idle_workers == 1
     engine.resume(works[0])
-    assert engine.next(0, 3) is works[0]
+    assert engine.dispatch(0, 3) is works[0]
     engine.finished(works[0], 3, 4, 4, 0, works[0].worker)
-    assert engine.next(0, 4) is works[1]
+    assert engine.dispatch(0, 4) is works[1]
 
 
 def test_more_is_collected_when_one_that_waits_starts() -> None:
@@ -230,7 +230,7 @@ def test_more_is_collected_when_one_that_waits_starts() -> None:
     entity = without_job(most_waiting=1)
     engine.ready(Work(entity, print), 0)
     entity.collect_more = lambda: collected.append(1)
-    first = engine.next(0, 0)
+    first = engine.dispatch(0, 0)
     assert first is not None and collected == [1] and entity.collect_more is None
 
 
@@ -247,6 +247,6 @@ def test_who_holds_the_gil_is_given_back_when_it_ends_waits_or_lends() -> None:
     ):
         work = Work(entities[0], print)
         engine.ready(work, 0)
-        assert engine.next(0, 0) is work and engine.interpreter_holder() is work
+        assert engine.dispatch(0, 0) is work and engine.interpreter_holder() is work
         end(work)
         assert engine.holders == [] and engine.interpreter_holder() is None
