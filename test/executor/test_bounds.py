@@ -114,7 +114,7 @@ def test_few_requests_wait_in_python_and_none_is_lost(make_executor, make_node):
         # one runs, and nobody takes more than wait
         assert wait_for(lambda: waiting(executor) == SERVICE_DEPTH)
         go_on.set()
-        assert wait_for(lambda: len(answered) == 60), len(answered)
+        assert wait_for(lambda: len(answered) == 60, 10.0), len(answered)
         assert wait_for(lambda: is_idle(executor))
     assert sorted(map(int, answered)) == list(range(1, 61))
     assert 0 < max(most) <= 60 - 1

@@ -9,6 +9,7 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.executor import gil, publishing
 from mddag_executor.executor.gil import GilCheck, GilHabit, LAST_CHECK_NS
 import msg_graph
 import pytest
@@ -260,3 +261,178 @@ def test_who_has_not_computed_since_the_last_check_waits():
     assert now < check.at <= now + LAST_CHECK_NS and check.at > at
     check.end()
     assert check.at == 0
+
+
+# --- what arrives beside a callback that computes for long ---------------------------------------
+
+BESIDE = """
+mddag: 1
+nodes:
+  - node: /node
+    callbacks:
+      - {name: long, subscription: /long, dag: long, period: 1s, deadline: 60s,
+         holds_interpreter: true}
+      - {name: urgent, subscription: /urgent, dag: urgent, period: 1s, deadline: 10ms,
+         holds_interpreter: true}
+      - {name: patient, subscription: /patient, dag: patient, period: 1s, deadline: 120s,
+         holds_interpreter: true}
+"""
+
+
+class Beside:
+    """
+    Three callbacks, one of which computes for long.
+
+    :ivar ran: what has happened, in order.
+    :ivar meanwhile: called, while the long one computes, until it returns true.
+    """
+
+    def __init__(self, executor: Any, node: Any) -> None:
+        self.ran: list[str] = []
+        self.begun = threading.Event()
+        self.meanwhile: Any = lambda: True
+        self.executor = executor
+        group = ReentrantCallbackGroup()
+        self.publishers = {
+            name: node.create_publisher(Header, f'/{name}', 10)
+            for name in ('long', 'urgent', 'patient')}
+        node.create_subscription(Header, '/long', self._long, 10, callback_group=group)
+        for name in ('urgent', 'patient'):
+            node.create_subscription(
+                Header, f'/{name}', lambda message, name=name: self.ran.append(name), 10,
+                callback_group=group)
+        executor.add_node(node)
+        assert wait_for(lambda: all(
+            p.get_subscription_count() == 1 for p in self.publishers.values()))
+
+    def publish(self, name: str) -> None:
+        self.publishers[name].publish(Header())
+
+    def _long(self, message: Header) -> None:
+        self.ran.append('begins')
+        self.begun.set()
+        compute(60)
+        end = time.monotonic() + 15.0
+        while not self.meanwhile() and time.monotonic() < end:
+            compute(1)
+        self.ran.append('ends')
+
+    def round(self, *names: str) -> list[str]:
+        """Publish some while the long one computes; return the order of all."""
+        self.ran.clear()
+        self.begun.clear()
+        self.publish('long')
+        assert self.begun.wait(15.0)
+        for name in names:
+            self.publish(name)
+        assert wait_for(lambda: len(self.ran) == 2 + len(names)), self.ran
+        return self.ran.copy()
+
+
+@pytest.fixture(params=['here', 'elsewhere'])
+def beside(request, make_executor, make_node, monkeypatch) -> Any:
+    """Give these callbacks; messages come from threads of this process, or as from elsewhere."""
+    monkeypatch.setattr(gil, 'IDLE_SHARE', -1.0)  # starving on a busy machine is no waiting
+    if request.param == 'elsewhere':
+        monkeypatch.setattr(publishing, 'subscribe', lambda topic, subscription: None)
+    executor = make_executor(msg_graph.loads(BESIDE, 'g.yaml'))
+    found = Beside(executor, make_node())
+    with Spinning(executor):
+        for name in found.publishers:  # so it is known how long each takes
+            found.publish(name)
+        assert wait_for(lambda: len(found.ran) == 4), found.ran
+        yield found
+
+
+def test_an_arrival_with_an_earlier_deadline_starts_beside_a_long_callback(beside):
+    beside.meanwhile = lambda: 'urgent' in beside.ran
+    for _ in range(3):
+        assert beside.round('urgent') == ['begins', 'urgent', 'ends']
+
+
+def test_it_does_so_at_once(beside):
+    """The long one does not wait for it."""
+    for _ in range(20):  # on a busy machine the long one may have ended before
+        order = beside.round('urgent')
+        if order == ['begins', 'urgent', 'ends']:
+            break
+    assert order == ['begins', 'urgent', 'ends']
+
+
+def test_an_arrival_with_a_later_deadline_is_collected_after_a_long_callback(beside):
+    """
+    Its callback never begins before the long one has ended.
+
+    As nobody is to be woken for it, it may only be taken then; so it must not be overlooked.
+    """
+    for _ in range(3):
+        assert beside.round('patient') == ['begins', 'ends', 'patient']
+    assert beside.executor.statistics()['dropped'] == {}
+
+
+def test_of_two_arrivals_beside_a_long_callback_one_overtakes(beside):
+    beside.meanwhile = lambda: 'urgent' in beside.ran
+    for names in (('patient', 'urgent'), ('urgent', 'patient')):
+        assert beside.round(*names) == ['begins', 'urgent', 'ends', 'patient']
+
+
+@pytest.mark.parametrize('beside', ['elsewhere'], indirect=True)
+def test_what_cannot_start_is_left_in_the_middleware(beside):
+    """While the long one computes for as long as usual, nobody wakes for the patient one."""
+    queued: list[int] = []
+
+    def meanwhile() -> bool:
+        queued.append(beside.executor.statistics()['queue'])
+        return True
+
+    beside.meanwhile = meanwhile
+    habit = next(each.habit for each in beside.executor._registry.by_id.values()
+                 if each.callback is not None and each.callback.name == 'long')
+    for _ in range(20):  # on a busy machine it may take longer than usual
+        habit.mean_ns = 50 * MS
+        assert beside.round('patient') == ['begins', 'ends', 'patient']
+        if queued[-1] == 0:
+            break
+    assert queued[-1] == 0
+
+
+def test_a_callback_that_releases_the_gil_starts_beside_a_long_one(make_executor, make_node):
+    node = make_node()
+    executor = make_executor(msg_graph.loads(
+        BESIDE.replace('120s,\n         holds_interpreter: true', '120s,\n         '
+                       'holds_interpreter: false'), 'g.yaml'))
+    beside = Beside(executor, node)
+    with Spinning(executor):
+        for name in beside.publishers:
+            beside.publish(name)
+        assert wait_for(lambda: len(beside.ran) == 4), beside.ran
+        beside.meanwhile = lambda: 'patient' in beside.ran
+        for _ in range(3):
+            assert beside.round('patient') == ['begins', 'patient', 'ends']
+
+
+def test_a_timer_that_is_due_beside_a_long_callback_runs_after_it(make_executor, make_node):
+    """And keeps its period: it was due while nobody was to be woken for it."""
+    node, ran = make_node(), []
+    group = ReentrantCallbackGroup()
+
+    def compute_long() -> None:
+        ran.append('begins')
+        compute(30)
+        ran.append('ends')
+
+    node.create_timer(0.1, compute_long, callback_group=group)
+    node.create_timer(0.01, lambda: ran.append('patient'), callback_group=group)
+    executor = make_executor(msg_graph.loads("""
+mddag: 1
+nodes:
+  - node: /node
+    callbacks:
+      - {name: long, timer: 100ms, dag: long, deadline: 5s, holds_interpreter: true}
+      - {name: patient, timer: 10ms, dag: patient, deadline: 20s, holds_interpreter: true}
+""", 'g.yaml'))
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: ran.count('ends') >= 5 and ran[-1] == 'patient', 30.0)
+    for before, after in zip(ran, ran[1:]):
+        assert before != 'begins' or after == 'ends', ran

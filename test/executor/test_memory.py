@@ -177,7 +177,7 @@ def test_a_destroyed_node_is_freed_without_the_collector(make_executor, ros_cont
         n_things = len(things) - 1  # publishers are not kept
         executor.add_node(node)
         assert wait_for(lambda: len(executor._registry.by_id) >= n_things)
-        assert wait_for(lambda: not executor._upkeep.changed)
+        assert wait_for(lambda: executor._pool.is_current)
         left = [weakref.ref(thing) for thing in (node, *things)]
         assert len(left) > 6
         node.destroy_node()

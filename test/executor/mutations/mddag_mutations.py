@@ -11,7 +11,7 @@ its call.  So a test that never ended shows as well: it has only begun.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 import json
 from pathlib import Path
 import threading
@@ -20,17 +20,18 @@ from typing import Any
 
 from mddag_executor.core import policies, tally
 from mddag_executor.core.state import COMPLETED, IDLE, JOB_END, LATE, OPEN
-from mddag_executor.executor import executor
+from mddag_executor.executor import compat, executor, workers
 from mddag_executor.executor.compat import BareTask
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, TASK
-from mddag_executor.executor.intake.events import EventsIntake
-from mddag_executor.executor.intake.sources import ClientSource
-from mddag_executor.executor.intake.waitset import WaitSetIntake
-from mddag_executor.executor.jobs import Jobs, Origin
-from mddag_executor.executor.pool import Pool
-from mddag_executor.executor.receiver import Receiver
+from mddag_executor.executor.inbox import Inbox
+from mddag_executor.executor.jobs import Jobs, Origin, Publication, PublisherState, Topic
+from mddag_executor.executor.loop import EventLoop
+from mddag_executor.executor.sources import Source
+from mddag_executor.executor.timers import TimerSource
+from mddag_executor.executor.waitables import WaitableSource, WaitSetThread
 from mddag_executor.executor.work import TaskWork, Work
+from mddag_executor.executor.workers import WorkerPool
 import pytest
 
 MUTATIONS: dict[str, Callable[[], None]] = {}
@@ -79,6 +80,7 @@ def depth_not_kept() -> None:
             message(self, work, *args)
         return broken
     replace(Engine, 'arrived', make)
+    replace(Engine, 'ready_message', make)
 
 
 @mutation('Of each kind of entity every twentieth callback does not run, and counts as run.')
@@ -101,14 +103,64 @@ def every_twentieth_lost() -> None:
 def every_twentieth_response_lost() -> None:
     count = 0
 
-    def make(arrived: Any) -> Any:
+    def make(complete: Any) -> Any:
         def broken(*args: Any) -> None:
             nonlocal count
             count += 1
             if count % 20:
-                arrived(*args)
+                complete(*args)
         return broken
-    replace(ClientSource, 'arrived', make)
+    replace(compat, 'complete_request', make)
+
+
+@mutation('What was left in the middleware since enough waits is never collected.')
+def rest_not_collected() -> None:
+    def make(collect: Any) -> Any:
+        def broken(self: Source) -> None:
+            collect(self)
+            self.entity.collect_more = None
+        return broken
+    replace(Source, 'collect', make)
+
+
+@mutation('Subscriptions that publishing threads have taken from announce nothing any more.')
+def held_subscriptions_not_released() -> None:
+    replace(EventLoop, 'release', lambda release: lambda self, source: None)
+    # which would register them again
+    replace(WorkerPool, 'classify', lambda classify: lambda self, source: None)
+
+
+@mutation('A timer that is reset is not looked at.')
+def resets_of_timers_not_noticed() -> None:
+    replace(TimerSource, 'collect', lambda collect: lambda self: None)
+
+
+# --- what is woken -------------------------------------------------------------------------------
+
+
+@mutation('While one worker runs something, no other one waits for what arrives.')
+def one_worker_at_a_time() -> None:
+    def make(admit: Any) -> Any:
+        def broken(self: WorkerPool) -> None:
+            if len(self._parked) == len(self._threads) or self._closed:
+                admit(self)
+        return broken
+    replace(WorkerPool, '_admit', make)
+
+
+@mutation('What was muted while a callback computed stays muted.')
+def muted_for_ever() -> None:
+    replace(EventLoop, 'unmute', lambda unmute: lambda self: [])
+
+
+@mutation('While a callback computes, threads wake for what cannot start.')
+def nothing_muted() -> None:
+    replace(EventLoop, 'mute', lambda mute: lambda self, bound: None)
+
+
+@mutation('While a callback computes, nobody wakes for what holds the GIL, however urgent it is.')
+def urgent_ones_muted() -> None:
+    replace(EventLoop, 'mute', lambda mute: lambda self, bound: mute(self, 0))
 
 
 # --- coroutines, exceptions, waking, the end -----------------------------------------------------
@@ -121,12 +173,7 @@ def coroutines_not_resumed() -> None:
 
 @mutation("A coroutine never goes on that awaits something other than one of rclpy's futures.")
 def unknown_waits_not_resumed() -> None:
-    def make(look_around: Any) -> Any:
-        def broken(self: Pool) -> Any:
-            self._polled.clear()
-            return look_around(self)
-        return broken
-    replace(Pool, 'look_around', make)
+    workers.POLL_NS = 10 ** 18
 
 
 @mutation('A task of rclpy 7.1.9 goes on by itself as well, so it does so twice.')
@@ -137,26 +184,31 @@ def tasks_go_on_by_themselves() -> None:
 @mutation('What a callback raises does not come out of spin.')
 def exceptions_swallowed() -> None:
     def broken(self: Any, error: BaseException) -> None:
-        self._ring()
+        self._at_once.ring()
     executor.MultiDeadlineExecutor._fail = broken  # type: ignore[method-assign]
 
 
 @mutation('What fails while something is taken does not come out of spin.')
-def exceptions_of_the_intake_swallowed() -> None:
-    replace(Receiver, 'on_intake_error', lambda on_error: lambda self, error: None)
+def exceptions_of_takes_swallowed() -> None:
+    def make(init: Any) -> Any:
+        def broken(self: Any, *args: Any) -> None:
+            init(self, *args[:-1], lambda error: None)
+        return broken
+    for kind in (Inbox, WaitableSource, WaitSetThread):
+        replace(kind, '__init__', make)
 
 
 @mutation('A task of a spinning executor is there, and nobody notices.')
 def create_task_does_not_wake_workers() -> None:
     def make(report: Any) -> Any:
-        def broken(self: Pool, event: Any, *args: Any) -> None:
+        def broken(self: WorkerPool, event: Any, *args: Any) -> None:
             if event == self.engine.ready and args[0].entity.kind == TASK:
                 with self.lock:
                     event(*args, self.tick())
             else:
                 report(self, event, *args)
         return broken
-    replace(Pool, 'report', make)
+    replace(WorkerPool, 'report', make)
 
 
 @mutation('A task does not end the wait of a spin_once.')
@@ -170,8 +222,8 @@ def add_node_does_not_wake() -> None:
 
 
 def _wakes_nobody(owner: Any, name: str) -> None:
-    def make_deaf(ring: Any) -> Any:
-        return lambda self: None if getattr(silent, 'on', False) else ring(self)
+    def make_deaf(wake: Any) -> Any:
+        return lambda self: None if getattr(silent, 'on', False) else wake(self)
 
     def make(method: Any) -> Any:
         def broken(*args: Any, **kwargs: Any) -> Any:
@@ -181,22 +233,21 @@ def _wakes_nobody(owner: Any, name: str) -> None:
             finally:
                 silent.on = before  # rclpy calls add_node in add_node
         return broken
-    replace(executor.MultiDeadlineExecutor, '_ring', make_deaf)
+    replace(EventLoop, 'wake', make_deaf)
     replace(owner, name, make)
 
 
 @mutation('A shutdown ends no worker thread, and says that it has.')
 def shutdown_leaves_workers() -> None:
-    def broken(self: Pool, timeout: float | None) -> bool:
+    def broken(self: WorkerPool, timeout: float | None) -> bool:
         self.pause()
         return True
-    Pool.close = broken  # type: ignore[method-assign]
+    WorkerPool.close = broken  # type: ignore[method-assign]
 
 
-@mutation('The threads of the intake go on when the spin has ended.')
-def shutdown_leaves_intake() -> None:
-    for kind in (EventsIntake, WaitSetIntake):
-        replace(kind, 'stop', lambda stop: lambda self: None)
+@mutation('The thread that waits in a wait set goes on when the spin has ended.')
+def shutdown_leaves_wait_set() -> None:
+    replace(WaitSetThread, 'stop', lambda stop: lambda self: None)
 
 
 # --- jobs and verdicts ---------------------------------------------------------------------------
@@ -204,14 +255,12 @@ def shutdown_leaves_intake() -> None:
 
 @mutation("A job's release is when its timer was looked at, and not when it was due.")
 def release_is_when_noticed() -> None:
-    def make(take_in: Any) -> Any:
-        def broken(self: Receiver, arrivals: Sequence[Work]) -> None:
-            for work in arrivals:
-                if work.due is not None:
-                    work.due = time.monotonic_ns()
-            take_in(self, arrivals)
+    def make(timer: Any) -> Any:
+        def broken(self: Inbox, fired: Any) -> None:
+            source, work, _, missed = fired
+            timer(self, (source, work, time.monotonic_ns(), missed))
         return broken
-    replace(Receiver, 'take_in', make)
+    replace(Inbox, 'timer', make)
 
 
 @mutation('A message belongs to the oldest open job that still waits for one like it.')
@@ -236,14 +285,19 @@ def messages_go_to_the_oldest_job() -> None:
 
 @mutation('A message belongs to the job before that of its publication.')
 def messages_go_to_the_job_before() -> None:
-    def make(find: Any) -> Any:
-        def broken(self: Jobs, *args: Any) -> Origin | None:
-            origin = find(self, *args)
-            broken.last, before = origin, broken.last  # type: ignore[attr-defined]
-            return before if origin is not None and before is not None else origin
-        broken.last = None  # type: ignore[attr-defined]
+    def make(publish: Any) -> Any:
+        before: dict[str, Origin] = {}
+
+        def broken(
+            self: Jobs, send: Any, publisher: Any, msg: Any, state: PublisherState, topic: Topic,
+            origin: Origin,
+        ) -> Publication:
+            origin, before[state.topic] = before.get(state.topic, origin), origin
+            publication: Publication = publish(
+                self, send, publisher, msg, state, topic, origin)
+            return publication
         return broken
-    replace(Jobs, 'find', make)
+    replace(Jobs, 'publish', make)
 
 
 @mutation('A sink that completes after its deadline counts as completed only.')

@@ -25,7 +25,7 @@ from .mddag_mutations import MEANING, MUTATIONS
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
-LIVE = HERE.parent.relative_to(ROOT)
+TESTS = HERE.parent.relative_to(ROOT)
 
 HUNG_S = 20
 """After so many seconds a test of a child hangs."""
@@ -36,7 +36,7 @@ AT_ONCE_S = 4.0
 @dataclass(frozen=True)
 class Case:
     """
-    A mutation and tests of ``test/live`` that must notice it.
+    A mutation and tests of ``test/executor`` that must notice it.
 
     :ivar every: each of them must notice it, else one of them.
     :ivar at_once: and by an assertion, before any time-out of the test's own.
@@ -49,52 +49,68 @@ class Case:
 
 
 def of(file: str, *names: str) -> list[str]:
-    """Return the ids of a file's tests; without a parameter it is that of the intake."""
-    return [f'{file}::{name}' if '[' in name else f'{file}::{name}[events]' for name in names]
+    """Return the ids of a file's tests."""
+    return [f'{file}::{name}' for name in names]
 
 
 CASES = [
     # those that take longest first
     Case('every_twentieth_lost', of(
         'test_each_runs.py', 'test_each_time_that_a_timer_is_due_counts', *(
-            f'test_each_of_many_runs_once[events-of_{kind}]' for kind in (
+            f'test_each_of_many_runs_once[of_{kind}]' for kind in (
                 'tasks', 'subscriptions', 'services', 'guards', 'waitables'))), every=True),
     Case('create_task_does_not_wake_spin_once', of(
-        'test_spin.py', 'test_what_is_new_wakes_a_spin_once_that_waits[events-task]')),
-    Case('shutdown_leaves_intake', of('test_spin.py', *(
-        f'test_no_thread_goes_on_though_the_context_does[{intake}-{end}]'
-        for intake in ('events', 'waitset') for end in ('shutdown', 'future'))), every=True),
+        'test_spin.py', 'test_what_is_new_wakes_a_spin_once_that_waits[task]')),
+    Case('shutdown_leaves_wait_set', of(
+        'test_spin.py', 'test_no_thread_goes_on_though_the_context_does[shutdown]')),
     Case('shutdown_leaves_workers', of(
-        'test_spin.py', 'test_no_thread_goes_on_though_the_context_does[events-shutdown]')),
+        'test_spin.py', 'test_no_thread_goes_on_though_the_context_does[shutdown]')),
     Case('unknown_waits_not_resumed', of(
         'test_spin.py',
-        'test_a_coroutine_that_awaits_something_unknown_is_asked_again[events-False]',
-        'test_a_coroutine_that_awaits_something_unknown_is_asked_again[events-True]'),
+        'test_a_coroutine_that_awaits_something_unknown_is_asked_again[False]',
+        'test_a_coroutine_that_awaits_something_unknown_is_asked_again[True]'),
         every=True),
     Case('groups_ignored', of('test_executor.py', 'test_mutually_exclusive_group_is_kept')),
     Case('rad_is_fifo', of(
         'test_deadlines.py',
-        'test_ready_callbacks_run_in_the_policys_order[events-rad-abc]')),
+        'test_ready_callbacks_run_in_the_policys_order[rad-abc]')),
     Case('depth_not_kept', of(
         'test_executor.py', 'test_queue_depth_is_kept_and_drops_are_counted')),
     Case('every_twentieth_response_lost', of(
-        'test_each_runs.py', 'test_each_of_many_runs_once[events-of_services]')),
+        'test_each_runs.py', 'test_each_of_many_runs_once[of_services]')),
     Case('coroutines_not_resumed', [
-        *of('test_each_runs.py', 'test_each_of_many_runs_once[events-of_coroutines]'),
+        *of('test_each_runs.py', 'test_each_of_many_runs_once[of_coroutines]'),
         *of('test_like_rclpy.py',
             'test_a_coroutine_goes_on_in_the_step_after_its_future_is_done')], every=True),
     Case('tasks_go_on_by_themselves', of(
         'test_newer_rclpy.py',
-        'test_a_task_awaits_one_future_after_another[events-await-own]')),
+        'test_a_task_awaits_one_future_after_another[await-own]')),
     Case('exceptions_swallowed', of(
         'test_spin.py', *(
-            f'test_an_exception_comes_out_of_spin[events-{kind}]' for kind in (
+            f'test_an_exception_comes_out_of_spin[{kind}]' for kind in (
                 'timer', 'subscription', 'service', 'guard', 'waitable', 'task',
                 'coroutine'))), every=True, at_once=True),
-    Case('exceptions_of_the_intake_swallowed', of(
+    Case('exceptions_of_takes_swallowed', of(
         'test_spin.py', 'test_what_fails_when_it_is_taken_comes_out_of_spin'), at_once=True),
     Case('create_task_does_not_wake_workers', of(
         'test_executor.py', 'test_create_task_wakes_an_idle_executor')),
+    Case('rest_not_collected', of(
+        'test_bounds.py', 'test_few_requests_wait_in_python_and_none_is_lost')),
+    Case('held_subscriptions_not_released', of(
+        'test_delivery.py',
+        'test_messages_of_this_process_and_of_another_one_come_all_and_in_order')),
+    Case('resets_of_timers_not_noticed', of(
+        'test_timers.py', 'test_a_timer_that_was_cancelled_runs_when_it_is_reset[spin]')),
+    Case('one_worker_at_a_time', of(
+        'test_executor.py', 'test_reentrant_group_fills_all_workers')),
+    Case('muted_for_ever', of(
+        'test_gil.py',
+        'test_what_cannot_start_is_left_in_the_middleware[elsewhere]')),
+    Case('nothing_muted', of(
+        'test_gil.py', 'test_what_cannot_start_is_left_in_the_middleware[elsewhere]')),
+    Case('urgent_ones_muted', of(
+        'test_gil.py',
+        'test_it_does_so_at_once[elsewhere]')),
     Case('add_node_does_not_wake', of(
         'test_executor.py', 'test_add_node_wakes_an_idle_executor')),
     Case('release_is_when_noticed', of(
@@ -131,7 +147,7 @@ def run(folder: Path, runs: list[tuple[str, list[str], list[str]]]) -> dict[str,
         PYTEST_DISABLE_PLUGIN_AUTOLOAD='1', OPENBLAS_NUM_THREADS='1', TMPDIR=str(folder))
     jobs = [{'name': mutation or 'whole', 'mutation': mutation, 'arguments': [
         '-q', '-p', 'pytest_timeout', '-p', 'no:cacheprovider', f'--timeout={HUNG_S}', *options,
-        *(str(LIVE / test) for test in tests)]} for mutation, tests, options in runs]
+        *(str(TESTS / test) for test in tests)]} for mutation, tests, options in runs]
     child = subprocess.Popen(
         [sys.executable, str(HERE / 'driver.py'), str(folder)], cwd=ROOT,
         env=environment, stdin=subprocess.PIPE, text=True, start_new_session=True)
@@ -148,7 +164,7 @@ def result(folder: Path, name: str) -> Result:
     report, output = folder / f'{name}.jsonl', folder / f'{name}.txt'
     for line in report.read_text().splitlines() if report.exists() else ():
         what = json.loads(line)
-        test = Path(what['test']).relative_to(LIVE).as_posix()
+        test = Path(what['test']).relative_to(TESTS).as_posix()
         if what['outcome'] == 'begun':
             found[test] = 'hung', 0.0
         elif found[test][0] in ('hung', 'passed'):  # of a test's failures the first one tells
