@@ -33,7 +33,7 @@ class AtOnce:
         self, engine: Engine, lock: Any, fail: Callable[[BaseException], None]
     ) -> None:
         self.loop = EventLoop(())
-        self.timers = TimerQueue(self.loop.wake, fail)
+        self.timers = TimerQueue(self.loop.wake, lambda: None, fail)
         self.failed = fail
         self._engine = engine
         self._lock = lock

@@ -190,6 +190,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._pool.serve_meanwhile = self._serve_meanwhile
         self._pool.stopped = self._stopped
         self._pool.context_ended = self._at_once.ring
+        self._pool.entities_changed = self.wake
         self._miss_log = MissLog(self._engine.verdicts)
         self._pool.missed = self._miss_log.write
         self._registry = Registry(task_set, self._engine, self._pool.leave_group)

@@ -59,7 +59,7 @@ class TimerSource:
     __slots__ = (
         'entity', 'timer', 'handle', 'fd', 'urgency', 'due', 'entry', 'simulated',
         'may_be_simulated', '_queue', '_next_call', '_call', '_until', '_period', '_offset',
-        '_clock')
+        '_clock', 'last_period')
 
     def __init__(self, entity: Entity, queue: TimerQueue) -> None:
         timer = entity.rclpy
@@ -74,6 +74,7 @@ class TimerSource:
         self._clock: Any = timer.clock
         self.may_be_simulated = timer.clock.clock_type == ClockType.ROS_TIME
         self._offset = 0
+        self.last_period = timer.timer_period_ns
         self.due = 0
         self.entry = 0
         self.simulated = False
@@ -138,13 +139,16 @@ class TimerQueue:
 
     :param on_jump: called, from any thread, when the clock of a timer has jumped: ``fire`` is to
         be called soon.
+    :param on_retimed: called when a timer has another period than before.
     :param on_error: gets what rcl raises.
     """
 
     def __init__(
-        self, on_jump: Callable[[], None], on_error: Callable[[BaseException], None]
+        self, on_jump: Callable[[], None], on_retimed: Callable[[], None],
+        on_error: Callable[[BaseException], None],
     ) -> None:
         self._on_jump = on_jump
+        self._on_retimed = on_retimed
         self._on_error = on_error
         self._timers: dict[int, TimerSource] = {}
         self._heap: list[tuple[int, int, TimerSource]] = []
@@ -283,6 +287,9 @@ class TimerQueue:
             return None
         work = source.call()
         after, period = source.next_due(), source.period()
+        if period != source.last_period:
+            source.last_period = period
+            self._on_retimed()
         if after is None:
             return None
         if period <= 0:

@@ -166,7 +166,7 @@ class WorkerPool:
         self._deferred: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
         self.inbox = inbox
-        self.timers = TimerQueue(self._jumped, fail)
+        self.timers = TimerQueue(self._jumped, lambda: self.entities_changed(), fail)
         self.running = False
         self.stopped_at = 0
         self.is_current = False
@@ -175,6 +175,8 @@ class WorkerPool:
         self.serve_meanwhile: Callable[[], Any] | None = None
         #: called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
         self.callback_ended: Callable[[Any, BaseException | None], bool] | None = None
+        #: called when there is something that the registry does not know of
+        self.entities_changed: Callable[[], None] = lambda: None
         #: called when deadlines were missed
         self.missed: Callable[[], None] = lambda: None
         #: called when it is noticed that the context has ended
@@ -696,6 +698,8 @@ class WorkerPool:
         if engine.to_ask_again:
             engine.ask_again()
         entity = work.entity
+        if entity.removed:
+            self.entities_changed()  # it can be forgotten now
         if entity.classify is not None and entity.is_nested != entity.habit.holds:
             entity.classify()
 
